@@ -1,0 +1,1 @@
+"""The Fast Research Interface 1.0: packets, state machine, and both ends of the socket."""

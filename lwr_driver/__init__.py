@@ -1,0 +1,1 @@
+"""The arm: its description, its connection, its guards, and the log of a session."""

@@ -1,0 +1,167 @@
+"""Reading YAML files into frozen dataclasses, with errors that name the file, the key and the remedy."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from fri.errors import ConfigurationError
+
+__all__ = ["CONFIGS", "find", "parse", "read_mapping", "read_yaml"]
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+
+T = TypeVar("T")
+
+
+def find(name: str | Path, *, beside: Path | None = None) -> Path:
+    """Path of the configuration file `name`.
+
+    Looked for as given (relative to the working directory), then in the folder of the file that names it
+    (`beside`), then in the project's `configs/`. Raises ConfigurationError with the places tried.
+    """
+    wanted = Path(name).expanduser()
+    places = [wanted] if wanted.is_absolute() else [Path.cwd() / wanted]
+    if not wanted.is_absolute():
+        if beside is not None:
+            places.append(beside / wanted)
+        places.append(CONFIGS / wanted)
+    for place in places:
+        if place.is_file():
+            return place.resolve()
+    tried = ", ".join(str(place) for place in places)
+    raise ConfigurationError(f"file {str(name)!r} not found; tried {tried}")
+
+
+def read_yaml(path: Path) -> Any:
+    """Parsed content of a YAML file (`safe_load`), with the position of a syntax error in the message."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigurationError(f"{path}: not valid YAML: {error}") from error
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Parsed content of a YAML file whose top level must be a mapping."""
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{path}: the top level must be a mapping of keys, found {_kind(content)}")
+    return content
+
+
+def parse(cls: type[T], content: Any, where: str) -> T:
+    """Build the dataclass `cls` from `content`, strictly: unknown keys, missing keys and wrong types are errors.
+
+    Nested dataclasses, `tuple[X, ...]`, fixed tuples, `dict[str, X]`, `X | None`, `Literal`, bool, int, float,
+    str and Path are understood. `where` names the file for messages. Non-finite numbers are refused.
+    A ConfigurationError raised by the dataclass's `__post_init__` gets the place put before it.
+    """
+    if not isinstance(content, Mapping):
+        raise ConfigurationError(f"{where}: expected a mapping of keys, found {_kind(content)}")
+    hints = typing.get_type_hints(cls)
+    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls)) if field.init}
+    for key in content:
+        if key not in fields:
+            near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
+            advice = f"did you mean `{near[0]}`?" if near else f"known keys: {', '.join(fields)}"
+            raise ConfigurationError(f"{where}: unknown key `{key}`; {advice}")
+    values = {}
+    for name, field in fields.items():
+        if name in content:
+            values[name] = _convert(hints[name], content[name], f"{where}: `{name}`")
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ConfigurationError(f"{where}: key `{name}` is missing")
+    try:
+        return cls(**values)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{where}: {error}") from error
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(arguments, value, where)
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise ConfigurationError(f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}")
+        return value
+    if origin is tuple:
+        return _convert_tuple(arguments, value, where)
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise ConfigurationError(f"{where}: expected a mapping, found {_kind(value)}")
+        return {str(key): _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
+    if dataclasses.is_dataclass(hint):
+        return parse(typing.cast(type, hint), value, where)
+    return _convert_scalar(hint, value, where)
+
+
+def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
+    if value is None and type(None) in options:
+        return None
+    failures = []
+    for option in options:
+        if option is type(None):
+            continue
+        try:
+            return _convert(option, value, where)
+        except ConfigurationError as error:
+            failures.append(error)
+    raise failures[0]
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ConfigurationError(f"{where}: expected a list, found {_kind(value)}")
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return tuple(_convert(arguments[0], item, f"{where}[{index}]") for index, item in enumerate(value))
+    if len(value) != len(arguments):
+        raise ConfigurationError(f"{where}: expected {len(arguments)} entries, found {len(value)}")
+    return tuple(
+        _convert(hint, item, f"{where}[{index}]")
+        for index, (hint, item) in enumerate(zip(arguments, value, strict=True))
+    )
+
+
+def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if not math.isfinite(value):
+            raise ConfigurationError(f"{where}: {value} is not a finite number")
+        return float(value)
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if hint in (int, str, bool) and type(value) is hint:
+        return value
+    expected = {
+        float: "a number",
+        int: "a whole number",
+        str: "a text",
+        bool: "true or false",
+        Path: "a path",
+    }
+    raise ConfigurationError(f"{where}: expected {expected.get(hint, hint)}, found {_kind(value)} {value!r}")
+
+
+def _kind(value: Any) -> str:
+    names = {
+        dict: "a mapping",
+        list: "a list",
+        str: "the text",
+        bool: "the truth value",
+        type(None): "nothing",
+    }
+    return names.get(type(value), f"the {type(value).__name__}")

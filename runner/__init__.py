@@ -1,0 +1,1 @@
+"""What a person drives: `lwr-run` and the experiment sequence."""
