@@ -1,0 +1,75 @@
+"""Reading of YAML into dataclasses: strict, and helpful where it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from fri.errors import ConfigurationError
+from lwr_driver.configuration import find, parse, read_mapping
+
+
+@dataclass(frozen=True)
+class Box:
+    size: tuple[float, float, float]
+    name: str = "box"
+
+
+@dataclass(frozen=True)
+class Cell:
+    margin: float
+    boxes: tuple[Box, ...] = ()
+    mode: Literal["fast", "slow"] = "slow"
+    limit: float | None = None
+    table: dict[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.margin < 0:
+            raise ConfigurationError(f"margin {self.margin} m is negative; give 0 or more")
+
+
+def test_nested_content_becomes_dataclasses() -> None:
+    content = {"margin": 1, "boxes": [{"size": [1, 2.5, 3]}], "mode": "fast", "table": {"a": 2}}
+    cell = parse(Cell, content, "cell.yaml")
+    assert cell == Cell(1.0, (Box((1.0, 2.5, 3.0)),), "fast", None, {"a": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"margn": 1}, "cell.yaml: unknown key `margn`; did you mean `margin`?"),
+        ({}, "cell.yaml: key `margin` is missing"),
+        ({"margin": "wide"}, "cell.yaml: `margin`: expected a number, found the text 'wide'"),
+        ({"margin": float("nan")}, "not a finite number"),
+        ({"margin": True}, "expected a number, found the truth value True"),
+        ({"margin": 0.1, "boxes": [{"size": [1, 2]}]}, "`boxes`[0]: `size`: expected 3 entries, found 2"),
+        ({"margin": 0.1, "mode": "quick"}, "'quick' is not one of fast, slow"),
+        ({"margin": -1}, "cell.yaml: margin -1.0 m is negative"),
+        ([], "expected a mapping of keys, found a list"),
+    ],
+)
+def test_a_mistake_is_named_with_its_place(content: object, message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse(Cell, content, "cell.yaml")
+    assert message in str(caught.value)
+
+
+def test_files_are_found_beside_and_in_configs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    beside = tmp_path / "folder"
+    beside.mkdir()
+    (beside / "own.yaml").write_text("a: 1\n")
+    assert find("own.yaml", beside=beside) == beside / "own.yaml"
+    assert find("emulator/table2.yaml").is_file()
+    with pytest.raises(ConfigurationError, match="tried"):
+        find("absent.yaml")
+
+
+def test_syntax_errors_name_file_and_line(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("a: [1, 2\nb: 3\n")
+    with pytest.raises(ConfigurationError, match=r"broken\.yaml: not valid YAML(.|\n)*line 2"):
+        read_mapping(broken)
