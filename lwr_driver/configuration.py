@@ -64,8 +64,8 @@ def read_mapping(path: Path) -> dict[str, Any]:
 def parse(cls: type[T], content: Any, where: str) -> T:
     """Build the dataclass `cls` from `content`, strictly: unknown or missing keys and wrong types are errors.
 
-    Understood: nested dataclasses, `tuple[X, ...]`, fixed tuples, `dict[str, X]`, `X | None`, `Literal`, bool,
-    int, float, str and Path. `where` names the file for messages. Non-finite numbers are refused.
+    Understood: nested dataclasses, `tuple[X, ...]`, fixed tuples, `dict[str, X]`, `X | None`, `Literal`,
+    bool, int, float, str and Path. `where` names the file. Non-finite numbers are refused.
     A ConfigurationError raised by the dataclass's `__post_init__` gets the place put before it.
     """
     if not isinstance(content, Mapping):
