@@ -1,0 +1,1 @@
+"""One module a verb of `lwr-run`; each holds a click command named `command`."""
