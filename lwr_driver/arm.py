@@ -1,0 +1,282 @@
+"""The arm as a description: names, limits, gears, stiffness and the URDF, checked once when it is loaded.
+
+Nothing here needs pinocchio: the real-time process reads its limits from the same object, and must stay light.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from lwr_driver.configuration import find, parse, read_mapping
+
+__all__ = ["JOINTS", "Arm", "LinkInertia", "link_inertias"]
+
+JOINTS = 7
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _JointEntry:
+    """One joint of the arm file. Limits are magnitudes; `position_deg` is (lower, upper)."""
+
+    name: str
+    position_deg: tuple[float, float]
+    velocity_deg_s: float
+    acceleration_rad_s2: float
+    jerk_rad_s3: float
+    torque_nm: float
+    gear_ratio: float
+    stiffness_nm_rad: float
+
+    def __post_init__(self) -> None:
+        lower, upper = self.position_deg
+        if not lower < upper:
+            raise ConfigurationError(f"joint {self.name}: position_deg {lower} to {upper} is no range")
+        for field in (
+            "velocity_deg_s",
+            "acceleration_rad_s2",
+            "jerk_rad_s3",
+            "torque_nm",
+            "gear_ratio",
+            "stiffness_nm_rad",
+        ):
+            value = getattr(self, field)
+            if not value > 0.0:
+                raise ConfigurationError(f"joint {self.name}: {field} is {value}; it must be above zero")
+
+
+@dataclass(frozen=True)
+class _ArmFile:
+    """The arm file as written; units are in the key names."""
+
+    schema_version: int
+    name: str
+    urdf: Path
+    position_margin_deg: float
+    lowest_resonance_hz: float
+    joints: tuple[_JointEntry, ...]
+
+    def __post_init__(self) -> None:
+        if self.schema_version != 1:
+            raise ConfigurationError(f"schema_version {self.schema_version} is unknown; this software reads 1")
+        if len(self.joints) != JOINTS:
+            raise ConfigurationError(f"{len(self.joints)} joints listed; the LWR4+ has {JOINTS}")
+        if not 0.0 <= self.position_margin_deg <= 20.0:
+            raise ConfigurationError(f"position_margin_deg {self.position_margin_deg} is not within 0 to 20")
+        if not 0.0 < self.lowest_resonance_hz < 1000.0:
+            raise ConfigurationError(f"lowest_resonance_hz {self.lowest_resonance_hz} is not within 0 to 1000")
+
+
+@dataclass(frozen=True)
+class LinkInertia:
+    """Inertial entry of one URDF link: mass [kg], centre of mass [m] and inertia about it [kg m²], link axes."""
+
+    link: str
+    mass: float
+    centre: Vector
+    inertia: Vector
+
+    def defect(self, tolerance: float = 1e-9) -> str | None:
+        """Why no rigid body has this inertia, or None if one does.
+
+        A body of positive density has a positive definite pseudo-inertia (Wensing, Kim and Slotine 2018): mass
+        above zero and Σ = ½ tr(I) 1 - I positive semidefinite, which contains the triangle inequality of the
+        principal moments.
+        """
+        if not self.mass > 0.0:
+            return f"mass {self.mass} kg is not above zero"
+        moments = np.linalg.eigvalsh(self.inertia)
+        if moments[0] <= 0.0:
+            return f"principal moment {moments[0]:.3g} kg m² is not above zero"
+        slack = float(moments[0] + moments[1] - moments[2])
+        if slack < -tolerance * float(moments[2]):
+            return f"principal moments {moments[0]:.4g}, {moments[1]:.4g}, {moments[2]:.4g} kg m² break I1 + I2 >= I3"
+        return None
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The arm that the driver commands. Arrays are (7,), read-only, in kinematic order A1 A2 E1 A3 A4 A5 A6.
+
+    q_min, q_max : position limits [rad]; `q_low`, `q_high` are these less `margin` [rad]
+    v_max, a_max, j_max : limits of what the driver ever commands [rad/s], [rad/s²], [rad/s³]
+    tau_max : joint torque limits [Nm]; gear_ratio : motor turns per joint turn
+    stiffness : joint stiffness [Nm/rad]; resonance_hz : lowest structural resonance [Hz]
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    q_min: Vector
+    q_max: Vector
+    margin: float
+    v_max: Vector
+    a_max: Vector
+    j_max: Vector
+    tau_max: Vector
+    gear_ratio: Vector
+    stiffness: Vector
+    resonance_hz: float
+    urdf: str
+    urdf_path: Path
+
+    @property
+    def q_low(self) -> Vector:
+        """Lowest position that is ever commanded [rad], (7,)."""
+        return self.q_min + self.margin
+
+    @property
+    def q_high(self) -> Vector:
+        """Highest position that is ever commanded [rad], (7,)."""
+        return self.q_max - self.margin
+
+    @classmethod
+    def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
+        """Read and check an arm file and the URDF that it names.
+
+        Raises ConfigurationError if a limit is not sane, the joint names differ from the URDF's chain, a link's
+        inertia belongs to no rigid body, or the URDF has no collision geometry.
+        """
+        path = find(name, beside=beside)
+        content = parse(_ArmFile, read_mapping(path), str(path))
+        urdf_path = find(content.urdf, beside=path.parent)
+        try:
+            urdf = urdf_path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigurationError(f"{urdf_path}: cannot be read: {error}") from error
+        joints = content.joints
+        position = np.radians([joint.position_deg for joint in joints])
+        margin = float(np.radians(content.position_margin_deg))
+        if np.any(position[:, 1] - position[:, 0] <= 2.0 * margin):
+            raise ConfigurationError(f"{path}: position_margin_deg leaves no range; lower it")
+        arm = cls(
+            name=content.name,
+            joint_names=tuple(joint.name for joint in joints),
+            q_min=_fixed(position[:, 0]),
+            q_max=_fixed(position[:, 1]),
+            margin=margin,
+            v_max=_fixed(np.radians([joint.velocity_deg_s for joint in joints])),
+            a_max=_fixed([joint.acceleration_rad_s2 for joint in joints]),
+            j_max=_fixed([joint.jerk_rad_s3 for joint in joints]),
+            tau_max=_fixed([joint.torque_nm for joint in joints]),
+            gear_ratio=_fixed([joint.gear_ratio for joint in joints]),
+            stiffness=_fixed([joint.stiffness_nm_rad for joint in joints]),
+            resonance_hz=content.lowest_resonance_hz,
+            urdf=urdf,
+            urdf_path=urdf_path,
+        )
+        _check_urdf(arm, str(urdf_path))
+        return arm
+
+
+def link_inertias(urdf: str, where: str = "URDF") -> dict[str, LinkInertia]:
+    """Inertial entries of the links of a URDF text by link name; links without one are left out.
+
+    Raises ConfigurationError if the text is not XML or an entry is incomplete or not a finite number.
+    """
+    inertias = {}
+    for link in _root(urdf, where).findall("link"):
+        entry = link.find("inertial")
+        if entry is None:
+            continue
+        name = link.get("name", "?")
+        place = f"{where}: inertial of link {name}"
+        mass, inertia = entry.find("mass"), entry.find("inertia")
+        if mass is None or inertia is None:
+            raise ConfigurationError(f"{place}: `mass` and `inertia` are both needed")
+        origin = entry.find("origin")
+        centre = _numbers(origin.get("xyz", "0 0 0") if origin is not None else "0 0 0", 3, place)
+        turn = _rotation(_numbers(origin.get("rpy", "0 0 0") if origin is not None else "0 0 0", 3, place))
+        xx, xy, xz, yy, yz, zz = (
+            _numbers(inertia.get(key, ""), 1, f"{place}: {key}")[0]
+            for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        local = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        value = _numbers(mass.get("value", ""), 1, f"{place}: mass")[0]
+        inertias[name] = LinkInertia(name, float(value), centre, turn @ local @ turn.T)
+    return inertias
+
+
+def _check_urdf(arm: Arm, where: str) -> None:
+    root = _root(arm.urdf, where)
+    moving = [joint for joint in root.findall("joint") if joint.get("type") in ("revolute", "continuous")]
+    names = tuple(joint.get("name", "?") for joint in moving)
+    if names != arm.joint_names:
+        raise ConfigurationError(
+            f"{where}: moving joints are {' '.join(names)}, the arm file lists {' '.join(arm.joint_names)}; "
+            "names and kinematic order must agree"
+        )
+    inertias = link_inertias(arm.urdf, where)
+    for joint, lower, upper in zip(moving, arm.q_min, arm.q_max, strict=True):
+        child = _attribute(joint.find("child"), "link", where)
+        if child not in inertias:
+            raise ConfigurationError(f"{where}: link {child} is moved by {joint.get('name')} but has no inertial")
+        limit = joint.find("limit")
+        if limit is not None and joint.get("type") == "revolute":
+            low, high = (
+                _numbers(limit.get(key, "0"), 1, f"{where}: limit of {joint.get('name')}")[0]
+                for key in ("lower", "upper")
+            )
+            if lower < low - 1e-4 or upper > high + 1e-4:
+                raise ConfigurationError(
+                    f"{where}: {joint.get('name')} may move {low:.4f} to {high:.4f} rad, the arm file allows "
+                    f"{lower:.4f} to {upper:.4f}; narrow the arm file's position_deg"
+                )
+    for inertia in inertias.values():
+        defect = inertia.defect()
+        if defect is not None:
+            raise ConfigurationError(f"{where}: link {inertia.link}: {defect}; no rigid body has this inertia")
+    if not root.findall("link/collision"):
+        raise ConfigurationError(
+            f"{where}: no link has collision geometry, so every collision check would pass; add primitive geometry"
+        )
+
+
+def _root(urdf: str, where: str) -> Any:
+    if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
+        raise ConfigurationError(f"{where}: document type declarations are not read; remove them")
+    try:
+        return ElementTree.fromstring(urdf)
+    except ElementTree.ParseError as error:
+        raise ConfigurationError(f"{where}: not valid XML: {error}") from error
+
+
+def _attribute(element: Any, key: str, where: str) -> str:
+    value = None if element is None else element.get(key)
+    if value is None:
+        raise ConfigurationError(f"{where}: an element lacks its attribute `{key}`")
+    return str(value)
+
+
+def _numbers(text: str, count: int, where: str) -> Vector:
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.empty(0)
+    if values.shape != (count,) or not np.all(np.isfinite(values)):
+        raise ConfigurationError(f"{where}: expected {count} finite number(s), found {text!r}")
+    return values
+
+
+def _rotation(rpy: Vector) -> Vector:
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _fixed(values: Any) -> Vector:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
