@@ -1,0 +1,121 @@
+"""Enumerations of FRI 1.0 and its session state machine, as data.
+
+The numbers are the protocol's. The members that exist only inside a KUKA client (state and quality "invalid")
+are left out: a packet that carries anything else than these values is malformed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum, IntEnum, IntFlag
+from types import MappingProxyType
+
+__all__ = [
+    "ALLOWED_FLAGS",
+    "ALL_DRIVES",
+    "CONTROL_BY_STRATEGY",
+    "FLAGS",
+    "STRATEGY_BY_CONTROL",
+    "TRANSITIONS",
+    "CommandFlag",
+    "Control",
+    "Quality",
+    "State",
+    "Trigger",
+]
+
+#: Drive bits of a fully powered arm: bit 0 is A1, bit 6 is A6.
+ALL_DRIVES = 0x7F
+
+
+class State(IntEnum):
+    """State of an FRI session, as in `$FRISTATE`. OFF is internal to the controller: nothing is sent then."""
+
+    OFF = 0
+    MON = 1
+    CMD = 2
+
+
+class Quality(IntEnum):
+    """The controller's judgement of the timing of the answers; commanding is allowed from BAD upwards."""
+
+    UNACCEPTABLE = 0
+    BAD = 1
+    OK = 2
+    PERFECT = 3
+
+
+class Control(IntEnum):
+    """Control mode of the arm."""
+
+    OTHER = 0
+    POSITION = 1
+    CART_IMP = 2
+    JNT_IMP = 3
+
+
+class CommandFlag(IntFlag):
+    """Which fields of a command the controller shall use; may change in monitor mode only."""
+
+    JNTPOS = 0x0001
+    JNTTRQ = 0x0004
+    JNTSTIFF = 0x0010
+    JNTDAMP = 0x0020
+    CARTPOS = 0x0100
+    TCPFT = 0x0400
+    CARTSTIFF = 0x1000
+    CARTDAMP = 0x2000
+
+
+class Trigger(Enum):
+    """What moves the session from one state to another."""
+
+    FRI_OPEN = "friOpen"
+    FRI_START = "friStart with the timing in sync"
+    FRI_STOP = "friStop"
+    FRI_CLOSE = "friClose"
+    FAULT = "fault"
+
+
+#: The session state machine: what is not listed does not change the state.
+TRANSITIONS: Mapping[tuple[State, Trigger], State] = MappingProxyType(
+    {
+        (State.OFF, Trigger.FRI_OPEN): State.MON,
+        (State.MON, Trigger.FRI_START): State.CMD,
+        (State.MON, Trigger.FRI_CLOSE): State.OFF,
+        (State.CMD, Trigger.FRI_STOP): State.MON,
+        (State.CMD, Trigger.FAULT): State.MON,
+    }
+)
+
+_JOINT = CommandFlag.JNTPOS | CommandFlag.JNTTRQ | CommandFlag.JNTSTIFF | CommandFlag.JNTDAMP
+_CARTESIAN = CommandFlag.CARTPOS | CommandFlag.TCPFT | CommandFlag.CARTSTIFF | CommandFlag.CARTDAMP
+
+#: The full flag set that a client sends in each control mode: 0x0001, 0x0035, 0x3500.
+FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
+    {
+        Control.OTHER: CommandFlag(0),
+        Control.POSITION: CommandFlag.JNTPOS,
+        Control.JNT_IMP: _JOINT,
+        Control.CART_IMP: _CARTESIAN,
+    }
+)
+
+#: Flags that make sense in each control mode. In Cartesian impedance JNTPOS asks for a null-space posture.
+ALLOWED_FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
+    {
+        Control.OTHER: _JOINT | _CARTESIAN,
+        Control.POSITION: CommandFlag.JNTPOS,
+        Control.JNT_IMP: _JOINT,
+        Control.CART_IMP: _CARTESIAN | CommandFlag.JNTPOS,
+    }
+)
+
+#: `$STIFFNESS.STRATEGY` of KRL for each control mode.
+STRATEGY_BY_CONTROL: Mapping[Control, int] = MappingProxyType(
+    {Control.POSITION: 10, Control.CART_IMP: 20, Control.JNT_IMP: 30}
+)
+
+CONTROL_BY_STRATEGY: Mapping[int, Control] = MappingProxyType(
+    {strategy: control for control, strategy in STRATEGY_BY_CONTROL.items()}
+)
