@@ -1,0 +1,244 @@
+"""The arm itself: elastic joints, friction and rigid links, advanced 1 ms at a time.
+
+`Plant` is all that the rest of the emulator knows of the physics, so a test can put other physics in its place.
+`ElasticArm` is the plant of the default emulator; an `Effect` adds to it what its equations leave out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import pinocchio as pin
+
+from sim_backend.rigid_body import Payload, with_payload
+from sim_backend.stiction import advance
+
+__all__ = ["CYCLE_S", "Drive", "Effect", "ElasticArm", "Loads", "Plant", "Reading"]
+
+CYCLE_S = 1e-3
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """An arm of n joints with motors; arrays are (n,) float64 in SI units and keep their identity.
+
+    `position`, `velocity`: links; `motor_position`, `motor_velocity`: motors, referred to the joint; `joint_torque`:
+    through the joint, positive where it holds the link against gravity; `motor_torque`: what the motor really gives,
+    referred to the joint.
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    motor_position: np.ndarray
+    motor_velocity: np.ndarray
+    joint_torque: np.ndarray
+    motor_torque: np.ndarray
+
+    def reset(self, position: np.ndarray) -> None:
+        """Put the links at rest at `position` (n,) in static equilibrium."""
+
+    def step(self, motor_torque: np.ndarray) -> None:
+        """Advance by 1 ms under the motor torque (n,) [Nm], held."""
+
+    def mount(self, payload: Payload | None) -> None:
+        """Weld `payload` to the last link (None: take it off), motors where they are, links at rest."""
+
+    def brake(self, engaged: bool) -> None:
+        """Close or open the brakes on the motor side."""
+
+    def push(self, torque: np.ndarray) -> None:
+        """External torque (n,) on the links [Nm], until changed: a person, a contact."""
+
+
+@dataclass
+class Loads:
+    """What an effect may change for the coming cycle; (n,) each.
+
+    `motor_torque` and `link_torque` [Nm] are added on the two sides of the elastic joint, positive in the direction
+    of motion (a resisting torque is negative). The friction rows are those of the equations, already holding the
+    nominal values; changing them keeps exact sticking.
+    """
+
+    motor_torque: np.ndarray
+    link_torque: np.ndarray
+    Fvm: np.ndarray
+    Fcm: np.ndarray
+    offm: np.ndarray
+    Fvl: np.ndarray
+    Fcl: np.ndarray
+    offl: np.ndarray
+
+
+@dataclass
+class Reading:
+    """What the sensors report in a cycle, (n,) each; an effect on a sensor changes it in place."""
+
+    position: np.ndarray
+    motor_position: np.ndarray
+    joint_torque: np.ndarray
+    motor_torque: np.ndarray
+
+
+class Effect(Protocol):
+    """Physics beyond the nominal equations. Called once per 1 ms cycle; state it keeps must follow from the seed."""
+
+    def start(self, joints: int, random: np.random.Generator) -> None:
+        """Begin a run of an arm with `joints` joints; `random` is this effect's own stream."""
+
+    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
+        """Change the torques and the friction of the cycle that begins at `time_s`."""
+
+    def sense(self, time_s: float, plant: Plant, reading: Reading) -> None:
+        """Change what the sensors report at `time_s`."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Joint and friction parameters, (n,) each: the last seven of a link's standard parameters, and the elasticity."""
+
+    Ia: np.ndarray
+    Fvl: np.ndarray
+    Fcl: np.ndarray
+    offl: np.ndarray
+    Fvm: np.ndarray
+    Fcm: np.ndarray
+    offm: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    brake_torque: np.ndarray = field(default_factory=lambda: np.full(7, 200.0))
+
+
+class ElasticArm:
+    """Two masses per joint (see `stiction`), rigid links and payload by pinocchio.
+
+    The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at the midpoint
+    that the present motion leads to; the joints advance in `substeps` steps within the cycle.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        drive: Drive,
+        *,
+        substeps: int = 4,
+        cycle_s: float = CYCLE_S,
+        effects: Sequence[Effect] = (),
+        random: np.random.SeedSequence | None = None,
+    ) -> None:
+        n = model.nv
+        self.bare = model
+        self.drive = drive
+        self.substeps = substeps
+        self.cycle_s = cycle_s
+        self.cycles = 0
+        self.descents = 0
+        self.energy = np.zeros(3)
+        self.state = np.zeros((4, n))
+        self.motor_position, self.motor_velocity, self.position, self.velocity = self.state
+        self.joint_torque = np.zeros(n)
+        self.motor_torque = np.zeros(n)
+        self.payload: Payload | None = None
+        self.effects = tuple(effects)
+        self._modes = np.zeros((2, n), dtype=np.int64)
+        self._joint = np.array([drive.Ia, drive.stiffness, drive.damping], dtype=float)
+        self._nominal = np.array(
+            [drive.Fvm, drive.Fcm, drive.offm, drive.Fvl, drive.Fcl, drive.offl], dtype=float
+        )
+        self._friction = self._nominal.copy()
+        self._push = np.zeros(n)
+        self._pushed = False
+        self._bias = np.zeros(n)
+        self._drive_torque = np.zeros(n)
+        self._last_velocity = np.zeros(n)
+        self.loads = Loads(np.zeros(n), np.zeros(n), *self._friction)
+        streams = (random or np.random.SeedSequence(0)).spawn(len(self.effects))
+        for effect, stream in zip(self.effects, streams, strict=True):
+            effect.start(n, np.random.default_rng(stream))
+        self._use(model)
+        self.reset(np.zeros(n))
+
+    def _use(self, model: pin.Model) -> None:
+        self.model = model
+        self._data = model.createData()
+
+    def reset(self, position: np.ndarray) -> None:
+        """Links at rest at `position` (n,); the motors where the joints' torsion carries gravity and offset."""
+        self.position[:] = position
+        self.velocity[:] = 0.0
+        self.motor_velocity[:] = 0.0
+        self._last_velocity[:] = 0.0
+        load = pin.computeGeneralizedGravity(self.model, self._data, self.position) + self._nominal[5]
+        load -= self._push
+        self.motor_position[:] = self.position + load / self._joint[1]
+        self._modes[:] = 0
+        self.joint_torque[:] = self._joint[1] * (self.motor_position - self.position)
+
+    def mount(self, payload: Payload | None) -> None:
+        """Weld `payload` to the last link; the links settle at rest on motors that stay where they are."""
+        self.payload = payload
+        self._use(with_payload(self.bare, payload))
+        self.velocity[:] = 0.0
+        self.motor_velocity[:] = 0.0
+        self._last_velocity[:] = 0.0
+        for _ in range(50):
+            load = pin.computeGeneralizedGravity(self.model, self._data, self.position) + self._nominal[5]
+            self.position[:] = self.motor_position - (load - self._push) / self._joint[1]
+        self.joint_torque[:] = self._joint[1] * (self.motor_position - self.position)
+
+    def brake(self, engaged: bool) -> None:
+        """The brakes add their torque to the motor-side Coulomb friction, so they hold without drift."""
+        self._nominal[1] = self.drive.Fcm + (self.drive.brake_torque if engaged else 0.0)
+        self._friction[:] = self._nominal
+
+    def push(self, torque: np.ndarray) -> None:
+        """External torque (n,) on the links [Nm], until changed."""
+        self._push[:] = torque
+        self._pushed = bool(np.any(self._push))
+
+    def step(self, motor_torque: np.ndarray) -> None:
+        """Advance by one cycle under the motor torque (n,) [Nm], held."""
+        self.motor_torque[:] = motor_torque
+        half = 0.5 * self.cycle_s
+        # Where the motion leads by the middle of the cycle: keeps the link equations second order.
+        middle_velocity = 1.5 * self.velocity - 0.5 * self._last_velocity
+        middle = self.position + half * middle_velocity
+        self._last_velocity[:] = self.velocity
+        mass = pin.crba(self.model, self._data, middle)
+        bias = pin.nonLinearEffects(self.model, self._data, middle, middle_velocity)
+        drive_torque = self.motor_torque
+        if self.effects or self._pushed:
+            loads = self.loads
+            loads.motor_torque[:] = 0.0
+            loads.link_torque[:] = self._push
+            self._friction[:] = self._nominal
+            time_s = self.cycles * self.cycle_s
+            for effect in self.effects:
+                effect.load(time_s, self, loads)
+            bias = bias - loads.link_torque
+            drive_torque = self.motor_torque + loads.motor_torque
+        self.descents += advance(
+            self.state,
+            self._modes,
+            mass,
+            bias,
+            drive_torque,
+            self._joint,
+            self._friction,
+            self.cycle_s,
+            self.substeps,
+            self.joint_torque,
+            self.energy,
+        )
+        self.cycles += 1
+
+    def stored_energy(self) -> float:
+        """Kinetic energy of links and motors, potential energy, energy in the elastic joints [J]."""
+        links = pin.computeKineticEnergy(self.model, self._data, self.position, self.velocity)
+        height = pin.computePotentialEnergy(self.model, self._data, self.position)
+        inertia, stiffness = self._joint[0], self._joint[1]
+        motors = 0.5 * float(inertia @ self.motor_velocity**2)
+        torsion = 0.5 * float(stiffness @ (self.motor_position - self.position) ** 2)
+        return float(links) + float(height) + motors + torsion
