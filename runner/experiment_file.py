@@ -9,8 +9,10 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+import pinocchio as pin
 
 from fri.errors import ConfigurationError
+from lwr_driver.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 
 __all__ = [
@@ -33,13 +35,14 @@ class Payload:
 
     mass : kg. com : centre of mass in the frame of link 7 [m].
     inertia : XX XY XZ YY YZ ZZ about the centre of mass [kg m²], zero where unknown.
+    shape : outer shape for the collision check; None leaves the payload out of it.
     """
 
     name: str
     mass: float
     com: tuple[float, float, float]
     inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    box: tuple[float, float, float] | None = None
+    shape: PayloadShape | None = None
 
     def __post_init__(self) -> None:
         if not self.name or "/" in self.name or self.name.startswith("."):
@@ -50,6 +53,13 @@ class Payload:
             raise ConfigurationError("payload name 'none' means the empty flange; leave the key out instead")
         if not 0 < self.mass <= 50:
             raise ConfigurationError(f"payload {self.name}: mass {self.mass} kg is outside 0 to 50 kg")
+
+    def body(self) -> pin.Inertia:
+        """The payload as a rigid body in the frame of link 7."""
+        xx, xy, xz, yy, yz, zz = self.inertia
+        return pin.Inertia(
+            self.mass, np.asarray(self.com), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        )
 
 
 @dataclass(frozen=True)
