@@ -25,6 +25,7 @@ __all__ = ["PayloadCheck", "Rest", "check_payload", "gravity_torque"]
 Vector = npt.NDArray[np.float64]
 
 RELATIVE_TOLERANCE = 0.15
+FRICTION_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,14 @@ class PayloadCheck:
         """True where every joint agrees within its tolerance."""
         return bool(np.all(np.abs(self.measured - self.predicted) <= self.tolerance))
 
+    def summary(self) -> str:
+        """The result in one line."""
+        error = float(np.max(np.abs(self.measured - self.predicted)))
+        weighs = (
+            "" if not np.isfinite(self.mass) else f", like {self.mass:.2f} kg at the announced centre of mass"
+        )
+        return f"static check of the payload: torques changed as announced within {error:.2f} Nm{weighs}"
+
     def reason(self, joint_names: tuple[str, ...]) -> str:
         """What disagrees, in one sentence with value, limit and advice."""
         excess = np.abs(self.measured - self.predicted) / self.tolerance
@@ -77,18 +86,18 @@ def gravity_torque(arm: Arm, q: Vector, payload: Payload | None) -> Vector:
     return np.asarray(pin.computeGeneralizedGravity(model, model.createData(), q))
 
 
-def check_payload(arm: Arm, before: Rest, after: Rest, friction: Vector, noise: float = 0.1) -> PayloadCheck:
+def check_payload(arm: Arm, before: Rest, after: Rest) -> PayloadCheck:
     """Compare the change of the joint torques at rest with the one that the announced payloads predict.
 
-    before, after : measurements at rest. friction : (n,) Coulomb torque on the link side [Nm]; twice of it is
-    allowed, since rest may be reached from either side. noise : allowance for sensor noise [Nm].
+    before, after : measurements at rest. Two per cent of the torque limit are allowed for the friction on
+    the link side, whose sign at rest is not known, and for the sensor.
     """
     bare_before = gravity_torque(arm, before.q, None)
     bare_after = gravity_torque(arm, after.q, None)
     measured = after.tau - before.tau
     predicted = gravity_torque(arm, after.q, after.payload) - gravity_torque(arm, before.q, before.payload)
     arm_moved = np.abs(bare_after - bare_before)
-    tolerance = 2.0 * friction + noise + RELATIVE_TOLERANCE * (np.abs(predicted) + arm_moved)
+    tolerance = FRICTION_SHARE * arm.tau_max + RELATIVE_TOLERANCE * (np.abs(predicted) + arm_moved)
     return PayloadCheck(measured, predicted, tolerance, _mass(arm, before, after), after.payload)
 
 

@@ -1,0 +1,241 @@
+"""The experiment: plan, approach, excite, log, swap the payload, and again, as one resumable sequence."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from fri.errors import RefusedError
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Cell
+from lwr_driver.collision import CollisionChecker
+from lwr_driver.driver import Driver, LinkState, Outcome
+from lwr_driver.driver import Progress as MotionProgress
+from lwr_driver.motion import Motion
+from runner.experiment_file import Experiment, Payload, SessionPlan
+from runner.interrupt import Interrupts
+from runner.operator import Operator
+from runner.payload import Rest, check_payload
+from runner.preflight import (
+    Preflight,
+    check_disk,
+    check_motion_limits,
+    check_path,
+    check_start,
+    check_torque,
+)
+from runner.progress import Progress
+from runner.route import route
+from runner.status import StatusLine
+from runner.versions import git_commit, software
+
+__all__ = ["Bench", "Record", "Run"]
+
+Vector = npt.NDArray[np.float64]
+Status = Literal["success", "abort", "fail"]
+
+REST_CYCLES_S = 0.5
+
+
+@dataclass(frozen=True)
+class Record:
+    """How one session ended: its file, status, reason, and the state of the link at its end."""
+
+    name: str
+    path: Path
+    status: Status
+    reason: str
+    link: LinkState | None = None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What the sequence needs from outside: the arm's description, a connected driver, a person."""
+
+    arm: Arm
+    cell: Cell
+    driver: Driver
+    operator: Operator
+    status: StatusLine = field(default_factory=StatusLine)
+
+
+class Run:
+    """One run of an experiment into one folder.
+
+    experiment : what to do. folder : where the logs go; sessions that are finished there are not repeated.
+    excite : gives the exciting motion, planned beforehand, at the controller's period [s].
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        folder: Path,
+        bench: Bench,
+        excite: Callable[[float], Motion],
+    ) -> None:
+        self.experiment = experiment
+        self.folder = folder
+        self.bench = bench
+        self.excite = excite
+        self._progress = Progress.load(folder)
+        self._mounted: Payload | None = None
+        self._rest: Rest | None = None
+
+    def sessions(self) -> list[Record]:
+        """Run every session that is not finished yet; returns the record of each, finished earlier or now.
+
+        A session that aborts or fails ends the sequence: its record is the last one.
+        """
+        records: list[Record] = []
+        for plan in self.experiment.sessions:
+            path = self.folder / f"{plan.name}.mcap"
+            if plan.name in self._progress.finished and path.is_file():
+                records.append(Record(plan.name, path, "success", "finished in an earlier run"))
+                self._mounted, self._rest = plan.payload, self._progress.rest(plan.name, plan.payload)
+                continue
+            record = self._session(plan, path)
+            records.append(record)
+            if record.status != "success":
+                break
+        return records
+
+    def _session(self, plan: SessionPlan, path: Path) -> Record:
+        bench = self.bench
+        bench.driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
+        self._swap(plan)
+        here = self._at_rest(plan.payload)
+        motion, preflight = self._prepare(plan, here)
+        preflight.enforce()
+        attempt = self._progress.begin(plan.name, path)
+        self._rest = None
+        bench.driver.record(path, self._metadata(plan, attempt), self._attachments(motion, preflight))
+        outcome = self._drive(plan, motion)
+        bench.driver.end_record(outcome.status, outcome.reason)
+        link = bench.driver.state()
+        if outcome.status == "success":
+            self._rest = self._at_rest(plan.payload)
+            self._progress.finish(plan.name, self._rest)
+        return Record(plan.name, path, outcome.status, outcome.reason, link)
+
+    def _swap(self, plan: SessionPlan) -> None:
+        """Have the payload of the session on the flange, and make sure that it is the announced one."""
+        bench = self.bench
+        before = self._rest
+        if plan.payload != self._mounted or before is None:
+            bench.status.say(f"payload for session {plan.name}: {_payload_name(plan.payload)}")
+            bench.operator.swap(self._mounted, plan.payload)
+            self._mounted = plan.payload
+        if before is None:
+            return
+        after = self._at_rest(plan.payload)
+        check = check_payload(bench.arm, before, after)
+        if not check.ok:
+            raise RefusedError(check.reason(bench.arm.joint_names))
+        bench.status.say(check.summary())
+
+    def _at_rest(self, payload: Payload | None) -> Rest:
+        measured = self.bench.driver.monitor(self._cycles(REST_CYCLES_S))
+        return Rest(measured.q, measured.tau, payload)
+
+    def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
+        """The motion of a session from where the arm is, with every check of it."""
+        bench, experiment = self.bench, self.experiment
+        state = bench.driver.state()
+        moves = experiment.moves
+        home = experiment.home(len(here.q))
+        excitation = self.excite(state.period_s)
+        checker = CollisionChecker(
+            bench.arm, bench.cell, plan.payload.shape if plan.payload is not None else None
+        )
+        margin = max(moves.clearance_m, bench.cell.margin_m)
+        best: tuple[Motion, Preflight] | None = None
+        for approach in ([state.setpoint], [state.setpoint, home]):
+            for retreat in ([home], []):
+                motion = route(
+                    bench.arm,
+                    approach,
+                    excitation,
+                    retreat,
+                    speed_scale=moves.speed_scale,
+                    settle_s=moves.settle_s,
+                    brake_s=moves.brake_s,
+                )
+                preflight = Preflight(
+                    (
+                        check_start(bench.arm, here.q, excitation.q[0], moves.max_start_distance_rad),
+                        *check_motion_limits(bench.arm, motion),
+                        check_torque(bench.arm, motion, plan.payload),
+                        check_path(checker, motion, margin),
+                        check_disk(self.folder, len(motion)),
+                    )
+                )
+                if preflight.ok:
+                    return motion, preflight
+                best = best or (motion, preflight)
+        assert best is not None
+        return best
+
+    def _drive(self, plan: SessionPlan, motion: Motion) -> Outcome:
+        """Command mode, the motion, and out of command mode again, whatever happens."""
+        driver, status = self.bench.driver, self.bench.status
+
+        def progress(now: MotionProgress) -> None:
+            error = 1000 * float(np.max(now.state.tracking_error))
+            status.show(
+                f"{plan.name}: {now.phase}",
+                now.row / max(now.rows, 1),
+                f"{now.time_s:6.1f} of {motion.duration_s:.1f} s  {now.state.state} {now.state.quality}  "
+                f"tracking {error:.1f} mrad  missed {now.state.miss_counter}",
+            )
+
+        with Interrupts(driver.request_stop, driver.drop_link):
+            driver.enter_command()
+            outcome = driver.execute(motion, progress)
+            status.clear()
+            if outcome.status != "fail":
+                driver.leave_command()
+        return outcome
+
+    def _cycles(self, seconds: float) -> int:
+        return max(10, round(seconds / self.bench.driver.state().period_s))
+
+    def _metadata(self, plan: SessionPlan, attempt: int) -> dict[str, str]:
+        experiment = self.experiment
+        payload = plan.payload
+        uid = f"{experiment.uid}-{plan.name}"
+        metadata = {
+            "robot": self.bench.arm.name,
+            "serial": experiment.serial,
+            "payload": "none" if payload is None else payload.name,
+            "experiment": experiment.name,
+            "uid": f"{uid}-{attempt}",
+            "parent_uid": f"{uid}-{attempt - 1}" if attempt > 1 else "",
+            "motor_torque_source": experiment.motor_torque.source,
+            "software": software(),
+            "git_commit": git_commit(),
+        }
+        if payload is not None:
+            metadata["payload_mass"] = repr(payload.mass)
+        return metadata
+
+    def _attachments(self, motion: Motion, preflight: Preflight) -> dict[str, bytes]:
+        time = np.arange(len(motion)) * motion.period_s
+        qd = np.gradient(motion.q, motion.period_s, axis=0)
+        buffer = io.BytesIO()
+        np.savez(buffer, time=time, q=motion.q, qd=qd, qdd=np.gradient(qd, motion.period_s, axis=0))
+        return {
+            "experiment.yaml": self.experiment.text.encode(),
+            "robot.urdf": self.bench.arm.urdf.encode(),
+            "plan.npz": buffer.getvalue(),
+            "preflight.json": preflight.to_json(),
+        }
+
+
+def _payload_name(payload: Payload | None) -> str:
+    return "none" if payload is None else f"{payload.name}, {payload.mass:g} kg"
