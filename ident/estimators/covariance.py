@@ -1,0 +1,226 @@
+"""Covariances that hold for what the residuals really are.
+
+The textbook covariance of equation (14) takes the rows for serially uncorrelated. Residuals of a real arm are
+not: unmodelled physics repeats with the motion, so neighbouring rows err alike and the textbook standard
+deviation can be several times too small. Here the scores of all rows of one instant are summed first, so
+correlation between joints and sides is covered too, and then
+
+* `hac`: Bartlett-weighted autocovariances of the scores (Newey and West 1987), bandwidth after Andrews (1991) or
+  stated, residuals corrected for the parameters fitted, critical values after Kiefer and Vogelsang (2005);
+* `bootstrap`: whole blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from ident.estimators.estimate import Covariance
+from ident.estimators.problem import FloatArray, Problem
+
+__all__ = ["CovarianceSettings", "Scores", "bootstrap", "effective_rows", "hac", "textbook"]
+
+_LONGEST = 4000
+_CHUNK = 8192
+
+
+@dataclass(frozen=True)
+class CovarianceSettings:
+    """Which covariance an estimate states.
+
+    kind : "hac" (serial-correlation robust, default), "bootstrap" (block bootstrap) or "textbook" (equation 14).
+    bandwidth_s : largest lag [s] of the HAC weights, None chooses it from the scores.
+    block_s : length of a bootstrap block [s], None takes twice the HAC bandwidth.
+    """
+
+    kind: Literal["hac", "bootstrap", "textbook"] = "hac"
+    bandwidth_s: float | None = None
+    block_s: float | None = None
+    draws: int = 400
+    seed: int = 20160
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Sum over all rows of one instant of row times weighted residual: one (T, p) array a record."""
+
+    records: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        coefficients: Sequence[FloatArray],
+        matrices: Sequence[FloatArray] | None = None,
+    ) -> Scores:
+        """Scores with a coefficient for each row (weight times residual); `matrices` replace the regressors."""
+        spans: dict[int, tuple[int, int]] = {}
+        for group in problem.groups:
+            if len(group.time_index):
+                first, last = int(group.time_index[0]), int(group.time_index[-1])
+                low, high = spans.get(group.record, (first, last))
+                spans[group.record] = (min(low, first), max(high, last))
+        records = {record: np.zeros((high - low + 1, len(problem.names))) for record, (low, high) in spans.items()}
+        for number, group in enumerate(problem.groups):
+            if not len(group.time_index):
+                continue
+            matrix = group.matrix if matrices is None else matrices[number]
+            target, offset = records[group.record], spans[group.record][0]
+            contiguous = group.time_index[-1] - group.time_index[0] + 1 == len(group.time_index)
+            for start in range(0, len(group.target), _CHUNK):
+                part = slice(start, start + _CHUNK)
+                product = matrix[part] * coefficients[number][part, None]
+                where = group.time_index[part] - offset
+                if contiguous:
+                    target[where[0] : where[-1] + 1] += product
+                else:
+                    target[where] += product
+        return cls(tuple(records[record] for record in sorted(records)))
+
+    @property
+    def samples(self) -> int:
+        """Number of instants."""
+        return sum(len(record) for record in self.records)
+
+    def bartlett(self, length: int) -> FloatArray:
+        """Sum over lags |l| < length of (1 - |l| / length) S_l: the sum of squares of all windows of `length`."""
+        p = self.records[0].shape[1]
+        total = np.zeros((p, p))
+        for record in self.records:
+            cumulative = np.vstack([np.zeros(p), np.cumsum(record, axis=0)])
+            ends = np.arange(1, len(record) + length)
+            windows = cumulative[np.minimum(ends, len(record))] - cumulative[np.maximum(ends - length, 0)]
+            total += windows.T @ windows
+        return total / length
+
+    def thinned(self, factor: int) -> Scores:
+        """Sums over `factor` neighbouring instants: the same long-run variance from fewer rows."""
+        return Scores(tuple(_block_sums(record, factor) for record in self.records))
+
+    def bandwidth(self, bread: FloatArray) -> float:
+        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own scores."""
+        numerator = denominator = 0.0
+        directions = bread.T / np.maximum(np.sqrt(np.abs(np.diag(bread))), 1e-300)
+        for record in self.records:
+            influence = record @ directions
+            now, before = influence[1:], influence[:-1]
+            power = np.sum(before**2, axis=0)
+            power = np.where(power > 0, power, 1.0)
+            rho = np.clip(np.sum(now * before, axis=0) / power, -0.97, 0.97)
+            sigma2 = np.mean((now - rho * before) ** 2, axis=0)
+            scale = np.mean(influence**2, axis=0)
+            keep = scale > 0
+            relative = sigma2[keep] / scale[keep]
+            r = rho[keep]
+            numerator += float(np.sum(4 * r**2 * relative**2 / ((1 - r) ** 6 * (1 + r) ** 2)))
+            denominator += float(np.sum(relative**2 / (1 - r) ** 4))
+        alpha = numerator / denominator if denominator > 0 else 0.0
+        return 1.1447 * (alpha * self.samples) ** (1.0 / 3.0)
+
+
+def textbook(bread: FloatArray) -> Covariance:
+    """(A^T R^-1 A)^-1 of equation (14): right only for serially uncorrelated residuals."""
+    return Covariance(bread, "textbook, equation (14): assumes serially uncorrelated residuals")
+
+
+def hac(
+    scores: Scores, bread: FloatArray, sample_time_s: float, bandwidth_s: float | None = None
+) -> tuple[Covariance, float]:
+    """bread x long-run variance of the scores x bread^T, and the bandwidth used [s]."""
+    factor = max(1, -(-max(len(record) for record in scores.records) // _LONGEST))
+    thin = scores.thinned(factor) if factor > 1 else scores
+    step = sample_time_s * factor
+    samples = thin.samples
+    if bandwidth_s is None:
+        length = int(np.ceil(thin.bandwidth(bread))) + 1
+        how = "automatic"
+    else:
+        length = round(bandwidth_s / step)
+        how = "stated"
+    length = int(np.clip(length, 1, max(1, samples // 4)))
+    matrix = bread @ thin.bartlett(length) @ bread.T
+    share = length / samples
+    inflation = (1.96 + 2.9694 * share + 0.4160 * share**2 - 0.5324 * share**3) / 1.96
+    kind = f"HAC (Bartlett, {how} bandwidth {length * step:.2f} s): robust to serial correlation"
+    return Covariance(matrix, kind, inflation=inflation), length * step
+
+
+def bootstrap(
+    problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int
+) -> Covariance:
+    """Covariance of `draws` weighted least-squares solutions over blocks of time drawn with replacement."""
+    length = max(1, round(block_s / problem.sample_time_s))
+    p = len(problem.names)
+    grams: dict[tuple[int, int], FloatArray] = {}
+    for group, number in zip(problem.groups, problem.class_of_group, strict=True):
+        block = group.time_index // length
+        edges = np.flatnonzero(np.diff(block)) + 1
+        for rows in np.split(np.arange(len(block)), edges):
+            if len(rows):
+                augmented = np.column_stack([group.matrix[rows], group.target[rows]])
+                key = (group.record, int(block[rows[0]]))
+                gram = grams.setdefault(key, np.zeros((p + 1, p + 1)))
+                gram += weights[number] * (augmented.T @ augmented)
+    stack = np.array(list(grams.values()))
+    random = np.random.default_rng(seed)
+    flat = stack.reshape(len(stack), -1)
+    scale = np.sqrt(np.diag(stack.sum(axis=0))[:p])
+    solutions = []
+    for _ in range(draws):
+        counts = random.multinomial(len(stack), np.full(len(stack), 1.0 / len(stack)))
+        total = (counts @ flat).reshape(p + 1, p + 1)
+        normal = total[:p, :p] / np.outer(scale, scale)
+        try:
+            solutions.append(np.linalg.solve(normal, total[:p, p] / scale) / scale)
+        except np.linalg.LinAlgError:
+            continue
+    matrix = np.atleast_2d(np.cov(np.array(solutions).T))
+    return Covariance(
+        matrix,
+        f"block bootstrap ({len(stack)} blocks of {length * problem.sample_time_s:.2f} s, {draws} draws): "
+        "robust to serial correlation",
+        degrees_of_freedom=max(1.0, len(stack) - 1.0),
+    )
+
+
+def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatArray:
+    """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's initial sequence."""
+    result = []
+    for row_class in problem.classes:
+        total: FloatArray = np.zeros(1)
+        count = 0
+        for index in row_class.groups:
+            group = problem.groups[index]
+            if not len(group.target):
+                continue
+            series = np.zeros(int(group.time_index[-1] - group.time_index[0]) + 1)
+            series[group.time_index - group.time_index[0]] = residuals[index]
+            lags = min(len(series), max(64, len(series) // 3))
+            correlation = fftconvolve(series, series[::-1])[len(series) - 1 :][:lags]
+            if len(correlation) > len(total):
+                total = np.pad(total, (0, len(correlation) - len(total)))
+            total[: len(correlation)] += correlation
+            count += len(group.target)
+        result.append(count / _correlation_time(total) if count else 0.0)
+    return np.array(result)
+
+
+def _correlation_time(autocovariance: FloatArray) -> float:
+    """1 + 2 sum rho_l, summed over pairs of lags while the pair is positive; at least 1."""
+    if autocovariance[0] <= 0:
+        return 1.0
+    rho = autocovariance / autocovariance[0]
+    pairs = rho[: len(rho) // 2 * 2].reshape(-1, 2).sum(axis=1)
+    negative = np.flatnonzero(pairs <= 0)
+    end = negative[0] if len(negative) else len(pairs)
+    return max(1.0, 2.0 * float(pairs[:end].sum()) - 1.0)
+
+
+def _block_sums(values: FloatArray, factor: int) -> FloatArray:
+    whole = -(-len(values) // factor) * factor
+    padded = np.pad(values, ((0, whole - len(values)), (0, 0)))
+    return padded.reshape(-1, factor, values.shape[1]).sum(axis=1)

@@ -1,0 +1,143 @@
+"""What an estimator returns, and the one interface of all estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from scipy.stats import norm, t
+
+from ident.estimators.problem import FloatArray, Problem
+
+__all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance (p, p) of the estimate, what it assumes (`kind`), and the degrees of freedom of its intervals.
+
+    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed those of the
+    normal law because a serial-correlation-robust variance is itself uncertain.
+    """
+
+    matrix: FloatArray
+    kind: str
+    degrees_of_freedom: float = float("inf")
+    inflation: float = 1.0
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
+
+
+@dataclass(frozen=True)
+class ClassFit:
+    """Residual of one joint and side.
+
+    sigma : std of the rows with the correct degrees of freedom [Nm]; rms : plain root mean square [Nm];
+    parameters : share of the p parameters that these rows consumed (the trace of their part of the hat matrix);
+    n_eff : number of independent rows that the serial correlation leaves.
+    """
+
+    joint: str
+    side: str
+    rows: int
+    parameters: float
+    sigma: float
+    rms: float
+    n_eff: float
+
+    @property
+    def label(self) -> str:
+        """Joint and side."""
+        return f"{self.joint} {self.side}"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Result of an estimator.
+
+    values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed, by
+    name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y - A chi [Nm]
+    of each row group.
+    """
+
+    method: str
+    names: tuple[str, ...]
+    values: FloatArray
+    covariance: Covariance
+    covariances: Mapping[str, Covariance]
+    classes: tuple[ClassFit, ...]
+    weights: FloatArray
+    residuals: tuple[FloatArray, ...]
+    iterations: int = 1
+    converged: bool = True
+    notes: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    standard: FloatArray | None = field(default=None)
+
+    @property
+    def std(self) -> FloatArray:
+        """Stated standard deviations (p,)."""
+        return self.covariance.std
+
+    @property
+    def rsd_percent(self) -> FloatArray:
+        """Relative standard deviations (p,) of equation (15) [%], from the stated covariance."""
+        return rsd_percent(self.values, self.std)
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation matrix (p, p) of the stated covariance."""
+        std = np.where(self.std > 0, self.std, 1.0)
+        return self.covariance.matrix / np.outer(std, std)
+
+    def interval(self, level: float = 0.95, *, covariance: str | None = None) -> FloatArray:
+        """Confidence limits (p, 2) at `level`, from the stated covariance or the one named."""
+        chosen = self.covariance if covariance is None else self.covariances[covariance]
+        tail = 0.5 + level / 2.0
+        finite = np.isfinite(chosen.degrees_of_freedom)
+        factor = t.ppf(tail, chosen.degrees_of_freedom) if finite else norm.ppf(tail)
+        half = chosen.inflation * factor * chosen.std
+        return np.column_stack([self.values - half, self.values + half])
+
+    def summary(self) -> str:
+        """Table of the parameters and of the residual per joint and side."""
+        units = self.units or ("",) * len(self.names)
+        lines = [
+            f"{self.method}: {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows, "
+            f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
+            + ("" if self.converged else ", NOT converged"),
+            f"standard deviations: {self.covariance.kind}",
+            "",
+            f"{'parameter':<10} {'estimate':>12} {'std':>10} {'RSD %':>8}  unit",
+        ]
+        rsd = self.rsd_percent
+        for index, name in enumerate(self.names):
+            lines.append(
+                f"{name:<10} {self.values[index]:>12.5g} {self.std[index]:>10.3g} {rsd[index]:>8.2f}  {units[index]}"
+            )
+        lines += ["", f"{'rows':<14} {'count':>7} {'n_eff':>7} {'consumed':>9} {'sigma Nm':>9} {'rms Nm':>9}"]
+        lines += [
+            f"{c.label:<14} {c.rows:>7} {c.n_eff:>7.0f} {c.parameters:>9.1f} {c.sigma:>9.4f} {c.rms:>9.4f}"
+            for c in self.classes
+        ]
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+
+class Estimator(Protocol):
+    """Settings in the constructor, work in `fit`."""
+
+    def fit(self, problem: Problem) -> Estimate:
+        """Estimate the parameters of the problem."""
+        ...
+
+
+def rsd_percent(values: FloatArray, std: FloatArray) -> FloatArray:
+    """100 std / |value|, equation (15); infinite where the value is zero."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(values != 0.0, 100.0 * std / np.abs(values), np.inf)

@@ -1,0 +1,287 @@
+"""The stacked linear regression y = A chi + e of equation (8), kept as groups of rows.
+
+A group holds the rows of one joint, one side (joint, motor or difference) and one session, in the order of
+time. Rows of one joint and side share a variance, equation (13): they form a *class*. Estimators work on the
+triangular factor of each class, [A y] = Q R, so an iteration costs the same for a thousand rows as for a
+million, and a residual sum of squares is ||R [-chi; 1]||^2 without cancellation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.blas import dsyrk
+
+from fri.errors import DataError
+
+__all__ = ["FloatArray", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
+
+FloatArray = NDArray[np.float64]
+
+_QR_ROWS = 4096
+_GRAM_PIVOT = 1e-5
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """Rows of one joint, side and session.
+
+    matrix : (m, p), rows of the observation matrix.
+    target : (m,), measured torques [Nm].
+    time_index : (m,) int64, strictly increasing number of the output sample within its session; neighbours in
+        time differ by one, excluded samples leave a gap.
+    record : number of the session (or of an uninterrupted part of it); time runs on only within a record.
+    """
+
+    joint: str
+    side: str
+    record: int
+    matrix: FloatArray
+    target: FloatArray
+    time_index: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        rows = self.target.shape
+        if self.matrix.ndim != 2 or rows != self.matrix.shape[:1] or self.time_index.shape != rows:
+            raise DataError(
+                f"{self.label}: matrix {self.matrix.shape}, target {self.target.shape} and time index "
+                f"{self.time_index.shape} do not agree; give (m, p), (m,) and (m,)"
+            )
+        if np.any(np.diff(self.time_index) <= 0):
+            raise DataError(f"{self.label}: the time index must increase from row to row; sort the rows by time")
+
+    @property
+    def label(self) -> str:
+        """Joint and side, the name of the variance class."""
+        return f"{self.joint} {self.side}"
+
+    def select(self, columns: Sequence[int] | NDArray[np.int64]) -> RowGroup:
+        """The same rows with some of the columns."""
+        return replace(self, matrix=np.ascontiguousarray(self.matrix[:, np.asarray(columns)]))
+
+
+@dataclass(frozen=True)
+class TriangularFactor:
+    """Upper triangular R (p + 1, p + 1) with R^T R = [A y]^T [A y], and the number of rows it stands for."""
+
+    r: FloatArray
+    rows: int
+
+    @classmethod
+    def of(cls, matrix: FloatArray, target: FloatArray) -> TriangularFactor:
+        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky where that is safe, blocked QR otherwise."""
+        if not len(target):
+            return cls(np.zeros((matrix.shape[1] + 1,) * 2), 0)
+        if len(target) > _QR_ROWS:
+            r = _gram_factor(matrix, target)
+            if r is not None:
+                return cls(r, len(target))
+        return cls(_blocked_qr(matrix, target), len(target))
+
+    @classmethod
+    def combine(cls, factors: Iterable[TriangularFactor], weights: Iterable[float]) -> TriangularFactor:
+        """Factor of the stack in which each part's rows are multiplied by sqrt(weight)."""
+        parts = [(factor, weight) for factor, weight in zip(factors, weights, strict=True) if factor.rows]
+        stack = np.vstack([np.sqrt(weight) * factor.r for factor, weight in parts])
+        r = np.linalg.qr(stack, mode="r")
+        if len(r) < r.shape[1]:
+            r = np.vstack([r, np.zeros((r.shape[1] - len(r), r.shape[1]))])
+        return cls(r, sum(factor.rows for factor, _ in parts))
+
+    @property
+    def parameters(self) -> int:
+        """Number p of parameters."""
+        return self.r.shape[1] - 1
+
+    @property
+    def normal(self) -> FloatArray:
+        """A^T A, (p, p)."""
+        r = self.r[:, :-1]
+        return r.T @ r
+
+    def sum_of_squares(self, values: FloatArray) -> float:
+        """||y - A chi||^2 for values (p,)."""
+        return float(np.sum((self.r @ np.append(-values, 1.0)) ** 2))
+
+    def solve(self) -> FloatArray:
+        """Least-squares solution (p,). The matrix must have full rank: see `Problem.require_rank`."""
+        p = self.parameters
+        return solve_triangular(self.r[:p, :p], self.r[:p, p])
+
+    def inverse_root(self) -> FloatArray:
+        """R^-1 (p, p) of the matrix part, so that (A^T A)^-1 = R^-1 R^-T."""
+        p = self.parameters
+        return solve_triangular(self.r[:p, :p], np.eye(p))
+
+    def select(self, columns: Sequence[int] | NDArray[np.int64]) -> TriangularFactor:
+        """Factor of the same rows with some of the columns."""
+        r = self.r[:, np.append(np.asarray(columns, dtype=np.int64), self.parameters)]
+        r = np.linalg.qr(r, mode="r")
+        if len(r) < r.shape[1]:
+            r = np.vstack([r, np.zeros((r.shape[1] - len(r), r.shape[1]))])
+        return TriangularFactor(r, self.rows)
+
+
+@dataclass(frozen=True)
+class RowClass:
+    """All groups of one joint and side: they share a variance (equation 13)."""
+
+    joint: str
+    side: str
+    groups: tuple[int, ...]
+    factor: TriangularFactor
+
+    @property
+    def label(self) -> str:
+        """Joint and side."""
+        return f"{self.joint} {self.side}"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A linear regression with named parameters.
+
+    names : p parameter names. groups : the rows. sample_time_s : time between neighbouring time indices [s].
+    units : p units, for tables; may be empty. record_names : one name a record, for messages.
+    """
+
+    names: tuple[str, ...]
+    groups: tuple[RowGroup, ...]
+    sample_time_s: float
+    units: tuple[str, ...] = ()
+    record_names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.groups:
+            raise DataError("no rows to estimate from: every sample was excluded; check the phases and the edges")
+        for group in self.groups:
+            if group.matrix.shape[1] != len(self.names):
+                raise DataError(
+                    f"{group.label}: {group.matrix.shape[1]} columns for {len(self.names)} parameter names"
+                )
+        if not self.sample_time_s > 0:
+            raise DataError(f"sample time {self.sample_time_s} s must be positive")
+
+    @property
+    def rows(self) -> int:
+        """Number r of rows."""
+        return sum(len(group.target) for group in self.groups)
+
+    @cached_property
+    def classes(self) -> tuple[RowClass, ...]:
+        """Variance classes in the order of their first group. Refuses non-finite entries."""
+        members: dict[str, list[int]] = {}
+        for index, group in enumerate(self.groups):
+            members.setdefault(group.label, []).append(index)
+        return tuple(self._row_class(label, indices) for label, indices in members.items())
+
+    def _row_class(self, label: str, indices: list[int]) -> RowClass:
+        factors = []
+        for index in indices:
+            group = self.groups[index]
+            factor = TriangularFactor.of(group.matrix, group.target)
+            if not np.all(np.isfinite(factor.r)):
+                raise DataError(f"{label}: non-finite torque or regressor entries; remove them before estimating")
+            factors.append(factor)
+        whole = factors[0] if len(factors) == 1 else TriangularFactor.combine(factors, [1.0] * len(factors))
+        first = self.groups[indices[0]]
+        return RowClass(first.joint, first.side, tuple(indices), whole)
+
+    @cached_property
+    def class_of_group(self) -> tuple[int, ...]:
+        """Index of the class of each group."""
+        found = {index: number for number, row_class in enumerate(self.classes) for index in row_class.groups}
+        return tuple(found[index] for index in range(len(self.groups)))
+
+    def weighted(self, weights: Sequence[float] | FloatArray) -> TriangularFactor:
+        """Factor of the whole stack with a weight (inverse variance) for each class."""
+        return TriangularFactor.combine([c.factor for c in self.classes], [float(w) for w in weights])
+
+    def residuals(self, values: FloatArray) -> tuple[FloatArray, ...]:
+        """y - A chi [Nm] of each group, each (m,)."""
+        return tuple(group.target - group.matrix @ values for group in self.groups)
+
+    def select(self, columns: Sequence[int] | NDArray[np.int64]) -> Problem:
+        """The same rows with some of the parameters."""
+        chosen = [int(c) for c in columns]
+        return Problem(
+            tuple(self.names[c] for c in chosen),
+            tuple(group.select(chosen) for group in self.groups),
+            self.sample_time_s,
+            tuple(self.units[c] for c in chosen) if self.units else (),
+            self.record_names,
+        )
+
+    def require_rank(self) -> float:
+        """Condition number of the column-normalised stack; DataError that names the parameters if rank is lost."""
+        factor = self.weighted(np.ones(len(self.classes)))
+        p = factor.parameters
+        norms = np.linalg.norm(factor.r[:, :p], axis=0)
+        empty = [self.names[i] for i in np.flatnonzero(norms == 0.0)]
+        if empty:
+            raise DataError(
+                f"no row says anything about {_listed(empty)}; move these joints, add the session that excites "
+                "them, or leave the parameters out of the model"
+            )
+        if self.rows < p:
+            raise DataError(f"{self.rows} rows cannot determine {p} parameters; record a longer motion")
+        _, singular, right = np.linalg.svd(factor.r[:, :p] / norms)
+        if singular[-1] <= singular[0] * max(self.rows, p) * np.finfo(float).eps:
+            suspects = [self.names[i] for i in np.flatnonzero(np.abs(right[-1]) > 0.1)]
+            raise DataError(
+                f"the motion cannot tell {_listed(suspects)} apart (singular value ratio "
+                f"{singular[-1] / singular[0]:.1e}); excite them, add a session (unloaded and loaded), or regroup"
+            )
+        return float(singular[0] / singular[-1])
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the unscaled, unweighted observation matrix: the figure of the paper's Table 1."""
+        singular = np.linalg.svd(self.weighted(np.ones(len(self.classes))).r[:, :-1], compute_uv=False)
+        return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
+
+
+def _listed(names: Sequence[str], limit: int = 12) -> str:
+    shown = ", ".join(names[:limit])
+    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+
+
+def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
+    """Cholesky factor of the equilibrated Gram matrix, or None where it would lose digits."""
+    p = matrix.shape[1]
+    gram = np.empty((p + 1, p + 1))
+    gram[:p, :p] = dsyrk(1.0, matrix.T, trans=0)
+    gram[:p, p] = matrix.T @ target
+    gram[p, p] = target @ target
+    scale = np.sqrt(np.diag(gram))
+    if not np.all(np.isfinite(scale)):
+        return np.full((p + 1, p + 1), np.nan)
+    scale[scale == 0.0] = 1.0
+    zero = np.diag(gram) == 0.0
+    equilibrated = gram / np.outer(scale, scale)
+    equilibrated[zero, zero] = 1.0
+    try:
+        r = cholesky(equilibrated, lower=False)
+    except np.linalg.LinAlgError:
+        return None
+    if np.min(np.diag(r)) < _GRAM_PIVOT:
+        return None
+    r[zero, zero] = 0.0
+    return r * scale
+
+
+def _blocked_qr(matrix: FloatArray, target: FloatArray) -> FloatArray:
+    p = matrix.shape[1]
+    r = np.zeros((0, p + 1))
+    for start in range(0, len(target), _QR_ROWS):
+        rows = slice(start, start + _QR_ROWS)
+        block = np.column_stack([matrix[rows], target[rows]])
+        if not np.all(np.isfinite(block)):
+            return np.full((p + 1, p + 1), np.nan)
+        r = np.linalg.qr(np.vstack([r, block]), mode="r")
+    return r if len(r) == p + 1 else np.vstack([r, np.zeros((p + 1 - len(r), p + 1))])

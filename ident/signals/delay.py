@@ -1,0 +1,177 @@
+"""How late the motor channel is against the joint channel, from the data, with its uncertainty.
+
+Of each joint the difference of the two torques obeys Model 3,
+
+    tau_m(t + d) - tau_l(t) = Ia qdd + Fvm qd + Fcm sign(qd) + offm,
+
+with one delay d for the channel. All terms pass the same low-pass; d enters through the filtered motor torque and
+its time derivative, so it is the solution of a small nonlinear least-squares problem, started from a grid. Its
+standard deviation is robust to serial correlation. A delay acts like a change of Ia by -Fvm d, so it must be known
+before Ia can be believed.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from fri.errors import DataError
+from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.problem import Problem, RowGroup
+from ident.estimators.weighted import WeightedLeastSquares
+from ident.signals.filters import ParallelFilter
+
+__all__ = ["Delay", "DelayData", "estimate_delay"]
+
+FloatArray = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+_STEPS = 12
+_GRID = 41
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of the motor channel [s] (positive: late), its standard deviation [s], and how it was found."""
+
+    seconds: float
+    std: float
+    how: str
+
+    def __str__(self) -> str:
+        if self.std > 0:
+            return f"{1e3 * self.seconds:.2f} ms ± {1e3 * self.std:.2f} ms ({self.how})"
+        return f"{1e3 * self.seconds:.2f} ms ({self.how})"
+
+
+@dataclass(frozen=True)
+class DelayData:
+    """One uninterrupted stretch: joint channel on (n,) times, motor channel on (m,) times [s].
+
+    qd, qdd, joint_torque : (n, J); motor_torque : (m, J). span : first and last time that may be used [s].
+    """
+
+    times: FloatArray
+    qd: FloatArray
+    qdd: FloatArray
+    joint_torque: FloatArray
+    motor_times: FloatArray
+    motor_torque: FloatArray
+    span: tuple[float, float]
+
+
+def estimate_delay(
+    stretches: Sequence[DelayData],
+    joint_names: Sequence[str],
+    *,
+    cutoff_hz: float = 5.0,
+    search_s: float = 0.1,
+    standstill_rad_s: float = 2e-3,
+) -> Delay:
+    """Delay d of the motor channel with tau_m(t + d) belonging to the joint state at t.
+
+    Raises DataError when the best delay lies at the edge of +- `search_s`, or no joint moves.
+    """
+    parts = [_Filtered.of(data, cutoff_hz, search_s, standstill_rad_s) for data in stretches]
+    parts = [part for part in parts if part is not None and part.moving.any()]
+    if not parts:
+        raise DataError("the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`")
+    grid = np.linspace(-search_s, search_s, _GRID)
+    cost = [_cost(parts, delay) for delay in grid]
+    best = int(np.argmin(cost))
+    if best in (0, len(grid) - 1):
+        raise DataError(
+            f"the motor channel fits the joint channel best at the edge of the searched delays, {1e3 * grid[best]:.0f} "
+            "ms; check the motor channel's clock and sign, raise `delay_search_s`, or state `motor_delay_s`"
+        )
+    delay = float(grid[best])
+    std = 0.0
+    for _ in range(_STEPS):
+        step, std = _newton(parts, joint_names, delay)
+        delay = float(np.clip(delay + np.clip(step, -0.01, 0.01), -search_s, search_s))
+        if abs(step) < 1e-3 * std or abs(step) < 1e-9:
+            break
+    logger.info("motor channel is %.3f ms late (standard deviation %.3f ms)", 1e3 * delay, 1e3 * std)
+    return Delay(delay, std, "estimated from the torque difference")
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """Filtered columns of one stretch at its output times, and the filtered motor torque as a smooth curve."""
+
+    outputs: FloatArray
+    joint_torque: FloatArray
+    columns: FloatArray
+    moving: NDArray[np.bool_]
+    curve: object
+    slope: object
+
+    @classmethod
+    def of(cls, data: DelayData, cutoff_hz: float, search_s: float, standstill: float) -> _Filtered | None:
+        low_pass = ParallelFilter(data.times, np.zeros(0), cutoff_hz)
+        margin = low_pass.half_width + search_s
+        first = max(data.span[0], float(data.motor_times[0])) + margin
+        last = min(data.span[1], float(data.motor_times[-1])) - margin
+        if last - first < 4.0 / cutoff_hz:
+            return None
+        outputs = np.arange(first, last, 1.0 / (2.5 * cutoff_hz))
+        fine = np.arange(first - search_s - 0.5 / cutoff_hz, last + search_s + 0.5 / cutoff_hz, 0.125 / cutoff_hz)
+        joint = ParallelFilter(data.times, outputs, cutoff_hz)
+        stacked = np.stack([data.qdd, data.qd, np.sign(data.qd), np.ones_like(data.qd)], axis=2)
+        smooth = ParallelFilter(data.motor_times, fine, cutoff_hz).apply(data.motor_torque)
+        curve = make_interp_spline(fine, smooth, k=5)
+        moving = joint.share(np.abs(data.qd) < standstill) < 0.05
+        return cls(outputs, joint.apply(data.joint_torque), joint.apply(stacked), moving, curve, curve.derivative())
+
+
+def _cost(parts: Sequence[_Filtered], delay: float) -> float:
+    """Sum over joints of the log residual power: the likelihood with one unknown variance a joint."""
+    total = 0.0
+    for joint in range(parts[0].joint_torque.shape[1]):
+        rows = [part.moving[:, joint] for part in parts]
+        if sum(int(r.sum()) for r in rows) < 16:
+            continue
+        matrix = np.vstack([part.columns[r, joint] for part, r in zip(parts, rows, strict=True)])
+        target = np.concatenate(
+            [
+                (part.curve(part.outputs + delay)[:, joint] - part.joint_torque[:, joint])[r]  # type: ignore[operator]
+                for part, r in zip(parts, rows, strict=True)
+            ]
+        )
+        residual = target - matrix @ np.linalg.lstsq(matrix, target, rcond=None)[0]
+        total += len(target) * float(np.log(residual @ residual + 1e-30))
+    return total
+
+
+def _newton(parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float) -> tuple[float, float]:
+    """Gauss-Newton step of the delay [s] and its standard deviation [s]."""
+    groups, names = [], []
+    active = [
+        joint
+        for joint in range(len(joint_names))
+        if sum(int(part.moving[:, joint].sum()) for part in parts) >= 16
+    ]
+    if not active:
+        raise DataError("the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`")
+    for place, joint in enumerate(active):
+        names += [f"{symbol} {joint_names[joint]}" for symbol in ("Ia", "Fvm", "Fcm", "offm")]
+        for record, part in enumerate(parts):
+            rows = np.flatnonzero(part.moving[:, joint])
+            if not len(rows):
+                continue
+            times = part.outputs[rows] + delay
+            matrix = np.zeros((len(rows), 4 * len(active) + 1))
+            matrix[:, 4 * place : 4 * place + 4] = part.columns[rows, joint]
+            matrix[:, -1] = -part.slope(times)[:, joint]  # type: ignore[operator]
+            target = part.curve(times)[:, joint] - part.joint_torque[rows, joint]  # type: ignore[operator]
+            groups.append(RowGroup(joint_names[joint], "difference", record, matrix, target, rows))
+    step = float(parts[0].outputs[1] - parts[0].outputs[0])
+    problem = Problem((*names, "delay"), tuple(groups), step)
+    estimate = WeightedLeastSquares(CovarianceSettings("hac")).fit(problem)
+    return float(estimate.values[-1]), float(estimate.std[-1])

@@ -1,0 +1,130 @@
+"""Sample times: lost samples, equidistant grids, stretches without interruption, and bridging."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from fri.errors import DataError
+
+__all__ = ["Stretch", "flag_outliers", "sample_period", "stretches"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_JITTER = 0.02
+_TOO_MANY = 0.01
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Equidistant samples without a long gap.
+
+    start : time of the first sample [s]; dt : sample time [s]; values : (n, k), bridged where `bridged` (n,);
+    resampled : whether the source's times were irregular, so that all values are interpolated.
+    """
+
+    start: float
+    dt: float
+    values: FloatArray
+    bridged: BoolArray
+    resampled: bool
+
+    @property
+    def times(self) -> FloatArray:
+        """Sample times (n,) [s]."""
+        return self.start + self.dt * np.arange(len(self.values))
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample [s]."""
+        return self.start + self.dt * (len(self.values) - 1)
+
+
+def sample_period(times: FloatArray, sequence: NDArray[np.int64] | None, where: str) -> float:
+    """Sample time [s]: median interval per step of the sequence counter (n,)."""
+    if len(times) < 16:
+        raise DataError(f"{where}: {len(times)} samples are too few; record at least a few seconds of motion")
+    step = np.diff(times)
+    if np.any(step <= 0):
+        at = times[int(np.argmax(step <= 0))]
+        raise DataError(f"{where}: time does not increase after t = {at:.6f} s; repair the clock of the source")
+    if sequence is not None and len(sequence) == len(times) and np.all(np.diff(sequence) > 0):
+        return float(np.median(step / np.diff(sequence)))
+    return float(np.median(step))
+
+
+def stretches(
+    times: FloatArray,
+    values: FloatArray,
+    bad: BoolArray,
+    dt: float,
+    longest_bridge_s: float,
+) -> tuple[list[Stretch], int]:
+    """Equidistant stretches of (n, k) values at (n,) times, and the number of samples lost.
+
+    Samples flagged `bad` (n,) and lost ones are bridged by a cubic spline through their neighbours and flagged; a
+    hole longer than `longest_bridge_s` ends the stretch.
+    """
+    good = np.flatnonzero(~bad)
+    if len(good) < 16:
+        return [], 0
+    intervals = np.diff(times)
+    lost = int(np.sum(np.maximum(np.rint(intervals[intervals > 1.75 * dt] / dt) - 1, 0)))
+    hole = np.diff(times[good]) > longest_bridge_s + 1.75 * dt
+    parts = np.split(good, np.flatnonzero(hole) + 1)
+    return [_uniform(times[part], values[part], dt) for part in parts if len(part) >= 16], lost
+
+
+def _uniform(times: FloatArray, values: FloatArray, dt: float) -> Stretch:
+    steps = np.rint((times - times[0]) / dt).astype(np.int64)
+    regular = np.all(np.diff(steps) > 0) and float(
+        np.max(np.abs(times - times[0] - steps * _fitted_step(times, steps, dt)))
+    ) < max(_JITTER * dt, 2e-9)
+    if regular:
+        step = _fitted_step(times, steps, dt)
+        count = int(steps[-1]) + 1
+        bridged = np.ones(count, dtype=bool)
+        bridged[steps] = False
+        if not bridged.any():
+            return Stretch(float(times[0]), step, values, bridged, False)
+        full = np.empty((count, values.shape[1]))
+        full[steps] = values
+        full[bridged] = CubicSpline(steps.astype(float), values)(np.flatnonzero(bridged).astype(float))
+        return Stretch(float(times[0]), step, full, bridged, False)
+    count = int(np.floor((times[-1] - times[0]) / dt)) + 1
+    grid = times[0] + dt * np.arange(count)
+    nearest = np.abs(grid - times[np.clip(np.searchsorted(times, grid), 0, len(times) - 1)])
+    before = np.abs(grid - times[np.clip(np.searchsorted(times, grid) - 1, 0, len(times) - 1)])
+    bridged = np.minimum(nearest, before) > 1.0 * dt
+    return Stretch(float(times[0]), dt, CubicSpline(times, values)(grid), bridged, True)
+
+
+def _fitted_step(times: FloatArray, steps: NDArray[np.int64], dt: float) -> float:
+    return float((times[-1] - times[0]) / steps[-1]) if len(steps) > 1 and steps[-1] else dt
+
+
+def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int]]:
+    """Flags (n, k) of samples far from the median of their five neighbours, and columns with too many to be that.
+
+    Far is more than `scale` robust standard deviations and more than 1 % of the range. Where over 1 % of a column
+    is far, nothing of it is flagged: that is not an outlier but a property of the signal.
+    """
+    padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
+    median = _median_of_five(*(padded[i : i + len(values)] for i in range(5)))
+    distance = np.abs(values - median)
+    robust = 1.4826 * np.median(distance, axis=0)
+    low, high = np.percentile(values, [0.5, 99.5], axis=0)
+    flags = distance > np.maximum(scale * robust, 0.01 * (high - low))
+    crowded = [int(column) for column in np.flatnonzero(flags.mean(axis=0) > _TOO_MANY)]
+    flags[:, crowded] = False
+    return flags, crowded
+
+
+def _median_of_five(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, e: FloatArray) -> FloatArray:
+    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
+    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
+    return np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
