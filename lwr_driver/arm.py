@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = ["JOINTS", "Arm", "LinkInertia", "link_inertias"]
+__all__ = ["JOINTS", "Arm", "Limits", "LinkInertia", "link_inertias"]
 
 JOINTS = 7
 
@@ -66,16 +66,34 @@ class _ArmFile:
 
     def __post_init__(self) -> None:
         if self.schema_version != 1:
-            raise ConfigurationError(f"schema_version {self.schema_version} is unknown; this software reads 1")
+            raise ConfigurationError(
+                f"schema_version {self.schema_version} is unknown; this software reads 1"
+            )
         if len(self.joints) != JOINTS:
             raise ConfigurationError(f"{len(self.joints)} joints listed; the LWR4+ has {JOINTS}")
         if not 0.0 <= self.position_margin_deg <= 20.0:
             raise ConfigurationError(f"position_margin_deg {self.position_margin_deg} is not within 0 to 20")
         if not 0.0 < self.lowest_resonance_hz < 1000.0:
-            raise ConfigurationError(f"lowest_resonance_hz {self.lowest_resonance_hz} is not within 0 to 1000")
+            raise ConfigurationError(
+                f"lowest_resonance_hz {self.lowest_resonance_hz} is not within 0 to 1000"
+            )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What may be commanded: each (7,) float64.
+
+    q_low, q_high [rad]; v_max [rad/s]; a_max [rad/s²]; j_max [rad/s³]
+    """
+
+    q_low: Vector
+    q_high: Vector
+    v_max: Vector
+    a_max: Vector
+    j_max: Vector
+
+
+@dataclass(frozen=True, eq=False)
 class LinkInertia:
     """Inertial entry of one URDF link: mass [kg], centre of mass [m] and inertia about it [kg m²], link axes."""
 
@@ -102,7 +120,7 @@ class LinkInertia:
         return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Arm:
     """The arm that the driver commands. Arrays are (7,), read-only, in kinematic order A1 A2 E1 A3 A4 A5 A6.
 
@@ -136,6 +154,11 @@ class Arm:
     def q_high(self) -> Vector:
         """Highest position that is ever commanded [rad], (7,)."""
         return self.q_max - self.margin
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of every command: position limits less the margin, and the rest as they are."""
+        return Limits(self.q_low, self.q_high, self.v_max, self.a_max, self.j_max)
 
     @classmethod
     def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
@@ -217,7 +240,9 @@ def _check_urdf(arm: Arm, where: str) -> None:
     for joint, lower, upper in zip(moving, arm.q_min, arm.q_max, strict=True):
         child = _attribute(joint.find("child"), "link", where)
         if child not in inertias:
-            raise ConfigurationError(f"{where}: link {child} is moved by {joint.get('name')} but has no inertial")
+            raise ConfigurationError(
+                f"{where}: link {child} is moved by {joint.get('name')} but has no inertial"
+            )
         limit = joint.find("limit")
         if limit is not None and joint.get("type") == "revolute":
             low, high = (
@@ -232,7 +257,9 @@ def _check_urdf(arm: Arm, where: str) -> None:
     for inertia in inertias.values():
         defect = inertia.defect()
         if defect is not None:
-            raise ConfigurationError(f"{where}: link {inertia.link}: {defect}; no rigid body has this inertia")
+            raise ConfigurationError(
+                f"{where}: link {inertia.link}: {defect}; no rigid body has this inertia"
+            )
     if not root.findall("link/collision"):
         raise ConfigurationError(
             f"{where}: no link has collision geometry, so every collision check would pass; add primitive geometry"

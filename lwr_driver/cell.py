@@ -25,7 +25,9 @@ class Box:
 
     def __post_init__(self) -> None:
         if min(self.size_m) <= 0.0:
-            raise ConfigurationError(f"box {self.name}: size_m {self.size_m} must be above zero in each direction")
+            raise ConfigurationError(
+                f"box {self.name}: size_m {self.size_m} must be above zero in each direction"
+            )
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,9 @@ class Cell:
 
     def __post_init__(self) -> None:
         if self.schema_version != 1:
-            raise ConfigurationError(f"schema_version {self.schema_version} is unknown; this software reads 1")
+            raise ConfigurationError(
+                f"schema_version {self.schema_version} is unknown; this software reads 1"
+            )
         if not 0.0 <= self.margin_m <= 0.5:
             raise ConfigurationError(f"margin_m {self.margin_m} is not within 0 to 0.5")
         names = [box.name for box in self.boxes]
