@@ -1,0 +1,192 @@
+"""The result of planning: one exciting motion with everything that is needed to run it, repeat it and trust
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from fri.errors import ConfigurationError
+from ident.excitation.check import Check, Margin
+from ident.excitation.fourier import FourierSeries
+from ident.excitation.motion import Array, ParametricMotion, Samples
+from lwr_driver.configuration import read_mapping
+
+__all__ = ["ExcitationPlan"]
+
+_SCHEMA = 1
+_CYCLE_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationPlan:
+    """An exciting motion, checked, with its objective values and where it came from.
+
+    motion : the parametrised motion; periods : how often it is repeated in one session
+    joint_names : in the order of the motion's columns
+    objectives : value of each criterion by name; rsd_percent : predicted relative standard deviation by
+    parameter [%]
+    check : margins against every limit at planning time
+    provenance : seeds, versions, limits, settings: plain values
+    """
+
+    motion: ParametricMotion
+    joint_names: tuple[str, ...]
+    periods: int = 1
+    objectives: Mapping[str, float] = field(default_factory=dict)
+    rsd_percent: Mapping[str, float] = field(default_factory=dict)
+    check: Check = field(default_factory=lambda: Check(()))
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.joint_names) != self.motion.joints:
+            raise ConfigurationError(
+                f"{len(self.joint_names)} joint names for a motion of {self.motion.joints} joints"
+            )
+        if self.periods < 1:
+            raise ConfigurationError(f"periods {self.periods} is below 1; at least one whole period is run")
+        for name in ("objectives", "rsd_percent", "provenance"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @property
+    def period_s(self) -> float:
+        """Duration of one period [s]."""
+        return self.motion.duration
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of all periods [s]."""
+        return self.periods * self.motion.duration
+
+    @property
+    def start(self) -> Array:
+        """Posture in which the motion starts and ends [rad], (joints,)."""
+        return self.motion.sample(0.0).q[0]
+
+    def sample(self, t: npt.ArrayLike) -> Samples:
+        """Positions, velocities, accelerations, jerks at t (n,) [s]; t may span several periods."""
+        times = np.atleast_1d(np.asarray(t, dtype=np.float64))
+        return self.motion.sample(np.mod(times, self.motion.duration))
+
+    def rows(self, period_s: float, periods: int | None = None) -> Array:
+        """Joint positions at every FRI cycle from the start to the end of the last period, both included;
+        (n, joints).
+
+        Raises ConfigurationError where a period of the motion is not a whole number of cycles: averaging
+        over periods needs samples at the same phase.
+        """
+        repeats = self.periods if periods is None else periods
+        if repeats < 1:
+            raise ConfigurationError(f"periods {repeats} is below 1; at least one whole period is run")
+        cycles = self.motion.duration / period_s
+        if abs(cycles - round(cycles)) > _CYCLE_TOLERANCE * cycles:
+            raise ConfigurationError(
+                f"motion period {self.motion.duration} s is {cycles:.4f} cycles of {period_s} s; choose a "
+                "base period that is a whole number of FRI cycles"
+            )
+        count = round(cycles)
+        one = self.motion.sample(np.arange(count) * period_s).q
+        return np.vstack([np.tile(one, (repeats, 1)), one[:1]])
+
+    def recheck(self, check: Callable[[ParametricMotion], Check]) -> Check:
+        """Check the motion again, under limits that may have changed since planning."""
+        return check(self.motion)
+
+    def to_yaml(self) -> str:
+        """Text of the plan file. Numbers keep every digit, so reading it back gives the same motion to the
+        last bit.
+        """
+        content = {
+            "schema_version": _SCHEMA,
+            "kind": "excitation plan",
+            "joint_names": list(self.joint_names),
+            "periods": self.periods,
+            "motion": _motion_to_mapping(self.motion),
+            "objectives": {key: float(value) for key, value in self.objectives.items()},
+            "rsd_percent": {key: float(value) for key, value in self.rsd_percent.items()},
+            "margins": [_margin_to_mapping(margin) for margin in self.check.margins],
+            "provenance": dict(self.provenance),
+        }
+        return yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=True)
+
+    def save(self, path: Path) -> None:
+        """Write the plan file."""
+        path.write_text(self.to_yaml(), encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> ExcitationPlan:
+        """Read a plan file; ConfigurationError names what is wrong with it."""
+        content = read_mapping(path)
+        try:
+            if content["schema_version"] != _SCHEMA or content["kind"] != "excitation plan":
+                raise ConfigurationError("not an excitation plan of schema_version 1")
+            margins = tuple(_margin_from_mapping(entry) for entry in content.get("margins", []))
+            return cls(
+                motion=_motion_from_mapping(content["motion"]),
+                joint_names=tuple(str(name) for name in content["joint_names"]),
+                periods=int(content["periods"]),
+                objectives=content.get("objectives", {}),
+                rsd_percent=content.get("rsd_percent", {}),
+                check=Check(margins),
+                provenance=content.get("provenance", {}),
+            )
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{path}: {error}") from error
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigurationError(f"{path}: not a readable excitation plan: {error!r}") from error
+
+
+def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
+    if isinstance(motion, FourierSeries):
+        return {
+            "type": "fourier",
+            "period_s": float(motion.period_s),
+            "harmonics": motion.harmonics,
+            "bias": motion.bias.tolist(),
+            "a": motion.a.tolist(),
+            "b": motion.b.tolist(),
+        }
+    raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
+
+
+def _motion_from_mapping(content: Any) -> ParametricMotion:
+    if content["type"] == "fourier":
+        return FourierSeries(
+            float(content["period_s"]),
+            np.array(content["bias"]),
+            np.array(content["a"]),
+            np.array(content["b"]),
+        )
+    raise ConfigurationError(f"motion type {content['type']!r} is unknown")
+
+
+def _margin_to_mapping(margin: Margin) -> dict[str, Any]:
+    return {
+        "constraint": margin.constraint,
+        "subject": margin.subject,
+        "value": float(margin.value),
+        "limit": float(margin.limit),
+        "slack": float(margin.slack),
+        "unit": margin.unit,
+        "time_s": float(margin.time_s),
+    }
+
+
+def _margin_from_mapping(entry: Any) -> Margin:
+    return Margin(
+        str(entry["constraint"]),
+        str(entry["subject"]),
+        float(entry["value"]),
+        float(entry["limit"]),
+        float(entry["slack"]),
+        str(entry["unit"]),
+        float(entry["time_s"]),
+    )

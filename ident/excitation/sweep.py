@@ -1,0 +1,293 @@
+"""Regressor and torque of a serial arm over a batch of samples, and their exact derivative in reverse mode.
+
+Body b's frame rotates about its z axis by q_b relative to a fixed placement in frame b-1. With w, wd, vd the
+angular velocity, angular acceleration and linear acceleration (gravity included) of frame b and with (l, a)
+the linear and angular velocity of its origin per unit velocity of joint j, all in frame b, the torque of
+joint j per parameter of body b is
+
+    M:            l.vd
+    (MX,MY,MZ):   l x wd + (l.w) w - (w.w) l + vd x a
+    inertia:      sym(a wd^T) + sym(e w^T),   e = a x w
+
+so the regressor is polynomial in the propagated vectors and the reverse sweep is the same recursion run
+backwards. Rotations are differentiated through d(R^T u)/dq = -z x (R^T u). Nothing is stored between the
+sweeps but the samples themselves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+__all__ = ["backward", "forward"]
+
+
+@njit(cache=True, error_model="numpy")
+def _kinematics(rot0, trans, gravity, q, qd, qdd, cs, w, wd, vd, lin, ang):  # type: ignore[no-untyped-def]
+    """Fill cos/sin (n, 2), w, wd, vd (n, 3) and lin, ang (b, j, 3) of one sample."""
+    n = q.shape[0]
+    for b in range(n):
+        c = np.cos(q[b])
+        s = np.sin(q[b])
+        cs[b, 0] = c
+        cs[b, 1] = s
+        px, py, pz = trans[b, 0], trans[b, 1], trans[b, 2]
+        r = rot0[b]
+        if b == 0:
+            wx = wy = wz = 0.0
+            dx = dy = dz = 0.0
+            ax, ay, az = -gravity[0], -gravity[1], -gravity[2]
+        else:
+            wx, wy, wz = w[b - 1, 0], w[b - 1, 1], w[b - 1, 2]
+            dx, dy, dz = wd[b - 1, 0], wd[b - 1, 1], wd[b - 1, 2]
+            wp = wx * px + wy * py + wz * pz
+            ww = wx * wx + wy * wy + wz * wz
+            ax = vd[b - 1, 0] + dy * pz - dz * py + wx * wp - ww * px
+            ay = vd[b - 1, 1] + dz * px - dx * pz + wy * wp - ww * py
+            az = vd[b - 1, 2] + dx * py - dy * px + wz * wp - ww * pz
+        ux = r[0, 0] * wx + r[1, 0] * wy + r[2, 0] * wz
+        uy = r[0, 1] * wx + r[1, 1] * wy + r[2, 1] * wz
+        uz = r[0, 2] * wx + r[1, 2] * wy + r[2, 2] * wz
+        tx = c * ux + s * uy
+        ty = c * uy - s * ux
+        w[b, 0] = tx
+        w[b, 1] = ty
+        w[b, 2] = uz + qd[b]
+        ux = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
+        uy = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz
+        uz = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
+        vx = c * ux + s * uy
+        vy = c * uy - s * ux
+        wd[b, 0] = vx + ty * qd[b]
+        wd[b, 1] = vy - tx * qd[b]
+        wd[b, 2] = uz + qdd[b]
+        ux = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
+        uy = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
+        uz = r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az
+        vd[b, 0] = c * ux + s * uy
+        vd[b, 1] = c * uy - s * ux
+        vd[b, 2] = uz
+        for j in range(b):
+            ax, ay, az = ang[b - 1, j, 0], ang[b - 1, j, 1], ang[b - 1, j, 2]
+            lx = lin[b - 1, j, 0] + ay * pz - az * py
+            ly = lin[b - 1, j, 1] + az * px - ax * pz
+            lz = lin[b - 1, j, 2] + ax * py - ay * px
+            ux = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
+            uy = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
+            ang[b, j, 0] = c * ux + s * uy
+            ang[b, j, 1] = c * uy - s * ux
+            ang[b, j, 2] = r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az
+            ux = r[0, 0] * lx + r[1, 0] * ly + r[2, 0] * lz
+            uy = r[0, 1] * lx + r[1, 1] * ly + r[2, 1] * lz
+            lin[b, j, 0] = c * ux + s * uy
+            lin[b, j, 1] = c * uy - s * ux
+            lin[b, j, 2] = r[0, 2] * lx + r[1, 2] * ly + r[2, 2] * lz
+        ang[b, b, 0] = 0.0
+        ang[b, b, 1] = 0.0
+        ang[b, b, 2] = 1.0
+        lin[b, b, 0] = 0.0
+        lin[b, b, 1] = 0.0
+        lin[b, b, 2] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def forward(  # type: ignore[no-untyped-def]
+    rot0, trans, gravity, q, qd, qdd, first, parameter, chi, eps, z, tau
+):
+    """Regressor columns and rigid-body torques of all samples.
+
+    rot0 (n, 3, 3), trans (n, 3), gravity (3,): the chain. q, qd, qdd (m, n). `parameter` (c,) holds the
+    index 0 to 9 of each selected column, sorted by body; the columns of body b are first[b] to first[b + 1].
+    chi (k, n, 10): k sets of body parameters. Filled: z (n, m, c + 4), joint j's selected columns from
+    first[j] on, then qdd_j, qd_j, smoothed sign(qd_j) = tanh(qd_j / eps), 1; tau (k, m, n) rigid-body torque
+    for each set.
+    """
+    m, n = q.shape
+    sets = chi.shape[0]
+    c = parameter.shape[0]
+    cs = np.empty((n, 2))
+    w = np.empty((n, 3))
+    wd = np.empty((n, 3))
+    vd = np.empty((n, 3))
+    lin = np.empty((n, n, 3))
+    ang = np.empty((n, n, 3))
+    y = np.empty(10)
+    tau[:] = 0.0
+    for i in range(m):
+        _kinematics(rot0, trans, gravity, q[i], qd[i], qdd[i], cs, w, wd, vd, lin, ang)
+        for j in range(n):
+            z[j, i, c] = qdd[i, j]
+            z[j, i, c + 1] = qd[i, j]
+            z[j, i, c + 2] = np.tanh(qd[i, j] / eps)
+            z[j, i, c + 3] = 1.0
+        for b in range(n):
+            wx, wy, wz = w[b, 0], w[b, 1], w[b, 2]
+            dx, dy, dz = wd[b, 0], wd[b, 1], wd[b, 2]
+            vx, vy, vz = vd[b, 0], vd[b, 1], vd[b, 2]
+            ww = wx * wx + wy * wy + wz * wz
+            for j in range(b + 1):
+                ax, ay, az = ang[b, j, 0], ang[b, j, 1], ang[b, j, 2]
+                lx, ly, lz = lin[b, j, 0], lin[b, j, 1], lin[b, j, 2]
+                ex = ay * wz - az * wy
+                ey = az * wx - ax * wz
+                ez = ax * wy - ay * wx
+                lw = lx * wx + ly * wy + lz * wz
+                y[0] = ax * dx + ex * wx
+                y[1] = ax * dy + ay * dx + ex * wy + ey * wx
+                y[2] = ax * dz + az * dx + ex * wz + ez * wx
+                y[3] = ay * dy + ey * wy
+                y[4] = ay * dz + az * dy + ey * wz + ez * wy
+                y[5] = az * dz + ez * wz
+                y[6] = ly * dz - lz * dy + lw * wx - ww * lx + vy * az - vz * ay
+                y[7] = lz * dx - lx * dz + lw * wy - ww * ly + vz * ax - vx * az
+                y[8] = lx * dy - ly * dx + lw * wz - ww * lz + vx * ay - vy * ax
+                y[9] = lx * vx + ly * vy + lz * vz
+                for k in range(first[b], first[b + 1]):
+                    z[j, i, k] = y[parameter[k]]
+                for s in range(sets):
+                    torque = 0.0
+                    for p in range(10):
+                        torque += y[p] * chi[s, b, p]
+                    tau[s, i, j] += torque
+
+
+@njit(cache=True, error_model="numpy")
+def backward(  # type: ignore[no-untyped-def]
+    rot0, trans, gravity, q, qd, qdd, first, parameter, chi, eps, zbar, taubar, qbar, qdbar, qddbar
+):
+    """Add the derivative with respect to q, qd, qdd (m, n) of a function of `forward`'s results.
+
+    zbar (n, m, c + 4) and taubar (k, m, n) are the function's derivatives with respect to z and tau.
+    """
+    m, n = q.shape
+    sets = chi.shape[0]
+    c = parameter.shape[0]
+    cs = np.empty((n, 2))
+    w = np.empty((n, 3))
+    wd = np.empty((n, 3))
+    vd = np.empty((n, 3))
+    lin = np.empty((n, n, 3))
+    ang = np.empty((n, n, 3))
+    wb = np.empty((n, 3))
+    db = np.empty((n, 3))
+    vb = np.empty((n, 3))
+    lb = np.empty((n, n, 3))
+    ab = np.empty((n, n, 3))
+    y = np.empty(10)
+    for i in range(m):
+        _kinematics(rot0, trans, gravity, q[i], qd[i], qdd[i], cs, w, wd, vd, lin, ang)
+        for j in range(n):
+            sign = np.tanh(qd[i, j] / eps)
+            qddbar[i, j] += zbar[j, i, c]
+            qdbar[i, j] += zbar[j, i, c + 1] + zbar[j, i, c + 2] * (1.0 - sign * sign) / eps
+        for b in range(n):
+            wx, wy, wz = w[b, 0], w[b, 1], w[b, 2]
+            dx, dy, dz = wd[b, 0], wd[b, 1], wd[b, 2]
+            vx, vy, vz = vd[b, 0], vd[b, 1], vd[b, 2]
+            ww = wx * wx + wy * wy + wz * wz
+            wbx = wby = wbz = 0.0
+            dbx = dby = dbz = 0.0
+            vbx = vby = vbz = 0.0
+            for j in range(b + 1):
+                for p in range(10):
+                    value = 0.0
+                    for s in range(sets):
+                        value += taubar[s, i, j] * chi[s, b, p]
+                    y[p] = value
+                for k in range(first[b], first[b + 1]):
+                    y[parameter[k]] += zbar[j, i, k]
+                ax, ay, az = ang[b, j, 0], ang[b, j, 1], ang[b, j, 2]
+                lx, ly, lz = lin[b, j, 0], lin[b, j, 1], lin[b, j, 2]
+                ex = ay * wz - az * wy
+                ey = az * wx - ax * wz
+                ez = ax * wy - ay * wx
+                # the adjoint of the inertia columns is a symmetric matrix S: S wd, S w, S a + ..., S e
+                ebx = y[0] * wx + y[1] * wy + y[2] * wz
+                eby = y[1] * wx + y[3] * wy + y[4] * wz
+                ebz = y[2] * wx + y[4] * wy + y[5] * wz
+                abx = y[0] * dx + y[1] * dy + y[2] * dz + wy * ebz - wz * eby
+                aby = y[1] * dx + y[3] * dy + y[4] * dz + wz * ebx - wx * ebz
+                abz = y[2] * dx + y[4] * dy + y[5] * dz + wx * eby - wy * ebx
+                mx, my, mz, mass = y[6], y[7], y[8], y[9]
+                wm = wx * mx + wy * my + wz * mz
+                lm = lx * mx + ly * my + lz * mz
+                lw = lx * wx + ly * wy + lz * wz
+                wbx += y[0] * ex + y[1] * ey + y[2] * ez + eby * az - ebz * ay
+                wby += y[1] * ex + y[3] * ey + y[4] * ez + ebz * ax - ebx * az
+                wbz += y[2] * ex + y[4] * ey + y[5] * ez + ebx * ay - eby * ax
+                wbx += wm * lx + lw * mx - 2.0 * lm * wx
+                wby += wm * ly + lw * my - 2.0 * lm * wy
+                wbz += wm * lz + lw * mz - 2.0 * lm * wz
+                dbx += y[0] * ax + y[1] * ay + y[2] * az + my * lz - mz * ly
+                dby += y[1] * ax + y[3] * ay + y[4] * az + mz * lx - mx * lz
+                dbz += y[2] * ax + y[4] * ay + y[5] * az + mx * ly - my * lx
+                vbx += ay * mz - az * my + mass * lx
+                vby += az * mx - ax * mz + mass * ly
+                vbz += ax * my - ay * mx + mass * lz
+                lb[b, j, 0] = dy * mz - dz * my + wm * wx - ww * mx + mass * vx
+                lb[b, j, 1] = dz * mx - dx * mz + wm * wy - ww * my + mass * vy
+                lb[b, j, 2] = dx * my - dy * mx + wm * wz - ww * mz + mass * vz
+                ab[b, j, 0] = abx + my * vz - mz * vy
+                ab[b, j, 1] = aby + mz * vx - mx * vz
+                ab[b, j, 2] = abz + mx * vy - my * vx
+            wb[b, 0], wb[b, 1], wb[b, 2] = wbx, wby, wbz
+            db[b, 0], db[b, 1], db[b, 2] = dbx, dby, dbz
+            vb[b, 0], vb[b, 1], vb[b, 2] = vbx, vby, vbz
+        for b in range(n - 1, -1, -1):
+            cb, sb = cs[b, 0], cs[b, 1]
+            r = rot0[b]
+            px, py, pz = trans[b, 0], trans[b, 1], trans[b, 2]
+            rate = qd[i, b]
+            tx, ty = w[b, 0], w[b, 1]
+            dbx, dby, dbz = db[b, 0], db[b, 1], db[b, 2]
+            wbx = wb[b, 0] - dby * rate
+            wby = wb[b, 1] + dbx * rate
+            wbz = wb[b, 2]
+            vbx, vby, vbz = vb[b, 0], vb[b, 1], vb[b, 2]
+            qddbar[i, b] += dbz
+            qdbar[i, b] += wbz + dbx * ty - dby * tx
+            angle = wbx * ty - wby * tx
+            angle += dbx * (wd[b, 1] + tx * rate) - dby * (wd[b, 0] - ty * rate)
+            angle += vbx * vd[b, 1] - vby * vd[b, 0]
+            if b > 0:
+                ux, uy = cb * vbx - sb * vby, sb * vbx + cb * vby
+                gx = r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * vbz
+                gy = r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * vbz
+                gz = r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * vbz
+                vb[b - 1, 0] += gx
+                vb[b - 1, 1] += gy
+                vb[b - 1, 2] += gz
+                ux, uy = cb * dbx - sb * dby, sb * dbx + cb * dby
+                db[b - 1, 0] += r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * dbz + py * gz - pz * gy
+                db[b - 1, 1] += r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * dbz + pz * gx - px * gz
+                db[b - 1, 2] += r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * dbz + px * gy - py * gx
+                wx, wy, wz = w[b - 1, 0], w[b - 1, 1], w[b - 1, 2]
+                gw = gx * wx + gy * wy + gz * wz
+                wp = wx * px + wy * py + wz * pz
+                gp = gx * px + gy * py + gz * pz
+                ux, uy = cb * wbx - sb * wby, sb * wbx + cb * wby
+                wb[b - 1, 0] += (
+                    r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * wbz + gw * px + wp * gx - 2.0 * gp * wx
+                )
+                wb[b - 1, 1] += (
+                    r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * wbz + gw * py + wp * gy - 2.0 * gp * wy
+                )
+                wb[b - 1, 2] += (
+                    r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * wbz + gw * pz + wp * gz - 2.0 * gp * wz
+                )
+                for j in range(b):
+                    ax, ay, az = ab[b, j, 0], ab[b, j, 1], ab[b, j, 2]
+                    lx, ly, lz = lb[b, j, 0], lb[b, j, 1], lb[b, j, 2]
+                    angle += ax * ang[b, j, 1] - ay * ang[b, j, 0] + lx * lin[b, j, 1] - ly * lin[b, j, 0]
+                    ux, uy = cb * lx - sb * ly, sb * lx + cb * ly
+                    gx = r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * lz
+                    gy = r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * lz
+                    gz = r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * lz
+                    lb[b - 1, j, 0] += gx
+                    lb[b - 1, j, 1] += gy
+                    lb[b - 1, j, 2] += gz
+                    ux, uy = cb * ax - sb * ay, sb * ax + cb * ay
+                    ab[b - 1, j, 0] += r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * az + py * gz - pz * gy
+                    ab[b - 1, j, 1] += r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * az + pz * gx - px * gz
+                    ab[b - 1, j, 2] += r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * az + px * gy - py * gx
+            qbar[i, b] += angle
