@@ -1,0 +1,249 @@
+"""The shared-memory ring between the FRI loop and the recorder: one writer, one reader, rows of fixed size.
+
+The loop fills `Ring.row` and calls `publish`, which copies the row into its slot and then advances the head; it never
+waits, allocates or calls the system. When the ring is full the new row is dropped and counted, so that a reader never
+sees a row that is half overwritten. The reader takes rows with `take` and frees them with `release`.
+
+Each counter is an aligned 8-byte word in a cache line of its own, written by one side only. The order "row first,
+head second" is kept by the total store order of x86-64, the architecture of the controller PCs.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from multiprocessing import resource_tracker, shared_memory
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from fri.packets import CMD, MSR
+
+__all__ = ["CAPACITY", "NO_PHASE", "ROW", "Ring"]
+
+CAPACITY = 8192
+"""Rows of a ring unless told otherwise: 8 s at 1 kHz, 11 MB."""
+
+NO_PHASE = -1
+"""Value of `phase` in rows that belong to no phase."""
+
+ROW = np.dtype(
+    [
+        ("t_recv", "<i8"),  # CLOCK_MONOTONIC when the packet was received [ns]
+        ("t_send", "<i8"),  # CLOCK_MONOTONIC after the answer was sent [ns], 0 without an answer
+        ("sequence", "<i8"),  # packet count of the controller, unwrapped
+        ("plan_index", "<i8"),  # row of the motion that was sent, -1 outside a motion
+        ("phase", "<i4"),  # index into the recorder's phase names, NO_PHASE for none
+        ("answered", "u1"),  # 1 if `cmd` was sent
+        ("flags", "u1"),  # free for the loop, not recorded
+        ("spare", "u1", (6,)),
+        ("msr", MSR),
+        ("cmd", CMD),
+    ]
+)
+"""One FRI cycle: what was received, what was answered, and when. No gaps, so a copy is a copy of all bytes."""
+
+_MAGIC = 0x4C57525F52494E47
+_LINE = 8  # words of a cache line
+_MAGIC_AT, _CAPACITY_AT, _ITEM_AT = 0, 1, 2
+_HEAD, _TAIL, _BEAT, _OVERRUNS, _WRITER, _LINES = 1, 2, 3, 4, 5, 6
+_HEADER_BYTES = _LINES * _LINE * 8
+
+_attach_lock = threading.Lock()
+
+
+class Ring:
+    """A ring of `ROW`s in shared memory. Made by `create`, opened in the other process by `attach(ring.name)`.
+
+    The process that created it calls `unlink` when both sides are done; `close` only drops this process's view.
+    """
+
+    def __init__(self, memory: shared_memory.SharedMemory, *, owner: bool) -> None:
+        self._memory = memory
+        self._owner = owner
+        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=memory.buf)
+        if int(words[_MAGIC_AT]) != _MAGIC or int(words[_ITEM_AT]) != ROW.itemsize:
+            del words
+            memory.close()
+            raise ConfigurationError(
+                f"shared memory {memory.name!r} is not a ring of {ROW.itemsize}-byte rows; "
+                "both processes must run the same version"
+            )
+        self.capacity = int(words[_CAPACITY_AT])
+        self._words = words
+        self._head = words[_HEAD * _LINE : _HEAD * _LINE + 1]
+        self._tail = words[_TAIL * _LINE : _TAIL * _LINE + 1]
+        self._beat = words[_BEAT * _LINE : _BEAT * _LINE + 1]
+        self._overruns = words[_OVERRUNS * _LINE : _OVERRUNS * _LINE + 1]
+        self._writer = words[_WRITER * _LINE : _WRITER * _LINE + 1]
+        self._rows = np.ndarray((self.capacity,), dtype=ROW, buffer=memory.buf, offset=_HEADER_BYTES)
+        self._bytes = memory.buf[_HEADER_BYTES : _HEADER_BYTES + self.capacity * ROW.itemsize]
+        self._published = int(self._head[0])
+        self.row: NDArray[Any] = np.zeros(1, dtype=ROW)
+        self.row["phase"] = NO_PHASE
+        self.row["plan_index"] = -1
+        self._row_bytes = memoryview(self.row).cast("B")
+
+    @classmethod
+    def create(cls, capacity: int = CAPACITY) -> Ring:
+        """A new ring with every page touched, so that the loop takes no page fault. Needs `unlink` at the end."""
+        if capacity < 2:
+            raise ConfigurationError(f"ring of {capacity} rows; it needs 2 at least")
+        size = _HEADER_BYTES + capacity * ROW.itemsize
+        try:
+            memory = shared_memory.SharedMemory(create=True, size=size)
+        except OSError as error:
+            raise ConfigurationError(
+                f"shared memory of {size / 1e6:.1f} MB cannot be had: {error}; free some of /dev/shm"
+            ) from error
+        np.frombuffer(memory.buf, dtype=np.uint8, count=size)[:] = 0
+        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=memory.buf)
+        words[_MAGIC_AT], words[_CAPACITY_AT], words[_ITEM_AT] = _MAGIC, capacity, ROW.itemsize
+        del words
+        return cls(memory, owner=True)
+
+    @classmethod
+    def attach(cls, name: str) -> Ring:
+        """The ring that another process created under `name`."""
+        try:
+            memory = _attach(name)
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"shared memory {name!r} cannot be opened: {error}; its creator must still run"
+            ) from error
+        if memory.size < _HEADER_BYTES:
+            size = memory.size
+            memory.close()
+            raise ConfigurationError(f"shared memory {name!r} of {size} bytes is no ring")
+        return cls(memory, owner=False)
+
+    @property
+    def name(self) -> str:
+        """Name under which the other process attaches."""
+        return self._memory.name
+
+    # -- the side of the loop --------------------------------------------------------------------------------
+
+    def start_writing(self) -> None:
+        """Declare this process the writer; the recorder watches it from now on."""
+        self._published = int(self._head[0])
+        self._beat[0] = time.monotonic_ns()
+        self._writer[0] = os.getpid()
+
+    def stop_writing(self) -> None:
+        """Declare that the writer ends on purpose: its silence is no fault any more."""
+        self._writer[0] = 0
+
+    def publish(self) -> bool:
+        """Copy `row` into the ring and make it visible. False, counted in `overruns`, if the ring is full."""
+        published = self._published
+        if published - self._tail[0] >= self.capacity:
+            self._overruns[0] += 1
+            return False
+        start = published % self.capacity * ROW.itemsize
+        self._bytes[start : start + ROW.itemsize] = self._row_bytes
+        self._published = published + 1
+        self._head[0] = published + 1
+        return True
+
+    def beat(self, now_ns: int) -> None:
+        """Sign of life of the writer, for each pass of the loop, also while no packet comes."""
+        self._beat[0] = now_ns
+
+    # -- the side of the recorder ----------------------------------------------------------------------------
+
+    def take(self, upto: int | None = None) -> NDArray[Any]:
+        """Copy of the rows not yet released, oldest first, shape (n,) of `ROW`; `upto` limits by row number."""
+        tail = int(self._tail[0])
+        head = int(self._head[0])
+        if upto is not None:
+            head = min(head, upto)
+        if head <= tail:
+            return np.zeros(0, dtype=ROW)
+        first, last = tail % self.capacity, (head - 1) % self.capacity
+        if first <= last:
+            return self._rows[first : last + 1].copy()
+        return np.concatenate([self._rows[first:], self._rows[: last + 1]])
+
+    def release(self, count: int) -> None:
+        """Free the `count` oldest rows for the writer."""
+        self._tail[0] += count
+
+    # -- both sides ------------------------------------------------------------------------------------------
+
+    @property
+    def head(self) -> int:
+        """Number of rows ever published."""
+        return int(self._head[0])
+
+    @property
+    def tail(self) -> int:
+        """Number of rows ever released by the recorder."""
+        return int(self._tail[0])
+
+    @property
+    def free(self) -> int:
+        """Rows that can be published before the ring is full; a loop in lock step waits for some."""
+        return self.capacity - int(self._head[0] - self._tail[0])
+
+    @property
+    def overruns(self) -> int:
+        """Rows dropped because the ring was full."""
+        return int(self._overruns[0])
+
+    @property
+    def heartbeat_ns(self) -> int:
+        """CLOCK_MONOTONIC of the writer's last sign of life [ns]."""
+        return int(self._beat[0])
+
+    @property
+    def writer_pid(self) -> int:
+        """Process id of the writer, 0 if there is none."""
+        return int(self._writer[0])
+
+    def close(self) -> None:
+        """Drop this process's view of the ring."""
+        if self._words.size == 0:
+            return
+        none = np.zeros(0, dtype=np.int64)
+        self._words = self._head = self._tail = self._beat = self._overruns = self._writer = none
+        self._rows = np.zeros(0, dtype=ROW)
+        self._bytes.release()
+        self._memory.close()
+
+    def unlink(self) -> None:
+        """Close, and give the memory back to the system once the other process closes too."""
+        self.close()
+        if self._owner:
+            self._owner = False
+            self._memory.unlink()
+
+    def __enter__(self) -> Ring:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._owner:
+            self.unlink()
+        else:
+            self.close()
+
+
+def _attach(name: str) -> shared_memory.SharedMemory:
+    if sys.version_info >= (3, 13):
+        return shared_memory.SharedMemory(name=name, track=False)
+    # Before 3.13 attaching registers the memory with this process's resource tracker, which then removes it
+    # under the creator's feet when this process ends.
+    with _attach_lock:
+        register = resource_tracker.register
+        resource_tracker.register = lambda *_: None
+        try:
+            return shared_memory.SharedMemory(name=name)
+        finally:
+            resource_tracker.register = register

@@ -1,0 +1,290 @@
+"""CDR messages of fixed layout, packed and unpacked by columns with numpy.
+
+A topic whose messages all have the same names and the same array lengths has messages of one size in which every field
+stands at the same place. `Layout` holds such a message as a template of bytes and the places of its fields. Packing
+copies the template n times and writes the columns into it; unpacking checks that all bytes outside the fields equal
+the template and reads the columns. Rows are moved as plain bytes, never as structured arrays with gaps, whose copies
+leave out what lies between the fields.
+
+CDR: 4 bytes of encapsulation (byte order and version), then the fields; a number is aligned to its own size (XCDR2: at
+most 4) counted from the end of the encapsulation, a string has its length with the closing zero, a sequence its count;
+an empty sequence has no padding after its count.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "CdrError",
+    "CdrReader",
+    "Layout",
+    "LayoutBuilder",
+    "controller_model_layout",
+    "fri_status_layout",
+    "joint_state_layout",
+    "read_joint_state_layout",
+    "tf_layout",
+]
+
+_ENCAPSULATIONS: dict[bytes, tuple[str, int]] = {
+    b"\x00\x00": (">", 8),
+    b"\x00\x01": ("<", 8),
+    b"\x00\x06": (">", 4),
+    b"\x00\x07": ("<", 4),
+    b"\x00\x10": (">", 4),
+    b"\x00\x11": ("<", 4),
+}
+"""Byte order and largest alignment of plain CDR; XCDR2 has two sets of numbers, of versions 1.2 and 1.3."""
+
+_TAIL_PADDING = 7
+"""Bytes that a serializer may add to the end of a message."""
+
+
+class CdrError(ValueError):
+    """The bytes of a message do not fit its definition."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Place of every field in messages of one size.
+
+    template : the message with all fields zero
+    fields : name -> (numpy type, shape, offset)
+    """
+
+    template: bytes
+    fields: Mapping[str, tuple[str, tuple[int, ...], int]]
+
+    def __post_init__(self) -> None:
+        names = list(self.fields)
+        dtype = np.dtype(
+            {
+                "names": names,
+                "formats": [(np.dtype(self.fields[name][0]), self.fields[name][1]) for name in names],
+                "offsets": [self.fields[name][2] for name in names],
+                "itemsize": len(self.template),
+            }
+        )
+        constant = np.ones(len(self.template), dtype=bool)
+        for code, shape, offset in self.fields.values():
+            constant[offset : offset + np.dtype(code).itemsize * int(np.prod(shape))] = False
+        object.__setattr__(self, "_dtype", dtype)
+        object.__setattr__(self, "_constant", np.flatnonzero(constant))
+        bytes_ = np.frombuffer(self.template, dtype=np.uint8)
+        object.__setattr__(self, "_expected", bytes_[constant])
+
+    @property
+    def size(self) -> int:
+        """Bytes of a message."""
+        return len(self.template)
+
+    def pack(self, columns: Mapping[str, Any], count: int) -> NDArray[np.uint8]:
+        """`count` messages, shape (count, size); `columns` maps each field to an array with `count` rows."""
+        rows = np.frombuffer(bytearray(self.template * count), dtype=np.uint8).reshape(count, self.size)
+        fields = self.view(rows)
+        for name in self.fields:
+            fields[name] = columns[name]
+        return rows
+
+    def view(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
+        """The messages `rows` (n, size) as records that share their memory."""
+        return np.ndarray((len(rows),), dtype=self._dtype, buffer=rows.data)  # type: ignore[attr-defined]
+
+    def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which of the messages `rows` (n, size) have these constants: names, counts, byte order, padding."""
+        return (rows[:, self._constant] == self._expected).all(axis=1)  # type: ignore[attr-defined,no-any-return]
+
+    def relaid(self, prefix: bytes, fields: Mapping[str, tuple[str, int]]) -> Layout:
+        """This layout behind `prefix`, with the scalar `fields` (name -> type, offset) of the prefix added."""
+        shifted = {name: (code, shape, at + len(prefix)) for name, (code, shape, at) in self.fields.items()}
+        added = {name: (code, (), at) for name, (code, at) in fields.items()}
+        return Layout(prefix + self.template, {**added, **shifted})
+
+
+class LayoutBuilder:
+    """Builds a little-endian XCDR1 `Layout` field by field, in the order of the message definition."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray(b"\x00\x01\x00\x00")
+        self._fields: dict[str, tuple[str, tuple[int, ...], int]] = {}
+
+    def numbers(self, name: str, code: str, shape: tuple[int, ...] = ()) -> LayoutBuilder:
+        """A number or an array of fixed length; `code` is the numpy type, such as `<f8`."""
+        size = np.dtype(code).itemsize
+        count = int(np.prod(shape))
+        if count:
+            self._align(size)
+            self._fields[name] = (code, shape, len(self._bytes))
+            self._bytes += bytes(size * count)
+        return self
+
+    def sequence(self, name: str, code: str, count: int) -> LayoutBuilder:
+        """A sequence that always has `count` numbers; no field if that is none."""
+        self._count(count)
+        return self.numbers(name, code, (count,))
+
+    def text(self, value: str) -> LayoutBuilder:
+        """A string that is always the same."""
+        data = value.encode() + b"\x00"
+        self._count(len(data))
+        self._bytes += data
+        return self
+
+    def texts(self, values: Sequence[str]) -> LayoutBuilder:
+        """A sequence of strings that is always the same."""
+        self._count(len(values))
+        for value in values:
+            self.text(value)
+        return self
+
+    def header(self, prefix: str = "", frame_id: str = "") -> LayoutBuilder:
+        """A `std_msgs/Header` with the fields `sec` and `nanosec`."""
+        return self.numbers(f"{prefix}sec", "<i4").numbers(f"{prefix}nanosec", "<u4").text(frame_id)
+
+    def count(self, value: int) -> LayoutBuilder:
+        """The count of a sequence whose elements follow."""
+        self._count(value)
+        return self
+
+    def layout(self) -> Layout:
+        """What was built."""
+        return Layout(bytes(self._bytes), dict(self._fields))
+
+    def _align(self, size: int) -> None:
+        self._bytes += bytes(-(len(self._bytes) - 4) % size)
+
+    def _count(self, value: int) -> None:
+        self._align(4)
+        self._bytes += struct.pack("<I", value)
+
+
+def joint_state_layout(names: Sequence[str], *, position: bool, velocity: bool, effort: bool) -> Layout:
+    """Layout of `sensor_msgs/msg/JointState` for the joints `names`, with or without each of the three arrays."""
+    builder = LayoutBuilder().header().texts(names)
+    for field, present in (("position", position), ("velocity", velocity), ("effort", effort)):
+        builder.sequence(field, "<f8", len(names) if present else 0)
+    return builder.layout()
+
+
+def fri_status_layout() -> Layout:
+    """Layout of `lwr_msgs/msg/FriStatus`."""
+    builder = (
+        LayoutBuilder().header().numbers("state", "<u2").numbers("quality", "<u2").numbers("sequence", "<u4")
+    )
+    builder.numbers("sample_time", "<f8")
+    for name in ("answer_rate", "latency", "jitter", "miss_rate"):
+        builder.numbers(name, "<f4")
+    builder.numbers("miss_counter", "<u4")
+    for name in ("power", "control", "error", "warning"):
+        builder.numbers(name, "<u2")
+    return builder.numbers("temperature", "<f4", (7,)).layout()
+
+
+def controller_model_layout() -> Layout:
+    """Layout of `lwr_msgs/msg/ControllerModel`."""
+    builder = LayoutBuilder().header().numbers("mass_matrix", "<f4", (49,)).numbers("gravity", "<f4", (7,))
+    builder.numbers("jacobian", "<f4", (42,)).numbers("estimated_external_torque", "<f4", (7,))
+    return builder.layout()
+
+
+def tf_layout(frames: Sequence[tuple[str, str]]) -> Layout:
+    """Layout of `tf2_msgs/msg/TFMessage` for the (parent, child) pairs `frames`; pose i is the field `pose_i`.
+
+    A pose is x y z [m] and the quaternion x y z w.
+    """
+    builder = LayoutBuilder().count(len(frames))
+    for index, (parent, child) in enumerate(frames):
+        builder.header(f"{index}_", parent).text(child).numbers(f"pose_{index}", "<f8", (7,))
+    return builder.layout()
+
+
+class CdrReader:
+    """Reads one message of any encapsulation field by field; `CdrError` where the bytes end or make no sense."""
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) < 4:
+            raise CdrError(f"message of {len(data)} bytes has no CDR encapsulation")
+        if data[:2] not in _ENCAPSULATIONS:
+            raise CdrError(f"CDR encapsulation 0x{data[:2].hex()} is not plain CDR")
+        self.order, self._widest = _ENCAPSULATIONS[data[:2]]
+        self._data = data
+        self._at = 4
+
+    def place(self, size: int, count: int) -> int:
+        """Offset of `count` numbers of `size` bytes each, which are stepped over."""
+        if count == 0:
+            return self._at
+        align = min(size, self._widest)
+        at = self._at + -(self._at - 4) % align
+        if count > (len(self._data) - at) // size:
+            raise CdrError(f"message of {len(self._data)} bytes ends before {count} numbers at byte {at}")
+        self._at = at + size * count
+        return at
+
+    def unsigned(self) -> int:
+        """A uint32."""
+        return int(struct.unpack_from(self.order + "I", self._data, self.place(4, 1))[0])
+
+    def signed(self) -> int:
+        """An int32."""
+        return int(struct.unpack_from(self.order + "i", self._data, self.place(4, 1))[0])
+
+    def text(self) -> str:
+        """A string; its length may or may not count the closing zero."""
+        length = self.unsigned()
+        data = self._data[self._at : self._at + length]
+        if len(data) < length:
+            raise CdrError(f"message of {len(self._data)} bytes ends within a text of {length} bytes")
+        self._at += length
+        try:
+            return data.removesuffix(b"\x00").decode()
+        except UnicodeDecodeError as error:
+            raise CdrError(f"a text is not UTF-8: {error}") from error
+
+    def texts(self) -> tuple[str, ...]:
+        """A sequence of strings."""
+        count = self.unsigned()
+        if count > (len(self._data) - self._at) // 4:
+            raise CdrError(f"message of {len(self._data)} bytes cannot hold {count} texts")
+        return tuple(self.text() for _ in range(count))
+
+    def finish(self) -> None:
+        """Raise if more is left than padding."""
+        left = len(self._data) - self._at
+        if left > _TAIL_PADDING:
+            raise CdrError(f"{left} bytes follow the last field")
+
+
+def read_joint_state_layout(data: bytes) -> tuple[Layout, tuple[str, ...]]:
+    """Layout and joint names of a `sensor_msgs/msg/JointState` message, in any plain CDR encapsulation.
+
+    Arrays that are empty are no fields of the layout. `CdrError` if an array is neither empty nor as long as the names.
+    """
+    reader = CdrReader(data)
+    order = reader.order
+    fields: dict[str, tuple[str, tuple[int, ...], int]] = {
+        "sec": (order + "i4", (), reader.place(4, 1)),
+        "nanosec": (order + "u4", (), reader.place(4, 1)),
+    }
+    reader.text()
+    names = reader.texts()
+    for field in ("position", "velocity", "effort"):
+        count = reader.unsigned()
+        if count not in (0, len(names)):
+            raise CdrError(f"`{field}` has {count} values for {len(names)} joint names")
+        at = reader.place(8, count)
+        if count:
+            fields[field] = (order + "f8", (count,), at)
+    reader.finish()
+    template = bytearray(data)
+    for code, shape, at in fields.values():
+        size = np.dtype(code).itemsize * int(np.prod(shape))
+        template[at : at + size] = bytes(size)
+    return Layout(bytes(template), fields), names

@@ -1,0 +1,244 @@
+"""The writing side of an MCAP file: whole chunks at once, each on the disk before the next begins.
+
+After every call the file ends with a whole record, so a killed process leaves a file that can be read up to there.
+When a write fails (disk full), what was written of the broken record is cut off again.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError, DataError
+from lwr_driver.session import mcap_format as mcap
+from lwr_driver.session.mcap_format import Opcode
+from lwr_driver.session.schemas import Schema
+
+__all__ = ["PROFILE", "Container", "Messages"]
+
+PROFILE = "ros2"
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Message records in the order of their log time.
+
+    records : complete message records
+    channel : (n,) int, channel numbers
+    log_time : (n,) int64 [ns]
+    """
+
+    records: Sequence[bytes]
+    channel: NDArray[np.int64]
+    log_time: NDArray[np.int64]
+
+
+@dataclass
+class _Channel:
+    number: int
+    schema: Schema
+    record: bytes
+    schema_record: bytes
+    written: bool = False
+
+
+class Container:
+    """An MCAP file being written. Refuses to overwrite a file.
+
+    fsync : force each chunk to the disk itself, so that even a power cut loses the open chunk only
+    level : zstd compression level
+    """
+
+    def __init__(self, path: Path, *, library: str, fsync: bool = False, level: int = 1) -> None:
+        self.path = path
+        self.offset = 0
+        self._fsync = fsync
+        self._compressor = zstandard.ZstdCompressor(level=level, write_checksum=False)
+        self._channels: dict[str, _Channel] = {}
+        self._schemas: dict[str, tuple[int, bytes]] = {}
+        self._counts: dict[int, int] = {}
+        self._chunks: list[bytes] = []
+        self._attachments: list[bytes] = []
+        self._metadata: list[bytes] = []
+        self._times: tuple[int, int] | None = None
+        try:
+            self._file = open(path, "xb", buffering=0)  # noqa: SIM115 - held as long as the object
+        except FileExistsError as error:
+            raise ConfigurationError(
+                f"session log {path} exists already; a log is never overwritten, choose another folder or name"
+            ) from error
+        except OSError as error:
+            raise ConfigurationError(
+                f"session log {path} cannot be created: {error.strerror}; choose a folder that can be written"
+            ) from error
+        try:
+            self._write(mcap.MAGIC + mcap.record(Opcode.HEADER, mcap.text(PROFILE), mcap.text(library)))
+        except BaseException:
+            self._file.close()
+            path.unlink(missing_ok=True)
+            raise
+
+    def attach(self, name: str, data: bytes, media_type: str, time_ns: int) -> None:
+        """Write an attachment."""
+        content = mcap.attachment(name, media_type, data, time_ns)
+        index = mcap.attachment_index(
+            self.offset, len(content), (time_ns, time_ns), len(data), name, media_type
+        )
+        self._write(content)
+        self._attachments.append(index)
+
+    def describe(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        content = mcap.metadata(name, values)
+        index = mcap.metadata_index(self.offset, len(content), name)
+        self._write(content)
+        self._metadata.append(index)
+
+    def channel(
+        self,
+        topic: str,
+        schema: Schema,
+        *,
+        schema_encoding: str = "ros2msg",
+        encoding: str = "cdr",
+        info: Mapping[str, str] | None = None,
+    ) -> int:
+        """Number of the channel `topic`; it is announced in the first chunk that holds one of its messages."""
+        if topic not in self._channels:
+            key = f"{schema.name}\0{schema_encoding}\0{schema.text}"
+            if key not in self._schemas:
+                number = len(self._schemas) + 1
+                self._schemas[key] = (
+                    number,
+                    mcap.schema(number, schema.name, schema_encoding, schema.text.encode()),
+                )
+            schema_number, schema_record = self._schemas[key]
+            number = len(self._channels) + 1
+            content = mcap.channel(number, schema_number, topic, encoding, info or {})
+            self._channels[topic] = _Channel(number, schema, content, schema_record)
+        return self._channels[topic].number
+
+    def write_chunk(self, messages: Messages) -> None:
+        """Write a chunk with its message indexes."""
+        if not len(messages.records):
+            return
+        used = np.unique(messages.channel)
+        fresh = [
+            channel for channel in self._channels.values() if channel.number in used and not channel.written
+        ]
+        announced: set[bytes] = {item.schema_record for item in self._channels.values() if item.written}
+        head: list[bytes] = []
+        for channel in fresh:
+            if channel.schema_record not in announced:
+                announced.add(channel.schema_record)
+                head.append(channel.schema_record)
+            head.append(channel.record)
+        plain = b"".join([*head, *messages.records])
+        packed = self._compressor.compress(plain)
+        times = (int(messages.log_time.min()), int(messages.log_time.max()))
+        chunk = mcap.record(
+            Opcode.CHUNK,
+            struct.pack("<QQQI", *times, len(plain), zlib.crc32(plain)),
+            mcap.text("zstd"),
+            struct.pack("<Q", len(packed)),
+            packed,
+        )
+        sizes = np.fromiter(map(len, messages.records), dtype=np.int64, count=len(messages.records))
+        starts = sum(map(len, head)) + np.cumsum(sizes) - sizes
+        parts, index_offsets, counts = [chunk], {}, {}
+        at = self.offset + len(chunk)
+        for number in used.tolist():
+            mine = messages.channel == number
+            entries = np.stack([messages.log_time[mine], starts[mine]], axis=1).astype("<u8").tobytes()
+            index = mcap.record(Opcode.MESSAGE_INDEX, struct.pack("<HI", number, len(entries)), entries)
+            index_offsets[number], counts[number] = at, int(mine.sum())
+            parts.append(index)
+            at += len(index)
+        place = (self.offset, len(chunk))
+        self._write(b"".join(parts))
+        self._chunks.append(
+            mcap.chunk_index(
+                times, place, index_offsets, at - place[0] - place[1], "zstd", (len(packed), len(plain))
+            )
+        )
+        for channel in fresh:
+            channel.written = True
+        for number, count in counts.items():
+            self._counts[number] = self._counts.get(number, 0) + count
+        first, last = self._times or times
+        self._times = (min(first, times[0]), max(last, times[1]))
+
+    def finish(self) -> None:
+        """Write the end of the data, the summary and the footer, and close."""
+        written = [channel for channel in self._channels.values() if channel.written]
+        summary_start = self.offset + 9 + 4
+        groups: list[tuple[Opcode, list[bytes]]] = [
+            (Opcode.SCHEMA, list(dict.fromkeys(channel.schema_record for channel in written))),
+            (Opcode.CHANNEL, [channel.record for channel in written]),
+            (
+                Opcode.STATISTICS,
+                [
+                    mcap.statistics(
+                        self._counts,
+                        len({channel.schema_record for channel in written}),
+                        len(self._attachments),
+                        len(self._metadata),
+                        len(self._chunks),
+                        self._times or (0, 0),
+                    )
+                ],
+            ),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+        summary, offsets = b"", b""
+        for opcode, records in groups:
+            if records:
+                start = summary_start + len(summary)
+                group = b"".join(records)
+                summary += group
+                offsets += mcap.record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(group)))
+        footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, summary_start + len(summary))
+        body = summary + offsets + footer
+        end = mcap.record(Opcode.DATA_END, struct.pack("<I", 0))
+        self._write(end + body + struct.pack("<I", zlib.crc32(body)) + mcap.MAGIC)
+        self._sync()
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close without an end, as a crash would."""
+        self._file.close()
+
+    def _write(self, data: bytes) -> None:
+        left = memoryview(data)
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            self._sync(only_if_asked=True)
+        except OSError as error:
+            self._cut()
+            raise DataError(
+                f"session log {self.path} cannot be written beyond byte {self.offset}: {error.strerror}; "
+                "what was recorded before is kept, free space on the disk before the next motion"
+            ) from error
+        self.offset += len(data)
+
+    def _sync(self, *, only_if_asked: bool = False) -> None:
+        if self._fsync or not only_if_asked:
+            os.fsync(self._file.fileno())
+
+    def _cut(self) -> None:
+        try:
+            self._file.truncate(self.offset)
+            self._file.seek(self.offset)
+        except OSError:
+            return

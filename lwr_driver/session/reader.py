@@ -1,0 +1,404 @@
+"""Reading a session log into columns of numpy arrays, whoever wrote it.
+
+The messages of a chunk are compared with the layouts met so far and read as strided columns; only a message that fits
+none of them is looked at field by field. What does not hold together is an error that names the file, the topic and the
+time; what is missing is said in `Session.missing`. Nothing is repaired on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from lwr_driver.session.cdr import (
+    CdrError,
+    CdrReader,
+    Layout,
+    controller_model_layout,
+    fri_status_layout,
+    read_joint_state_layout,
+)
+from lwr_driver.session.columns import ControllerModelColumns, JointColumns, Phase, StatusColumns, stamp
+from lwr_driver.session.scan import Block, ChannelRecord, Scan
+from lwr_driver.session.schemas import TOPICS
+from lwr_driver.session.session import Missing, Session
+
+__all__ = ["read_session"]
+
+SCHEMA_VERSION = "1"
+_FIELDS = ("position", "velocity", "effort")
+_NEEDED = {"/joint_states": "position", "/motor_states": "effort", "/joint_command": "position"}
+_TEXT_TOPICS = ("/experiment/phase", "/robot_description")
+_FIXED_TOPICS = ("/fri/status", "/fri/controller_model")
+_MANY_LAYOUTS = 8
+"""Layouts of one block and size after which messages are decoded one by one."""
+
+
+def read_session(path: str | Path, joint_names: Sequence[str] | None = None) -> Session:
+    """The session in the MCAP file `path`.
+
+    joint_names : joints wanted, in this order; None takes those of `/joint_states` as they are
+
+    A file that was cut is read up to its last whole chunk and `missing` says what is not there. DataError, with file,
+    topic and time, for: no MCAP, no `/joint_states`, a damaged chunk amid others, wrong types, joints that are unknown
+    or change, values that are not finite, log times or counters that do not rise.
+    """
+    scan = Scan(path)
+    source = str(scan.path)
+    joints = {topic: _JointTopic(source, topic) for topic in _NEEDED}
+    texts: dict[str, list[tuple[int, str]]] = {topic: [] for topic in _TEXT_TOPICS}
+    fixed = {
+        "/fri/status": _FixedTopic(fri_status_layout()),
+        "/fri/controller_model": _FixedTopic(controller_model_layout()),
+    }
+    readable: dict[int, bool] = {}
+    notes: list[str] = []
+    for block in scan.blocks():
+        for number in np.unique(block.channel).tolist():
+            channel = scan.channels.get(number)
+            if channel is None:
+                raise DataError(
+                    f"{source}: a message in the chunk at byte {block.offset} belongs to no channel"
+                )
+            if channel.topic not in TOPICS or channel.topic == "/tf":
+                continue
+            if number not in readable:
+                readable[number] = _check_types(
+                    source, channel, int(block.log_time[block.channel == number][0]), notes
+                )
+            if not readable[number]:
+                continue
+            rows = np.flatnonzero(block.channel == number)
+            if channel.topic in joints:
+                joints[channel.topic].take(block, rows)
+            elif channel.topic in texts:
+                texts[channel.topic] += _texts(source, channel.topic, block, rows)
+            elif not fixed[channel.topic].take(block, rows):
+                readable[number] = False
+                notes.append(
+                    f"{channel.topic} holds other messages than its definition says and was not read"
+                )
+    return _session(scan, joints, texts, fixed, notes, joint_names)
+
+
+def _session(
+    scan: Scan,
+    joints: Mapping[str, _JointTopic],
+    texts: Mapping[str, list[tuple[int, str]]],
+    fixed: Mapping[str, _FixedTopic],
+    notes: list[str],
+    joint_names: Sequence[str] | None,
+) -> Session:
+    source = str(scan.path)
+    metadata = _metadata(scan, "session")
+    end = _metadata(scan, "session_end")
+    if metadata is None:
+        notes.append("there is no metadata record `session`")
+    elif metadata.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        raise DataError(
+            f"{source}: schema version {metadata['schema_version']!r}; this software reads {SCHEMA_VERSION!r}, "
+            "use the version that recorded it"
+        )
+    columns = {topic: reader.columns(notes) for topic, reader in joints.items()}
+    joint = columns["/joint_states"]
+    if joint is None:
+        topics = sorted({channel.topic for channel in scan.channels.values()})
+        cut = (
+            ""
+            if scan.whole
+            else "; the file was cut before its first whole chunk"
+            if not topics
+            else "; it was cut"
+        )
+        raise DataError(f"{source}: no message on /joint_states; topics: {', '.join(topics) or 'none'}{cut}")
+    for topic, other in columns.items():
+        if other is not None and topic != "/joint_states":
+            columns[topic] = _in_order_of(joint, other)
+    phases = tuple(Phase(*item) for item in texts["/experiment/phase"])
+    for before, after in zip(phases, phases[1:], strict=False):
+        if after.log_time <= before.log_time:
+            raise DataError(
+                f"{source}: /experiment/phase {after.name!r} at {stamp(after.log_time)} follows {stamp(before.log_time)}; "
+                "log times must be strictly increasing"
+            )
+    missing = Missing(
+        ended=end is not None,
+        closed=scan.closed,
+        bytes_unread=scan.bytes_unread,
+        lost_from=scan.lost_from,
+        lost_to=scan.lost_to,
+        samples={topic: item.lost for topic, item in columns.items() if item is not None and item.lost},
+        notes=tuple(notes),
+    )
+    description = texts["/robot_description"]
+    session = Session(
+        path=scan.path,
+        metadata=metadata or {},
+        end=end,
+        joint_names=joint.names,
+        joint=joint,
+        motor=columns["/motor_states"],
+        command=columns["/joint_command"],
+        phases=phases,
+        status=fixed["/fri/status"].status(),
+        controller_model=fixed["/fri/controller_model"].controller_model(),
+        robot_description=description[0][1] if description else None,
+        attachments={name: data for name, (_, _, data) in scan.attachments.items()},
+        missing=missing,
+    )
+    return session if joint_names is None else session.select(joint_names)
+
+
+def _metadata(scan: Scan, name: str) -> dict[str, str] | None:
+    found = [values for key, values in scan.metadata if key == name]
+    return found[-1] if found else None
+
+
+def _check_types(source: str, channel: ChannelRecord, log_time: int, notes: list[str]) -> bool:
+    """Whether a channel can be read. DataError for a channel that matters; a note for one that does not."""
+    wanted = TOPICS[channel.topic]
+    found = channel.schema.name if channel.schema is not None else "no schema"
+    problem = ""
+    if channel.encoding != "cdr":
+        problem = f"message encoding {channel.encoding!r} instead of 'cdr'"
+    elif found.replace("/msg/", "/") != wanted.name.replace("/msg/", "/"):
+        problem = f"messages of type {found} instead of {wanted.name}"
+    elif channel.schema is not None and channel.schema.encoding == "ros2msg" and channel.schema.data:
+        given = _definition(channel.schema.data.decode(errors="replace"))
+        if given != _definition(wanted.text):
+            problem = f"another definition of {wanted.name} ({'; '.join(given)})"
+    if not problem:
+        return True
+    if channel.topic in _FIXED_TOPICS:
+        notes.append(f"{channel.topic} has {problem} and was not read")
+        return False
+    raise DataError(f"{source}: {channel.topic} at {stamp(log_time)} has {problem}")
+
+
+def _definition(text: str) -> tuple[str, ...]:
+    """Fields of the main message of a `ros2msg` definition, without comments, constants and blanks."""
+    fields = []
+    for line in text.split("\n"):
+        if line.startswith("==="):
+            break
+        words = line.split("#")[0].split()
+        if len(words) >= 2 and "=" not in "".join(words[1:]):
+            kind = words[0].replace("/msg/", "/")
+            fields.append(f"{'std_msgs/Header' if kind == 'Header' else kind} {words[1]}")
+    return tuple(fields)
+
+
+def _texts(source: str, topic: str, block: Block, rows: NDArray[np.int64]) -> list[tuple[int, str]]:
+    found = []
+    for row in rows.tolist():
+        log_time = int(block.log_time[row])
+        try:
+            found.append((log_time, CdrReader(block.message(row)).text()))
+        except CdrError as error:
+            raise DataError(f"{source}: {topic} at {stamp(log_time)}: {error}") from error
+    return found
+
+
+def _in_order_of(joint: JointColumns, other: JointColumns) -> JointColumns:
+    for name in other.names:
+        if name not in joint.names:
+            raise DataError(
+                f"{other.source}: {other.topic} at {stamp(other.log_time)} has the joint {name!r}, unknown to "
+                f"/joint_states, which has {', '.join(joint.names)}"
+            )
+    return other.select([name for name in joint.names if name in other.names])
+
+
+@dataclass
+class _JointTopic:
+    """Collects the messages of one topic of joint states."""
+
+    source: str
+    topic: str
+    names: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    layouts: dict[int, list[tuple[Layout, list[int] | None]]] = field(default_factory=dict)
+    parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    unstamped: tuple[int, int] | None = None
+
+    def take(self, block: Block, rows: NDArray[np.int64]) -> None:
+        sizes = block.sizes[rows]
+        count = len(rows)
+        values = {name: np.empty((count, len(self.names))) for name in self.fields}
+        stamps = np.empty(count, dtype=np.int64)
+        for size in np.unique(sizes).tolist():
+            left = np.flatnonzero(sizes == size)
+            layouts = self.layouts.setdefault(size, [])
+            tried = 0
+            while len(left):
+                if tried < min(len(layouts), _MANY_LAYOUTS):
+                    layout, columns = layouts[tried]
+                    tried += 1
+                    data = (
+                        block.gather(rows[left], size) if size else np.zeros((len(left), 0), dtype=np.uint8)
+                    )
+                    fits = layout.matches(data)
+                    if not fits.any():
+                        continue
+                    done = left[fits]
+                    records = layout.view(np.ascontiguousarray(data[fits]))
+                    left = left[~fits]
+                else:
+                    layout, columns = self._learn(block, int(rows[left[0]]))
+                    if len(layouts) < _MANY_LAYOUTS:
+                        layouts.append((layout, columns))
+                        if not values:
+                            values = {name: np.empty((count, len(self.names))) for name in self.fields}
+                        continue
+                    done, left = left[:1], left[1:]
+                    records = layout.view(block.gather(rows[done], size))
+                for name in self.fields:
+                    read = records[name].astype(np.float64)
+                    values[name][done] = read if columns is None else read[:, columns]
+                stamps[done] = records["sec"].astype(np.int64) * 10**9 + records["nanosec"]
+        log_time = block.log_time[rows]
+        off = np.flatnonzero(stamps != log_time)
+        if len(off) and self.unstamped is None:
+            self.unstamped = (int(log_time[off[0]]), int(stamps[off[0]]))
+        columns_ = {
+            "log_time": log_time,
+            "publish_time": block.publish_time[rows],
+            "sequence": block.sequence[rows],
+            **values,
+        }
+        for name, part in columns_.items():
+            self.parts.setdefault(name, []).append(part)
+
+    def _learn(self, block: Block, row: int) -> tuple[Layout, list[int] | None]:
+        """Layout of a message, and which of its columns belong to our joints; None if all in order."""
+        where = f"{self.source}: {self.topic} at {stamp(int(block.log_time[row]))}"
+        try:
+            layout, names = read_joint_state_layout(block.message(row))
+        except CdrError as error:
+            raise DataError(f"{where}: not a sensor_msgs/msg/JointState: {error}") from error
+        if not names or len(set(names)) != len(names):
+            raise DataError(
+                f"{where}: joint names {', '.join(names) or 'are missing'}; each joint needs a name of its own"
+            )
+        fields = tuple(name for name in _FIELDS if name in layout.fields)
+        if not self.names:
+            self.names, self.fields = names, fields
+            needed = _NEEDED[self.topic]
+            if needed not in fields:
+                raise DataError(f"{where}: `{needed}` is empty; the topic needs it")
+        if set(names) != set(self.names):
+            raise DataError(
+                f"{where}: joint names change from {', '.join(self.names)} to {', '.join(names)}; "
+                "a topic must hold the same joints in every message"
+            )
+        if fields != self.fields:
+            raise DataError(
+                f"{where}: {' and '.join(fields) or 'nothing'} given, {' and '.join(self.fields)} before"
+            )
+        if names == self.names:
+            return layout, None
+        return layout, [names.index(name) for name in self.names]
+
+    def columns(self, notes: list[str]) -> JointColumns | None:
+        """All samples, checked."""
+        if not self.parts:
+            return None
+        count = sum(map(len, self.parts["log_time"]))
+        joined = {name: np.concatenate(parts) for name, parts in self.parts.items()}
+        self.parts = {}
+        for name in _FIELDS:
+            if name in joined:
+                self._check_finite(name, joined[name], joined["log_time"])
+            else:
+                joined[name] = np.empty((count, 0))
+        columns = JointColumns(topic=self.topic, names=self.names, source=self.source, **joined)
+        self._check_rising("log time", columns.log_time, columns.log_time, 1)
+        self._check_rising("publish time", columns.publish_time, columns.log_time, 0)
+        if columns.numbered:
+            self._check_rising("sequence", columns.sequence, columns.log_time, 1)
+        else:
+            notes.append(f"{self.topic}: the samples carry no counter, so lost ones cannot be seen")
+        if self.unstamped is not None:
+            time, other = self.unstamped
+            notes.append(
+                f"{self.topic}: header.stamp differs from the log time, first at {stamp(time)} by "
+                f"{(other - time) * 1e-9:.6f} s; the log time is used"
+            )
+        return columns
+
+    def _check_finite(self, name: str, values: NDArray[np.float64], log_time: NDArray[np.int64]) -> None:
+        finite = np.isfinite(values)
+        if not finite.all():
+            row, column = np.argwhere(~finite)[0].tolist()
+            raise DataError(
+                f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: `{name}` of joint {self.names[column]} is "
+                f"{values[row, column]} ({int((~finite).sum())} such values); it must be finite"
+            )
+
+    def _check_rising(
+        self, name: str, values: NDArray[np.int64], log_time: NDArray[np.int64], least: int
+    ) -> None:
+        steps = np.diff(values)
+        if (steps < least).any():
+            row = int(np.flatnonzero(steps < least)[0]) + 1
+            unit = " ns" if "time" in name else ""
+            verb = "repeats" if steps[row - 1] == 0 else "runs backwards"
+            raise DataError(
+                f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: {name} {verb}, from {values[row - 1]}{unit} "
+                f"to {values[row]}{unit}; it must rise with every sample"
+            )
+
+
+@dataclass
+class _FixedTopic:
+    """Collects messages of a definition of our own, which all have one layout."""
+
+    layout: Layout
+    rows: list[NDArray[np.uint8]] = field(default_factory=list)
+    log_time: list[NDArray[np.int64]] = field(default_factory=list)
+    publish_time: list[NDArray[np.int64]] = field(default_factory=list)
+
+    def take(self, block: Block, rows: NDArray[np.int64]) -> bool:
+        if (block.sizes[rows] != self.layout.size).any():
+            return False
+        data = block.gather(rows, self.layout.size)
+        if not self.layout.matches(data).all():
+            return False
+        self.rows.append(data)
+        self.log_time.append(block.log_time[rows])
+        self.publish_time.append(block.publish_time[rows])
+        return True
+
+    def _columns(self) -> dict[str, Any]:
+        fields = self.layout.view(np.concatenate(self.rows))
+        columns: dict[str, Any] = {
+            name: np.ascontiguousarray(fields[name])
+            for name in self.layout.fields
+            if name not in ("sec", "nanosec")
+        }
+        columns["log_time"] = np.concatenate(self.log_time)
+        columns["publish_time"] = np.concatenate(self.publish_time)
+        return columns
+
+    def status(self) -> StatusColumns | None:
+        return StatusColumns(**self._columns()) if self.rows else None
+
+    def controller_model(self) -> ControllerModelColumns | None:
+        if not self.rows:
+            return None
+        columns = self._columns()
+        count = len(columns["log_time"])
+        return ControllerModelColumns(
+            log_time=columns["log_time"],
+            publish_time=columns["publish_time"],
+            mass_matrix=columns["mass_matrix"].reshape(count, 7, 7).astype(np.float64),
+            gravity=columns["gravity"].astype(np.float64),
+            jacobian=columns["jacobian"].reshape(count, 6, 7).astype(np.float64),
+            estimated_external_torque=columns["estimated_external_torque"].astype(np.float64),
+        )

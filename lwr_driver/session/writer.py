@@ -1,0 +1,471 @@
+"""Writing a session log from columns of numpy arrays.
+
+Used by the recorder while the arm moves, by the import of a controller's trace, and by the import of recordings made
+elsewhere. Messages are collected by topic and written as chunks of 0.5 s of log time, so the bytes of a log depend on
+the samples alone and not on how they arrived.
+"""
+
+from __future__ import annotations
+
+import datetime
+import struct
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fri.errors import ConfigurationError, DataError
+from lwr_driver.session import mcap_format as mcap
+from lwr_driver.session.cdr import (
+    Layout,
+    LayoutBuilder,
+    controller_model_layout,
+    fri_status_layout,
+    joint_state_layout,
+    tf_layout,
+)
+from lwr_driver.session.columns import stamp
+from lwr_driver.session.container import Container, Messages
+from lwr_driver.session.frames import LinkFrames
+from lwr_driver.session.schemas import TOPICS
+
+__all__ = ["CHUNK_PERIOD_S", "SLOW_PERIOD_NS", "ExitStatus", "SessionWriter", "session_metadata"]
+
+CHUNK_PERIOD_S = 0.5
+SLOW_PERIOD_NS = 20_000_000
+"""Period of the channels that need not come every cycle: 50 Hz."""
+
+SCHEMA_VERSION = "1"
+LIBRARY = "lwr-identification"
+
+ExitStatus = Literal["success", "abort", "fail"]
+
+_MEDIA_TYPES = {
+    ".yaml": "application/yaml",
+    ".urdf": "application/xml",
+    ".npz": "application/octet-stream",
+    ".json": "application/json",
+}
+_LATEST_NS = 2**31 * 10**9
+_PREFIX_FIELDS = {
+    "channel_sequence": ("<u4", 11),
+    "log_time": ("<u8", 15),
+    "publish_time": ("<u8", 23),
+}
+
+
+def session_metadata(
+    *,
+    robot: str,
+    serial: str = "",
+    payload: str = "none",
+    payload_mass: float | None = None,
+    experiment: str = "",
+    uid: str | None = None,
+    parent_uid: str = "",
+    motor_torque_source: str = "none",
+    software: str = LIBRARY,
+    git_commit: str = "",
+    utc_start: str | None = None,
+    **more: str,
+) -> dict[str, str]:
+    """The metadata record `session`, complete. `uid` and `utc_start` are made up from chance and the clock if missing.
+
+    payload_mass : [kg]; more : further keys, such as where imported data came from
+    """
+    values = {
+        "schema_version": SCHEMA_VERSION,
+        "robot": robot,
+        "serial": serial,
+        "payload": payload,
+        "experiment": experiment,
+        "uid": uuid.uuid4().hex if uid is None else uid,
+        "parent_uid": parent_uid,
+        "motor_torque_source": motor_torque_source,
+        "software": software,
+        "git_commit": git_commit,
+        "utc_start": datetime.datetime.now(datetime.UTC).isoformat() if utc_start is None else utc_start,
+        **more,
+    }
+    if payload_mass is not None:
+        values["payload_mass"] = repr(float(payload_mass))
+    return values
+
+
+class SessionWriter:
+    """Writes one session. A context manager; an exception within ends the session with status `fail`.
+
+    path : the new file; an existing one is never overwritten
+    joint_names : joints of all columns, as in the URDF; any number
+    metadata : the record `session`, see `session_metadata`
+    robot_description : URDF text, written to `/robot_description`, attached as `robot.urdf`, and the source of `/tf`
+    attachments : file name -> content, written first
+    start_ns : log time of the attachments [ns]
+    fsync : force each chunk to the disk
+
+    Log times of a topic must be strictly increasing (DataError otherwise). Every `write_...` takes arrays with n rows;
+    `publish_time` defaults to the log time, `sequence` to a running count. Call `advance` when nothing earlier will
+    come any more; whole chunks are written then. Errors: ConfigurationError if the file cannot be created, DataError if
+    it cannot be written on (disk full).
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        joint_names: Sequence[str],
+        metadata: Mapping[str, str],
+        *,
+        robot_description: str | None = None,
+        attachments: Mapping[str, bytes] | None = None,
+        start_ns: int = 0,
+        chunk_period_s: float = CHUNK_PERIOD_S,
+        fsync: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self.joint_names = tuple(joint_names)
+        if not self.joint_names or len(set(self.joint_names)) != len(self.joint_names):
+            raise ConfigurationError(
+                f"session log {path}: joint names {self.joint_names} must be different, one at least"
+            )
+        self.samples = 0
+        self.missed = 0
+        self.closed = False
+        self._last_sequence: int | None = None
+        self._period_ns = round(chunk_period_s * 1e9)
+        self._frames = None if robot_description is None else LinkFrames(robot_description)
+        self._description = robot_description
+        self._layouts: dict[object, Layout] = {}
+        self._queues: dict[int, deque[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {}
+        self._last: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self._slow_bucket: dict[str, int] = {}
+        self._container = Container(self.path, library=LIBRARY, fsync=fsync)
+        try:
+            self._container.describe("session", metadata)
+            files = dict(attachments or {})
+            if robot_description is not None:
+                files.setdefault("robot.urdf", robot_description.encode())
+            for name, data in files.items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                self._container.attach(name, data, media_type, start_ns)
+        except BaseException:
+            self._container.abandon()
+            self.path.unlink(missing_ok=True)
+            raise
+
+    def write_joint_states(
+        self,
+        log_time: ArrayLike,
+        position: ArrayLike,
+        effort: ArrayLike | None = None,
+        *,
+        velocity: ArrayLike | None = None,
+        publish_time: ArrayLike | None = None,
+        sequence: ArrayLike | None = None,
+    ) -> None:
+        """Measured joint positions [rad] and joint torque sensors [Nm], (n, J) each."""
+        arrays = {"position": position, "velocity": velocity, "effort": effort}
+        numbers = self._joint_states("/joint_states", log_time, arrays, publish_time, sequence)
+        if len(numbers):
+            before = numbers[0] - 1 if self._last_sequence is None else self._last_sequence
+            self.missed += int(np.maximum(np.diff(numbers, prepend=before) - 1, 0).sum())
+            self._last_sequence = int(numbers[-1])
+            self.samples += len(numbers)
+
+    def write_motor_states(
+        self,
+        log_time: ArrayLike,
+        effort: ArrayLike,
+        position: ArrayLike | None = None,
+        *,
+        publish_time: ArrayLike | None = None,
+        sequence: ArrayLike | None = None,
+    ) -> None:
+        """Motor torques referred to the joint side [Nm], (n, J), and motor positions referred to it [rad]."""
+        arrays = {"position": position, "velocity": None, "effort": effort}
+        self._joint_states("/motor_states", log_time, arrays, publish_time, sequence)
+
+    def write_joint_command(
+        self,
+        log_time: ArrayLike,
+        position: ArrayLike,
+        *,
+        publish_time: ArrayLike | None = None,
+        sequence: ArrayLike | None = None,
+    ) -> None:
+        """Commanded joint positions [rad], (n, J), at the times of the cycles in which they were sent."""
+        arrays = {"position": position, "velocity": None, "effort": None}
+        self._joint_states("/joint_command", log_time, arrays, publish_time, sequence)
+
+    def write_phase(self, log_time: int, name: str, *, publish_time: int | None = None) -> None:
+        """Beginning of the phase `name`."""
+        self._write_text("/experiment/phase", log_time, name, publish_time)
+
+    def write_status(
+        self,
+        log_time: ArrayLike,
+        columns: Mapping[str, Any],
+        *,
+        publish_time: ArrayLike | None = None,
+        sequence: ArrayLike | None = None,
+    ) -> None:
+        """State and statistics of the FRI session; `columns` are the fields of `lwr_msgs/msg/FriStatus`, n rows each."""
+        self._add("/fri/status", "status", fri_status_layout, log_time, columns, publish_time, sequence)
+
+    def write_controller_model(
+        self,
+        log_time: ArrayLike,
+        *,
+        mass_matrix: ArrayLike,
+        gravity: ArrayLike,
+        jacobian: ArrayLike,
+        estimated_external_torque: ArrayLike,
+        publish_time: ArrayLike | None = None,
+        sequence: ArrayLike | None = None,
+    ) -> None:
+        """The controller's own model: (n, 7, 7) [kg m2], (n, 7) [Nm], (n, 6, 7), (n, 7) [Nm]."""
+        times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
+        columns = {
+            "mass_matrix": np.asarray(mass_matrix).reshape(len(times), 49),
+            "gravity": gravity,
+            "jacobian": np.asarray(jacobian).reshape(len(times), 42),
+            "estimated_external_torque": estimated_external_torque,
+        }
+        self._add(
+            "/fri/controller_model", "model", controller_model_layout, times, columns, publish_time, sequence
+        )
+
+    def write_link_frames(
+        self, log_time: ArrayLike, position: ArrayLike, *, publish_time: ArrayLike | None = None
+    ) -> None:
+        """Link frames of the robot description at the joint positions (n, J) [rad]; nothing without a description.
+
+        All rows given are written; `slow` picks those that belong to 50 Hz.
+        """
+        if self._frames is None:
+            return
+        self.write_tf(
+            log_time,
+            self._frames.pairs,
+            self._frames.poses(self.joint_names, np.atleast_2d(np.asarray(position, dtype=np.float64))),
+            publish_time=publish_time,
+        )
+
+    def write_tf(
+        self,
+        log_time: ArrayLike,
+        pairs: Sequence[tuple[str, str]],
+        poses: NDArray[np.float64],
+        *,
+        publish_time: ArrayLike | None = None,
+    ) -> None:
+        """Poses (n, frames, 7), x y z [m] and quaternion x y z w, of the child frames in their parents `pairs`."""
+        frames = tuple(pairs)
+        times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
+        columns: dict[str, Any] = {f"pose_{index}": poses[:, index] for index in range(len(frames))}
+        for index in range(len(frames)):
+            columns[f"{index}_sec"], columns[f"{index}_nanosec"] = times // 10**9, times % 10**9
+        self._add("/tf", frames, lambda: tf_layout(frames), times, columns, publish_time, None)
+
+    def slow(self, topic: str, publish_time: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the rows a 50 Hz topic takes: the first of every 20 ms of the source's clock. Keeps its place."""
+        buckets = publish_time // SLOW_PERIOD_NS
+        previous = self._slow_bucket.get(topic)
+        taken = np.empty(len(buckets), dtype=bool)
+        if len(buckets):
+            taken[0] = previous is None or buckets[0] != previous
+            taken[1:] = buckets[1:] != buckets[:-1]
+            self._slow_bucket[topic] = int(buckets[-1])
+        return taken
+
+    def advance(self, log_time: int) -> None:
+        """Write all chunks that end at or before `log_time`: no message before it will come any more."""
+        self._emit(log_time // self._period_ns * self._period_ns)
+
+    def close(
+        self, exit_status: ExitStatus = "success", reason: str = "", more: Mapping[str, str] | None = None
+    ) -> None:
+        """Write what is left, the record `session_end` and the summary. Does nothing if it is closed already.
+
+        After a failed write this still tries to end the file with what was written before; the error is raised then too.
+        """
+        if self.closed:
+            return
+        self.closed = True
+        failure: DataError | None = None
+        try:
+            self._emit(None)
+        except DataError as error:
+            failure, exit_status, reason = error, "fail", reason or str(error)
+        end = {
+            "exit_status": exit_status,
+            "reason": reason,
+            "samples": str(self.samples),
+            "missed": str(self.missed),
+            **(more or {}),
+        }
+        try:
+            self._container.describe("session_end", end)
+            self._container.finish()
+        except DataError:
+            self._container.abandon()
+            raise
+        if failure is not None:
+            raise failure
+
+    def abandon(self) -> None:
+        """Close the file without an end, as a crash would."""
+        self.closed = True
+        self._container.abandon()
+
+    def __enter__(self) -> SessionWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+        else:
+            self.close("abort" if isinstance(error, KeyboardInterrupt) else "fail", str(error) or repr(error))
+
+    def _joint_states(
+        self,
+        topic: str,
+        log_time: ArrayLike,
+        arrays: Mapping[str, ArrayLike | None],
+        publish_time: ArrayLike | None,
+        sequence: ArrayLike | None,
+    ) -> NDArray[np.int64]:
+        columns: dict[str, Any] = {}
+        for field, values in arrays.items():
+            if values is not None:
+                array = np.atleast_2d(np.asarray(values, dtype=np.float64))
+                if array.shape[1:] == (0,):
+                    continue
+                if array.shape[1:] != (len(self.joint_names),):
+                    raise DataError(
+                        f"session log {self.path}: {topic} `{field}` has shape {array.shape}; "
+                        f"it must be (n, {len(self.joint_names)}), a column for each joint"
+                    )
+                columns[field] = array
+        present = {field: field in columns for field in ("position", "velocity", "effort")}
+        return self._add(
+            topic,
+            (self.joint_names, *present.values()),
+            lambda: joint_state_layout(self.joint_names, **present),
+            log_time,
+            columns,
+            publish_time,
+            sequence,
+        )
+
+    def _write_text(self, topic: str, log_time: int, value: str, publish_time: int | None) -> None:
+        self._add(
+            topic, value, lambda: LayoutBuilder().text(value).layout(), log_time, {}, publish_time, None
+        )
+
+    def _add(
+        self,
+        topic: str,
+        key: object,
+        build: Any,
+        log_time: ArrayLike,
+        columns: Mapping[str, Any],
+        publish_time: ArrayLike | None,
+        sequence: ArrayLike | None,
+    ) -> NDArray[np.int64]:
+        times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
+        count = len(times)
+        done = self._counts.get(topic, 0)
+        published = times if publish_time is None else np.atleast_1d(np.asarray(publish_time, dtype=np.int64))
+        numbers = np.arange(done, done + count) if sequence is None else np.atleast_1d(np.asarray(sequence))
+        numbers = numbers.astype(np.int64, copy=False)
+        lengths = {name: len(np.atleast_1d(values)) for name, values in columns.items()}
+        lengths |= {"publish_time": len(published), "sequence": len(numbers)}
+        for name, length in lengths.items():
+            if length != count:
+                raise DataError(
+                    f"session log {self.path}: {topic} `{name}` has {length} rows for {count} log times"
+                )
+        if not count:
+            return numbers
+        self._check_times(topic, times)
+        if published.min() < 0 or numbers.min() < 0 or numbers.max() >= 2**32:
+            raise DataError(
+                f"session log {self.path}: {topic} has publish times from {published.min()} ns and sequence numbers "
+                f"{numbers.min()} to {numbers.max()}; both count from 0, a sequence number ends at {2**32 - 1}"
+            )
+        number = self._container.channel(topic, TOPICS[topic])
+        layout_key = (topic, key)
+        if layout_key not in self._layouts:
+            layout = build()
+            prefix = mcap.message_prefix(number, layout.size)
+            self._layouts[layout_key] = layout.relaid(prefix, _PREFIX_FIELDS)
+        layout = self._layouts[layout_key]
+        values = {"channel_sequence": numbers, "log_time": times, "publish_time": published, **columns}
+        if "sec" in layout.fields:
+            values["sec"], values["nanosec"] = times // 10**9, times % 10**9
+        self._queues.setdefault(number, deque()).append((times, layout.pack(values, count)))
+        self._counts[topic] = done + count
+        return numbers
+
+    def _check_times(self, topic: str, times: NDArray[np.int64]) -> None:
+        steps = np.diff(times, prepend=self._last.get(topic, times[0] - 1))
+        if (steps <= 0).any():
+            row = int(np.flatnonzero(steps <= 0)[0])
+            before = int(times[row] - steps[row])
+            raise DataError(
+                f"session log {self.path}: {topic} at {stamp(int(times[row]))} follows {stamp(before)}; "
+                "log times must be strictly increasing"
+            )
+        if times[0] < 0 or times[-1] >= _LATEST_NS:
+            raise DataError(
+                f"session log {self.path}: {topic} at {stamp(int(times[0]))} to {stamp(int(times[-1]))}; "
+                "log times are UTC from 1970 to 2038"
+            )
+        self._last[topic] = int(times[-1])
+
+    def _emit(self, boundary: int | None) -> None:
+        """Write the chunks of all windows that end at or before `boundary`; all of them if None."""
+        while True:
+            heads = [int(queue[0][0][0]) for queue in self._queues.values() if queue]
+            if not heads:
+                return
+            stop = (min(heads) // self._period_ns + 1) * self._period_ns
+            if boundary is not None and stop > boundary:
+                return
+            if self._description is not None:
+                description, self._description = self._description, None
+                self._write_text("/robot_description", min(heads), description, None)
+            self._container.write_chunk(self._take(stop))
+
+    def _take(self, stop: int) -> Messages:
+        """Take all messages before `stop` off the queues, in order of log time."""
+        records: list[bytes] = []
+        channels: list[NDArray[np.int64]] = []
+        times: list[NDArray[np.int64]] = []
+        for number, queue in self._queues.items():
+            while queue and queue[0][0][0] < stop:
+                log_time, rows = queue.popleft()
+                count = int(np.searchsorted(log_time, stop, side="left"))
+                if count < len(log_time):
+                    queue.appendleft((log_time[count:], rows[count:]))
+                size = rows.shape[1]
+                raw = rows[:count].tobytes()
+                records += [raw[start : start + size] for start in range(0, len(raw), size)]
+                channels.append(np.full(count, number, dtype=np.int64))
+                times.append(log_time[:count])
+        log_times = np.concatenate(times)
+        order = np.argsort(log_times, kind="stable")
+        return Messages(
+            [records[row] for row in order.tolist()], np.concatenate(channels)[order], log_times[order]
+        )
+
+
+assert struct.calcsize("<BQHIQQ") == mcap.MESSAGE_HEAD.size == 31
