@@ -1,0 +1,328 @@
+"""From a recording and its mapping to a session log: conversion to SI at the joint, checks, and writing."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError, DataError
+from ident.import_log.mapping import LogMapping, Signal, TimeBase
+from ident.import_log.table import Recording
+from lwr_driver.configuration import find
+from lwr_driver.session import SessionWriter, session_metadata
+
+__all__ = ["ImportReport", "import_log"]
+
+FloatArray = NDArray[np.float64]
+
+_ONCE = ("position", "velocity", "joint_torque")
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What an import did; prints itself.
+
+    rows : samples written of each topic. rows_in_source : samples that the recording holds.
+    period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
+    """
+
+    path: Path
+    robot: str
+    uid: str
+    joints: tuple[str, ...]
+    rows: Mapping[str, int]
+    rows_in_source: int
+    duration_s: float
+    period_s: float
+    shortest_s: float
+    longest_s: float
+    conversions: tuple[str, ...]
+    digests: Mapping[str, str]
+
+    def __str__(self) -> str:
+        written = ", ".join(f"{topic} {count}" for topic, count in self.rows.items())
+        jitter = "regular" if self.longest_s - self.shortest_s < 1e-6 else "kept as recorded"
+        lines = [
+            f"{self.robot}: {len(self.joints)} joints, {self.duration_s:.3f} s",
+            f"  rows      {written} (recording: {self.rows_in_source})",
+            f"  period    median {self.period_s * 1e3:.4g} ms, {self.shortest_s * 1e3:.4g} to "
+            f"{self.longest_s * 1e3:.4g} ms, {jitter}",
+            *(f"  {line}" for line in self.conversions),
+            *(f"  read      {name}  sha256 {digest[:16]}" for name, digest in self.digests.items()),
+            f"  written   {self.path}  uid {self.uid}",
+        ]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class _Channel:
+    times: NDArray[np.int64]
+    published: NDArray[np.int64]
+    values: FloatArray
+
+
+def import_log(
+    mapping: LogMapping,
+    source: str | Path,
+    output: str | Path,
+    *,
+    rows: tuple[int, int] | None = None,
+    payload: str | None = None,
+    payload_mass: float | None = None,
+    serial: str | None = None,
+    beside: Path | None = None,
+) -> ImportReport:
+    """Write the recording `source` (a file, or the folder that holds the mapping's files) as the session `output`.
+
+    rows : first and one past the last row of every file to take (from 0); None takes all.
+    payload, payload_mass [kg], serial : instead of the mapping's. beside : folder of the mapping file, for its URDF.
+
+    The session's uid follows from the content of the files and the rows taken, so the same recording is recognised
+    when it is imported again. Raises DataError naming file, column and row for non-finite values, times that do
+    not increase, files of unequal length or missing columns; ConfigurationError for an output that exists.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise DataError(f"{source}: no such file or folder; give the recording that the mapping describes")
+    recording = Recording(source, mapping.delimiter, mapping.header)
+    total, channels = _read(mapping, recording, rows)
+    joint = channels["position"]
+    digest = hashlib.sha256(
+        repr((sorted(recording.digests.values()), rows, mapping.joints)).encode()
+    ).hexdigest()
+    urdf = None if mapping.urdf is None else find(mapping.urdf, beside=beside).read_text(encoding="utf-8")
+    start = datetime.datetime.fromtimestamp(int(joint.times[0]) * 1e-9, datetime.UTC).isoformat()
+    metadata = session_metadata(
+        robot=mapping.robot,
+        serial=mapping.serial if serial is None else serial,
+        payload=mapping.payload if payload is None else payload,
+        payload_mass=mapping.payload_mass if payload_mass is None else payload_mass,
+        experiment="import",
+        uid=digest[:32],
+        motor_torque_source="none" if mapping.motor_torque is None else f"import of {source.name}",
+        utc_start=start,
+        imported_from=source.name,
+        imported_rows="all" if rows is None else f"{rows[0]}:{rows[1]} of {total}",
+        imported_sha256=" ".join(f"{name}={value}" for name, value in recording.digests.items()),
+        source=mapping.source,
+    )
+    with SessionWriter(
+        Path(output),
+        mapping.joints,
+        metadata,
+        robot_description=None,
+        attachments=_attachments(mapping, urdf),
+    ) as writer:
+        _write(writer, channels)
+    written = {
+        topic: len(channels[key].times)
+        for topic, key in (
+            ("/joint_states", "position"),
+            ("/motor_states", "motor_torque"),
+            ("/joint_command", "command"),
+        )
+        if key in channels
+    }
+    steps = np.diff(joint.times) * 1e-9
+    return ImportReport(
+        path=Path(output),
+        robot=mapping.robot,
+        uid=digest[:32],
+        joints=mapping.joints,
+        rows=written,
+        rows_in_source=total,
+        duration_s=float(joint.times[-1] - joint.times[0]) * 1e-9,
+        period_s=float(np.median(steps)),
+        shortest_s=float(steps.min()),
+        longest_s=float(steps.max()),
+        conversions=_conversions(mapping),
+        digests=recording.digests,
+    )
+
+
+def _read(
+    mapping: LogMapping, recording: Recording, rows: tuple[int, int] | None
+) -> tuple[int, dict[str, _Channel]]:
+    """Rows of the recording, and every channel converted to joint side and SI."""
+    joints = len(mapping.joints)
+    channels: dict[str, _Channel] = {}
+    total = 0
+    for name, signal in mapping.signals.items():
+        raw = recording.columns(signal, joints, name)
+        place = f"{recording.path(signal.file)}: `{name}`"
+        base = signal.time if signal.time is not None else mapping.time
+        clock = _clock(mapping, base, signal, recording, len(raw), place)
+        total = len(raw) if name == "position" else total
+        if name in _ONCE and len(raw) != total:
+            raise DataError(
+                f"{place} has {len(raw)} rows, the positions have {total}; the recording is not whole"
+            )
+        raw, clock = _cut(raw, rows, place), _cut(clock, rows, place)
+        _refuse_non_finite(raw, mapping.joints, place, 0 if rows is None else rows[0])
+        times = _log_times(mapping, base, clock, place, 0 if rows is None else rows[0])
+        channels[name] = _Channel(
+            times, _published(mapping, base, times), _convert(mapping, name, signal, raw)
+        )
+    if len(channels["position"].times) < 2:
+        raise DataError(
+            f"{recording.source}: {len(channels['position'].times)} samples are no motion; two at least"
+        )
+    return total, channels
+
+
+def _clock(
+    mapping: LogMapping, base: TimeBase, signal: Signal, recording: Recording, count: int, place: str
+) -> FloatArray:
+    """Times of the samples (n,) [s] by the source's clock."""
+    if base.column is None:
+        assert base.rate_hz is not None
+        return np.arange(count) / base.rate_hz
+    file = base.file if base.file is not None else signal.file
+    times = recording.column(file, base.column) * base.seconds
+    if len(times) != count:
+        raise DataError(f"{place} has {count} rows, its time column {base.column!r} has {len(times)}")
+    return times
+
+
+def _log_times(
+    mapping: LogMapping, base: TimeBase, clock: FloatArray, place: str, first: int
+) -> NDArray[np.int64]:
+    """UTC [ns] of each sample; strictly increasing, or an error that names the rows."""
+    if not np.isfinite(clock).all():
+        row = int(np.flatnonzero(~np.isfinite(clock))[0])
+        raise DataError(
+            f"{place}: time in row {first + row} is {clock[row]}; a log needs the time of every sample"
+        )
+    origin = _origin_ns(mapping, base)
+    # Whole seconds and the rest apart: a double holds unix time to 0.2 us only once, not twice.
+    whole = np.floor(clock)
+    times = whole.astype(np.int64) * 10**9 + np.rint((clock - whole) * 1e9).astype(np.int64) + origin
+    backwards = np.flatnonzero(np.diff(times) <= 0)
+    if len(backwards):
+        row = int(backwards[0])
+        raise DataError(
+            f"{place}: time {clock[row + 1]:.9g} s in row {first + row + 1} follows {clock[row]:.9g} s; times must "
+            f"increase ({len(backwards)} such rows); repair the clock of the recording or import without it by `rate_hz`"
+        )
+    if times[0] < 0:
+        raise DataError(
+            f"{place}: times begin at {clock[0]:.9g} s, before 1970; give `start_utc`, the UTC of time 0"
+        )
+    return times
+
+
+def _published(mapping: LogMapping, base: TimeBase, times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The source's own clock [ns]; counted from the first sample where it begins below zero."""
+    published = times - _origin_ns(mapping, base)
+    return published - min(0, int(published[0]))
+
+
+def _origin_ns(mapping: LogMapping, base: TimeBase) -> int:
+    """UTC [ns] of the source's time 0."""
+    return _utc_ns(mapping.start_utc) if base.zero == "start" and mapping.start_utc is not None else 0
+
+
+def _utc_ns(text: str) -> int:
+    try:
+        moment = datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ConfigurationError(
+            f"`start_utc` {text!r} is no time such as 2016-04-07T13:01:04+00:00"
+        ) from error
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.UTC)
+    elapsed = moment - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    return (elapsed.days * 86400 + elapsed.seconds) * 10**9 + elapsed.microseconds * 1000
+
+
+def _cut(values: FloatArray, rows: tuple[int, int] | None, place: str) -> FloatArray:
+    if rows is None:
+        return values
+    first, last = rows
+    if not 0 <= first < last <= len(values):
+        raise DataError(f"{place}: rows {first}:{last} asked for, the recording has 0:{len(values)}")
+    return values[first:last]
+
+
+def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, first: int) -> None:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise DataError(
+            f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} ({int(bad.sum())} such values); "
+            "leave these rows out with `--rows`, a session holds measured values only"
+        )
+
+
+def _convert(mapping: LogMapping, name: str, signal: Signal, raw: FloatArray) -> FloatArray:
+    """Values (n, joints) at the joint: the formulas at the head of `ident.import_log.mapping`."""
+    values = raw * signal.factors(len(mapping.joints), name)
+    if signal.side == "motor":
+        matrix = mapping.matrix
+        values = values @ matrix if signal.quantity == "torque" else np.linalg.solve(matrix, values.T).T
+    return values + mapping.offset if signal.quantity == "angle" else values
+
+
+def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
+    def values(name: str) -> FloatArray | None:
+        return channels[name].values if name in channels else None
+
+    joint = channels["position"]
+    writer.write_joint_states(
+        joint.times,
+        joint.values,
+        values("joint_torque"),
+        velocity=values("velocity"),
+        publish_time=joint.published,
+    )
+    if "motor_torque" in channels:
+        motor = channels["motor_torque"]
+        position = values("motor_position")
+        if position is not None and not np.array_equal(channels["motor_position"].times, motor.times):
+            raise DataError(
+                f"{writer.path}: `motor_position` and `motor_torque` have different times; they are one channel"
+            )
+        writer.write_motor_states(motor.times, motor.values, position, publish_time=motor.published)
+    if "command" in channels:
+        command = channels["command"]
+        writer.write_joint_command(command.times, command.values, publish_time=command.published)
+
+
+def _attachments(mapping: LogMapping, urdf: str | None) -> dict[str, bytes]:
+    import yaml
+
+    files = {"mapping.yaml": yaml.safe_dump(_plain(dataclasses.asdict(mapping)), sort_keys=False).encode()}
+    if urdf is not None:
+        files["robot.urdf"] = urdf.encode()
+    return files
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items() if item is not None}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _conversions(mapping: LogMapping) -> tuple[str, ...]:
+    lines = []
+    for name, signal in mapping.signals.items():
+        steps = [signal.unit]
+        if signal.scale is not None:
+            steps.append(f"x {signal.scale}")
+        if signal.sign != 1:
+            steps.append(f"sign {signal.sign}")
+        if signal.side == "motor":
+            steps.append("motor side, through the gear")
+        if signal.quantity == "angle" and mapping.offset_rad is not None:
+            steps.append("+ offset")
+        lines.append(f"{name:<15} {', '.join(steps)}")
+    return tuple(lines)

@@ -1,0 +1,285 @@
+"""The mapping file: which columns of a recording are which channel, in which units, on which side of the gear.
+
+Conventions of the conversion, with R the matrix of the transmission, q_motor = R q (n x n)::
+
+    R[i, i] = reduction of joint i (negative where motor and joint turn against each other)
+    R[m, j] = further ratios: how far motor m turns when joint j turns (a wrist whose drives are coupled)
+
+    position   joint side:  sign * scale * unit * x + offset      motor side:  inv(R) (sign * scale * unit * x) + offset
+    velocity   the same without offset
+    torque     joint side:  sign * scale * unit * x               motor side:  R' (sign * scale * unit * x)
+
+The torque rule is the power balance tau' qd = tau_motor' qd_motor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from lwr_driver.configuration import find, parse, read_mapping
+
+__all__ = ["Coupling", "LogMapping", "Signal", "TimeBase", "Transmission"]
+
+_TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_UNITS = {
+    "rad": ("angle", 1.0),
+    "deg": ("angle", math.pi / 180.0),
+    "rev": ("angle", 2.0 * math.pi),
+    "counts": ("angle", None),
+    "m": ("angle", 1.0),
+    "rad/s": ("rate", 1.0),
+    "deg/s": ("rate", math.pi / 180.0),
+    "rpm": ("rate", 2.0 * math.pi / 60.0),
+    "m/s": ("rate", 1.0),
+    "Nm": ("torque", 1.0),
+    "mNm": ("torque", 1e-3),
+    "N": ("torque", 1.0),
+    "A": ("torque", None),
+}
+Unit = Literal["rad", "deg", "rev", "counts", "m", "rad/s", "deg/s", "rpm", "m/s", "Nm", "mNm", "N", "A"]
+
+
+@dataclass(frozen=True)
+class TimeBase:
+    """When the samples were taken: a column of the recording, or a fixed rate.
+
+    file : file of the column, relative to the source; None is the source itself (or the signal's own file).
+    column : name or number (from 1) of a CSV column, or name of an NPZ array; kept as it is, jitter included.
+    unit : of the column. rate_hz : of a recording without a time column.
+    zero : "start" if the column counts from a moment of its own, "unix" if it counts from 1970-01-01 UTC.
+    """
+
+    column: str | int | None = None
+    file: str | None = None
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    rate_hz: float | None = None
+    zero: Literal["start", "unix"] = "start"
+
+    def __post_init__(self) -> None:
+        if (self.column is None) == (self.rate_hz is None):
+            raise ConfigurationError("`time` needs either `column` or `rate_hz`, and not both")
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise ConfigurationError(f"`rate_hz` is {self.rate_hz}, it must be positive")
+
+    @property
+    def seconds(self) -> float:
+        """Seconds in a unit of the column."""
+        return _TIME_UNITS[self.unit]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One quantity of all joints.
+
+    file : file, relative to the source; None is the source itself.
+    columns : names or numbers (from 1) of CSV columns, one a joint; None takes all columns in their order.
+    array : name of a two-dimensional NPZ array (rows are samples); `columns` are then numbers (from 1).
+    unit : of the numbers. `counts` and `A` have no size of their own and need `scale` (rad a count, Nm/A).
+    side : `motor` before the gear, `joint` after it.
+    sign : 1 or -1, one a joint or one for all. scale : factor, one a joint or one for all.
+    time : when the signal has a clock of its own; None takes that of the mapping.
+    """
+
+    unit: Unit
+    file: str | None = None
+    columns: tuple[str | int, ...] | None = None
+    array: str | None = None
+    side: Literal["joint", "motor"] = "joint"
+    sign: int | tuple[int, ...] = 1
+    scale: float | tuple[float, ...] | None = None
+    time: TimeBase | None = None
+
+    def __post_init__(self) -> None:
+        signs = self.sign if isinstance(self.sign, tuple) else (self.sign,)
+        if any(sign not in (1, -1) for sign in signs):
+            raise ConfigurationError(f"`sign` is {self.sign}, it must be 1 or -1 for each joint")
+        if _UNITS[self.unit][1] is None and self.scale is None:
+            raise ConfigurationError(
+                f"unit `{self.unit}` has no size of its own; give `scale` (rad a count, Nm/A)"
+            )
+        scales = self.scale if isinstance(self.scale, tuple) else (self.scale,)
+        if any(scale is not None and scale == 0.0 for scale in scales):
+            raise ConfigurationError("`scale` is 0, which would wipe out the measurement")
+
+    @property
+    def quantity(self) -> str:
+        """What the unit measures: angle, rate or torque."""
+        return _UNITS[self.unit][0]
+
+    def factors(self, joints: int, where: str) -> NDArray[np.float64]:
+        """sign x scale x unit for each joint (n,)."""
+        size = _UNITS[self.unit][1]
+        factors = np.full(joints, 1.0 if size is None else size)
+        for name, value in (("sign", self.sign), ("scale", self.scale)):
+            if value is None:
+                continue
+            values = np.atleast_1d(np.array(value, dtype=np.float64))
+            if len(values) not in (1, joints):
+                raise ConfigurationError(f"{where}: `{name}` has {len(values)} entries for {joints} joints")
+            factors *= values
+        return factors
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Motor `motor` turns `ratio` times as far as joint `joint`, besides what its own joint makes it turn."""
+
+    motor: str
+    joint: str
+    ratio: float
+
+
+@dataclass(frozen=True)
+class Transmission:
+    """Between motors and joints: q_motor = R q. reduction : the diagonal of R, may be negative."""
+
+    reduction: tuple[float, ...]
+    coupling: tuple[Coupling, ...] = ()
+
+    def matrix(self, joints: tuple[str, ...]) -> NDArray[np.float64]:
+        """R (n, n). ConfigurationError if it does not fit the joints or has no inverse."""
+        if len(self.reduction) != len(joints):
+            raise ConfigurationError(
+                f"`reduction` has {len(self.reduction)} entries for {len(joints)} joints"
+            )
+        matrix = np.diag(self.reduction)
+        for entry in self.coupling:
+            for name in (entry.motor, entry.joint):
+                if name not in joints:
+                    raise ConfigurationError(f"`coupling` names joint {name!r}; joints: {', '.join(joints)}")
+            if entry.motor == entry.joint:
+                raise ConfigurationError(
+                    f"`coupling` of {entry.motor!r} with itself belongs into `reduction`"
+                )
+            matrix[joints.index(entry.motor), joints.index(entry.joint)] = entry.ratio
+        if 0.0 in self.reduction or np.linalg.cond(matrix) > 1e9:
+            raise ConfigurationError(
+                "the transmission has no inverse; every joint needs a motor that moves it"
+            )
+        return matrix
+
+
+@dataclass(frozen=True)
+class LogMapping:
+    """A mapping file, see the head of the module and the files in `configs/imports/`.
+
+    robot : model, as in the metadata of the session. joints : names, as in the URDF, base to tip.
+    time : when the samples were taken. position : measured joint position, the one signal that must exist.
+    joint_torque : joint torque sensor. motor_torque : motor torque or current.
+    velocity, motor_position, command : measured velocity, motor position, commanded position.
+    offset_rad : added to the positions of each joint after the gear, to meet the zero of the URDF.
+    urdf : file of the arm, found as configuration files are, attached to the session.
+    delimiter : of CSV files; None tries comma, semicolon, tab and blanks.
+    header : whether CSV files name their columns in the first row.
+    """
+
+    robot: str
+    joints: tuple[str, ...]
+    time: TimeBase
+    position: Signal
+    schema_version: Literal[1] = 1
+    serial: str = ""
+    payload: str = "none"
+    payload_mass: float | None = None
+    start_utc: str | None = None
+    source: str = ""
+    joint_torque: Signal | None = None
+    motor_torque: Signal | None = None
+    velocity: Signal | None = None
+    motor_position: Signal | None = None
+    command: Signal | None = None
+    transmission: Transmission | None = None
+    offset_rad: tuple[float, ...] | None = None
+    urdf: str | None = None
+    delimiter: str | None = None
+    header: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.joints or len(set(self.joints)) != len(self.joints):
+            raise ConfigurationError("`joints` must hold different names, one at least")
+        if self.offset_rad is not None and len(self.offset_rad) != len(self.joints):
+            raise ConfigurationError(
+                f"`offset_rad` has {len(self.offset_rad)} entries for {len(self.joints)} joints"
+            )
+        kinds = {
+            "position": "angle",
+            "motor_position": "angle",
+            "command": "angle",
+            "velocity": "rate",
+            "joint_torque": "torque",
+            "motor_torque": "torque",
+        }
+        for name, signal in self.signals.items():
+            if signal.quantity != kinds[name]:
+                raise ConfigurationError(f"`{name}` has unit `{signal.unit}`, which does not measure that")
+            if signal.columns is not None and len(signal.columns) != len(self.joints):
+                raise ConfigurationError(
+                    f"`{name}`: {len(signal.columns)} `columns` for {len(self.joints)} joints; name one column a joint"
+                )
+            if signal.side == "motor" and self.transmission is None:
+                raise ConfigurationError(
+                    f"`{name}` is on the motor side; the gear is needed, give `transmission`"
+                )
+            signal.factors(len(self.joints), f"`{name}`")
+        if self.joint_torque is not None and self.joint_torque.side == "motor":
+            raise ConfigurationError(
+                "`joint_torque` is the sensor behind the gear and cannot be on the motor side; is it `motor_torque`?"
+            )
+        for name in ("velocity", "joint_torque"):
+            signal = self.signals.get(name)
+            if signal is not None and signal.time is not None:
+                raise ConfigurationError(
+                    f"`{name}` belongs to the samples of `position` and has no `time` of its own"
+                )
+        if self.motor_position is not None and self.motor_torque is None:
+            raise ConfigurationError(
+                "`motor_position` goes with `motor_torque`, which the mapping does not have"
+            )
+        if self.joint_torque is None and self.motor_torque is None:
+            raise ConfigurationError("the mapping has no torque; give `joint_torque` or `motor_torque`")
+        self.matrix  # noqa: B018 - checked once, here
+
+    @property
+    def signals(self) -> dict[str, Signal]:
+        """The signals that there are, by name."""
+        names = ("position", "velocity", "joint_torque", "motor_torque", "motor_position", "command")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """R (n, n) of q_motor = R q; the identity without a transmission."""
+        if self.transmission is None:
+            return np.eye(len(self.joints))
+        return self.transmission.matrix(self.joints)
+
+    @property
+    def offset(self) -> NDArray[np.float64]:
+        """Offsets of the positions (n,) [rad]."""
+        return np.zeros(len(self.joints)) if self.offset_rad is None else np.array(self.offset_rad)
+
+    @classmethod
+    def load(cls, name: str | Path) -> LogMapping:
+        """Read a mapping file, looked for as given, in `configs/` and in `configs/imports/`."""
+        path = mapping_path(name)
+        return parse(cls, read_mapping(path), str(path))
+
+
+def mapping_path(name: str | Path) -> Path:
+    """Where the mapping file `name` is; a bare name such as `tx40` means `configs/imports/tx40.yaml`."""
+    try:
+        return find(name)
+    except ConfigurationError:
+        bare = Path("imports") / Path(name).with_suffix(".yaml")
+        try:
+            return find(bare)
+        except ConfigurationError as error:
+            raise ConfigurationError(
+                f"mapping file {str(name)!r} not found; looked also for: {error}"
+            ) from error
