@@ -90,9 +90,13 @@ class Chain:
         if not self.link_names:
             object.__setattr__(self, "link_names", tuple(f"link_{k}" for k in range(1, n + 1)))
         placements = self.link_placements
-        placements = np.tile(np.eye(4), (n, 1, 1)) if placements is None else np.array(placements, dtype=float)
+        placements = (
+            np.tile(np.eye(4), (n, 1, 1)) if placements is None else np.array(placements, dtype=float)
+        )
         if placements.shape != (n, 4, 4) or len(self.link_names) != n:
-            raise ConfigurationError(f"chain: {n} joints need {n} link names and link placements of shape (4, 4)")
+            raise ConfigurationError(
+                f"chain: {n} joints need {n} link names and link placements of shape (4, 4)"
+            )
         placements.setflags(write=False)
         object.__setattr__(self, "link_placements", placements)
 
@@ -118,10 +122,14 @@ class Chain:
         for number, row in enumerate(rows, start=1):
             unknown = set(row) - {"name", "kind", "alpha", "d", "theta", "r"}
             if unknown:
-                raise ConfigurationError(f"joint {number}: unknown key `{sorted(unknown)[0]}` in the modified-DH table")
+                raise ConfigurationError(
+                    f"joint {number}: unknown key `{sorted(unknown)[0]}` in the modified-DH table"
+                )
             kind = row.get("kind", "revolute")
             if kind not in ("revolute", "prismatic"):
-                raise ConfigurationError(f"joint {number}: kind {kind!r} is neither `revolute` nor `prismatic`")
+                raise ConfigurationError(
+                    f"joint {number}: kind {kind!r} is neither `revolute` nor `prismatic`"
+                )
             names.append(str(row.get("name", f"q{number}")))
             prismatic.append(kind == "prismatic")
             table.append([float(row.get(key, 0.0)) for key in ("alpha", "d", "theta", "r")])
@@ -131,7 +139,9 @@ class Chain:
             np.array(prismatic, dtype=bool),
             *constants,
             gravity=np.asarray(gravity, dtype=np.float64),
-            base_placement=np.eye(4) if base_placement is None else np.asarray(base_placement, dtype=np.float64),
+            base_placement=np.eye(4)
+            if base_placement is None
+            else np.asarray(base_placement, dtype=np.float64),
         )
 
     @classmethod
@@ -158,7 +168,9 @@ class Chain:
         joints = urdf.chain(root, tip)
         movable = [joint for joint in joints if joint.movable]
         if not movable:
-            raise ConfigurationError(f"robot {urdf.name!r}: no movable joint between {root or urdf.root!r} and the tip")
+            raise ConfigurationError(
+                f"robot {urdf.name!r}: no movable joint between {root or urdf.root!r} and the tip"
+            )
         local, pending = [], np.eye(4)
         for joint in joints:
             pending = pending @ joint.origin
@@ -208,7 +220,9 @@ class Chain:
         """(n, 10) parameters in modified-DH frames from the same about the URDF's link frames."""
         assert self.link_placements is not None
         rows = np.asarray(inertial, dtype=np.float64)
-        return np.array([parameters.transform(row, pose) for row, pose in zip(rows, self.link_placements, strict=True)])
+        return np.array(
+            [parameters.transform(row, pose) for row, pose in zip(rows, self.link_placements, strict=True)]
+        )
 
     def inertial_to_links(self, inertial: ArrayLike) -> NDArray[np.float64]:
         """(n, 10) parameters about the URDF's link frames from those in modified-DH frames."""
@@ -224,7 +238,9 @@ class Chain:
         at 0). Raises ConfigurationError when the chain was not read from a URDF.
         """
         if self.urdf is None:
-            raise ConfigurationError("the chain comes from a table, not from a URDF; it has no inertial parameters")
+            raise ConfigurationError(
+                "the chain comes from a table, not from a URDF; it has no inertial parameters"
+            )
         urdf = read_urdf(self.urdf)
         stop = set(self.joint_names)
         return self.inertial_from_links([urdf.lumped_inertial(link, stop) for link in self.link_names])
@@ -386,7 +402,9 @@ def _build_frames(
     for frame in frames:
         row = _read_mdh(np.linalg.inv(before) @ frame, snap_rad)
         if row is None:
-            raise ConfigurationError("the joint axes of the URDF do not yield modified-DH frames; check its joint origins")
+            raise ConfigurationError(
+                "the joint axes of the URDF do not yield modified-DH frames; check its joint origins"
+            )
         table.append(row)
         before = frame
     placements = np.array([np.linalg.inv(frame) @ link for frame, link in zip(frames, links, strict=True)])
@@ -441,5 +459,3 @@ def _perpendicular(link: NDArray[np.float64], axis: NDArray[np.float64]) -> NDAr
         if np.linalg.norm(x) > 1e-3:
             return x / np.linalg.norm(x)
     raise ConfigurationError("a link frame of the URDF is not a rotation; check its joint origins")
-
-

@@ -82,7 +82,9 @@ def split_name(name: str) -> tuple[str, int, bool]:
     """
     match = _NAME.match(name)
     if match is None:
-        raise ConfigurationError(f"parameter name {name!r} is not a symbol followed by a link number, as in `ZZ2R`")
+        raise ConfigurationError(
+            f"parameter name {name!r} is not a symbol followed by a link number, as in `ZZ2R`"
+        )
     return match[1], int(match[2]), bool(match[3])
 
 

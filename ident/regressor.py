@@ -23,9 +23,17 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.kinematics import Chain
 
-__all__ = ["all_columns", "check_states", "gravity_torque", "mass_matrix", "rigid_regressor", "torque"]
+__all__ = [
+    "all_columns",
+    "check_states",
+    "fill_rigid",
+    "gravity_torque",
+    "mass_matrix",
+    "rigid_regressor",
+    "torque",
+]
 
-_BLOCK = 64
+_BLOCK = 128
 
 Floats = NDArray[np.float64]
 
@@ -85,42 +93,64 @@ def rigid_regressor(
     if out is None:
         out = np.zeros((count, chain.n, samples))
     elif out.shape != (count, chain.n, samples) or not out.flags.c_contiguous or out.dtype != np.float64:
-        raise ConfigurationError(f"`out` must be C-contiguous float64 of shape ({count}, {chain.n}, {samples})")
-    fill_rigid(chain, *states, wanted, out)
+        raise ConfigurationError(
+            f"`out` must be C-contiguous float64 of shape ({count}, {chain.n}, {samples})"
+        )
+    fill_rigid(chain, *states, wanted, out[:, None])
     return out.transpose(1, 2, 0)
 
 
 def fill_rigid(
     chain: Chain, q: Floats, qd: Floats, qdd: Floats, columns: NDArray[np.int64], out: NDArray[np.float64]
 ) -> None:
-    """`rigid_regressor` without checks: writes the rows (column, joint, sample) of `out` (>= C, n, N)."""
-    position = np.ascontiguousarray(q.T)
-    angle = np.where(chain.prismatic[:, None], 0.0, position) + chain.theta[:, None]
-    offset = np.where(chain.prismatic[:, None], position, 0.0) + chain.r[:, None]
+    """`rigid_regressor` without checks and without an array of its own.
+
+    out : (>= C, >= 1, n, >= N) float64 C-contiguous; entries [column, 0, joint, sample] are written, and only those
+        that the chain's structure allows to differ from zero.
+    """
+    _fill(q, qd, qdd, *_constants(chain), chain.gravity, columns, out)
+
+
+def _constants(chain: Chain) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     cosine, sine = chain.cos_sin_alpha
-    _fill(
-        np.cos(angle),
-        np.sin(angle),
-        offset,
-        np.ascontiguousarray(qd.T),
-        np.ascontiguousarray(qdd.T),
-        cosine,
-        sine,
-        chain.d,
-        chain.prismatic.astype(np.float64),
-        chain.gravity,
-        columns,
-        out,
-    )
+    return cosine, sine, chain.d, chain.theta, chain.r, chain.prismatic.astype(np.float64)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _cos_sin(angle, cosine, sine, size):  # type: ignore[no-untyped-def]  # noqa: D103
+    # The polynomials and the three-part pi/2 of FreeBSD's msun (k_sin.c, k_cos.c, e_rem_pio2.c), without
+    # branches so that the loop vectorises; error below 1 ulp for |angle| < 1e5.
+    for s in range(size):
+        x = angle[s]
+        turns = np.rint(x * 0.6366197723675814)
+        y = x - turns * 1.5707963267341256
+        y = y - turns * 6.077100506303966e-11
+        y = y - turns * 2.0222662487959506e-21
+        z = y * y
+        p = z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)
+        p = z * (-1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + p))
+        p = -1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + p)
+        sin_y = y + y * z * p
+        p = z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
+        p = z * (2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + p))
+        p = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + p)
+        cos_y = 1.0 - (0.5 * z - z * z * p)
+        quarter = turns - 4.0 * np.floor(0.25 * turns)
+        odd = (quarter == 1.0) | (quarter == 3.0)
+        c, t = (sin_y, cos_y) if odd else (cos_y, sin_y)
+        cosine[s] = -c if (quarter == 1.0) | (quarter == 2.0) else c
+        sine[s] = -t if quarter >= 2.0 else t
 
 
 @njit(cache=True, error_model="numpy")
-def _fill(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, columns, out):  # type: ignore[no-untyped-def]  # noqa: D103
-    n, samples = ct.shape
+def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  # type: ignore[no-untyped-def]  # noqa: D103
+    samples, n = q.shape
     # Rows of the scratch: 0-2 omega, 3-5 alpha, 6-8 acceleration, 9-14 the products of omega.
     body = np.zeros((15, _BLOCK))
     # Six numbers (v, w) for each joint below or at the link.
     twist = np.zeros((n, 6, _BLOCK))
+    # cos and sin of theta, r, qd, qdd, theta of the link at hand.
+    joint = np.zeros((6, _BLOCK))
     for start in range(0, samples, _BLOCK):
         size = min(_BLOCK, samples - start)
         for s in range(size):
@@ -130,23 +160,29 @@ def _fill(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, columns, out):  # 
             body[7, s] = -gravity[1]
             body[8, s] = -gravity[2]
         for k in range(n):
-            c, sn = ct[k, start : start + size], st[k, start : start + size]
-            r = rr[k, start : start + size]
-            speed, thrust = qd[k, start : start + size], qdd[k, start : start + size]
-            _advance(body, c, sn, r, speed, thrust, ca[k], sa[k], d[k], prismatic[k], size)
+            turning = 1.0 - prismatic[k]
+            for s in range(size):
+                position = q[start + s, k]
+                joint[5, s] = theta[k] + turning * position
+                joint[2, s] = r[k] + prismatic[k] * position
+                joint[3, s] = qd[start + s, k]
+                joint[4, s] = qdd[start + s, k]
+            _cos_sin(joint[5], joint[0], joint[1], size)
+            _advance(body, joint, ca[k], sa[k], d[k], prismatic[k], size)
             for j in range(k):
-                _carry(twist[j], c, sn, r, ca[k], sa[k], d[k], size)
+                _carry(twist[j], joint, ca[k], sa[k], d[k], size)
             for s in range(size):
                 for i in range(6):
                     twist[k, i, s] = 0.0
                 twist[k, 2, s] = prismatic[k]
-                twist[k, 5, s] = 1.0 - prismatic[k]
+                twist[k, 5, s] = turning
             for j in range(k + 1):
                 _columns_of_link(body, twist[j], columns[k], out, j, start, size)
 
 
 @njit(cache=True, inline="always")
-def _advance(body, c, sn, r, speed, thrust, ca, sa, d, prismatic, size):  # type: ignore[no-untyped-def]  # noqa: D103
+def _advance(body, joint, ca, sa, d, prismatic, size):  # type: ignore[no-untyped-def]  # noqa: D103
+    c, sn, r, speed, thrust = joint[0], joint[1], joint[2], joint[3], joint[4]
     wx, wy, wz = body[0], body[1], body[2]
     ex, ey, ez = body[3], body[4], body[5]
     ax, ay, az = body[6], body[7], body[8]
@@ -184,7 +220,8 @@ def _advance(body, c, sn, r, speed, thrust, ca, sa, d, prismatic, size):  # type
 
 
 @njit(cache=True, inline="always")
-def _carry(twist, c, sn, r, ca, sa, d, size):  # type: ignore[no-untyped-def]  # noqa: D103
+def _carry(twist, joint, ca, sa, d, size):  # type: ignore[no-untyped-def]  # noqa: D103
+    c, sn, r = joint[0], joint[1], joint[2]
     for s in range(size):
         px, py, pz = d, -sa * r[s], ca * r[s]
         w0, w1, w2 = twist[3, s], twist[4, s], twist[5, s]
@@ -205,31 +242,31 @@ def _columns_of_link(body, twist, column, out, joint, start, size):  # type: ign
     xx, yy, zz, xy, xz, yz = body[9], body[10], body[11], body[12], body[13], body[14]
     vx, vy, vz, wx, wy, wz = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5]
     if column[0] >= 0:
-        o = out[column[0], joint, start : start + size]
+        o = out[column[0], 0, joint, start : start + size]
         for s in range(size):
             o[s] = wx[s] * ex[s] + wy[s] * xz[s] - wz[s] * xy[s]
     if column[1] >= 0:
-        o = out[column[1], joint, start : start + size]
+        o = out[column[1], 0, joint, start : start + size]
         for s in range(size):
             o[s] = wx[s] * (ey[s] - xz[s]) + wy[s] * (ex[s] + yz[s]) + wz[s] * (xx[s] - yy[s])
     if column[2] >= 0:
-        o = out[column[2], joint, start : start + size]
+        o = out[column[2], 0, joint, start : start + size]
         for s in range(size):
             o[s] = wx[s] * (ez[s] + xy[s]) + wy[s] * (zz[s] - xx[s]) + wz[s] * (ex[s] - yz[s])
     if column[3] >= 0:
-        o = out[column[3], joint, start : start + size]
+        o = out[column[3], 0, joint, start : start + size]
         for s in range(size):
             o[s] = -wx[s] * yz[s] + wy[s] * ey[s] + wz[s] * xy[s]
     if column[4] >= 0:
-        o = out[column[4], joint, start : start + size]
+        o = out[column[4], 0, joint, start : start + size]
         for s in range(size):
             o[s] = wx[s] * (yy[s] - zz[s]) + wy[s] * (ez[s] - xy[s]) + wz[s] * (ey[s] + xz[s])
     if column[5] >= 0:
-        o = out[column[5], joint, start : start + size]
+        o = out[column[5], 0, joint, start : start + size]
         for s in range(size):
             o[s] = wx[s] * yz[s] - wy[s] * xz[s] + wz[s] * ez[s]
     if column[6] >= 0:
-        o = out[column[6], joint, start : start + size]
+        o = out[column[6], 0, joint, start : start + size]
         for s in range(size):
             o[s] = (
                 ay[s] * wz[s]
@@ -239,7 +276,7 @@ def _columns_of_link(body, twist, column, out, joint, start, size):  # type: ign
                 + vz[s] * (xz[s] - ey[s])
             )
     if column[7] >= 0:
-        o = out[column[7], joint, start : start + size]
+        o = out[column[7], 0, joint, start : start + size]
         for s in range(size):
             o[s] = (
                 az[s] * wx[s]
@@ -249,7 +286,7 @@ def _columns_of_link(body, twist, column, out, joint, start, size):  # type: ign
                 + vz[s] * (yz[s] + ex[s])
             )
     if column[8] >= 0:
-        o = out[column[8], joint, start : start + size]
+        o = out[column[8], 0, joint, start : start + size]
         for s in range(size):
             o[s] = (
                 ax[s] * wy[s]
@@ -259,7 +296,7 @@ def _columns_of_link(body, twist, column, out, joint, start, size):  # type: ign
                 - vz[s] * (xx[s] + yy[s])
             )
     if column[9] >= 0:
-        o = out[column[9], joint, start : start + size]
+        o = out[column[9], 0, joint, start : start + size]
         for s in range(size):
             o[s] = vx[s] * ax[s] + vy[s] * ay[s] + vz[s] * az[s]
 
@@ -347,7 +384,14 @@ def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, ou
             else:
                 e0, e1, e2 = e0 + w1 * rate, e1 - w0 * rate, e2 + qdd[s, k]
                 w2 += rate
-            xx, xy, xz, yy, yz, zz = bodies[k, 0], bodies[k, 1], bodies[k, 2], bodies[k, 3], bodies[k, 4], bodies[k, 5]
+            xx, xy, xz, yy, yz, zz = (
+                bodies[k, 0],
+                bodies[k, 1],
+                bodies[k, 2],
+                bodies[k, 3],
+                bodies[k, 4],
+                bodies[k, 5],
+            )
             h0, h1, h2, m = bodies[k, 6], bodies[k, 7], bodies[k, 8], bodies[k, 9]
             # omega x h, then f = m a + alpha x h + omega x (omega x h)
             g0, g1, g2 = w1 * h2 - w2 * h1, w2 * h0 - w0 * h2, w0 * h1 - w1 * h0

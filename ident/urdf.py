@@ -62,7 +62,9 @@ class Urdf:
         start = root if root is not None else self.root
         for link in (start, tip):
             if link is not None and link not in self.inertials:
-                raise ConfigurationError(f"robot {self.name!r} has no link {link!r}; links: {', '.join(self.inertials)}")
+                raise ConfigurationError(
+                    f"robot {self.name!r} has no link {link!r}; links: {', '.join(self.inertials)}"
+                )
         if tip is None:
             tip = self._only_tip(start)
         parent_joint = {joint.child: joint for joint in self.joints}
@@ -130,7 +132,9 @@ def read_urdf(source: str | Path) -> Urdf:
     for joint in joints:
         for name in (joint.parent, joint.child):
             if name not in inertials:
-                raise ConfigurationError(f"{place}: joint {joint.name!r} refers to link {name!r}, which does not exist")
+                raise ConfigurationError(
+                    f"{place}: joint {joint.name!r} refers to link {name!r}, which does not exist"
+                )
     return Urdf(tree.get("name", "robot"), text, joints, inertials)
 
 
