@@ -14,7 +14,6 @@ import numpy.typing as npt
 from fri.errors import RefusedError
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
 from lwr_driver.driver import Driver, LinkState, Outcome
 from lwr_driver.driver import Progress as MotionProgress
 from lwr_driver.motion import Motion
@@ -22,16 +21,9 @@ from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.interrupt import Interrupts
 from runner.operator import Operator
 from runner.payload import Rest, check_payload
-from runner.preflight import (
-    Preflight,
-    check_disk,
-    check_motion_limits,
-    check_path,
-    check_start,
-    check_torque,
-)
+from runner.preflight import Preflight
+from runner.preparation import session_motion
 from runner.progress import Progress
-from runner.route import route
 from runner.status import StatusLine
 from runner.versions import git_commit, software
 
@@ -109,8 +101,16 @@ class Run:
         bench = self.bench
         bench.driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
         self._swap(plan)
-        here = self._at_rest(plan.payload)
-        motion, preflight = self._prepare(plan, here)
+        state = bench.driver.state()
+        motion, preflight = session_motion(
+            self.experiment,
+            bench.arm,
+            bench.cell,
+            plan,
+            self.excite(state.period_s),
+            state.q_command,
+            self.folder,
+        )
         preflight.enforce()
         attempt = self._progress.begin(plan.name, path)
         self._rest = None
@@ -142,44 +142,6 @@ class Run:
     def _at_rest(self, payload: Payload | None) -> Rest:
         measured = self.bench.driver.monitor(self._cycles(REST_CYCLES_S))
         return Rest(measured.q, measured.tau, payload)
-
-    def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
-        """The motion of a session from where the arm is, with every check of it."""
-        bench, experiment = self.bench, self.experiment
-        state = bench.driver.state()
-        moves = experiment.moves
-        home = experiment.home(len(here.q))
-        excitation = self.excite(state.period_s)
-        checker = CollisionChecker(
-            bench.arm, bench.cell, plan.payload.shape if plan.payload is not None else None
-        )
-        margin = max(moves.clearance_m, bench.cell.margin_m)
-        best: tuple[Motion, Preflight] | None = None
-        for approach in ([state.setpoint], [state.setpoint, home]):
-            for retreat in ([home], []):
-                motion = route(
-                    bench.arm,
-                    approach,
-                    excitation,
-                    retreat,
-                    speed_scale=moves.speed_scale,
-                    settle_s=moves.settle_s,
-                    brake_s=moves.brake_s,
-                )
-                preflight = Preflight(
-                    (
-                        check_start(bench.arm, here.q, excitation.q[0], moves.max_start_distance_rad),
-                        *check_motion_limits(bench.arm, motion),
-                        check_torque(bench.arm, motion, plan.payload),
-                        check_path(checker, motion, margin),
-                        check_disk(self.folder, len(motion)),
-                    )
-                )
-                if preflight.ok:
-                    return motion, preflight
-                best = best or (motion, preflight)
-        assert best is not None
-        return best
 
     def _drive(self, plan: SessionPlan, motion: Motion) -> Outcome:
         """Command mode, the motion, and out of command mode again, whatever happens."""

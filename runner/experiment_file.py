@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -167,6 +167,7 @@ class Experiment:
     cell: str = "cell.yaml"
     backend: Literal["emulator", "fri"] = "emulator"
     emulator: str = "emulator/default.yaml"
+    emulator_settings: dict[str, Any] = field(default_factory=dict)
     lock_step: bool = True
     serial: str = ""
     link: Link = field(default_factory=Link)
@@ -200,6 +201,11 @@ class Experiment:
         object.__setattr__(experiment, "source", path)
         object.__setattr__(experiment, "text", path.read_text(encoding="utf-8"))
         return experiment
+
+    @property
+    def emulator_path(self) -> Path:
+        """Path of the emulator's configuration."""
+        return find(self.emulator, beside=self.source.parent)
 
     @property
     def uid(self) -> str:

@@ -80,8 +80,8 @@ def check_motion_limits(arm: Arm, motion: Motion) -> list[Item]:
     for worst in extremes(arm, motion):
         items.append(
             Item(
-                f"{worst.quantity} of {worst.joint}",
-                f"{worst.value:.4g} {worst.unit} at t = {worst.time_s:.3f} s",
+                f"{worst.quantity}",
+                f"{worst.joint} {worst.value:.4g} {worst.unit} at t = {worst.time_s:.3f} s",
                 f"{worst.limit:.4g} {worst.unit}",
                 worst.ok,
                 "lower `speed_scale`, or lengthen `period_s` of the excitation in the experiment file",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import select
 import subprocess
 import sys
@@ -157,8 +158,14 @@ class EmulatorProcess:
         """What the process has written to its error output so far."""
         if self._errors is None:
             return ""
-        self._errors.seek(0)
-        return self._errors.read().decode(errors="replace")
+        # The child writes at the same file offset, so it must not be moved.
+        return os.pread(self._errors.fileno(), 1 << 20, 0).decode(errors="replace")
+
+    def wait(self) -> int:
+        """Wait until the process ends by itself; returns its exit status."""
+        if self._process is None:
+            raise RobotError("emulator is not running; call `start` or use it in a `with` block")
+        return self._process.wait()
 
     def stop(self) -> int | None:
         """End the process; returns its exit status, None if it never ran. Safe to call twice."""
