@@ -79,14 +79,16 @@ def import_log(
     serial: str | None = None,
     beside: Path | None = None,
 ) -> ImportReport:
-    """Write the recording `source` (a file, or the folder that holds the mapping's files) as the session `output`.
+    """Write the recording `source` (a file, or the folder of the mapping's files) as the session `output`.
 
     rows : first and one past the last row of every file to take (from 0); None takes all.
-    payload, payload_mass [kg], serial : instead of the mapping's. beside : folder of the mapping file, for its URDF.
+    payload, payload_mass [kg], serial : instead of the mapping's.
+    beside : folder of the mapping file, for its URDF.
 
-    The session's uid follows from the content of the files and the rows taken, so the same recording is recognised
-    when it is imported again. Raises DataError naming file, column and row for non-finite values, times that do
-    not increase, files of unequal length or missing columns; ConfigurationError for an output that exists.
+    The session's uid follows from the content of the files and the rows taken, so the same recording is
+    recognised when it is imported again. Raises DataError naming file, column and row for non-finite values,
+    times that do not increase, files of unequal length or missing columns; ConfigurationError for an output
+    that exists.
     """
     source = Path(source)
     if not source.exists():
@@ -208,8 +210,9 @@ def _log_times(
     if len(backwards):
         row = int(backwards[0])
         raise DataError(
-            f"{place}: time {clock[row + 1]:.9g} s in row {first + row + 1} follows {clock[row]:.9g} s; times must "
-            f"increase ({len(backwards)} such rows); repair the clock of the recording or import without it by `rate_hz`"
+            f"{place}: time {clock[row + 1]:.9g} s in row {first + row + 1} follows {clock[row]:.9g} s; "
+            f"times must increase ({len(backwards)} such rows); repair the clock of the recording or import "
+            "without it by `rate_hz`"
         )
     if times[0] < 0:
         raise DataError(
@@ -256,8 +259,8 @@ def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, 
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise DataError(
-            f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} ({int(bad.sum())} such values); "
-            "leave these rows out with `--rows`, a session holds measured values only"
+            f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} ({int(bad.sum())} such "
+            "values); leave these rows out with `--rows`, a session holds measured values only"
         )
 
 
@@ -266,7 +269,7 @@ def _convert(mapping: LogMapping, name: str, signal: Signal, raw: FloatArray) ->
     values = raw * signal.factors(len(mapping.joints), name)
     if signal.side == "motor":
         matrix = mapping.matrix
-        values = values @ matrix if signal.quantity == "torque" else np.linalg.solve(matrix, values.T).T
+        values = values @ (matrix if signal.quantity == "torque" else np.linalg.inv(matrix).T)
     return values + mapping.offset if signal.quantity == "angle" else values
 
 
@@ -315,7 +318,7 @@ def _plain(value: object) -> object:
 def _conversions(mapping: LogMapping) -> tuple[str, ...]:
     lines = []
     for name, signal in mapping.signals.items():
-        steps = [signal.unit]
+        steps: list[str] = [signal.unit]
         if signal.scale is not None:
             steps.append(f"x {signal.scale}")
         if signal.sign != 1:

@@ -1,13 +1,14 @@
-"""The mapping file: which columns of a recording are which channel, in which units, on which side of the gear.
+"""The mapping file: which columns of a recording are which channel, in which units, before or behind the gear.
 
 Conventions of the conversion, with R the matrix of the transmission, q_motor = R q (n x n)::
 
     R[i, i] = reduction of joint i (negative where motor and joint turn against each other)
     R[m, j] = further ratios: how far motor m turns when joint j turns (a wrist whose drives are coupled)
 
-    position   joint side:  sign * scale * unit * x + offset      motor side:  inv(R) (sign * scale * unit * x) + offset
-    velocity   the same without offset
-    torque     joint side:  sign * scale * unit * x               motor side:  R' (sign * scale * unit * x)
+    y = sign * scale * unit * x
+    position   joint side:  y + offset      motor side:  inv(R) y + offset
+    velocity   joint side:  y               motor side:  inv(R) y
+    torque     joint side:  y               motor side:  R' y
 
 The torque rule is the power balance tau' qd = tau_motor' qd_motor.
 """
@@ -221,7 +222,7 @@ class LogMapping:
                 raise ConfigurationError(f"`{name}` has unit `{signal.unit}`, which does not measure that")
             if signal.columns is not None and len(signal.columns) != len(self.joints):
                 raise ConfigurationError(
-                    f"`{name}`: {len(signal.columns)} `columns` for {len(self.joints)} joints; name one column a joint"
+                    f"`{name}`: {len(signal.columns)} `columns` for {len(self.joints)} joints; name one each"
                 )
             if signal.side == "motor" and self.transmission is None:
                 raise ConfigurationError(
@@ -230,11 +231,11 @@ class LogMapping:
             signal.factors(len(self.joints), f"`{name}`")
         if self.joint_torque is not None and self.joint_torque.side == "motor":
             raise ConfigurationError(
-                "`joint_torque` is the sensor behind the gear and cannot be on the motor side; is it `motor_torque`?"
+                "`joint_torque` is the sensor behind the gear, it cannot be on the motor side; "
+                "is it `motor_torque`?"
             )
         for name in ("velocity", "joint_torque"):
-            signal = self.signals.get(name)
-            if signal is not None and signal.time is not None:
+            if name in self.signals and self.signals[name].time is not None:
                 raise ConfigurationError(
                     f"`{name}` belongs to the samples of `position` and has no `time` of its own"
                 )

@@ -1,4 +1,4 @@
-"""Recordings as named columns: CSV (any delimiter, with or without header) and NPZ, refused when not whole."""
+"""Recordings as named columns: CSV (any delimiter, with or without header) and NPZ; refused if not whole."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ class Recording:
             return values[:, [_number(path, names, column) for column in signal.columns]]
         if values.shape[1] != joints:
             raise DataError(
-                f"{label} has {values.shape[1]} columns for {joints} joints; name them in `columns` of `{what}`"
+                f"{label} has {values.shape[1]} columns for {joints} joints; "
+                f"name them in `columns` of `{what}`"
             )
         return values
 
