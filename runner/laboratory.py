@@ -1,4 +1,4 @@
-"""The set-up around an experiment: the arm or its emulator, the driver connected to it, and who stands there."""
+"""The set-up of an experiment: the arm or its emulator, the driver connected to it, and who stands there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 import socket
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Self
 
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
