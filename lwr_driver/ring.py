@@ -1,11 +1,12 @@
 """The shared-memory ring between the FRI loop and the recorder: one writer, one reader, rows of fixed size.
 
-The loop fills `Ring.row` and calls `publish`, which copies the row into its slot and then advances the head; it never
-waits, allocates or calls the system. When the ring is full the new row is dropped and counted, so that a reader never
-sees a row that is half overwritten. The reader takes rows with `take` and frees them with `release`.
+The loop fills `Ring.row` and calls `publish`, which copies the row into its slot and then advances the head;
+it never waits, allocates or calls the system. When the ring is full the new row is dropped and counted, so
+that a reader never sees a row that is half overwritten. The reader takes rows with `take` and frees them with
+`release`.
 
-Each counter is an aligned 8-byte word in a cache line of its own, written by one side only. The order "row first,
-head second" is kept by the total store order of x86-64, the architecture of the controller PCs.
+Each counter is an aligned 8-byte word in a cache line of its own, written by one side only. The order "row
+first, head second" is kept by the total store order of x86-64, the architecture of the controller PCs.
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ ROW = np.dtype(
         ("cmd", CMD),
     ]
 )
-"""One FRI cycle: what was received, what was answered, and when. No gaps, so a copy is a copy of all bytes."""
+"""One FRI cycle: what was received, what was answered, and when.
+
+No gaps, so a copy is a copy of all bytes.
+"""
 
 _MAGIC = 0x4C57525F52494E47
 _LINE = 8  # words of a cache line
@@ -58,15 +62,17 @@ _attach_lock = threading.Lock()
 
 
 class Ring:
-    """A ring of `ROW`s in shared memory. Made by `create`, opened in the other process by `attach(ring.name)`.
+    """A ring of `ROW`s in shared memory, made by `create` and opened in the other process by `attach`.
 
-    The process that created it calls `unlink` when both sides are done; `close` only drops this process's view.
+    The process that created it calls `unlink` when both sides are done; `close` only drops this process's
+    view.
     """
 
     def __init__(self, memory: shared_memory.SharedMemory, *, owner: bool) -> None:
         self._memory = memory
         self._owner = owner
-        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=memory.buf)
+        buffer: Any = memory.buf
+        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=buffer)
         if int(words[_MAGIC_AT]) != _MAGIC or int(words[_ITEM_AT]) != ROW.itemsize:
             del words
             memory.close()
@@ -81,17 +87,20 @@ class Ring:
         self._beat = words[_BEAT * _LINE : _BEAT * _LINE + 1]
         self._overruns = words[_OVERRUNS * _LINE : _OVERRUNS * _LINE + 1]
         self._writer = words[_WRITER * _LINE : _WRITER * _LINE + 1]
-        self._rows = np.ndarray((self.capacity,), dtype=ROW, buffer=memory.buf, offset=_HEADER_BYTES)
-        self._bytes = memory.buf[_HEADER_BYTES : _HEADER_BYTES + self.capacity * ROW.itemsize]
+        self._rows = np.ndarray((self.capacity,), dtype=ROW, buffer=buffer, offset=_HEADER_BYTES)
+        self._bytes: memoryview = buffer[_HEADER_BYTES : _HEADER_BYTES + self.capacity * ROW.itemsize]
         self._published = int(self._head[0])
         self.row: NDArray[Any] = np.zeros(1, dtype=ROW)
         self.row["phase"] = NO_PHASE
         self.row["plan_index"] = -1
-        self._row_bytes = memoryview(self.row).cast("B")
+        self._row_bytes = self.row.data.cast("B")
 
     @classmethod
     def create(cls, capacity: int = CAPACITY) -> Ring:
-        """A new ring with every page touched, so that the loop takes no page fault. Needs `unlink` at the end."""
+        """A new ring with every page touched, so that the loop takes no page fault.
+
+        Needs `unlink` at the end.
+        """
         if capacity < 2:
             raise ConfigurationError(f"ring of {capacity} rows; it needs 2 at least")
         size = _HEADER_BYTES + capacity * ROW.itemsize
@@ -101,8 +110,9 @@ class Ring:
             raise ConfigurationError(
                 f"shared memory of {size / 1e6:.1f} MB cannot be had: {error}; free some of /dev/shm"
             ) from error
-        np.frombuffer(memory.buf, dtype=np.uint8, count=size)[:] = 0
-        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=memory.buf)
+        buffer: Any = memory.buf
+        np.frombuffer(buffer, dtype=np.uint8, count=size)[:] = 0
+        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=buffer)
         words[_MAGIC_AT], words[_CAPACITY_AT], words[_ITEM_AT] = _MAGIC, capacity, ROW.itemsize
         del words
         return cls(memory, owner=True)
@@ -158,7 +168,7 @@ class Ring:
     # -- the side of the recorder ----------------------------------------------------------------------------
 
     def take(self, upto: int | None = None) -> NDArray[Any]:
-        """Copy of the rows not yet released, oldest first, shape (n,) of `ROW`; `upto` limits by row number."""
+        """Copy of the rows not yet released, oldest first, (n,) of `ROW`; `upto` limits by row number."""
         tail = int(self._tail[0])
         head = int(self._head[0])
         if upto is not None:

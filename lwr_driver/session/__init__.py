@@ -1,7 +1,7 @@
 """The session log: one MCAP file for one motion of the arm with one payload. Writer and reader side by side.
 
-`SessionWriter` writes; `read_session` reads into columns of numpy arrays; `recover` makes the file of a killed recorder
-whole; `describe` says what a file holds.
+`SessionWriter` writes; `read_session` reads into columns of numpy arrays; `recover` makes the file of a
+killed recorder whole; `describe` says what a file holds.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """CDR messages of fixed layout, packed and unpacked by columns with numpy.
 
-A topic whose messages all have the same names and the same array lengths has messages of one size in which every field
-stands at the same place. `Layout` holds such a message as a template of bytes and the places of its fields. Packing
-copies the template n times and writes the columns into it; unpacking checks that all bytes outside the fields equal
-the template and reads the columns. Rows are moved as plain bytes, never as structured arrays with gaps, whose copies
-leave out what lies between the fields.
+A topic whose messages all have the same names and the same array lengths has messages of one size in which
+every field stands at the same place. `Layout` holds such a message as a template of bytes and the places of
+its fields. Packing copies the template n times and writes the columns into it; unpacking checks that all
+bytes outside the fields equal the template and reads the columns. Rows are moved as plain bytes, never as
+structured arrays with gaps, whose copies leave out what lies between the fields.
 
-CDR: 4 bytes of encapsulation (byte order and version), then the fields; a number is aligned to its own size (XCDR2: at
-most 4) counted from the end of the encapsulation, a string has its length with the closing zero, a sequence its count;
-an empty sequence has no padding after its count.
+CDR: 4 bytes of encapsulation (byte order and version), then the fields; a number is aligned to its own size
+(XCDR2: at most 4) counted from the end of the encapsulation, a string has its length with the closing zero, a
+sequence its count; an empty sequence has no padding after its count.
 """
 
 from __future__ import annotations
@@ -99,10 +99,12 @@ class Layout:
 
     def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which of the messages `rows` (n, size) have these constants: names, counts, byte order, padding."""
-        return (rows[:, self._constant] == self._expected).all(axis=1)  # type: ignore[attr-defined,no-any-return]
+        constant: NDArray[np.intp] = self._constant  # type: ignore[attr-defined]
+        expected: NDArray[np.uint8] = self._expected  # type: ignore[attr-defined]
+        return np.asarray((rows[:, constant] == expected).all(axis=1))
 
     def relaid(self, prefix: bytes, fields: Mapping[str, tuple[str, int]]) -> Layout:
-        """This layout behind `prefix`, with the scalar `fields` (name -> type, offset) of the prefix added."""
+        """This layout behind `prefix`, with the prefix's numbers `fields` (name -> type, offset)."""
         shifted = {name: (code, shape, at + len(prefix)) for name, (code, shape, at) in self.fields.items()}
         added = {name: (code, (), at) for name, (code, at) in fields.items()}
         return Layout(prefix + self.template, {**added, **shifted})
@@ -166,7 +168,7 @@ class LayoutBuilder:
 
 
 def joint_state_layout(names: Sequence[str], *, position: bool, velocity: bool, effort: bool) -> Layout:
-    """Layout of `sensor_msgs/msg/JointState` for the joints `names`, with or without each of the three arrays."""
+    """Layout of `sensor_msgs/msg/JointState` for the joints `names`, with or without each array."""
     builder = LayoutBuilder().header().texts(names)
     for field, present in (("position", position), ("velocity", velocity), ("effort", effort)):
         builder.sequence(field, "<f8", len(names) if present else 0)
@@ -195,7 +197,7 @@ def controller_model_layout() -> Layout:
 
 
 def tf_layout(frames: Sequence[tuple[str, str]]) -> Layout:
-    """Layout of `tf2_msgs/msg/TFMessage` for the (parent, child) pairs `frames`; pose i is the field `pose_i`.
+    """Layout of `tf2_msgs/msg/TFMessage` for (parent, child) pairs; pose i is the field `pose_i`.
 
     A pose is x y z [m] and the quaternion x y z w.
     """
@@ -206,7 +208,7 @@ def tf_layout(frames: Sequence[tuple[str, str]]) -> Layout:
 
 
 class CdrReader:
-    """Reads one message of any encapsulation field by field; `CdrError` where the bytes end or make no sense."""
+    """Reads one message of any encapsulation field by field; `CdrError` where the bytes make no sense."""
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 4:
@@ -265,7 +267,8 @@ class CdrReader:
 def read_joint_state_layout(data: bytes) -> tuple[Layout, tuple[str, ...]]:
     """Layout and joint names of a `sensor_msgs/msg/JointState` message, in any plain CDR encapsulation.
 
-    Arrays that are empty are no fields of the layout. `CdrError` if an array is neither empty nor as long as the names.
+    Arrays that are empty are no fields of the layout. `CdrError` if an array is neither empty nor as long as
+    the names.
     """
     reader = CdrReader(data)
     order = reader.order

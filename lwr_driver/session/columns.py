@@ -27,7 +27,7 @@ class Gap(NamedTuple):
     """Samples missing before the row `row`: how many, and the log times of the rows around [ns]."""
 
     row: int
-    count: int
+    lost: int
     before: int
     after: int
 
@@ -74,7 +74,7 @@ class JointColumns:
     @property
     def lost(self) -> int:
         """Number of lost samples between the first and the last."""
-        return sum(gap.count for gap in self.gaps)
+        return sum(gap.lost for gap in self.gaps)
 
     @property
     def period_s(self) -> float:
@@ -85,7 +85,10 @@ class JointColumns:
         return float(np.median(np.diff(times))) * 1e-9
 
     def select(self, names: Sequence[str]) -> JointColumns:
-        """The same samples with the joints `names` in this order. DataError names a joint that is not there."""
+        """The same samples with the joints `names` in this order.
+
+        DataError names a joint that is not there.
+        """
         wanted = tuple(names)
         if wanted == self.names:
             return self
@@ -153,7 +156,8 @@ class StatusColumns:
 class ControllerModelColumns:
     """The channel `/fri/controller_model`, n samples of the controller's own model, float64.
 
-    mass_matrix (n, 7, 7) [kg m2], gravity (n, 7) [Nm], jacobian (n, 6, 7), estimated_external_torque (n, 7) [Nm]
+    mass_matrix (n, 7, 7) [kg m2], gravity (n, 7) [Nm], jacobian (n, 6, 7), estimated_external_torque (n, 7)
+    [Nm]
     """
 
     log_time: NDArray[np.int64]

@@ -1,7 +1,7 @@
 """The writing side of an MCAP file: whole chunks at once, each on the disk before the next begins.
 
-After every call the file ends with a whole record, so a killed process leaves a file that can be read up to there.
-When a write fails (disk full), what was written of the broken record is cut off again.
+After every call the file ends with a whole record, so a killed process leaves a file that can be read up to
+there. When a write fails (disk full), what was written of the broken record is cut off again.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Container:
             self._file = open(path, "xb", buffering=0)  # noqa: SIM115 - held as long as the object
         except FileExistsError as error:
             raise ConfigurationError(
-                f"session log {path} exists already; a log is never overwritten, choose another folder or name"
+                f"session log {path} exists already; a log is never overwritten, choose another folder"
             ) from error
         except OSError as error:
             raise ConfigurationError(
@@ -111,7 +111,7 @@ class Container:
         encoding: str = "cdr",
         info: Mapping[str, str] | None = None,
     ) -> int:
-        """Number of the channel `topic`; it is announced in the first chunk that holds one of its messages."""
+        """Number of the channel `topic`; it is announced in the first chunk with one of its messages."""
         if topic not in self._channels:
             key = f"{schema.name}\0{schema_encoding}\0{schema.text}"
             if key not in self._schemas:

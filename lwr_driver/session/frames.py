@@ -1,4 +1,4 @@
-"""Poses of the link frames from the joint positions, for `/tf`: batches with numpy, straight from the URDF."""
+"""Poses of the link frames from the joint positions, for `/tf`: by batches, straight from the URDF."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class _Joint:
 class LinkFrames:
     """Pose of every link relative to its parent, as `/tf` wants it: no chain has to be multiplied.
 
-    A joint with origin (p, r) and axis a at position q has the translation p and the rotation r * (cos q/2, a sin q/2)
-    (quaternions); a prismatic joint has the translation p + q R(r) a and the rotation r.
+    A joint with origin (p, r) and axis a at position q has the translation p and the rotation r * (cos q/2, a
+    sin q/2) (quaternions); a prismatic joint has the translation p + q R(r) a and the rotation r.
 
     pairs : (parent, child) links in the order of the URDF
     """

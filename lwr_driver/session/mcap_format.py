@@ -123,7 +123,7 @@ def chunk_index(
     compression: str,
     sizes: tuple[int, int],
 ) -> bytes:
-    """Where a chunk stands: (first, last) log time, (offset, length), its message indexes, (packed, plain) size."""
+    """Where a chunk stands: (first, last) log time, (offset, length), indexes, (packed, plain) size."""
     offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
     head = struct.pack("<QQQQI", *times, *place, len(offsets))
     return record(

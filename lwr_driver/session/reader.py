@@ -1,12 +1,13 @@
 """Reading a session log into columns of numpy arrays, whoever wrote it.
 
-The messages of a chunk are compared with the layouts met so far and read as strided columns; only a message that fits
-none of them is looked at field by field. What does not hold together is an error that names the file, the topic and the
-time; what is missing is said in `Session.missing`. Nothing is repaired on the way.
+The messages of a chunk are compared with the layouts met so far and read as strided columns; only a message
+that fits none of them is looked at field by field. What does not hold together is an error that names the
+file, the topic and the time; what is missing is said in `Session.missing`. Nothing is repaired on the way.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,9 +46,9 @@ def read_session(path: str | Path, joint_names: Sequence[str] | None = None) -> 
 
     joint_names : joints wanted, in this order; None takes those of `/joint_states` as they are
 
-    A file that was cut is read up to its last whole chunk and `missing` says what is not there. DataError, with file,
-    topic and time, for: no MCAP, no `/joint_states`, a damaged chunk amid others, wrong types, joints that are unknown
-    or change, values that are not finite, log times or counters that do not rise.
+    A file that was cut is read up to its last whole chunk and `missing` says what is not there. DataError,
+    with file, topic and time, for: no MCAP, no `/joint_states`, a damaged chunk amid others, wrong types,
+    joints that are unknown or change, values that are not finite, log times or counters that do not rise.
     """
     scan = Scan(path)
     source = str(scan.path)
@@ -102,8 +103,8 @@ def _session(
         notes.append("there is no metadata record `session`")
     elif metadata.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
         raise DataError(
-            f"{source}: schema version {metadata['schema_version']!r}; this software reads {SCHEMA_VERSION!r}, "
-            "use the version that recorded it"
+            f"{source}: schema version {metadata['schema_version']!r}; this software reads "
+            f"{SCHEMA_VERSION!r}, use the version that recorded it"
         )
     columns = {topic: reader.columns(notes) for topic, reader in joints.items()}
     joint = columns["/joint_states"]
@@ -121,10 +122,11 @@ def _session(
         if other is not None and topic != "/joint_states":
             columns[topic] = _in_order_of(joint, other)
     phases = tuple(Phase(*item) for item in texts["/experiment/phase"])
-    for before, after in zip(phases, phases[1:], strict=False):
+    for before, after in itertools.pairwise(phases):
         if after.log_time <= before.log_time:
             raise DataError(
-                f"{source}: /experiment/phase {after.name!r} at {stamp(after.log_time)} follows {stamp(before.log_time)}; "
+                f"{source}: /experiment/phase {after.name!r} at {stamp(after.log_time)} follows "
+                f"{stamp(before.log_time)}; "
                 "log times must be strictly increasing"
             )
     missing = Missing(
@@ -209,8 +211,8 @@ def _in_order_of(joint: JointColumns, other: JointColumns) -> JointColumns:
     for name in other.names:
         if name not in joint.names:
             raise DataError(
-                f"{other.source}: {other.topic} at {stamp(other.log_time)} has the joint {name!r}, unknown to "
-                f"/joint_states, which has {', '.join(joint.names)}"
+                f"{other.source}: {other.topic} at {stamp(other.log_time)} has the joint {name!r}, "
+                f"unknown to /joint_states, which has {', '.join(joint.names)}"
             )
     return other.select([name for name in joint.names if name in other.names])
 
@@ -244,11 +246,11 @@ class _JointTopic:
                         block.gather(rows[left], size) if size else np.zeros((len(left), 0), dtype=np.uint8)
                     )
                     fits = layout.matches(data)
-                    if not fits.any():
-                        continue
-                    done = left[fits]
-                    records = layout.view(np.ascontiguousarray(data[fits]))
-                    left = left[~fits]
+                    if fits.all():
+                        done, left = left, left[:0]
+                    else:
+                        done, left, data = left[fits], left[~fits], data[fits]
+                    records = layout.view(data)
                 else:
                     layout, columns = self._learn(block, int(rows[left[0]]))
                     if len(layouts) < _MANY_LAYOUTS:
@@ -284,7 +286,7 @@ class _JointTopic:
             raise DataError(f"{where}: not a sensor_msgs/msg/JointState: {error}") from error
         if not names or len(set(names)) != len(names):
             raise DataError(
-                f"{where}: joint names {', '.join(names) or 'are missing'}; each joint needs a name of its own"
+                f"{where}: joint names {', '.join(names) or 'are missing'}; each joint needs its own"
             )
         fields = tuple(name for name in _FIELDS if name in layout.fields)
         if not self.names:
@@ -337,8 +339,8 @@ class _JointTopic:
         if not finite.all():
             row, column = np.argwhere(~finite)[0].tolist()
             raise DataError(
-                f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: `{name}` of joint {self.names[column]} is "
-                f"{values[row, column]} ({int((~finite).sum())} such values); it must be finite"
+                f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: `{name}` of joint "
+                f"{self.names[column]} is {values[row, column]} ({int((~finite).sum())} such values); it must be finite"
             )
 
     def _check_rising(
@@ -350,8 +352,8 @@ class _JointTopic:
             unit = " ns" if "time" in name else ""
             verb = "repeats" if steps[row - 1] == 0 else "runs backwards"
             raise DataError(
-                f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: {name} {verb}, from {values[row - 1]}{unit} "
-                f"to {values[row]}{unit}; it must rise with every sample"
+                f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: {name} {verb}, "
+                f"from {values[row - 1]}{unit} to {values[row]}{unit}; it must rise with every sample"
             )
 
 

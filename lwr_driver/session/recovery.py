@@ -49,8 +49,9 @@ def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
 
     out : default is `NAME.recovered.mcap` beside `path`; an existing file is refused
 
-    Damaged chunks are left out and named. A missing `session_end` is added with exit status `fail`. The result is read
-    back and compared message by message count before it gets its name. DataError if nothing can be recovered.
+    Damaged chunks are left out and named. A missing `session_end` is added with exit status `fail`. The
+    result is read back and compared message by message count before it gets its name. DataError if nothing
+    can be recovered.
     """
     path = Path(path)
     out = path.with_suffix(".recovered.mcap") if out is None else Path(out)
@@ -83,7 +84,7 @@ def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
 def copy_messages(
     scan: Scan, container: Container, *, metadata: Mapping[str, str] | None = None
 ) -> dict[str, int]:
-    """Copy attachments, metadata and messages of `scan`, each chunk as it was, in order of log time within it.
+    """Copy attachments, metadata and messages of `scan` chunk by chunk, by log time within each.
 
     metadata : replaces the record `session`. Returns the number of messages of each topic.
     """
@@ -109,7 +110,7 @@ def copy_messages(
 
 @contextlib.contextmanager
 def replacing(out: Path) -> Iterator[Path]:
-    """A name beside `out` to write to, which takes the name `out` in one step if all went well and vanishes if not."""
+    """A file beside `out` to write to: it takes the name `out` in one step, or vanishes on an error."""
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     partial.unlink(missing_ok=True)
     try:

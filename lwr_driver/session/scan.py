@@ -1,15 +1,15 @@
 """The reading side of an MCAP file: its records from front to back, as far as they are whole.
 
-Nothing relies on the summary at the end, so the file of a killed recorder reads like any other. Of each chunk the
-messages are found through the message indexes that follow it; the indexes are checked against the data and replaced by a
-walk through the records where they are missing or wrong.
+Nothing relies on the summary at the end, so the file of a killed recorder reads like any other. Of each chunk
+the messages are found through the message indexes that follow it; the indexes are checked against the data
+and replaced by a walk through the records where they are missing or wrong.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -221,8 +221,8 @@ class Scan:
 
     def _chunk(
         self, chunk: tuple[int, bytes], index: list[bytes], damage: tuple[int, str] | None
-    ) -> Iterator[Block]:
-        """Yields the block of a chunk and returns the damage met so far that no good chunk has followed yet."""
+    ) -> Generator[Block, None, tuple[int, str] | None]:
+        """Yields the block of a chunk; returns the damage so far that no good chunk has followed yet."""
         at, content = chunk
         self.chunks += 1
         try:
@@ -297,7 +297,7 @@ class Scan:
         )
 
     def _indexed(self, data: bytes, plain: NDArray[np.uint8], index: list[bytes]) -> NDArray[np.int64] | None:
-        """Starts of the message records by the indexes; None if those do not account for every byte of the chunk."""
+        """Starts of the message records by the indexes; None if those do not account for every byte."""
         parts = []
         for content in index:
             if (
@@ -328,7 +328,7 @@ class Scan:
         return starts
 
     def _walk(self, data: bytes, start: int, stop: int, at: int) -> NDArray[np.int64]:
-        """Starts of the message records between two places, found record by record; takes in schemas and channels."""
+        """Starts of the message records between two places, by a walk that takes in schemas and channels."""
         starts = []
         while start < stop:
             if start + 9 > stop:
@@ -434,7 +434,7 @@ def _span(content: bytes) -> str:
 
 
 def _lz4(packed: memoryview, size: int) -> bytes:
-    import lz4.frame  # mcap's own dependency; only needed for logs of other tools
+    import lz4.frame  # type: ignore[import-untyped]  # mcap's own dependency, for logs of other tools
 
     decompressor = lz4.frame.LZ4FrameDecompressor()
     data: bytes = decompressor.decompress(packed, max_length=size)

@@ -112,7 +112,7 @@ class Session:
         )
 
     def spans(self, name: str) -> tuple[tuple[int, int], ...]:
-        """[start, stop) log times [ns] of every phase called `name`, or whose name begins with `name` and a space."""
+        """[start, stop) log times [ns] of every phase `name`, and of those numbered `name N`."""
         stops = [*(phase.log_time for phase in self.phases[1:]), int(self.joint.log_time[-1]) + 1]
         return tuple(
             (phase.log_time, stop)

@@ -81,7 +81,8 @@ class SessionSummary:
             f"  {'topic':<24}{'samples':>9}{'Hz':>9}{'lost':>7}{'longest pause':>16}",
         ]
         lines += [
-            f"  {item.topic:<24}{item.samples:>9}{item.rate_hz:>9.1f}{item.lost:>7}{item.longest_pause_s * 1e3:>13.1f} ms"
+            f"  {item.topic:<24}{item.samples:>9}{item.rate_hz:>9.1f}{item.lost:>7}"
+            f"{item.longest_pause_s * 1e3:>13.1f} ms"
             for item in self.channels
         ]
         lines += ["", f"  {'joint':<12}{'from':>9}{'to':>9} rad{'sensor rms':>13}{'motor rms':>12} Nm"]

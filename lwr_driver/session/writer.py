@@ -1,8 +1,8 @@
 """Writing a session log from columns of numpy arrays.
 
-Used by the recorder while the arm moves, by the import of a controller's trace, and by the import of recordings made
-elsewhere. Messages are collected by topic and written as chunks of 0.5 s of log time, so the bytes of a log depend on
-the samples alone and not on how they arrived.
+Used by the recorder while the arm moves, by the import of a controller's trace, and by the import of
+recordings made elsewhere. Messages are collected by topic and written as chunks of 0.5 s of log time, so the
+bytes of a log depend on the samples alone and not on how they arrived.
 """
 
 from __future__ import annotations
@@ -74,8 +74,9 @@ def session_metadata(
     utc_start: str | None = None,
     **more: str,
 ) -> dict[str, str]:
-    """The metadata record `session`, complete. `uid` and `utc_start` are made up from chance and the clock if missing.
+    """The metadata record `session`, complete.
 
+    uid, utc_start : made from chance and from the clock if None; give both where logs must repeat bit for bit
     payload_mass : [kg]; more : further keys, such as where imported data came from
     """
     values = {
@@ -103,15 +104,16 @@ class SessionWriter:
     path : the new file; an existing one is never overwritten
     joint_names : joints of all columns, as in the URDF; any number
     metadata : the record `session`, see `session_metadata`
-    robot_description : URDF text, written to `/robot_description`, attached as `robot.urdf`, and the source of `/tf`
+    robot_description : URDF text, written to `/robot_description`, attached as `robot.urdf`, and the source
+    of `/tf`
     attachments : file name -> content, written first
     start_ns : log time of the attachments [ns]
     fsync : force each chunk to the disk
 
-    Log times of a topic must be strictly increasing (DataError otherwise). Every `write_...` takes arrays with n rows;
-    `publish_time` defaults to the log time, `sequence` to a running count. Call `advance` when nothing earlier will
-    come any more; whole chunks are written then. Errors: ConfigurationError if the file cannot be created, DataError if
-    it cannot be written on (disk full).
+    Log times of a topic must be strictly increasing (DataError otherwise). Every `write_...` takes arrays
+    with n rows; `publish_time` defaults to the log time, `sequence` to a running count. Call `advance` when
+    nothing earlier will come any more; whole chunks are written then. Errors: ConfigurationError if the file
+    cannot be created, DataError if it cannot be written on (disk full).
     """
 
     def __init__(
@@ -214,7 +216,7 @@ class SessionWriter:
         publish_time: ArrayLike | None = None,
         sequence: ArrayLike | None = None,
     ) -> None:
-        """State and statistics of the FRI session; `columns` are the fields of `lwr_msgs/msg/FriStatus`, n rows each."""
+        """State and statistics of the FRI session; `columns` are the fields of `FriStatus`, n rows each."""
         self._add("/fri/status", "status", fri_status_layout, log_time, columns, publish_time, sequence)
 
     def write_controller_model(
@@ -243,7 +245,7 @@ class SessionWriter:
     def write_link_frames(
         self, log_time: ArrayLike, position: ArrayLike, *, publish_time: ArrayLike | None = None
     ) -> None:
-        """Link frames of the robot description at the joint positions (n, J) [rad]; nothing without a description.
+        """Link frames at the joint positions (n, J) [rad]; nothing without a robot description.
 
         All rows given are written; `slow` picks those that belong to 50 Hz.
         """
@@ -264,7 +266,7 @@ class SessionWriter:
         *,
         publish_time: ArrayLike | None = None,
     ) -> None:
-        """Poses (n, frames, 7), x y z [m] and quaternion x y z w, of the child frames in their parents `pairs`."""
+        """Poses (n, frames, 7), x y z [m] and quaternion x y z w, of child frames in their parents."""
         frames = tuple(pairs)
         times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
         columns: dict[str, Any] = {f"pose_{index}": poses[:, index] for index in range(len(frames))}
@@ -273,7 +275,10 @@ class SessionWriter:
         self._add("/tf", frames, lambda: tf_layout(frames), times, columns, publish_time, None)
 
     def slow(self, topic: str, publish_time: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the rows a 50 Hz topic takes: the first of every 20 ms of the source's clock. Keeps its place."""
+        """Which of the rows a 50 Hz topic takes: the first of every 20 ms of the source's clock.
+
+        Keeps its place.
+        """
         buckets = publish_time // SLOW_PERIOD_NS
         previous = self._slow_bucket.get(topic)
         taken = np.empty(len(buckets), dtype=bool)
@@ -292,7 +297,8 @@ class SessionWriter:
     ) -> None:
         """Write what is left, the record `session_end` and the summary. Does nothing if it is closed already.
 
-        After a failed write this still tries to end the file with what was written before; the error is raised then too.
+        After a failed write this still tries to end the file with what was written before; the error is
+        raised then too.
         """
         if self.closed:
             return
@@ -398,8 +404,9 @@ class SessionWriter:
         self._check_times(topic, times)
         if published.min() < 0 or numbers.min() < 0 or numbers.max() >= 2**32:
             raise DataError(
-                f"session log {self.path}: {topic} has publish times from {published.min()} ns and sequence numbers "
-                f"{numbers.min()} to {numbers.max()}; both count from 0, a sequence number ends at {2**32 - 1}"
+                f"session log {self.path}: {topic} has publish times from {published.min()} ns and "
+                f"sequence numbers {numbers.min()} to {numbers.max()}; both count from 0, "
+                f"sequence numbers up to {2**32 - 1}"
             )
         number = self._container.channel(topic, TOPICS[topic])
         layout_key = (topic, key)
