@@ -18,7 +18,14 @@ class ControllerEnd:
     def receive(self, timeout_s: float) -> bytes | None:
         """Next datagram of the PC, or None after `timeout_s` (0: what is there already)."""
 
-    def lock_step(self, session: KrcSession, sample: Sample, *, patience_s: float = 10.0, idle: Callable[[], bool] | None = None) -> Setpoint | None:
+    def lock_step(
+        self,
+        session: KrcSession,
+        sample: Sample,
+        *,
+        patience_s: float = 10.0,
+        idle: Callable[[], bool] | None = None,
+    ) -> Setpoint | None:
         """One cycle: send, wait for the answer (MON: for ever; CMD: patience_s, then a miss), close the cycle.
 
         The very first packet is sent again every 0.2 s until anything was answered. `idle` is called every 50 ms of waiting; True gives up (None).

@@ -1,100 +1,595 @@
-"""The controller's end of a session, without a socket (signatures; bodies follow)."""
+"""The controller's end of an FRI session, without a socket and without a clock.
+
+One cycle is ``packet`` (the 916 bytes to send), any number of ``receive`` (datagrams that came back) and
+``close_cycle`` (the setpoints of the next period). Everything else happens between cycles: the KRL calls
+``fri_open``, ``fri_start``, ``fri_stop``, ``fri_close``, the drives, the KRL variables. The same calls give the same bytes.
+
+What the protocol fixes is fixed here: the controller sends first; in command mode ``cmd_jnt_pos`` remains KRL's own
+setpoint and ``cmd_jnt_pos_fri_offset`` is what FRI adds, so that absolute and superposing clients both work; missing
+answers are bridged by extrapolation and then end command mode, as do wrong commands and limits, never by clipping;
+commands are interpolated to 1 ms, which delays them by one period. Thresholds are the policy's (``fri.policy``).
+
+Two readings of ours: the offset refers to the setpoint accepted last, the end of the interpolation; and after a
+fallback KRL must set its own setpoint anew (``resync``) before command mode can be entered again.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import struct
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fri.states import ALL_DRIVES, Control, Quality, State
+from fri.event import Event, EventKind
+from fri.judge import CommandJudge
+from fri.packets import CMD, JOINT_NAMES, JOINTS, CmdBuffer, Fault, new_msr
+from fri.policy import KrcLimits, KrcPolicy
+from fri.ramp import StopRamp
+from fri.sample import IDENTITY_POSE, Sample
+from fri.states import (
+    ALL_DRIVES,
+    CONTROL_BY_STRATEGY,
+    TRANSITIONS,
+    CommandFlag,
+    Control,
+    Quality,
+    State,
+    Trigger,
+)
+from fri.timing import AnswerStatistics, classify
 
-
-@dataclass(frozen=True)
-class KrcPolicy:
-    """What KUKA leaves silent; every number is ours."""
-
-
-@dataclass(frozen=True)
-class KrcLimits:
-    """Limits that the controller enforces: q_min, q_max [rad], v_max [rad/s], a_max [rad/s^2], all (7,)."""
-
-    q_min: np.ndarray
-    q_max: np.ndarray
-    v_max: np.ndarray
-    a_max: np.ndarray
-
-
-@dataclass(slots=True)
-class Sample:
-    """What the arm measures; filled by the emulator, read by ``KrcSession.packet``. Arrays are float, written in place.
-
-    msr_jnt_pos (7,), msr_jnt_trq (7,), est_ext_jnt_trq (7,), est_ext_tcp_ft (6,), gravity (7,), mass_matrix (7,7),
-    jacobian (6,7), msr_cart_pos (12,), cmd_cart_pos (12,), temperature (7,).
-    """
-
-
-class Event(NamedTuple):
-    """Something that happened to the session: `cycle` (int), `kind` (EventKind), `text`."""
-
-    cycle: int
-    kind: object
-    text: str
+__all__ = ["Event", "EventKind", "KrcLimits", "KrcPolicy", "KrcSession", "Sample", "Setpoint"]
 
 
 class Setpoint(NamedTuple):
-    """What the arm follows during the cycle that begins: positions (n, 7), one row a millisecond (n = T / 1 ms)."""
+    """What the arm shall follow during the period that begins.
+
+    positions : (n, 7) [rad], one row for each millisecond of the period; state : of the session;
+    drop : the event that ended command mode since the last cycle, or None.
+    """
 
     positions: np.ndarray
     state: State
-    event: Event | None  # set in the cycle in which the session was dropped
+    drop: Event | None
 
     @property
     def position(self) -> np.ndarray:
-        """Last row, (7,)."""
+        """Setpoint at the end of the period, (7,) [rad]."""
+        return self.positions[-1]
 
 
 class KrcSession:
-    """Session of the controller.
+    """An FRI session as the controller sees it.
 
-    Public attributes: ``state quality control power error warning t1 quality_ceiling send_seq sample_time_s cycle
-    answered_this_cycle last_event events miss_counter``; KRL: ``to_real to_int from_real from_int`` (16,) arrays,
-    ``to_bool from_bool`` int bit masks (``$FRI_TO_INT[n]`` is ``to_int[n-1]``).
+    Parameters
+    ----------
+    limits : KrcLimits
+        What commands are held against.
+    q : array_like
+        (7,) position of KRL's setpoint at the beginning [rad].
+    policy : KrcPolicy or None
+        Our choices where KUKA is silent.
+    control : Control
+        Control mode; ``set_strategy`` changes it.
+    power : int
+        Drive bits.
+    uptime_s : float
+        The controller's clock at the beginning.
+    first_sequence : int
+        Counter of the first packet.
+
+    Attributes
+    ----------
+    state, quality, control : State, Quality, Control
+    power, error, warning : int
+        Drive bits; change them with ``set_drives``.
+    quality_ceiling : Quality
+        Upper bound on the quality, for provoking a drop; PERFECT leaves it alone.
+    sample_time_ms : int
+        Period of the last ``fri_open``; 1 before it.
+    cycle : int
+        Packets made so far.
+    to_real, to_int : np.ndarray
+        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL. `to_bool` is a mask, bit 0 is ``[1]``.
+    answered, malformed_now : bool
+        Whether this cycle has its valid answer; whether a malformed datagram came in it.
+    last_event : Event or None
+    events : deque of Event
+        The last 256.
     """
+
+    _head = struct.Struct("<HH").pack_into
+    _bools = struct.Struct("<H").pack_into
+    _intf = struct.Struct("<fHHfffffffIHHHH").pack_into
 
     def __init__(
         self,
         limits: KrcLimits,
-        q: np.ndarray,
+        q: ArrayLike,
         policy: KrcPolicy | None = None,
         *,
         control: Control = Control.POSITION,
         power: int = ALL_DRIVES,
         uptime_s: float = 0.0,
-    ) -> None: ...
+        first_sequence: int = 0,
+    ) -> None:
+        self.limits = limits
+        self.policy = policy = policy if policy is not None else KrcPolicy()
+        self.state = State.OFF
+        self.quality = Quality.UNACCEPTABLE
+        self.quality_ceiling = Quality.PERFECT
+        self.control = control
+        self.power = power
+        self.error = 0
+        self.warning = 0
+        self.sample_time_ms = 1
+        self.cycle = 0
+        self.last_event: Event | None = None
+        self.events: deque[Event] = deque(maxlen=256)
 
-    def fri_open(self, sample_time_ms: int) -> State: ...
+        record = new_msr()
+        self._record = record
+        self._bytes = record.reshape(1).view(np.uint8).data
+        self.to_real: np.ndarray = record["krl_real"]
+        self.to_int: np.ndarray = record["krl_int"]
+        self.to_bool = 0
+        self._views: dict[str, np.ndarray] = {name: record[name] for name in Sample.__dataclass_fields__}
+        self._cmd_jnt_pos: np.ndarray = record["cmd_jnt_pos"]
+        self._offset: np.ndarray = record["cmd_jnt_pos_fri_offset"]
+        record["cmd_cart_pos_fri_offset"] = IDENTITY_POSE
+
+        # KRL's setpoint is kept as the float32 that is sent, so that setpoint plus offset is exact for clients.
+        self._krl = _as_sent(q)
+        self._target = self._krl.copy()
+        self._previous = self._target
+        self._goal = self._target
+        self._ramp: StopRamp | None = None
+        self._ramp_ms = 0
+        self._fractions = np.ones((1, 1))
+        self._safety_limits = 1.0
+        self._t1 = False
+        self._judge = CommandJudge(limits, policy)
+
+        self._uptime_ms = round(uptime_s * 1000.0)
+        self._sequence = (first_sequence - 1) & 0xFFFF
+        self._reflected = 0
+        self._statistics = AnswerStatistics(policy.window)
+        self._dwell = 0
+        self._start_pending = False
+        self.needs_resync = False
+        self._open = False
+        self.answered = False
+        self.malformed_now = False
+        self._fault: Fault | None = None
+        self._delay_ns = 0
+        self._incoming = CmdBuffer()
+        self._command = CmdBuffer()
+        self._monitor_flags: int | None = None
+        self._first_command = True
+        self._missed = 0
+        self._drop: Event | None = None
+        self._counts = dict.fromkeys(("answered", "late", "duplicated", "malformed", "starts", "drops"), 0)
+
+    @property
+    def sample_time_s(self) -> float:
+        """Period [s]."""
+        return self.sample_time_ms * 1e-3
+
+    @property
+    def timestamp_s(self) -> float:
+        """The controller's clock at the last packet [s]."""
+        return self._uptime_ms * 1e-3
+
+    @property
+    def send_seq(self) -> int:
+        """Counter of the last packet."""
+        return self._sequence
+
+    @property
+    def t1(self) -> bool:
+        """Whether the operating mode is T1, with its lower speed limits."""
+        return self._t1
+
+    @t1.setter
+    def t1(self, value: bool) -> None:
+        self._t1 = value
+        self._tell_judge()
+
+    @property
+    def ramping(self) -> bool:
+        """Whether the arm is still braking after command mode."""
+        return self._ramp is not None
+
+    @property
+    def setpoint(self) -> np.ndarray:
+        """Total setpoint, KRL plus FRI, (7,) [rad]; a copy."""
+        return self._target.copy()
+
+    @property
+    def krl_setpoint(self) -> np.ndarray:
+        """KRL's own setpoint, (7,) [rad]; a copy."""
+        return self._krl.copy()
+
+    @property
+    def command(self) -> np.ndarray:
+        """The last valid answer, shape (), dtype `CMD`; zeros before the first. Do not keep it over a cycle."""
+        return self._command.record
+
+    @property
+    def from_real(self) -> np.ndarray:
+        """``$FRI_FRM_REA``, (16,), as of the last valid answer."""
+        return self._command.krl_real
+
+    @property
+    def from_int(self) -> np.ndarray:
+        """``$FRI_FRM_INT``, (16,), as of the last valid answer."""
+        return self._command.krl_int
+
+    @property
+    def from_bool(self) -> int:
+        """``$FRI_FRM_BOOL`` as a mask, bit 0 is ``[1]``."""
+        return self._command.krl_bool
+
+    @property
+    def miss_counter(self) -> int:
+        """Missing answers since the session was opened."""
+        return self._statistics.miss_counter
+
+    def counters(self) -> dict[str, int]:
+        """Packets, answers in time, late, duplicated and malformed ones, misses, starts and drops by name."""
+        return {"packets": self.cycle, "missed": self.miss_counter, **self._counts}
+
+    def fri_open(self, sample_time_ms: int) -> State:
+        """``friOpen(T)``: start sending every T = 1..100 ms; statistics begin anew."""
+        if not 1 <= sample_time_ms <= 100:
+            raise ValueError(f"friOpen sample time {sample_time_ms} ms is outside 1..100 ms")
+        if not self._transition(Trigger.FRI_OPEN):
+            return self.state
+        self.sample_time_ms = int(sample_time_ms)
+        self._fractions = np.arange(1, self.sample_time_ms + 1)[:, np.newaxis] / self.sample_time_ms
+        self._tell_judge()
+        self._statistics = AnswerStatistics(self.policy.window)
+        self.quality = Quality.UNACCEPTABLE
+        self._dwell = 0
+        self._monitor_flags = None
+        self._note(EventKind.OPENED, f"opened with {self.sample_time_ms} ms")
+        return self.state
+
     def fri_start(self, safety_limits: float = 1.0) -> State:
-        """Request command mode; it is entered at a cycle boundary as soon as the timing is in sync."""
+        """``friStart(x)``: ask for command mode with the limits shrunk to `safety_limits` (0..1].
 
-    def fri_stop(self) -> State: ...
-    def fri_close(self) -> State: ...
-    def set_strategy(self, strategy: int) -> None: ...
-    def set_drives(self, power: int, error: int = 0, warning: int = 0) -> None: ...
-    def drop(self, text: str) -> None:
-        """Fall back to monitor for a reason outside the protocol (e-stop, mode change)."""
+        It is entered at the beginning of a cycle as soon as the timing has been good for long enough and the
+        arm stands; ``fri_stop`` withdraws the request. After a fallback it is refused until ``resync``.
+        """
+        if not 0.0 < safety_limits <= 1.0:
+            raise ValueError(f"friStart limit factor {safety_limits} is outside (0, 1]")
+        if self.state is not State.MON:
+            return self.state
+        if self.needs_resync:
+            self._note(
+                EventKind.REFUSED,
+                "start refused: KRL's setpoint must be set anew after a fallback (PTP $AXIS_ACT)",
+            )
+            return self.state
+        self._safety_limits = float(safety_limits)
+        self._tell_judge()
+        self._start_pending = True
+        return self.state
 
-    def move_krl(self, q: np.ndarray) -> None:
-        """KRL's own setpoint moves (also in CMD, where the offset takes up the difference)."""
+    def fri_stop(self) -> State:
+        """``friStop()``: back to monitor mode; an arm in motion is braked."""
+        self._start_pending = False
+        if self._transition(Trigger.FRI_STOP):
+            self._begin_ramp()
+            self._note(EventKind.STOPPED, "stopped")
+        return self.state
 
-    def resync(self, q: np.ndarray | None = None) -> None:
-        """Set KRL's setpoint to `q`, or to the present total setpoint: the offset becomes zero."""
+    def fri_close(self) -> State:
+        """``friClose()``: stop sending, after ``fri_stop`` if need be; there is no goodbye packet."""
+        self.fri_stop()
+        if self._transition(Trigger.FRI_CLOSE):
+            self._open = False
+            self._note(EventKind.CLOSED, "closed")
+        return self.state
+
+    def set_strategy(self, strategy: int) -> None:
+        """``$STIFFNESS.STRATEGY`` with commit: 10 position, 20 Cartesian, 30 joint impedance; not in command mode."""
+        if self.state is State.CMD:
+            raise RuntimeError(
+                f"strategy {strategy} cannot be committed in command mode; call fri_stop first"
+            )
+        control = CONTROL_BY_STRATEGY.get(int(strategy), Control.OTHER)
+        if control is not self.control:
+            # The client must have seen the new mode before command mode begins.
+            self.control = control
+            self._dwell = 0
+
+    def set_drives(self, power: int, error: int = 0, warning: int = 0) -> None:
+        """Set the drive bits; switching off or an error during command mode ends it."""
+        switched_off = self.power != 0 and power == 0
+        if power and not self.power:
+            self._first_command = True
+        self.power, self.error, self.warning = power, error, warning
+        if self.state is not State.CMD:
+            return
+        if error:
+            names = ", ".join(name for bit, name in enumerate(JOINT_NAMES) if error >> bit & 1)
+            self.drop(EventKind.DRIVE_ERROR, f"drive error of {names}")
+        elif switched_off and self.policy.drop_on_drives_off:
+            self.drop(EventKind.DRIVES_OFF, "drives switched off in command mode")
+        elif switched_off:
+            self._previous = self._target
+
+    def drop(self, kind: EventKind, text: str) -> None:
+        """End command mode as the controller does: monitor mode, the arm braked, KRL out of step. No-op otherwise."""
+        if not self._transition(Trigger.FAULT):
+            return
+        self._start_pending = False
+        self.needs_resync = True
+        self._counts["drops"] += 1
+        self._begin_ramp()
+        self._drop = self._note(kind, text)
+
+    def move_krl(self, q: ArrayLike) -> None:
+        """Move KRL's setpoint to `q` (7,) [rad] within the next period.
+
+        In command mode the arm goes on following FRI and the offset takes up the difference.
+        """
+        krl = _as_sent(q)
+        if self.state is not State.CMD and self._ramp is None:
+            self._goal = self._goal + (krl - self._krl)
+        self._krl = krl
+
+    def resync(self, q: ArrayLike | None = None) -> None:
+        """Set KRL's setpoint to `q`, or to the present total setpoint, so that the offset is zero.
+
+        Not in command mode and not while the arm is braking. A given `q` becomes the setpoint at once.
+        """
+        if self.state is State.CMD or self._ramp is not None:
+            raise RuntimeError("KRL's setpoint cannot be set anew while FRI moves the arm; stop it first")
+        self._krl = _as_sent(self._target if q is None else q)
+        self._target = self._goal = self._previous = self._krl.copy()
+        self.needs_resync = False
 
     def packet(self, sample: Sample) -> bytes:
-        """Begin a cycle: the 916 bytes to send."""
+        """Begin a cycle: the 916 bytes that the controller sends now."""
+        if self.state is State.OFF or self._open:
+            reason = (
+                "the session is not open" if self.state is State.OFF else "the cycle before is not closed"
+            )
+            raise RuntimeError(f"no packet: {reason}")
+        if self._start_pending:
+            self._try_start()
+        self.cycle += 1
+        self._uptime_ms += self.sample_time_ms
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        self._open = True
+        self.answered = False
+        self.malformed_now = False
+        self._fault = None
+        statistics = self._statistics
+        period = self.sample_time_ms * 1e-3
+        buffer = self._bytes
+        self._head(buffer, 0, self._sequence, self._reflected)
+        self._bools(buffer, 136, self.to_bool & 0xFFFF)
+        self._intf(
+            buffer,
+            140,
+            self._uptime_ms * 1e-3,
+            self.state,
+            self.quality,
+            period,
+            period,
+            self._safety_limits,
+            statistics.answer_rate,
+            statistics.latency,
+            statistics.jitter,
+            statistics.miss_rate,
+            statistics.miss_counter & 0xFFFFFFFF,
+            self.power,
+            self.control,
+            self.error,
+            self.warning,
+        )
+        for name, view in self._views.items():
+            view[...] = getattr(sample, name)
+        self._cmd_jnt_pos[:] = self._krl
+        np.subtract(self._target, self._krl, out=self._offset, casting="same_kind")
+        return bytes(buffer)
 
-    def receive(self, datagram: bytes, delay_s: float = 0.0) -> bool:
-        """A datagram that arrived `delay_s` after the packet; True if it is this cycle's valid answer."""
+    def receive(self, datagram: bytes | bytearray | memoryview, delay_s: float = 0.0) -> bool:
+        """Take in a datagram that came `delay_s` after the packet; True if it is this cycle's answer.
+
+        The first valid answer counts. An answer is valid if length, id and size are right and it reflects the
+        packet sent last; one that reflects an older packet is late.
+        """
+        if not self._open:
+            return False
+        incoming = self._incoming
+        fault = incoming.load(datagram)
+        if fault is not None:
+            self._counts["malformed"] += 1
+            self.malformed_now = True
+            self._fault = fault
+            return False
+        self._reflected = incoming.send_seq
+        age = (self._sequence - incoming.refl_seq) & 0xFFFF
+        delay_ns = round(delay_s * 1e9)
+        if age:
+            self._counts["late"] += 1
+            self._statistics.late(age, age * self.sample_time_ms * 1_000_000 + delay_ns)
+            return False
+        if self.answered:
+            self._counts["duplicated"] += 1
+            return False
+        self.answered = True
+        self._counts["answered"] += 1
+        self._delay_ns = delay_ns
+        self._incoming, self._command = self._command, incoming
+        return True
 
     def close_cycle(self) -> Setpoint:
-        """End the cycle: judge the answers and give the setpoints of the next T. Works in OFF too (hold or ramp)."""
+        """End the cycle: judge what came back and give the setpoints of the period that begins.
+
+        While the session is OFF it may be called without a packet: the arm holds, or goes on braking.
+        """
+        if self.state is State.OFF:
+            self._uptime_ms += self.sample_time_ms
+            positions = self._coast()
+        elif not self._open:
+            raise RuntimeError("no cycle to close: call packet() first")
+        else:
+            self._open = False
+            self._statistics.close(self._delay_ns if self.answered else None)
+            self._rate()
+            positions = self._follow() if self.state is State.CMD else self._monitor()
+        drop, self._drop = self._drop, None
+        return Setpoint(positions, self.state, drop)
+
+    def _transition(self, trigger: Trigger) -> bool:
+        state = TRANSITIONS.get((self.state, trigger))
+        if state is None:
+            return False
+        self.state = state
+        return True
+
+    def _note(self, kind: EventKind, text: str) -> Event:
+        event = Event(self.cycle, kind, text)
+        self.last_event = event
+        self.events.append(event)
+        return event
+
+    def _tell_judge(self) -> None:
+        self._judge.tighten(self.sample_time_s, self._safety_limits, self._t1)
+
+    def _rate(self) -> None:
+        statistics = self._statistics
+        quality = classify(
+            statistics.packets, statistics.answer_rate, statistics.latency, self.sample_time_s, self.policy
+        )
+        self.quality = min(quality, self.quality_ceiling)
+        self._dwell = self._dwell + 1 if self.quality >= self.policy.start_quality else 0
+
+    def _try_start(self) -> None:
+        if self._dwell < self.policy.start_dwell or self._ramp is not None:
+            return
+        if self.quality < self.policy.start_quality or not self._transition(Trigger.FRI_START):
+            return
+        self._start_pending = False
+        self._first_command = True
+        self._missed = 0
+        self._previous = self._goal = self._target
+        self._counts["starts"] += 1
+        self._note(EventKind.STARTED, f"command mode with limits x {self._safety_limits:.2f}")
+
+    def _monitor(self) -> np.ndarray:
+        if self.answered:
+            self._monitor_flags = self._command.cmd_flags
+        return self._coast()
+
+    def _begin_ramp(self) -> None:
+        velocity = (self._target - self._previous) / self.sample_time_s
+        self._previous = self._goal = self._target
+        self._missed = 0
+        if not velocity.any():
+            return
+        deceleration = self.limits.a_max * self.policy.stop_acceleration_factor
+        self._ramp = StopRamp(
+            self._target,
+            velocity,
+            deceleration,
+            deceleration / self.policy.stop_jerk_time_s,
+            self.limits.q_min,
+            self.limits.q_max,
+        )
+        self._ramp_ms = 0
+
+    def _coast(self) -> np.ndarray:
+        """Setpoints of a period without commands: brake, or follow KRL."""
+        if self._ramp is None:
+            start, self._target = self._target, self._goal
+            return self._line(start, self._target)
+        times = (self._ramp_ms + np.arange(1, self.sample_time_ms + 1)) * 1e-3
+        positions = self._ramp.position(times)
+        self._ramp_ms += self.sample_time_ms
+        self._target = self._previous = self._goal = positions[-1].copy()
+        if self._ramp_ms * 1e-3 >= self._ramp.duration_s:
+            self._ramp = None
+        return positions
+
+    def _line(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Linear interpolation to 1 ms, (n, 7), ending exactly at `end`."""
+        if self.sample_time_ms == 1:
+            return end.reshape(1, JOINTS).copy()
+        positions = start + self._fractions * (end - start)
+        positions[-1] = end
+        return positions
+
+    def _follow(self) -> np.ndarray:
+        """Judge a cycle of command mode."""
+        target: np.ndarray | None = None
+        if self._fault is not None and self.policy.drop_on_malformed:
+            self.drop(EventKind.MALFORMED, f"malformed datagram in command mode: {self._fault.value}")
+        elif self.answered:
+            target = self._commanded()
+        else:
+            target = self._bridged()
+        if self.state is State.CMD and self.quality < self.policy.hold_quality:
+            self.drop(
+                EventKind.QUALITY,
+                f"quality {self.quality.name} in command mode is below {self.policy.hold_quality.name}: "
+                f"answer rate {self._statistics.answer_rate:.2f}, latency {self._statistics.latency * 1e3:.2f} ms",
+            )
+        if self.state is not State.CMD or target is None:
+            return self._coast()
+        self._previous, self._target = self._target, target
+        self._goal = target
+        return self._line(self._previous, target)
+
+    def _bridged(self) -> np.ndarray | None:
+        """The next setpoint without an answer: the last step once more."""
+        self._missed += 1
+        if self._missed > self.policy.bridged_cycles:
+            self.drop(
+                EventKind.MISSES,
+                f"{self._missed} answers in a row are missing, at most {self.policy.bridged_cycles} are bridged",
+            )
+            return None
+        target = self._target + (self._target - self._previous)
+        objection = self._judge.position(target.tolist(), "extrapolated")
+        if objection is not None:
+            self.drop(*objection)
+            return None
+        return target
+
+    def _commanded(self) -> np.ndarray | None:
+        """The setpoint of the answer, or None after it ended command mode."""
+        command = self._command
+        objection = self._judge.flags(command, self._monitor_flags, self.control)
+        target = self._target
+        if objection is None and command.cmd_flags & CommandFlag.JNTPOS:
+            if self.power == 0:
+                objection = self._judge.mirror(command, target, "the command with the drives off")
+            else:
+                if self._first_command:
+                    objection = self._judge.mirror(command, target, "the first command")
+                if objection is None:
+                    objection = self._judge.step(command, target, self._previous, self._missed)
+                if objection is None:
+                    target = command.jnt_pos.astype(float)
+                    self._first_command = False
+        if objection is not None:
+            self.drop(*objection)
+            return None
+        self._missed = 0
+        return target
+
+
+def _as_sent(q: ArrayLike) -> np.ndarray:
+    """(7,) float64 copy of `q` with the values that float32 can carry."""
+    values = np.array(q, dtype=CMD["jnt_pos"].base).astype(float)
+    if values.shape != (JOINTS,) or not np.isfinite(values).all():
+        raise ValueError(f"joint position {values} must be {JOINTS} finite numbers")
+    return values

@@ -23,6 +23,7 @@ __all__ = [
     "CMD_OFFSETS",
     "CMD_SIZE",
     "JOINTS",
+    "JOINT_NAMES",
     "MSR",
     "MSR_ID",
     "MSR_OFFSETS",
@@ -34,7 +35,9 @@ __all__ = [
     "new_msr",
 ]
 
-JOINTS = 7
+#: Joints in the order of the wire, which is the kinematic order; E1 is the third.
+JOINT_NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
+JOINTS = len(JOINT_NAMES)
 
 MSR_ID = 0x2006
 CMD_ID = 0x1005
@@ -166,7 +169,9 @@ def _assert_layout(dtype: np.dtype, size: int, offsets: dict[str, int]) -> None:
     assert fields is not None
     found = {name: field[1] for name, field in fields.items()}
     if dtype.itemsize != size or found != offsets:
-        raise AssertionError(f"packet layout is {found} in {dtype.itemsize} bytes, must be {offsets} in {size}")
+        raise AssertionError(
+            f"packet layout is {found} in {dtype.itemsize} bytes, must be {offsets} in {size}"
+        )
 
 
 _assert_layout(MSR, MSR_SIZE, MSR_OFFSETS)
@@ -185,7 +190,7 @@ class Fault(Enum):
     LENGTH = "length"
     ID = "datagram id"
     SIZE = "packet size field"
-    FIELD = "state, quality, control or sample time outside the protocol"
+    FIELD = "state, quality, control, sample time or timestamp outside the protocol"
     VALUE = "joint values not finite or not possible"
 
 
@@ -246,8 +251,14 @@ class MsrBuffer:
             return Fault.SIZE
         timestamp, state, quality, _, sample_time = self._intf(buffer, 140)
         power, control, error = self._robot(buffer, 180)
-        # 1 to 100 ms with room for float32; the comparison is also false for NaN.
-        if state > 2 or quality > 3 or control > 3 or not 0.0009 < sample_time < 0.1001:
+        # 1 to 100 ms with room for float32; the comparisons are also false for NaN.
+        if (
+            state > 2
+            or quality > 3
+            or control > 3
+            or not 0.0009 < sample_time < 0.1001
+            or not -1e9 < timestamp < 1e9
+        ):
             return Fault.FIELD
         values = self._values(buffer, 216)
         # The norms are NaN or infinite as soon as one value is, and then the comparisons are false.

@@ -1,36 +1,453 @@
-"""The PC's end of the link (signatures; bodies follow)."""
+"""The PC's end of the link: receive measurements, answer each one once.
+
+The PC is the server: it binds its port, the controller sends first, and every packet is answered to the address it
+came from. What arrives is checked (length, id, size field, enumerations, finite joint values) and counted; only
+packets of the controller are answered. Outside commanding the answer is the mirror of the controller's setpoint,
+
+    jnt_pos = cmd_jnt_pos + cmd_jnt_pos_fri_offset,
+
+with the flags of the control mode and no additional torque. Flags change in monitor mode only.
+
+The path of a packet allocates nothing that lasts, logs nothing and makes one system call to receive and one to
+answer; what is rare (another sender, a restart) is kept in ``events`` for the caller to report.
+"""
 
 from __future__ import annotations
 
+import ipaddress
+import select
+import socket
+import struct
+from collections import deque
+from enum import Enum
+from math import hypot, isfinite
+from time import monotonic, monotonic_ns
+from types import TracebackType
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import ArrayLike
+
+from fri.errors import ConfigurationError, NetworkError
+from fri.packets import JOINT_NAMES, JOINTS, Fault, MsrBuffer, new_cmd
+from fri.sequence import Arrival, SequenceTracker
+from fri.states import FLAGS, Control, State
+
+__all__ = ["DEFAULT_PORT", "LinkEvent", "LinkEventKind", "RemoteEnd"]
+
+#: UDP port on which FRI clients listen unless the controller is set up otherwise.
+DEFAULT_PORT = 49938
+
+_CMD = int(State.CMD)
+# Another port of the controller's host is the controller started again only if the known port has been quiet so long.
+_PORT_GRACE_S = 0.1
+# So many different foreign hosts are named in events; further ones are counted only.
+_NAMED_FOREIGN = 16
+# Even with a timeout of zero, worthless datagrams are cleared away for so long.
+_SHORTEST_FLOOD_S = 0.005
+
+
+class LinkEventKind(Enum):
+    """What happened on the link."""
+
+    LOCKED = "locked"
+    FOREIGN = "foreign"
+    PORT_CHANGED = "port changed"
+    RESTARTED = "restarted"
+
+
+class LinkEvent(NamedTuple):
+    """Something rare on the link: number of the newest packet then, kind, and a sentence."""
+
+    sequence: int
+    kind: LinkEventKind
+    text: str
+
+
+def _ip(value: str, subject: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(value))
+    except ValueError:
+        raise ConfigurationError(
+            f"{subject} {value!r} is not an IPv4 address; give four numbers such as 192.168.0.100"
+        ) from None
 
 
 class RemoteEnd:
-    """PC end of an FRI link.
+    """PC end of an FRI link; a context manager that closes the socket.
 
-    Attributes kept up to date by ``receive`` (plain ints/floats/bools, read them freely):
-    ``sequence`` (int, unwrapped), ``state``, ``quality``, ``power``, ``error``, ``control``, ``sample_time_s``,
-    ``timestamp_s``, ``commanding`` (state CMD and power != 0), ``controller`` ((ip, port) | None),
-    ``msr`` (MSR record, shape (), reused by the next receive: copy what you keep),
-    ``command`` (CMD record, shape (): exactly what the last answer sent), views ``krl_real``, ``krl_int`` of it,
-    ``send_seq``; counters ``received answered lost repeated reordered malformed foreign restarts port_changes
-    unreflected send_errors``; ``events`` deque of LinkEvent(sequence, kind, text).
+    Parameters
+    ----------
+    address : str
+        IPv4 address of the network interface to bind; nothing else is listened on.
+    port : int
+        UDP port to bind, 0 for any free one.
+    controller : str or None
+        IPv4 address of the controller. With None the sender of the first valid packet is taken.
+    first_sequence : int
+        Counter of the first answer.
+
+    Attributes
+    ----------
+    msr : np.ndarray
+        Last measurement, shape (), dtype `MSR`. The next ``receive`` overwrites it: copy what you keep.
+    command : np.ndarray
+        The command, shape (), dtype `CMD`; after ``answer`` it is exactly what was sent.
+    krl_real, krl_int : np.ndarray
+        (16,) views into `command`: ``$FRI_FRM_REA[n]`` is ``krl_real[n - 1]``. They stay until changed and are
+        cleared when the controller restarts, so that a request made to the run before is not made again.
+    sequence : int
+        Unwrapped number of the last measurement; state, quality, power, control, error (int), timestamp_s and
+        sample_time_s are its fields, received_ns the monotonic time of its arrival.
+    commanding : bool
+        Whether its answer moves the arm: state CMD and drives on.
+    events : deque of LinkEvent
+        The last 64 rare events.
+    received, answered, lost, repeated, reordered, suspect, malformed, foreign, restarts, port_changes, unreflected, send_errors : int
+        Counters. `lost` includes what came too late (`reordered`); `unreflected` counts answers of ours that the
+        controller had not seen when it sent its next packet.
+
+    Raises
+    ------
+    ConfigurationError
+        An address or the port is not one.
+    NetworkError
+        The address cannot be bound.
     """
 
-    def __init__(self, address: str, port: int = 49938, controller: str | None = None, first_sequence: int = 0) -> None: ...
+    def __init__(
+        self,
+        address: str,
+        port: int = DEFAULT_PORT,
+        controller: str | None = None,
+        first_sequence: int = 1,
+    ) -> None:
+        host = _ip(address, "PC address")
+        if not 0 <= port <= 65535:
+            raise ConfigurationError(f"port {port} is outside 0..65535; FRI uses {DEFAULT_PORT} by default")
+        self._controller_ip = None if controller is None else _ip(controller, "controller address")
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            raise NetworkError(
+                f"cannot bind UDP {host}:{port}: {error.strerror}; check that the address is this PC's "
+                "and that no other FRI client is running"
+            ) from error
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self.controller: tuple[str, int] | None = None
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
+        self._receive_timeout = -1.0
+
+        self._msr = MsrBuffer()
+        self.msr = self._msr.record
+        self.command = new_cmd()
+        self.krl_real: np.ndarray = self.command["krl_real"]
+        self.krl_int: np.ndarray = self.command["krl_int"]
+        self._out = self.command.reshape(1).view(np.uint8).data
+        self._jnt_pos: np.ndarray = self.command["jnt_pos"]
+        self._add_jnt_trq: np.ndarray = self.command["add_jnt_trq"]
+        self._cart_pos: np.ndarray = self.command["cart_pos"]
+        self._pack_sequence = struct.Struct("<HH").pack_into
+        self.set_impedance(np.full(JOINTS, 1000.0), np.full(JOINTS, 0.7))
+        self.command["cart_stiffness"] = (1000.0, 1000.0, 1000.0, 100.0, 100.0, 100.0)
+        self.command["cart_damping"] = 0.7
+        self._flags_control = -1
+        self._torque_set = False
+        self._unanswered = False
+        self._answered_last = False
+
+        self.send_seq = (first_sequence - 1) & 0xFFFF
+        self.sequence = -1
+        self.state = int(State.OFF)
+        self.quality = 0
+        self.power = 0
+        self.control = int(Control.OTHER)
+        self.error = 0
+        self.timestamp_s = 0.0
+        self.sample_time_s = 0.0
+        self.received_ns = 0
+        self.commanding = False
+
+        self._tracker = SequenceTracker()
+        self._heard_s = 0.0
+        self._named_foreign: set[str] = set()
+        self.events: deque[LinkEvent] = deque(maxlen=64)
+        self.received = 0
+        self.answered = 0
+        self.malformed = 0
+        self.malformed_by: dict[Fault, int] = dict.fromkeys(Fault, 0)
+        self.foreign = 0
+        self.port_changes = 0
+        self.unreflected = 0
+        self.send_errors = 0
+
+    @property
+    def lost(self) -> int:
+        """Packets of the controller that never came or came too late."""
+        return self._tracker.lost
+
+    @property
+    def repeated(self) -> int:
+        """Packets that came more than once."""
+        return self._tracker.repeated
+
+    @property
+    def reordered(self) -> int:
+        """Packets that came after a newer one."""
+        return self._tracker.reordered
+
+    @property
+    def suspect(self) -> int:
+        """Packets held back because their counter fitted nothing."""
+        return self._tracker.suspect
+
+    @property
+    def restarts(self) -> int:
+        """How often the controller has started counting anew."""
+        return self._tracker.restarts
+
+    def counters(self) -> dict[str, int]:
+        """All counters by name."""
+        return {
+            "received": self.received,
+            "answered": self.answered,
+            "lost": self.lost,
+            "repeated": self.repeated,
+            "reordered": self.reordered,
+            "suspect": self.suspect,
+            "malformed": self.malformed,
+            "foreign": self.foreign,
+            "restarts": self.restarts,
+            "port_changes": self.port_changes,
+            "unreflected": self.unreflected,
+            "send_errors": self.send_errors,
+        }
 
     def receive(self, timeout_s: float) -> np.ndarray | None:
-        """Next valid, new measurement (record of shape ()) or None after `timeout_s`; repeated and late ones are counted only."""
+        """Wait for the next new packet of the controller.
 
-    def answer(self, jnt_pos: np.ndarray | None = None, add_jnt_trq: np.ndarray | None = None) -> bool:
-        """Answer the packet last received, once. Outside commanding, or with None, the mirror is sent; True if `jnt_pos` was used."""
+        Repeated, late, malformed and foreign datagrams are counted and passed over within the same timeout.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Longest wait [s]; 0 takes what is there. The kernel rounds it up to its tick, up to 10 ms.
+
+        Returns
+        -------
+        np.ndarray or None
+            ``self.msr``, or None after `timeout_s`.
+        """
+        self._unanswered = False
+        deadline = monotonic() + max(timeout_s, _SHORTEST_FLOOD_S)
+        flags = self._set_timeout(timeout_s)
+        buffer = self._msr.buffer
+        receive_into = self._socket.recvfrom_into
+        while True:
+            try:
+                length, source = receive_into(buffer, 0, flags)
+            except BlockingIOError:
+                return None
+            if self._accept(length, source):
+                return self.msr
+            # A flood of worthless datagrams must not hold the caller beyond its timeout.
+            remaining = deadline - monotonic()
+            if remaining <= 0.0:
+                return None
+            flags = self._set_timeout(remaining if timeout_s > 0.0 else 0.0)
 
     def pending(self) -> bool:
-        """Whether a further datagram waits already (the one in hand is then stale)."""
+        """Whether another datagram is waiting, which makes the one in hand a stale one."""
+        return bool(self._poll.poll(0))
 
-    def set_krl_bool(self, index: int, value: bool) -> None: ...
-    def set_impedance(self, stiffness: np.ndarray, damping: np.ndarray) -> None: ...
-    def counters(self) -> dict[str, int]: ...
-    def close(self) -> None: ...
-    def __enter__(self) -> RemoteEnd: ...
-    def __exit__(self, *exc: object) -> None: ...
+    def answer(self, jnt_pos: ArrayLike | None = None, add_jnt_trq: ArrayLike | None = None) -> bool:
+        """Answer the packet that ``receive`` returned; once.
+
+        Parameters
+        ----------
+        jnt_pos : array_like or None
+            (7,) setpoint [rad]. It is used only while `commanding`; otherwise, and with None, the mirror goes out.
+        add_jnt_trq : array_like or None
+            (7,) additional torque [Nm], likewise; None is zero.
+
+        Returns
+        -------
+        bool
+            True if `jnt_pos` was sent, False if the mirror was, or if the network refused the datagram.
+
+        Raises
+        ------
+        RuntimeError
+            There is no packet to answer, or it has been answered.
+        ValueError
+            A value is not finite as float32; nothing is sent.
+        """
+        if not self._unanswered:
+            raise RuntimeError(
+                "no packet to answer: answer() needs a receive() that returned a packet, once each"
+            )
+        msr = self._msr
+        commanding = self.commanding
+        used = commanding and jnt_pos is not None
+        if used:
+            self._jnt_pos[:] = jnt_pos
+            _check_finite(self._jnt_pos, "setpoint", "rad")
+        else:
+            np.add(msr.cmd_jnt_pos, msr.cmd_jnt_pos_fri_offset, out=self._jnt_pos)
+        if commanding and add_jnt_trq is not None:
+            self._add_jnt_trq[:] = add_jnt_trq
+            _check_finite(self._add_jnt_trq, "additional torque", "Nm")
+            self._torque_set = True
+        elif self._torque_set:
+            self._add_jnt_trq[:] = 0.0
+            self._torque_set = False
+        if self._flags_control != msr.control and (msr.state != _CMD or self._flags_control < 0):
+            self._flags_control = msr.control
+            self.command["cmd_flags"] = int(FLAGS[Control(msr.control)])
+        if msr.control == Control.CART_IMP:
+            self._cart_pos[:] = msr.cmd_cart_pos
+        self._unanswered = False
+        self.send_seq = (self.send_seq + 1) & 0xFFFF
+        self._pack_sequence(self._out, 0, self.send_seq, msr.send_seq)
+        assert self.controller is not None
+        try:
+            self._socket.sendto(self._out, self.controller)
+        except OSError:
+            self.send_errors += 1
+            return False
+        self.answered += 1
+        self._answered_last = True
+        return used
+
+    def set_krl_bool(self, index: int, value: bool) -> None:
+        """Set bit `index` (0..15), which is ``$FRI_FRM_BOOL[index + 1]``, in the answers from now on."""
+        if not 0 <= index < 16:
+            raise ValueError(f"KRL boolean index {index} is outside 0..15")
+        bits = int(self.command["krl_bool"])
+        self.command["krl_bool"] = bits | 1 << index if value else bits & ~(1 << index)
+
+    def set_impedance(self, stiffness: ArrayLike, damping: ArrayLike) -> None:
+        """Set joint stiffness (7,) [Nm/rad] and normalised damping (7,), used in joint impedance control."""
+        self.command["jnt_stiffness"] = stiffness
+        self.command["jnt_damping"] = damping
+
+    def close(self) -> None:
+        """Close the socket; the controller notices by the missing answers."""
+        self._socket.close()
+
+    def __enter__(self) -> RemoteEnd:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _set_timeout(self, timeout_s: float) -> int:
+        """Arm the receive timeout; returns the flags for the receive call."""
+        if timeout_s <= 0.0:
+            return socket.MSG_DONTWAIT
+        if timeout_s != self._receive_timeout:
+            # Zero would mean for ever, so at least a microsecond.
+            seconds, micros = divmod(max(1, round(timeout_s * 1e6)), 1_000_000)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", seconds, micros))
+            self._receive_timeout = timeout_s
+        return 0
+
+    def _accept(self, length: int, source: tuple[str, int]) -> bool:
+        """Judge the datagram in the buffer; True if it is a new packet of the controller."""
+        new_source = False
+        if source != self.controller:
+            if not self._may_be_controller(source):
+                self._count_foreign(source)
+                return False
+            new_source = True
+        msr = self._msr
+        fault = msr.fault(length)
+        if fault is not None:
+            self.malformed += 1
+            self.malformed_by[fault] += 1
+            return False
+        if new_source:
+            new_source = self._lock(source)
+        now_ns = monotonic_ns()
+        self._heard_s = now_ns * 1e-9
+        tracker = self._tracker
+        losses = tracker.lost
+        arrival = tracker.feed(msr.send_seq, msr.timestamp, msr.sample_time, new_source)
+        if arrival is not Arrival.NEW:
+            if arrival is not Arrival.RESTARTED:
+                return False
+            self._restarted()
+        if self._answered_last and tracker.lost == losses and msr.refl_seq != self.send_seq:
+            self.unreflected += 1
+        self._answered_last = False
+        self.received += 1
+        self.received_ns = now_ns
+        self.sequence = tracker.sequence
+        self.state = msr.state
+        self.quality = msr.quality
+        self.power = msr.power
+        self.control = msr.control
+        self.error = msr.error
+        self.timestamp_s = msr.timestamp
+        self.sample_time_s = msr.sample_time
+        self.commanding = msr.state == _CMD and msr.power != 0
+        self._unanswered = True
+        return True
+
+    def _may_be_controller(self, source: tuple[str, int]) -> bool:
+        if self.controller is None:
+            return self._controller_ip is None or source[0] == self._controller_ip
+        return source[0] == self.controller[0] and monotonic() - self._heard_s >= _PORT_GRACE_S
+
+    def _lock(self, source: tuple[str, int]) -> bool:
+        """Take `source` for the controller; True if another port was known before."""
+        known = self.controller
+        self.controller = source
+        if known is None:
+            self._event(LinkEventKind.LOCKED, f"controller is {source[0]}:{source[1]}")
+            return False
+        self.port_changes += 1
+        self._event(
+            LinkEventKind.PORT_CHANGED,
+            f"controller {source[0]} sends from port {source[1]} instead of {known[1]}; it was opened again",
+        )
+        return True
+
+    def _restarted(self) -> None:
+        self._event(LinkEventKind.RESTARTED, "controller counts anew; it was started again")
+        self.krl_real[:] = 0.0
+        self.krl_int[:] = 0
+        self.command["krl_bool"] = 0
+        self._flags_control = -1
+        self._answered_last = False
+
+    def _count_foreign(self, source: tuple[str, int]) -> None:
+        self.foreign += 1
+        host = source[0]
+        if host in self._named_foreign or len(self._named_foreign) >= _NAMED_FOREIGN:
+            return
+        self._named_foreign.add(host)
+        expected = f"{self.controller[0]}:{self.controller[1]}" if self.controller else self._controller_ip
+        self._event(
+            LinkEventKind.FOREIGN,
+            f"datagrams from {host}:{source[1]} are not answered: the controller is {expected}",
+        )
+
+    def _event(self, kind: LinkEventKind, text: str) -> None:
+        self.events.append(LinkEvent(self.sequence, kind, text))
+
+
+def _check_finite(values: np.ndarray, subject: str, unit: str) -> None:
+    if isfinite(hypot(*values.tolist())):
+        return
+    for name, value in zip(JOINT_NAMES, values.tolist(), strict=True):
+        if not isfinite(value):
+            raise ValueError(f"{name} {subject} is {value} {unit}, must be finite; nothing was sent")

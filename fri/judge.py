@@ -1,0 +1,142 @@
+"""The controller's judgement of a command: flags, finiteness, mirror, limits.
+
+An objection is the kind and the sentence with which command mode ends; nothing is ever clipped. The arithmetic is on
+plain floats of seven joints, which is faster here than arrays, and every comparison is written so that NaN fails it.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import numpy as np
+
+from fri.event import EventKind
+from fri.packets import JOINT_NAMES, JOINTS, CmdBuffer
+from fri.policy import KrcLimits, KrcPolicy
+from fri.states import ALLOWED_FLAGS, CommandFlag, Control
+
+__all__ = ["CommandJudge", "Objection"]
+
+Objection = tuple[EventKind, str]
+
+_JNTPOS = int(CommandFlag.JNTPOS)
+# The positions are judged joint by joint; these only for being numbers.
+_OTHER_FIELDS = (
+    (int(CommandFlag.JNTTRQ), "add_jnt_trq"),
+    (int(CommandFlag.JNTSTIFF), "jnt_stiffness"),
+    (int(CommandFlag.JNTDAMP), "jnt_damping"),
+    (int(CommandFlag.CARTPOS), "cart_pos"),
+    (int(CommandFlag.TCPFT), "add_tcp_ft"),
+    (int(CommandFlag.CARTSTIFF), "cart_stiffness"),
+    (int(CommandFlag.CARTDAMP), "cart_damping"),
+)
+
+
+class CommandJudge:
+    """Judges commands against the limits of an arm; ``tighten`` sets the period and the factors on the speed."""
+
+    def __init__(self, limits: KrcLimits, policy: KrcPolicy) -> None:
+        self._limits = limits
+        self._policy = policy
+        self._q_min = (limits.q_min - policy.limit_tolerance).tolist()
+        self._q_max = (limits.q_max + policy.limit_tolerance).tolist()
+        self.tighten(0.001, 1.0, False)
+
+    def tighten(self, period_s: float, safety_limits: float, t1: bool) -> None:
+        """Set the period [s], the argument of friStart and whether the reduced speed of T1 applies."""
+        factor = safety_limits * (self._policy.t1_velocity_factor if t1 else 1.0)
+        self._period = period_s
+        self._reason = f"limit factor {safety_limits:.2f}{' in T1' if t1 else ''}"
+        self._steps = (self._limits.v_max * factor * period_s + self._policy.limit_tolerance).tolist()
+
+    def flags(self, command: CmdBuffer, monitored: int | None, control: Control) -> Objection | None:
+        """Flags as in monitor mode (`monitored`), fit for the control mode, and numbers in every flagged field."""
+        flags = command.cmd_flags
+        if monitored is not None and flags != monitored:
+            return (
+                EventKind.FLAGS_CHANGED,
+                f"command flags changed from {monitored:#06x} to {flags:#06x} in command mode; "
+                "they may change in monitor mode only",
+            )
+        needed = _JNTPOS if control is Control.POSITION else 0
+        if flags & ~int(ALLOWED_FLAGS[control]) or flags & needed != needed:
+            return EventKind.WRONG_FLAGS, f"command flags {flags:#06x} do not fit control {control.name}"
+        if flags & ~_JNTPOS:
+            for flag, name in _OTHER_FIELDS:
+                if flags & flag and not np.isfinite(command.record[name]).all():
+                    return EventKind.NOT_FINITE, f"command field {name} is not finite"
+        return None
+
+    def position(self, q: list[float], what: str) -> Objection | None:
+        """All positions numbers and inside their limits."""
+        low, high = self._q_min, self._q_max
+        for joint in range(JOINTS):
+            if low[joint] <= q[joint] <= high[joint]:
+                continue
+            name = JOINT_NAMES[joint]
+            if not isfinite(q[joint]):
+                return EventKind.NOT_FINITE, f"{name} {what} position is {q[joint]}"
+            return (
+                EventKind.POSITION,
+                f"{name} {what} position {q[joint]:.5f} rad is outside "
+                f"{self._limits.q_min[joint]:.5f}..{self._limits.q_max[joint]:.5f} rad",
+            )
+        return None
+
+    def mirror(self, command: CmdBuffer, target: np.ndarray, what: str) -> Objection | None:
+        """The commanded position where the total setpoint is."""
+        tolerance = self._policy.mirror_tolerance
+        q = command.jnt_pos.tolist()
+        for joint, now in enumerate(target.tolist()):
+            distance = abs(q[joint] - now)
+            if distance <= tolerance:
+                continue
+            name = JOINT_NAMES[joint]
+            if not isfinite(distance):
+                return EventKind.NOT_FINITE, f"{name} commanded position is {q[joint]}"
+            return (
+                EventKind.NOT_MIRRORED,
+                f"FRI interpolation error: {name} of {what} is {distance:.5f} rad from the mirror, "
+                f"at most {tolerance:g} rad",
+            )
+        return None
+
+    def step(
+        self, command: CmdBuffer, target: np.ndarray, previous: np.ndarray, missed: int
+    ) -> Objection | None:
+        """Position, speed and, where the policy asks for it, acceleration of the way from `target` to the command.
+
+        `previous` is the setpoint before `target`, `missed` the cycles bridged since the last command.
+        """
+        q = command.jnt_pos.tolist()
+        objection = self.position(q, "commanded")
+        if objection is not None:
+            return objection
+        steps = self._steps
+        for joint, now in enumerate(target.tolist()):
+            step = q[joint] - now
+            if not -steps[joint] <= step <= steps[joint]:
+                return (
+                    EventKind.VELOCITY,
+                    f"excessive commanded joint speed: {JOINT_NAMES[joint]} {abs(step) / self._period:.4f} rad/s "
+                    f"exceeds {steps[joint] / self._period:.4f} rad/s ({self._reason})",
+                )
+        if self._policy.acceleration_factor is None:
+            return None
+        return self._acceleration(command.jnt_pos, target, previous, missed, self._policy.acceleration_factor)
+
+    def _acceleration(
+        self, q: np.ndarray, target: np.ndarray, previous: np.ndarray, missed: int, factor: float
+    ) -> Objection | None:
+        # After n bridged cycles a constant acceleration shows as (n + 1)(n + 2) / 2 times its change of step.
+        widening = (missed + 1) * (missed + 2) / 2
+        allowed = self._limits.a_max * factor * self._period**2 * widening + 2 * self._policy.limit_tolerance
+        change = np.abs((q - target) - (target - previous))
+        joint = int((change / allowed).argmax())
+        if change[joint] <= allowed[joint]:
+            return None
+        return (
+            EventKind.ACCELERATION,
+            f"{JOINT_NAMES[joint]} commanded acceleration {change[joint] / self._period**2:.2f} rad/s^2 exceeds "
+            f"{allowed[joint] / self._period**2:.2f} rad/s^2",
+        )

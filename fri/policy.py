@@ -1,0 +1,149 @@
+"""What the controller enforces: the limits of the arm, and our choices where KUKA's documents are silent.
+
+The documents fix that the timing is rated over the last 100 packets, that command mode needs good timing "for some
+time", that single dropouts are bridged by extrapolation, and that limits and errors end command mode. They give no
+thresholds. Every number of ``KrcPolicy`` is therefore ours, chosen to be plausible and configurable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from fri.packets import JOINT_NAMES, JOINTS
+from fri.states import Quality
+
+__all__ = ["KrcLimits", "KrcPolicy"]
+
+
+@dataclass(frozen=True)
+class KrcPolicy:
+    """Policy of the controller's end where KUKA is silent; all of it is ours.
+
+    Attributes
+    ----------
+    window : int
+        Packets over which answers are rated (this one is KUKA's: 100).
+    minimum_packets : int
+        Packets before any quality above UNACCEPTABLE is given.
+    perfect_rate, ok_rate, bad_rate : float
+        Least answer rate for PERFECT, OK and BAD.
+    perfect_latency : float
+        Largest mean latency for PERFECT, as a fraction of the sample time.
+    start_quality : Quality
+        Quality that friStart needs ...
+    start_dwell : int
+        ... for so many packets in a row, counted anew when the control mode changes.
+    hold_quality : Quality
+        Least quality for staying in command mode.
+    bridged_cycles : int
+        Consecutive missing answers bridged by linear extrapolation; one more ends command mode.
+    drop_on_malformed : bool
+        Whether a malformed datagram ends command mode (otherwise it is only a missing answer).
+    drop_on_drives_off : bool
+        Whether switching the drives off during command mode ends it. Entering it with the drives off is normal.
+    mirror_tolerance : float
+        Largest distance [rad] of the first command, and of any command with the drives off, from the mirror.
+    limit_tolerance : float
+        Allowance on position and step limits for the rounding of float32 [rad].
+    t1_velocity_factor : float
+        Factor on the velocity limits in operating mode T1.
+    acceleration_factor : float or None
+        Factor on the acceleration limits for commands; None does not check acceleration.
+    stop_acceleration_factor : float
+        Deceleration of the arm after command mode, as a factor on the acceleration limits.
+    stop_jerk_time_s : float
+        Time [s] in which that deceleration builds up.
+    """
+
+    window: int = 100
+    minimum_packets: int = 100
+    perfect_rate: float = 0.99
+    ok_rate: float = 0.95
+    bad_rate: float = 0.80
+    perfect_latency: float = 0.5
+    start_quality: Quality = Quality.OK
+    start_dwell: int = 100
+    hold_quality: Quality = Quality.BAD
+    bridged_cycles: int = 3
+    drop_on_malformed: bool = True
+    drop_on_drives_off: bool = True
+    mirror_tolerance: float = 1e-3
+    limit_tolerance: float = 1e-6
+    t1_velocity_factor: float = 0.25
+    acceleration_factor: float | None = None
+    stop_acceleration_factor: float = 1.0
+    stop_jerk_time_s: float = 0.02
+
+    def __post_init__(self) -> None:
+        _require(self.window >= 2, "window", self.window, "at least 2 packets")
+        _require(
+            1 <= self.minimum_packets <= self.window,
+            "minimum_packets",
+            self.minimum_packets,
+            f"within 1..window ({self.window})",
+        )
+        _require(
+            0.0 <= self.bad_rate <= self.ok_rate <= self.perfect_rate <= 1.0,
+            "bad_rate, ok_rate, perfect_rate",
+            (self.bad_rate, self.ok_rate, self.perfect_rate),
+            "ascending within 0..1",
+        )
+        _require(self.start_dwell >= 0, "start_dwell", self.start_dwell, "0 packets or more")
+        _require(self.bridged_cycles >= 0, "bridged_cycles", self.bridged_cycles, "0 cycles or more")
+        for name in (
+            "perfect_latency",
+            "mirror_tolerance",
+            "t1_velocity_factor",
+            "stop_acceleration_factor",
+            "stop_jerk_time_s",
+        ):
+            _require(0.0 < getattr(self, name) < np.inf, name, getattr(self, name), "positive and finite")
+        _require(
+            0.0 <= self.limit_tolerance < 1e-3, "limit_tolerance", self.limit_tolerance, "within 0..1e-3 rad"
+        )
+        if self.acceleration_factor is not None:
+            _require(
+                self.acceleration_factor > 0.0,
+                "acceleration_factor",
+                self.acceleration_factor,
+                "positive or absent",
+            )
+
+
+@dataclass(frozen=True)
+class KrcLimits:
+    """Limits of the arm that the controller enforces, each (7,) in wire order.
+
+    q_min, q_max : positions [rad]; v_max : speeds [rad/s]; a_max : accelerations [rad/s^2], used for the stop and,
+    where the policy asks for it, for commands.
+    """
+
+    q_min: np.ndarray
+    q_max: np.ndarray
+    v_max: np.ndarray
+    a_max: np.ndarray
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            values = np.array(getattr(self, field.name), dtype=float)
+            if values.shape != (JOINTS,) or not np.isfinite(values).all():
+                raise ConfigurationError(f"{field.name} is {values}, must be {JOINTS} finite numbers")
+            values.flags.writeable = False
+            object.__setattr__(self, field.name, values)
+        for joint, name in enumerate(JOINT_NAMES):
+            if not self.q_min[joint] < self.q_max[joint]:
+                raise ConfigurationError(
+                    f"{name} q_min {self.q_min[joint]:.4f} rad is not below q_max {self.q_max[joint]:.4f} rad"
+                )
+            if not (self.v_max[joint] > 0.0 and self.a_max[joint] > 0.0):
+                raise ConfigurationError(
+                    f"{name} v_max {self.v_max[joint]} rad/s and a_max {self.a_max[joint]} rad/s^2 must be positive"
+                )
+
+
+def _require(condition: bool, name: str, value: object, requirement: str) -> None:
+    if not condition:
+        raise ConfigurationError(f"controller policy `{name}` is {value}, must be {requirement}")

@@ -1,0 +1,138 @@
+"""The controller's 16-bit packet counter as a 64-bit one, and what became of the packets in between.
+
+A jump of the counter is either a gap (packets were lost), a late packet (the network changed the order), a damaged
+packet, or a controller that was started again. The controller's timestamp tells them apart: over a gap, counter and clock
+advance together. A jump that fits nothing is held back until the next packet confirms it, so that a single
+damaged packet is not taken for a restart.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+__all__ = ["Arrival", "SequenceTracker"]
+
+_WRAP = 0x10000
+# Disagreement of counter and clock over a jump that still counts as agreement [packets], plus 5 % of the jump.
+_SLACK = 16
+# So many old packets in a row, in order, are a controller that counts from an earlier number.
+_OLD_RUN = 8
+_FLOAT32_EPS = 1.2e-7
+
+
+class Arrival(Enum):
+    """What a packet's counter says about it."""
+
+    NEW = "new"
+    REPEATED = "repeated"
+    REORDERED = "reordered"
+    SUSPECT = "suspect"
+    RESTARTED = "restarted"
+
+
+class SequenceTracker:
+    """Unwraps `send_seq` and counts.
+
+    Attributes
+    ----------
+    sequence : int
+        Number of the newest packet. It starts with the first packet's own count and always increases; after a
+        restart of the controller it goes on with the next number.
+    lost : int
+        Packets that never arrived, or arrived after a newer one.
+    repeated, reordered, suspect, restarts : int
+        Packets that came again; that came after a newer one; whose counter fitted nothing; restarts seen.
+    """
+
+    __slots__ = (
+        "_last",
+        "_old",
+        "_old_run",
+        "_suspect",
+        "_timestamp",
+        "lost",
+        "reordered",
+        "repeated",
+        "restarts",
+        "sequence",
+        "suspect",
+    )
+
+    def __init__(self) -> None:
+        self.sequence = -1
+        self.lost = 0
+        self.repeated = 0
+        self.reordered = 0
+        self.suspect = 0
+        self.restarts = 0
+        self._last = -1
+        self._timestamp = 0.0
+        self._old = 0
+        self._old_run = 0
+        self._suspect = -1
+
+    def feed(self, send_seq: int, timestamp: float, sample_time: float, new_source: bool = False) -> Arrival:
+        """Take in one packet's counter (0..65535), timestamp [s] and sample time [s].
+
+        `new_source` says that it came from another port than the last one: an older count is then a restart at once.
+        """
+        last = self._last
+        if last < 0:
+            self.sequence = send_seq
+            self._last = send_seq
+            self._timestamp = timestamp
+            return Arrival.NEW
+        delta = ((send_seq - last + 0x8000) & 0xFFFF) - 0x8000
+        if delta == 1:
+            return self._advance(1, send_seq, timestamp)
+        return self._jump(delta, send_seq, timestamp, sample_time, new_source)
+
+    def _advance(self, step: int, send_seq: int, timestamp: float) -> Arrival:
+        self.sequence += step
+        self.lost += step - 1
+        self._last = send_seq
+        self._timestamp = timestamp
+        self._old_run = 0
+        self._suspect = -1
+        return Arrival.NEW
+
+    def _jump(
+        self, delta: int, send_seq: int, timestamp: float, sample_time: float, new_source: bool
+    ) -> Arrival:
+        elapsed = timestamp - self._timestamp
+        cycles = elapsed / sample_time
+        resolution = 2.0 * _FLOAT32_EPS * max(abs(timestamp), abs(self._timestamp)) / sample_time
+        # The counter fixes the step up to multiples of its wrap; the clock picks the multiple.
+        step = delta if elapsed == 0.0 else delta + _WRAP * round((cycles - delta) / _WRAP)
+        agrees = elapsed == 0.0 or abs(step - cycles) <= _SLACK + 0.05 * abs(cycles) + resolution
+        if agrees and step > 0:
+            return self._advance(step, send_seq, timestamp)
+        if new_source:
+            return self._restart(send_seq, timestamp)
+        if agrees and step == 0:
+            self.repeated += 1
+            return self._old_packet(send_seq, timestamp, Arrival.REPEATED)
+        if agrees:
+            self.reordered += 1
+            return self._old_packet(send_seq, timestamp, Arrival.REORDERED)
+        if self._suspect >= 0 and 0 <= ((send_seq - self._suspect) & 0xFFFF) <= _SLACK:
+            return self._restart(send_seq, timestamp)
+        self._suspect = send_seq
+        self.suspect += 1
+        return Arrival.SUSPECT
+
+    def _old_packet(self, send_seq: int, timestamp: float, arrival: Arrival) -> Arrival:
+        """Count old packets in a row; a repeat of the newest packet itself is no sign of a restart."""
+        if arrival is Arrival.REPEATED:
+            return arrival
+        follows = self._old_run > 0 and ((send_seq - self._old) & 0xFFFF) <= 1
+        self._old_run = self._old_run + 1 if follows else 1
+        self._old = send_seq
+        if self._old_run >= _OLD_RUN:
+            return self._restart(send_seq, timestamp)
+        return arrival
+
+    def _restart(self, send_seq: int, timestamp: float) -> Arrival:
+        self.restarts += 1
+        self._advance(1, send_seq, timestamp)
+        return Arrival.RESTARTED
