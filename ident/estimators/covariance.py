@@ -64,7 +64,9 @@ class Scores:
                 first, last = int(group.time_index[0]), int(group.time_index[-1])
                 low, high = spans.get(group.record, (first, last))
                 spans[group.record] = (min(low, first), max(high, last))
-        records = {record: np.zeros((high - low + 1, len(problem.names))) for record, (low, high) in spans.items()}
+        records = {
+            record: np.zeros((high - low + 1, len(problem.names))) for record, (low, high) in spans.items()
+        }
         for number, group in enumerate(problem.groups):
             if not len(group.time_index):
                 continue
@@ -149,9 +151,7 @@ def hac(
     return Covariance(matrix, kind, inflation=inflation), length * step
 
 
-def bootstrap(
-    problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int
-) -> Covariance:
+def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int) -> Covariance:
     """Covariance of `draws` weighted least-squares solutions over blocks of time drawn with replacement."""
     length = max(1, round(block_s / problem.sample_time_s))
     p = len(problem.names)

@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
-from scipy.linalg.blas import dsyrk
 
 from fri.errors import DataError
 
@@ -53,7 +52,9 @@ class RowGroup:
                 f"{self.time_index.shape} do not agree; give (m, p), (m,) and (m,)"
             )
         if np.any(np.diff(self.time_index) <= 0):
-            raise DataError(f"{self.label}: the time index must increase from row to row; sort the rows by time")
+            raise DataError(
+                f"{self.label}: the time index must increase from row to row; sort the rows by time"
+            )
 
     @property
     def label(self) -> str:
@@ -88,10 +89,7 @@ class TriangularFactor:
         """Factor of the stack in which each part's rows are multiplied by sqrt(weight)."""
         parts = [(factor, weight) for factor, weight in zip(factors, weights, strict=True) if factor.rows]
         stack = np.vstack([np.sqrt(weight) * factor.r for factor, weight in parts])
-        r = np.linalg.qr(stack, mode="r")
-        if len(r) < r.shape[1]:
-            r = np.vstack([r, np.zeros((r.shape[1] - len(r), r.shape[1]))])
-        return cls(r, sum(factor.rows for factor, _ in parts))
+        return cls(_triangle(stack), sum(factor.rows for factor, _ in parts))
 
     @property
     def parameters(self) -> int:
@@ -121,10 +119,7 @@ class TriangularFactor:
     def select(self, columns: Sequence[int] | NDArray[np.int64]) -> TriangularFactor:
         """Factor of the same rows with some of the columns."""
         r = self.r[:, np.append(np.asarray(columns, dtype=np.int64), self.parameters)]
-        r = np.linalg.qr(r, mode="r")
-        if len(r) < r.shape[1]:
-            r = np.vstack([r, np.zeros((r.shape[1] - len(r), r.shape[1]))])
-        return TriangularFactor(r, self.rows)
+        return TriangularFactor(_triangle(r), self.rows)
 
 
 @dataclass(frozen=True)
@@ -158,7 +153,9 @@ class Problem:
 
     def __post_init__(self) -> None:
         if not self.groups:
-            raise DataError("no rows to estimate from: every sample was excluded; check the phases and the edges")
+            raise DataError(
+                "no rows to estimate from: every sample was excluded; check the phases and the edges"
+            )
         for group in self.groups:
             if group.matrix.shape[1] != len(self.names):
                 raise DataError(
@@ -186,7 +183,9 @@ class Problem:
             group = self.groups[index]
             factor = TriangularFactor.of(group.matrix, group.target)
             if not np.all(np.isfinite(factor.r)):
-                raise DataError(f"{label}: non-finite torque or regressor entries; remove them before estimating")
+                raise DataError(
+                    f"{label}: non-finite torque or regressor entries; remove them before estimating"
+                )
             factors.append(factor)
         whole = factors[0] if len(factors) == 1 else TriangularFactor.combine(factors, [1.0] * len(factors))
         first = self.groups[indices[0]]
@@ -255,7 +254,7 @@ def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
     """Cholesky factor of the equilibrated Gram matrix, or None where it would lose digits."""
     p = matrix.shape[1]
     gram = np.empty((p + 1, p + 1))
-    gram[:p, :p] = dsyrk(1.0, matrix.T, trans=0)
+    gram[:p, :p] = matrix.T @ matrix
     gram[:p, p] = matrix.T @ target
     gram[p, p] = target @ target
     scale = np.sqrt(np.diag(gram))
@@ -283,5 +282,12 @@ def _blocked_qr(matrix: FloatArray, target: FloatArray) -> FloatArray:
         block = np.column_stack([matrix[rows], target[rows]])
         if not np.all(np.isfinite(block)):
             return np.full((p + 1, p + 1), np.nan)
-        r = np.linalg.qr(np.vstack([r, block]), mode="r")
-    return r if len(r) == p + 1 else np.vstack([r, np.zeros((p + 1 - len(r), p + 1))])
+        r = _triangle(np.vstack([r, block]))
+    return r
+
+
+def _triangle(stack: FloatArray) -> FloatArray:
+    """R (k, k) of the QR decomposition of (m, k), with rows of zeros where m < k."""
+    r = np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
+    missing = r.shape[1] - r.shape[0]
+    return np.vstack([r, np.zeros((missing, r.shape[1]))]) if missing > 0 else r

@@ -78,10 +78,12 @@ def estimate_delay(
 
     Raises DataError when the best delay lies at the edge of +- `search_s`, or no joint moves.
     """
-    parts = [_Filtered.of(data, cutoff_hz, search_s, standstill_rad_s) for data in stretches]
-    parts = [part for part in parts if part is not None and part.moving.any()]
+    found = [_Filtered.of(data, cutoff_hz, search_s, standstill_rad_s) for data in stretches]
+    parts = [part for part in found if part is not None and part.moving.any()]
     if not parts:
-        raise DataError("the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`")
+        raise DataError(
+            "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
+        )
     grid = np.linspace(-search_s, search_s, _GRID)
     cost = [_cost(parts, delay) for delay in grid]
     best = int(np.argmin(cost))
@@ -121,13 +123,17 @@ class _Filtered:
         if last - first < 4.0 / cutoff_hz:
             return None
         outputs = np.arange(first, last, 1.0 / (2.5 * cutoff_hz))
-        fine = np.arange(first - search_s - 0.5 / cutoff_hz, last + search_s + 0.5 / cutoff_hz, 0.125 / cutoff_hz)
+        fine = np.arange(
+            first - search_s - 0.5 / cutoff_hz, last + search_s + 0.5 / cutoff_hz, 0.125 / cutoff_hz
+        )
         joint = ParallelFilter(data.times, outputs, cutoff_hz)
         stacked = np.stack([data.qdd, data.qd, np.sign(data.qd), np.ones_like(data.qd)], axis=2)
         smooth = ParallelFilter(data.motor_times, fine, cutoff_hz).apply(data.motor_torque)
         curve = make_interp_spline(fine, smooth, k=5)
         moving = joint.share(np.abs(data.qd) < standstill) < 0.05
-        return cls(outputs, joint.apply(data.joint_torque), joint.apply(stacked), moving, curve, curve.derivative())
+        return cls(
+            outputs, joint.apply(data.joint_torque), joint.apply(stacked), moving, curve, curve.derivative()
+        )
 
 
 def _cost(parts: Sequence[_Filtered], delay: float) -> float:
@@ -158,7 +164,9 @@ def _newton(parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float
         if sum(int(part.moving[:, joint].sum()) for part in parts) >= 16
     ]
     if not active:
-        raise DataError("the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`")
+        raise DataError(
+            "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
+        )
     for place, joint in enumerate(active):
         names += [f"{symbol} {joint_names[joint]}" for symbol in ("Ia", "Fvm", "Fcm", "offm")]
         for record, part in enumerate(parts):

@@ -132,7 +132,9 @@ class ParallelFilter:
     @cached_property
     def _table(self) -> tuple[FloatArray, FloatArray]:
         time = np.linspace(0.0, self.half_width, 4097)
-        return time, np.sinc(2.0 * self.cutoff_hz * time) * _kaiser(time / self.half_width, self.attenuation_db)
+        return time, np.sinc(2.0 * self.cutoff_hz * time) * _kaiser(
+            time / self.half_width, self.attenuation_db
+        )
 
     def _kernel(self, distance: FloatArray) -> FloatArray:
         time, value = self._table

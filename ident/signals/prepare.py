@@ -108,11 +108,13 @@ def prepare(
     settings = settings or SignalSettings()
     name = session.path.name
     _check_finite(session.joint, name)
-    origin = _clock(session.joint)[0]
-    times = (_clock(session.joint) - origin) * 1e-9
+    origin = int(_clock(session.joint)[0])
+    times = np.asarray((_clock(session.joint) - origin) * 1e-9, dtype=np.float64)
     position, effort = session.joint.position, session.joint.effort
     if not effort.shape[1]:
-        raise DataError(f"{name}: /joint_states has no effort, so no joint torque; record it or choose motor rows only")
+        raise DataError(
+            f"{name}: /joint_states has no effort, so no joint torque; record it or choose motor rows only"
+        )
     sequence = session.joint.sequence if session.joint.numbered else None
     dt = sample_period(times, sequence, f"{name}: /joint_states")
     warnings: list[str] = []
@@ -124,7 +126,7 @@ def prepare(
                 f"{name}: {session.joint_names[column]} {what} jumps too often for outliers, nothing was removed; "
                 "look at the channel"
             )
-    bad = position_flags.any(axis=1)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1))
     parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
@@ -137,11 +139,14 @@ def prepare(
             f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone says nothing "
             "about inertia and friction"
         )
-    windows, periods = _windows(session, times, origin)
+    windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
-    excitation = excitation_frequency(whole, dt)
     motions = [_Motion.of(part, effort_flags, times, settings) for part in parts]
-    motor_data = _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
+    longest = max(motions, key=lambda motion: len(motion.qd))
+    excitation = excitation_frequency(longest.qd, dt)
+    motor_data = (
+        _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
+    )
     delay = _delay(motor_data, motions, session.joint_names, settings) if motor_data is not None else None
     passages = [
         passage
@@ -205,7 +210,9 @@ class _Motion:
     flagged: BoolArray
 
     @classmethod
-    def of(cls, part: Stretch, effort_flags: BoolArray, times: FloatArray, settings: SignalSettings) -> _Motion:
+    def of(
+        cls, part: Stretch, effort_flags: BoolArray, times: FloatArray, settings: SignalSettings
+    ) -> _Motion:
         joints = effort_flags.shape[1]
         q = low_pass(part.values[:, :joints], part.dt, settings.cutoff_hz, settings.order)
         qd, qdd = differentiate(q, part.dt)
@@ -252,7 +259,9 @@ class _Motion:
             state = interpolate_uniform(state, self.stretch.start, self.stretch.dt, actual)
             bridged = self.flagged[np.clip(nearest, 0, len(self.flagged) - 1)]
         q, qd, qdd = np.split(state, 3, axis=1)
-        lost = self.stretch.bridged[np.clip(nearest, 0, len(bridged) - 1)] if len(bridged) else np.zeros(0, bool)
+        lost = (
+            self.stretch.bridged[np.clip(nearest, 0, len(bridged) - 1)] if len(bridged) else np.zeros(0, bool)
+        )
         return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside] | lost[:, None])
 
 
@@ -292,7 +301,7 @@ def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -
 
 
 def _motor(
-    session: Session, origin: float, settings: SignalSettings, name: str, warnings: list[str]
+    session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
     assert session.motor is not None
@@ -300,7 +309,7 @@ def _motor(
     if not session.motor.effort.shape[1]:
         raise DataError(f"{name}: /motor_states has no effort; record motor torques or choose Model 1")
     clock, reference = _clock(session.motor), _clock(session.joint)
-    times = (clock - origin) * 1e-9
+    times = np.asarray((clock - origin) * 1e-9, dtype=np.float64)
     span = (reference[-1] - reference[0]) * 1e-9
     overlap = min(times[-1], span) - max(times[0], 0.0)
     if overlap < 0.5 * (times[-1] - times[0]):
@@ -362,7 +371,7 @@ def _check_finite(columns: JointColumns, name: str) -> None:
             )
 
 
-def _windows(session: Session, times: FloatArray, origin: float) -> tuple[list[tuple[float, float]], bool]:
+def _windows(session: Session, times: FloatArray) -> tuple[list[tuple[float, float]], bool]:
     """Spans [s] that rows may come from: the periods, else the excitation, else everything."""
     for name in ("period", "excitation"):
         spans = session.spans(name)
@@ -389,7 +398,7 @@ def _row_grid(
         if joined and np.ptp(lengths) < 0.1 * step:
             count = max(1, round(length / step))
             total = count * len(windows)
-            return first + (length / count) * np.arange(total), count
+            return first + (length / count) * np.arange(total, dtype=np.float64), count
     return np.arange(first, last + 1e-9, step), None
 
 

@@ -15,16 +15,15 @@ __all__ = ["advice", "excitation_frequency", "optimal_cutoff"]
 FloatArray = NDArray[np.float64]
 
 
-def excitation_frequency(position: FloatArray, dt: float, share: float = 0.999) -> float:
-    """Frequency [Hz] below which lies `share` of the velocity power of the fastest-changing joint.
+def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) -> float:
+    """Frequency [Hz] below which lies `share` of the power of the fastest-changing joint velocity.
 
-    position : (n, J), equidistant. For a Fourier excitation this is about n_f w0, the highest harmonic.
+    velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest harmonic.
     """
     highest = 0.0
-    moved = np.ptp(position, axis=0)
-    for joint in np.flatnonzero(moved > 1e-2):
-        frequency, power = _spectrum(position[:, joint], dt)
-        power = power * frequency**2
+    power_of_joint = np.var(velocity, axis=0)
+    for joint in np.flatnonzero(power_of_joint > 1e-4 * power_of_joint.max(initial=0.0)):
+        frequency, power = _spectrum(velocity[:, joint], dt)
         cumulative = np.cumsum(power)
         if cumulative[-1] > 0:
             highest = max(highest, float(frequency[np.searchsorted(cumulative, share * cumulative[-1])]))

@@ -36,7 +36,7 @@ class Stretch:
     @property
     def times(self) -> FloatArray:
         """Sample times (n,) [s]."""
-        return self.start + self.dt * np.arange(len(self.values))
+        return self.start + self.dt * np.arange(len(self.values), dtype=np.float64)
 
     @property
     def end(self) -> float:
@@ -51,7 +51,9 @@ def sample_period(times: FloatArray, sequence: NDArray[np.int64] | None, where: 
     step = np.diff(times)
     if np.any(step <= 0):
         at = times[int(np.argmax(step <= 0))]
-        raise DataError(f"{where}: time does not increase after t = {at:.6f} s; repair the clock of the source")
+        raise DataError(
+            f"{where}: time does not increase after t = {at:.6f} s; repair the clock of the source"
+        )
     if sequence is not None and len(sequence) == len(times) and np.all(np.diff(sequence) > 0):
         return float(np.median(step / np.diff(sequence)))
     return float(np.median(step))
@@ -66,8 +68,8 @@ def stretches(
 ) -> tuple[list[Stretch], int]:
     """Equidistant stretches of (n, k) values at (n,) times, and the number of samples lost.
 
-    Samples flagged `bad` (n,) and lost ones are bridged by a cubic spline through their neighbours and flagged; a
-    hole longer than `longest_bridge_s` ends the stretch.
+    Samples flagged `bad` (n,) and lost ones are bridged by a cubic spline through their neighbours and
+    flagged; a hole longer than `longest_bridge_s` ends the stretch.
     """
     good = np.flatnonzero(~bad)
     if len(good) < 16:
@@ -108,15 +110,18 @@ def _fitted_step(times: FloatArray, steps: NDArray[np.int64], dt: float) -> floa
 
 
 def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int]]:
-    """Flags (n, k) of samples far from the median of their five neighbours, and columns with too many to be that.
+    """Flags (n, k) of samples far from the median of five, and the columns with too many for outliers.
 
-    Far is more than `scale` robust standard deviations and more than 1 % of the range. Where over 1 % of a column
-    is far, nothing of it is flagged: that is not an outlier but a property of the signal.
+    Far is more than `scale` robust standard deviations and more than 1 % of the range, the deviation taken from
+    the cubic through the four neighbours, which follows any slope. The median keeps steps, so the reversal of
+    Coulomb friction is no outlier. Where over 1 % of a column is far, nothing of it is flagged: that is not an
+    outlier but a property of the signal.
     """
     padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
-    median = _median_of_five(*(padded[i : i + len(values)] for i in range(5)))
-    distance = np.abs(values - median)
-    robust = 1.4826 * np.median(distance, axis=0)
+    far_left, left, middle, right, far_right = (padded[i : i + len(values)] for i in range(5))
+    distance = np.abs(values - _median_of_five(far_left, left, middle, right, far_right))
+    cubic = np.abs(values - (4.0 * (left + right) - far_left - far_right) / 6.0)
+    robust = 1.4826 * np.median(cubic, axis=0)
     low, high = np.percentile(values, [0.5, 99.5], axis=0)
     flags = distance > np.maximum(scale * robust, 0.01 * (high - low))
     crowded = [int(column) for column in np.flatnonzero(flags.mean(axis=0) > _TOO_MANY)]

@@ -1,0 +1,248 @@
+"""Maximum a posteriori: least squares with a prior model (CAD, or another arm of the series).
+
+The prior says where the parameters are expected and how far from there they may lie; the data decide how much to
+trust it. Rows count with their effective number, so that thousands of correlated rows do not drown the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from fri.errors import ConfigurationError, DataError
+from ident.estimators.covariance import CovarianceSettings, effective_rows
+from ident.estimators.estimate import Covariance, Estimate
+from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.solution import class_variances, consumed_parameters, estimate_from
+from ident.estimators.weighted import weighted_solution
+
+__all__ = ["MaximumAPosteriori", "Prior"]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Normal prior: mean (p,) and precision (p, p), the inverse covariance; zero precision knows nothing."""
+
+    mean: FloatArray
+    precision: FloatArray
+
+    def __post_init__(self) -> None:
+        p = len(self.mean)
+        if self.precision.shape != (p, p) or not np.all(np.isfinite(self.precision)):
+            raise ConfigurationError(
+                f"prior precision has shape {self.precision.shape} or is not finite; give ({p}, {p})"
+            )
+        if np.linalg.eigvalsh(self.precision)[0] < -1e-9 * max(
+            np.abs(self.precision).max(initial=0.0), 1e-300
+        ):
+            raise ConfigurationError(
+                "prior precision is not positive semi-definite; it is an inverse covariance"
+            )
+
+    @classmethod
+    def independent(cls, mean: FloatArray, std: FloatArray) -> Prior:
+        """Independent parameters with standard deviations (p,); infinite where nothing is known."""
+        return cls(
+            np.where(np.isfinite(std), mean, 0.0), np.diag(1.0 / np.asarray(std, dtype=np.float64) ** 2)
+        )
+
+    @classmethod
+    def projected(
+        cls, mean: FloatArray, covariance: FloatArray, projection: FloatArray, known: FloatArray
+    ) -> Prior:
+        """Prior of base parameters chi_B = P chi from one of standard parameters.
+
+        mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool, base
+        parameters that the prior speaks of, the others stay free.
+        """
+        chosen = np.flatnonzero(known)
+        part = projection[chosen]
+        inner = part @ covariance @ part.T
+        scale = np.sqrt(np.diag(inner))
+        if np.any(scale <= 0):
+            raise ConfigurationError("a base parameter that the prior speaks of has no prior variance")
+        precision = np.zeros((len(projection),) * 2)
+        block = np.linalg.inv(inner / np.outer(scale, scale) + 1e-9 * np.eye(len(chosen))) / np.outer(
+            scale, scale
+        )
+        precision[np.ix_(chosen, chosen)] = 0.5 * (block + block.T)
+        full = np.zeros(len(projection))
+        full[chosen] = part @ mean
+        return cls(full, precision)
+
+
+@dataclass(frozen=True)
+class MaximumAPosteriori:
+    """Minimises sum of (n_eff / n) ||e_c||^2 / sigma_c^2 + (chi - chi_0)^T Lambda (chi - chi_0) / s.
+
+    strength : how the prior's scale s is chosen: "evidence" maximises the marginal likelihood of the data (MacKay
+        1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the prior's own
+        standard deviations, smaller is firmer).
+    blocks : number of blocks of the cross-validation.
+    """
+
+    prior: Prior
+    strength: Literal["evidence", "cross_validation"] | float = "evidence"
+    covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
+    blocks: int = 6
+    iterations: int = 20
+
+    def fit(self, problem: Problem) -> Estimate:
+        """Estimate (p,); the stated covariance is the posterior's, which counts the effective rows."""
+        if len(self.prior.mean) != len(problem.names):
+            raise DataError(
+                f"the prior has {len(self.prior.mean)} parameters, the problem {len(problem.names)}"
+            )
+        values, weights = _start(problem, self.prior)
+        scale, converged = 1.0, False
+        for iteration in range(1, self.iterations + 1):
+            tempered = weights * _shares(problem, values)
+            scale_new = self._scale(problem, tempered)
+            new, root = _posterior(problem, self.prior, tempered, scale_new)
+            consumed = consumed_parameters(problem, tempered, root)
+            weights = 1.0 / class_variances(problem, new, consumed)
+            change = float(np.max(np.abs(new - values) / np.linalg.norm(root, axis=1)))
+            values = new
+            done = abs(np.log(scale_new / scale)) < 1e-3 and change < 1e-3
+            scale = scale_new
+            if iteration > 1 and done:
+                converged = True
+                break
+        tempered = weights * _shares(problem, values)
+        values, root = _posterior(problem, self.prior, tempered, scale)
+        bread = root @ root.T
+        coefficients = [
+            tempered[number] * residual
+            for residual, number in zip(problem.residuals(values), problem.class_of_group, strict=True)
+        ]
+        estimate = estimate_from(
+            problem,
+            method="MAP",
+            values=values,
+            weights=weights,
+            bread=bread,
+            consumed=consumed_parameters(problem, tempered, root),
+            settings=replace(
+                self.covariance, kind="hac" if self.covariance.kind == "bootstrap" else self.covariance.kind
+            ),
+            coefficients=coefficients,
+            iterations=iteration,
+            converged=converged,
+            notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({self._how()})",),
+        )
+        posterior = Covariance(bread, "posterior with the effective number of rows: holds if the prior does")
+        return replace(
+            estimate, covariance=posterior, covariances={**estimate.covariances, "posterior": posterior}
+        )
+
+    def _how(self) -> str:
+        return "stated" if isinstance(self.strength, (int, float)) else self.strength.replace("_", "-")
+
+    def _scale(self, problem: Problem, tempered: FloatArray) -> float:
+        if isinstance(self.strength, (int, float)):
+            return float(self.strength)
+        if self.strength == "evidence":
+            cost = _evidence_cost(problem, self.prior, tempered)
+        else:
+            cost = _cross_validation_cost(problem, self.prior, tempered, self.blocks)
+        grid = np.linspace(-12.0, 12.0, 25)
+        coarse = [cost(point) for point in grid]
+        best = int(np.argmin(coarse))
+        low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+        found = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-3})
+        return float(np.exp(found.x))
+
+
+def _start(problem: Problem, prior: Prior) -> tuple[FloatArray, FloatArray]:
+    """First values and weights; the data alone need not determine the parameters."""
+    if not np.any(prior.precision):
+        values, weights, *_ = weighted_solution(problem)
+        return values, weights
+    ones = np.ones(len(problem.classes))
+    factor = problem.weighted(ones)
+    mean_square = factor.sum_of_squares(np.zeros(factor.parameters)) / max(factor.rows, 1)
+    weights = ones / max(1e-4 * mean_square, np.finfo(float).tiny)
+    values, root = _posterior(problem, prior, weights, 1.0)
+    consumed = consumed_parameters(problem, weights, root)
+    return values, 1.0 / class_variances(problem, values, consumed)
+
+
+def _shares(problem: Problem, values: FloatArray) -> FloatArray:
+    """n_eff / n of each class."""
+    rows = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
+    return np.minimum(effective_rows(problem, problem.residuals(values)) / rows, 1.0)
+
+
+def _root_of(precision: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(precision)
+    keep = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
+    return np.sqrt(values[keep])[:, None] * vectors[:, keep].T
+
+
+def _posterior(
+    problem: Problem, prior: Prior, weights: FloatArray, scale: float
+) -> tuple[FloatArray, FloatArray]:
+    """Values (p,) and root (p, p) with root root^T the posterior covariance."""
+    r = problem.weighted(weights).r
+    penalty = _root_of(prior.precision) / np.sqrt(scale)
+    stacked = np.vstack([r, np.column_stack([penalty, penalty @ prior.mean])])
+    factor = np.asarray(np.linalg.qr(stacked, mode="r"), dtype=np.float64)
+    p = len(prior.mean)
+    diagonal = np.abs(np.diag(factor))[:p]
+    if np.any(diagonal <= 1e-10 * np.linalg.norm(factor[:, :p], axis=0)):
+        problem.require_rank()
+    root = np.linalg.solve(factor[:p, :p], np.eye(p))
+    return root @ factor[:p, p], root
+
+
+def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray):  # type: ignore[no-untyped-def]  # noqa: ANN202
+    """Minus the log marginal likelihood as a function of log s."""
+    r = problem.weighted(weights).r
+    p = len(prior.mean)
+    penalty = _root_of(prior.precision)
+
+    def cost(log_scale: float) -> float:
+        firm = penalty * np.exp(-0.5 * log_scale)
+        stacked = np.vstack([r, np.column_stack([firm, firm @ prior.mean])])
+        factor = np.asarray(np.linalg.qr(stacked, mode="r"), dtype=np.float64)
+        misfit = float(factor[p, p] ** 2) if len(factor) > p else 0.0
+        return (
+            float(np.sum(np.log(np.abs(np.diag(factor)[:p])))) + 0.5 * len(penalty) * log_scale + 0.5 * misfit
+        )
+
+    return cost
+
+
+def _cross_validation_cost(problem: Problem, prior: Prior, weights: FloatArray, blocks: int):  # type: ignore[no-untyped-def]  # noqa: ANN202
+    """Weighted squared error on blocks of time left out, as a function of log s."""
+    p = len(prior.mean)
+    grams = np.zeros((blocks, p + 1, p + 1))
+    for group, number in zip(problem.groups, problem.class_of_group, strict=True):
+        if not len(group.target):
+            continue
+        span = int(group.time_index[-1]) + 1
+        block = np.minimum(group.time_index * blocks // span, blocks - 1)
+        for part in range(blocks):
+            rows = block == part
+            augmented = np.column_stack([group.matrix[rows], group.target[rows]])
+            grams[part] += weights[number] * (augmented.T @ augmented)
+    total = grams.sum(axis=0)
+
+    def cost(log_scale: float) -> float:
+        firm = prior.precision * np.exp(-log_scale)
+        error = 0.0
+        for part in range(blocks):
+            rest = total - grams[part]
+            normal = rest[:p, :p] + firm
+            scale = np.sqrt(np.diag(normal))
+            scale[scale == 0] = 1.0
+            right = rest[:p, p] + firm @ prior.mean
+            values = np.linalg.lstsq(normal / np.outer(scale, scale), right / scale, rcond=1e-12)[0] / scale
+            vector = np.append(-values, 1.0)
+            error += float(vector @ grams[part] @ vector)
+        return error
+
+    return cost

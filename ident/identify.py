@@ -1,0 +1,322 @@
+"""From session logs to a dynamic model with a certificate for each parameter."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError, DataError
+from ident.base import BaseSet, numeric_base
+from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.estimate import Estimate, Estimator
+from ident.estimators.ordinary import OrdinaryLeastSquares
+from ident.estimators.problem import Problem
+from ident.estimators.robust import RobustLeastSquares
+from ident.estimators.total import TotalLeastSquares
+from ident.estimators.weighted import WeightedLeastSquares
+from ident.kinematics import Chain
+from ident.observation import observe
+from ident.signals.prepare import PreparedSession, prepare
+from ident.signals.settings import SignalSettings
+from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Side
+
+if TYPE_CHECKING:
+    from lwr_driver.session import Session
+
+__all__ = ["Identification", "IdentificationSettings", "identify"]
+
+FloatArray = NDArray[np.float64]
+EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
+
+logger = logging.getLogger(__name__)
+
+_ESTIMATORS: dict[str, EstimatorFactory] = {
+    "ols": lambda base, problem, covariance: OrdinaryLeastSquares(covariance),
+    "wls": lambda base, problem, covariance: WeightedLeastSquares(covariance),
+    "huber": lambda base, problem, covariance: RobustLeastSquares("huber", covariance=covariance),
+    "tukey": lambda base, problem, covariance: RobustLeastSquares("tukey", covariance=covariance),
+    "tls": lambda base, problem, covariance: TotalLeastSquares(covariance=covariance),
+}
+_WIDE_CONDITION = 100.0
+
+
+@dataclass(frozen=True)
+class IdentificationSettings:
+    """What to estimate and how.
+
+    model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
+    estimator : "wls" (default), "ols", "huber", "tukey", "tls", or a factory that gets the base set, the problem and
+        the covariance settings and returns an estimator.
+    without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
+    resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
+    """
+
+    model: int = 2
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    estimator: str | EstimatorFactory = "wls"
+    covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
+    without: tuple[str, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
+    coulomb: Coulomb = field(default_factory=Coulomb)
+    resonance_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.estimator, str) and self.estimator not in _ESTIMATORS:
+            known = ", ".join(_ESTIMATORS)
+            raise ConfigurationError(f"estimator {self.estimator!r} is unknown; choose one of {known}")
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Result of `identify`.
+
+    base : the base parameters and their regrouping; estimate : values, covariance and residuals.
+    prepared : the sessions as filtered; problem : the stacked regression. warnings : sentences for the report.
+    """
+
+    settings: IdentificationSettings
+    structure: ModelStructure
+    base: BaseSet
+    problem: Problem
+    estimate: Estimate
+    prepared: tuple[PreparedSession, ...]
+    payloads: tuple[str | None, ...]
+    condition: float
+    condition_normalised: float
+    warnings: tuple[str, ...]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of standard, not identifiable, regrouped and base parameters."""
+        return {
+            "standard": int(self.structure.active.sum()),
+            "not_identifiable": len(self.base.not_identifiable),
+            "regrouped": len(self.base.dependent),
+            "base": len(self.base),
+        }
+
+    @property
+    def parameters(self) -> list[dict[str, Any]]:
+        """One entry a base parameter: name, unit, estimate, std, rsd_percent."""
+        rsd = self.estimate.rsd_percent
+        return [
+            {
+                "name": name,
+                "unit": unit,
+                "estimate": float(self.estimate.values[k]),
+                "std": float(self.estimate.std[k]),
+                "rsd_percent": float(rsd[k]),
+            }
+            for k, (name, unit) in enumerate(zip(self.base.names, self.base.units, strict=True))
+        ]
+
+    @property
+    def torque_rms(self) -> dict[str, dict[str, float]]:
+        """Root mean square of the residual torque [Nm] by side and joint."""
+        result: dict[str, dict[str, float]] = {}
+        for fit in self.estimate.classes:
+            result.setdefault(fit.side, {})[fit.joint] = fit.rms
+        return result
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything a file or a report needs, as plain numbers and texts."""
+        return {
+            "model": self.settings.model,
+            "estimator": self.estimate.method,
+            "covariance": self.estimate.covariance.kind,
+            "sessions": [
+                {
+                    "name": session.name,
+                    "payload": payload,
+                    "rows": session.counts["rows"],
+                    "lost_samples": session.counts["lost"],
+                    "motor_delay_s": session.delay.seconds if session.delay is not None else None,
+                    "motor_delay_std_s": session.delay.std if session.delay is not None else None,
+                    "excitation_hz": session.excitation_hz,
+                    "cutoff_hz": session.cutoff_hz,
+                }
+                for session, payload in zip(self.prepared, self.payloads, strict=True)
+            ],
+            "counts": self.counts,
+            "condition": self.condition,
+            "condition_normalised": self.condition_normalised,
+            "parameters": self.parameters,
+            "torque_rms": self.torque_rms,
+            "warnings": list(self.warnings),
+        }
+
+    def summary(self) -> str:
+        """The result as text."""
+        counts = self.counts
+        lines = [
+            f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} not "
+            f"identifiable, {counts['regrouped']} regrouped, {counts['base']} base",
+        ]
+        for session, payload in zip(self.prepared, self.payloads, strict=True):
+            delay = f", motor channel late by {session.delay}" if session.delay is not None else ""
+            lines.append(
+                f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
+                f"{session.counts['lost']} samples lost{delay}"
+            )
+        lines.append(
+            f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
+        )
+        lines += ["", self.estimate.summary()]
+        if self.warnings:
+            lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
+        return "\n".join(lines)
+
+
+def identify(
+    sessions: Sequence[Session], chain: Chain, settings: IdentificationSettings | None = None
+) -> Identification:
+    """Identify the arm `chain` from one or more sessions, stacked.
+
+    The payload of each session is the one its metadata names (`none`: the bare arm). A session without motor
+    torques adds its joint rows only. Raises DataError with advice for input that cannot be used.
+    """
+    settings = settings or IdentificationSettings()
+    if not sessions:
+        raise DataError("no session given; name at least one session file")
+    chosen = [session.select(chain.joint_names) for session in sessions]
+    _same_robot(chosen)
+    needs_motor = settings.model in (2, 3)
+    with_motor = [session.motor is not None for session in chosen]
+    if needs_motor and not any(with_motor):
+        names = ", ".join(session.path.name for session in chosen)
+        raise DataError(
+            f"Model {settings.model} needs motor torques, and {names} "
+            f"ha{'s' if len(chosen) == 1 else 've'} no /motor_states; choose Model 1 (`--model 1`), or record with a "
+            "motor torque source"
+        )
+    if settings.model == 3:
+        chosen = [session for session, has in zip(chosen, with_motor, strict=True) if has]
+    payloads = [_payload(session) for session in chosen]
+    names = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
+    structure = ModelStructure(
+        chain, settings.model, names, settings.without, settings.couplings, settings.coulomb
+    )
+    prepared = [
+        prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
+        for session in chosen
+    ]
+    warnings = [warning for session in prepared for warning in session.warnings]
+    _every_joint_moves(prepared, chain)
+    mounted = payloads if settings.model != 3 else [None] * len(payloads)
+    base = numeric_base(structure, _conditions(structure, prepared, mounted))
+    problem = observe(prepared, mounted, structure, columns=base.columns, names=base.names, units=base.units)
+    normalised = problem.require_rank()
+    estimate = _estimator(settings, base, problem).fit(problem)
+    warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
+    warnings += _condition_warnings(normalised, estimate)
+    return Identification(
+        settings=settings,
+        structure=structure,
+        base=base,
+        problem=problem,
+        estimate=estimate,
+        prepared=tuple(prepared),
+        payloads=tuple(payloads),
+        condition=problem.condition,
+        condition_normalised=normalised,
+        warnings=tuple(warnings),
+    )
+
+
+def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
+    factory = _ESTIMATORS[settings.estimator] if isinstance(settings.estimator, str) else settings.estimator
+    return factory(base, problem, settings.covariance)
+
+
+def _payload(session: Session) -> str | None:
+    name = session.metadata.get("payload", "none").strip()
+    return None if name in ("", "none") else name
+
+
+def _same_robot(sessions: Sequence[Session]) -> None:
+    for key in ("robot", "serial"):
+        found = {session.metadata.get(key, "") for session in sessions} - {""}
+        if len(found) > 1:
+            listed = ", ".join(f"{s.path.name}: {s.metadata.get(key) or 'unnamed'}" for s in sessions)
+            raise DataError(
+                f"the sessions are of different robots by their `{key}` ({listed}); identify each robot by itself"
+            )
+
+
+def _every_joint_moves(prepared: Sequence[PreparedSession], chain: Chain) -> None:
+    still = [name for name in chain.joint_names if not any(name in session.moving for session in prepared)]
+    if still:
+        raise DataError(
+            f"joint{'s' if len(still) > 1 else ''} {', '.join(still)} never move{'s' if len(still) == 1 else ''}; "
+            "plan an excitation that moves every joint, or identify with a chain in which these joints are fixed"
+        )
+
+
+def _conditions(
+    structure: ModelStructure, prepared: Sequence[PreparedSession], payloads: Sequence[str | None]
+) -> tuple[Condition, ...]:
+    found: dict[Condition, None] = {}
+    for session, payload in zip(prepared, payloads, strict=True):
+        sides: tuple[Side, ...] = tuple(
+            side for side in structure.sides if side == "joint" or session.has_motor
+        )
+        if sides:
+            found[Condition(payload, sides)] = None
+    return tuple(found)
+
+
+def _payload_warnings(
+    sessions: Sequence[Session],
+    payloads: Sequence[str | None],
+    base: BaseSet,
+    estimate: Estimate,
+    structure: ModelStructure,
+) -> list[str]:
+    found = []
+    if structure.payloads and None not in payloads:
+        found.append(
+            "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into the arm's; "
+            "add an unloaded session of the same arm"
+        )
+    for payload in structure.payloads:
+        link = structure.payload_link(payload)
+        assert link is not None
+        name = f"M{link + 1}"
+        if name not in base.names:
+            continue
+        place = base.names.index(name)
+        mass, std = float(estimate.values[place]), float(estimate.std[place])
+        masses = {
+            s.metadata.get("payload_mass", "")
+            for s, p in zip(sessions, payloads, strict=True)
+            if p == payload
+        }
+        stated = [float(m) for m in masses if m]
+        if mass < 3.0 * std:
+            found.append(
+                f"payload {payload!r}: the estimated mass {mass:.3f} ± {std:.3f} kg is not above zero; it was announced "
+                "but not mounted, or mounted in the unloaded session too: correct the metadata or repeat the session"
+            )
+        elif stated and abs(mass - stated[0]) > max(0.1 * stated[0], 3.0 * std):
+            found.append(
+                f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg against {stated[0]:.3f} kg stated; check "
+                "what was mounted, and the torque sensors' gain"
+            )
+    return found
+
+
+def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
+    if normalised < _WIDE_CONDITION:
+        return []
+    inverse = np.linalg.inv(estimate.correlation + 1e-12 * np.eye(len(estimate.names)))
+    worst = np.argsort(-np.diag(inverse))[:8]
+    names = ", ".join(estimate.names[k] for k in worst)
+    return [
+        f"condition number of the normalised columns {normalised:.0f} exceeds {_WIDE_CONDITION:.0f}; the motion hardly "
+        f"separates {names}: excite them, or judge them by their RSD"
+    ]

@@ -1,0 +1,171 @@
+"""From prepared sessions to the stacked regression: one filter for the torque and for every regressor column.
+
+The regressor is evaluated at the sample times of the torque it explains, and both pass the same parallel low-pass
+down to the row rate, Coulomb columns included (parallel decimation). The full-rate matrix exists only for a
+stretch of rows at a time, so the memory does not grow with the sampling rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from ident.estimators.problem import Problem, RowGroup
+from ident.signals.filters import ParallelFilter
+from ident.signals.prepare import Passage, PreparedSession, TorqueChannel
+from ident.structure import ModelStructure, Side
+
+__all__ = ["observe"]
+
+FloatArray = NDArray[np.float64]
+
+_ROWS = 32
+
+
+def observe(
+    sessions: Sequence[PreparedSession],
+    payloads: Sequence[str | None],
+    structure: ModelStructure,
+    *,
+    columns: Sequence[int] | NDArray[np.int64] | None = None,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] = (),
+) -> Problem:
+    """Stacked problem of the sessions, each with the payload mounted in it.
+
+    columns : indices of the structure's columns (default all active ones); names : their names in the result.
+    Sessions without a motor channel contribute their joint rows only. Rows of a joint that stood still or whose
+    samples are missing are left out. Raises DataError when no row is left.
+    """
+    chosen = np.flatnonzero(structure.active) if columns is None else np.asarray(columns, dtype=np.int64)
+    titles = [structure.names[c] for c in chosen] if names is None else list(names)
+    groups: list[RowGroup] = []
+    for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
+        for side in structure.sides:
+            parts = [
+                part
+                for passage in session.passages
+                if (part := _side(passage, side, structure, payload, chosen, session)) is not None
+            ]
+            if parts:
+                groups += _groups(session, number, side, parts)
+    if not groups:
+        raise DataError(
+            f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a joint stood "
+            "still, samples were missing or the channel was absent; check the phases and channels of the sessions"
+        )
+    return Problem(
+        tuple(titles),
+        tuple(groups),
+        sessions[0].row_time_s,
+        tuple(units),
+        tuple(session.name for session in sessions),
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Rows of one passage and side: matrix (n, K, C), target (K, n), valid (K, n), row numbers (K,)."""
+
+    matrix: FloatArray
+    target: FloatArray
+    valid: NDArray[np.bool_]
+    index: NDArray[np.int64]
+
+
+def _side(
+    passage: Passage,
+    side: Side,
+    structure: ModelStructure,
+    payload: str | None,
+    columns: NDArray[np.int64],
+    session: PreparedSession,
+) -> _Part | None:
+    if side == "joint":
+        matrix, target = _filtered(passage.joint, passage.rows, side, structure, payload, columns, session)
+        return _Part(matrix, target, passage.joint_valid, passage.index)
+    if passage.motor is None or passage.motor_valid is None:
+        return None
+    matrix, target = _filtered(passage.motor, passage.rows, side, structure, payload, columns, session)
+    valid = passage.motor_valid
+    if side == "difference":
+        settings = session.settings
+        parallel = ParallelFilter(
+            passage.joint.times, passage.rows, settings.decimate_hz, settings.attenuation_db
+        )
+        target = target - parallel.apply(passage.joint.torque)
+        valid = valid & passage.joint_valid
+    return _Part(matrix, target, valid, passage.index)
+
+
+def _filtered(
+    channel: TorqueChannel,
+    rows: FloatArray,
+    side: Side,
+    structure: ModelStructure,
+    payload: str | None,
+    columns: NDArray[np.int64],
+    session: PreparedSession,
+) -> tuple[FloatArray, FloatArray]:
+    """Filtered regressor (n, K, C) and torque (K, n) of one channel at the times of the rows (K,)."""
+    settings = session.settings
+    joints = structure.chain.n
+    matrix = np.empty((joints, len(rows), len(columns)))
+    target = np.empty((len(rows), joints))
+    for first in range(0, len(rows), _ROWS):
+        some = rows[first : first + _ROWS]
+        parallel = ParallelFilter(channel.times, some, settings.decimate_hz, settings.attenuation_db)
+        blocks = parallel.blocks()
+        low, high = blocks[0][1].start, blocks[-1][1].stop
+        wide = structure.regressor(
+            channel.q[low:high],
+            channel.qd[low:high],
+            channel.qdd[low:high],
+            payload=payload,
+            sides=(side,),
+            columns=columns,
+        )
+        # The regressor's memory runs (column, joint, sample): one product filters all columns.
+        flat = wide.T.reshape(len(columns) * joints, high - low)
+        for outputs, samples, weights in blocks:
+            inside = slice(samples.start - low, samples.stop - low)
+            filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
+            place = slice(first + outputs.start, first + outputs.stop)
+            matrix[:, place] = filtered.transpose(1, 2, 0)
+            target[place] = weights @ channel.torque[samples]
+    return matrix, target
+
+
+def _groups(session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]) -> list[RowGroup]:
+    groups = []
+    for joint, name in enumerate(session.joint_names):
+        keep = [part.valid[:, joint] for part in parts]
+        matrix = np.concatenate([part.matrix[joint][k] for part, k in zip(parts, keep, strict=True)])
+        target = np.concatenate([part.target[k, joint] for part, k in zip(parts, keep, strict=True)])
+        index = np.concatenate([part.index[k] for part, k in zip(parts, keep, strict=True)])
+        if not len(target):
+            continue
+        group = RowGroup(name, side, number, matrix, target, index)
+        if session.settings.average_periods and session.period_rows is not None and session.periods > 1:
+            group = _averaged(group, session.period_rows, session.periods)
+        if len(group.target):
+            groups.append(group)
+    return groups
+
+
+def _averaged(group: RowGroup, period_rows: int, periods: int) -> RowGroup:
+    """Mean of the rows of equal phase over all periods; a phase that one period lacks is left out."""
+    phase = group.time_index % period_rows
+    order = np.argsort(phase, kind="stable")
+    values, starts, counts = np.unique(phase[order], return_index=True, return_counts=True)
+    del values
+    full = counts == periods
+    if not full.any():
+        return group
+    sums = np.add.reduceat(group.matrix[order], starts, axis=0)[full] / periods
+    means = np.add.reduceat(group.target[order], starts)[full] / periods
+    return RowGroup(group.joint, group.side, group.record, sums, means, phase[order][starts][full])
