@@ -82,8 +82,11 @@ class Reading:
     motor_torque: np.ndarray
 
 
-class Effect(Protocol):
-    """Physics beyond the nominal equations. Called once per 1 ms cycle; state it keeps must follow from the seed."""
+class Effect:
+    """Physics beyond the nominal equations: a subclass overrides what it needs.
+
+    Called once per 1 ms cycle. What it keeps must follow from its random stream and from what it is given.
+    """
 
     def start(self, joints: int, random: np.random.Generator) -> None:
         """Begin a run of an arm with `joints` joints; `random` is this effect's own stream."""
@@ -92,7 +95,10 @@ class Effect(Protocol):
         """Change the torques and the friction of the cycle that begins at `time_s`."""
 
     def sense(self, time_s: float, plant: Plant, reading: Reading) -> None:
-        """Change what the sensors report at `time_s`."""
+        """Change position and joint torque as the sensors report them at `time_s`; the controller sees them too."""
+
+    def sense_motor(self, time_s: float, plant: Plant, reading: Reading) -> None:
+        """Change the motor torque as it is reported at `time_s`."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""Run the emulator: ``python -m sim_backend emulator/default.yaml --fri-port 49938``."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import sys
+from typing import Any
+
+import click
+import yaml
+
+from fri.errors import ConfigurationError, LwrError
+from sim_backend.configuration import load_configuration
+from sim_backend.service import Service
+
+__all__ = ["main", "run"]
+
+
+def run(
+    config: str,
+    *,
+    lock_step: bool,
+    fri_host: str = "127.0.0.1",
+    fri_port: int = 49938,
+    pendant_port: int = 0,
+    overrides: dict[str, Any] | None = None,
+    follow_stdin: bool = False,
+    announce: bool = False,
+) -> None:
+    """Run an emulator in this process until it is told to end; see `main` for the arguments."""
+    service = Service(
+        load_configuration(config, overrides),
+        (fri_host, fri_port),
+        pendant_port,
+        follow=sys.stdin.fileno() if follow_stdin else None,
+    )
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: service.stop())
+        if announce:
+            sys.stdout.write(json.dumps({"pendant_port": service.pendant.port}) + "\n")
+            sys.stdout.flush()
+        else:
+            click.echo(
+                f"emulator: FRI to {fri_host}:{fri_port} in {'lock step' if lock_step else 'real time'}, "
+                f"pendant on 127.0.0.1:{service.pendant.port}, Ctrl-C ends it"
+            )
+        service.run(lock_step)
+    finally:
+        service.close()
+
+
+@click.command()
+@click.argument("config", default="emulator/default.yaml")
+@click.option("--lock-step/--real-time", default=False, help="Own clock, one cycle per answer; or the wall's.")
+@click.option("--fri-host", default="127.0.0.1", show_default=True, help="Where the PC's end listens.")
+@click.option("--fri-port", default=49938, show_default=True, help="Its port.")
+@click.option("--pendant-port", default=0, help="Port of the pendant on 127.0.0.1; 0 takes a free one.")
+@click.option("--period-ms", type=float, help="FRI cycle, 1 to 100 ms, instead of the configured one.")
+@click.option("--seed", type=int, help="Seed of everything random, instead of the configured one.")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Replace a key, e.g. robot.payload=none.")
+@click.option("--follow-stdin", is_flag=True, help="End when standard input ends.")
+@click.option("--announce", is_flag=True, help="Print the pendant's port as one line of JSON.")
+@click.option("-v", "--verbose", is_flag=True, help="Log what happens to standard error.")
+def main(
+    config: str,
+    lock_step: bool,
+    fri_host: str,
+    fri_port: int,
+    pendant_port: int,
+    period_ms: float | None,
+    seed: int | None,
+    settings: tuple[str, ...],
+    follow_stdin: bool,
+    announce: bool,
+    verbose: bool,
+) -> None:
+    """Emulate a KUKA LWR4+ and its controller: talks FRI over UDP to the PC, and has a pendant."""
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
+    )
+    try:
+        run(
+            config,
+            lock_step=lock_step,
+            fri_host=fri_host,
+            fri_port=fri_port,
+            pendant_port=pendant_port,
+            overrides=_overrides(settings, period_ms, seed),
+            follow_stdin=follow_stdin,
+            announce=announce,
+        )
+    except LwrError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_code)
+
+
+def _overrides(settings: tuple[str, ...], period_ms: float | None, seed: int | None) -> dict[str, Any]:
+    overrides: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise ConfigurationError(f"--set {setting!r} is not of the form KEY=VALUE")
+        try:
+            overrides[key] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigurationError(f"--set {setting!r}: the value is not valid YAML") from error
+    if period_ms is not None:
+        if period_ms != int(period_ms):
+            raise ConfigurationError(f"--period-ms {period_ms:g} is no whole number of milliseconds")
+        overrides["fri.period_ms"] = int(period_ms)
+    if seed is not None:
+        overrides["seed"] = seed
+    return overrides
+
+
+if __name__ == "__main__":
+    main()

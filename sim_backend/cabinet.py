@@ -1,0 +1,260 @@
+"""The control cabinet: arm, sensors, position controller, FRI session and KRL program, without any socket.
+
+Deterministic: what it does follows from the configuration, the seed, the datagrams and the operator's actions, each
+at its cycle. One FRI cycle is `packet`, any number of `receive`, and `close`, which simulates the cycle's
+milliseconds. The packet carries the sensors' values of the millisecond that has just ended, all of one instant.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from typing import Any
+
+import numpy as np
+
+from fri.errors import ConfigurationError, RobotError
+from fri.krc import KrcLimits, KrcSession, Sample
+from fri.krl import PROGRAMS, Interpreter, KrlProgram
+from fri.packets import CMD_OFFSETS, CMD_SIZE
+from fri.states import ALL_DRIVES, State
+from lwr_driver.arm import Arm
+from sim_backend.configuration import EmulatorConfig, Plugin
+from sim_backend.controller import ControllerModel, PositionController
+from sim_backend.monitor import CommandMonitor
+from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
+from sim_backend.recording import ControllerTrace, KrlReals
+from sim_backend.rigid_body import chain
+from sim_backend.sensors import Sensors
+from sim_backend.truth import robot_file, true_arm
+
+__all__ = ["Cabinet"]
+
+log = logging.getLogger(__name__)
+
+_JNT_POS = CMD_OFFSETS["jnt_pos"]
+_STILL_MS = 100
+
+
+def _load(plugin: Plugin, *arguments: Any, **named: Any) -> Any:
+    """Make the object that `plugin` names."""
+    module, _, name = plugin.type.partition(":")
+    try:
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"{plugin.type!r} cannot be imported: {error}") from error
+    return cls(*arguments, **named, **plugin.options)
+
+
+class Cabinet:
+    """See the module. `milliseconds` and `cycle` count since the start and never go back."""
+
+    def __init__(self, config: EmulatorConfig) -> None:
+        self.config = config
+        # Each consumer has its own stream: switching one off leaves the noise of the others as it was.
+        plant_seed, sensor_seed, self.wire_seed = np.random.SeedSequence(config.seed).spawn(3)
+        self.arm = Arm.load(str(config.beside(config.limits)))
+        self.file = robot_file(config)
+        self.plant = self._make_plant(plant_seed)
+        self.joints = self.plant.position.size
+        self.sensors = Sensors(config.sensors, self.joints, sensor_seed)
+        self.reading = self.sensors.reading
+        self.model = ControllerModel(
+            chain(config.beside(config.controller.urdf)),
+            config.controller.load,
+            config.controller.external_cutoff_hz,
+        )
+        self.controller = PositionController(config.controller)
+        self.krl_reals = KrlReals(config.krl_reals, self.joints)
+        self.trace = ControllerTrace(config.trace, self.arm.joint_names)
+        self.program_name: str = config.fri.program
+        self.period_ms = config.fri.period_ms
+        self.monitor = CommandMonitor(self.arm, self.period_ms * CYCLE_S)
+        self.sample = Sample()
+        self.sample.temperature[:] = config.sensors.temperature
+        self.milliseconds = 0
+        self.cycle = 0
+        self.packets = 0
+        self.received = 0
+        self.powered = True
+        self.error_bits = 0
+        self.warning_bits = 0
+        self.moving = False
+        self._idle_cycles = 0
+        self._last_setpoint = np.zeros(self.joints)
+        self._model_age = 0
+        self._commanding = False
+        self._zero = np.zeros(self.joints)
+        self._begin(np.array(config.robot.start_position))
+
+    def _make_plant(self, seed: np.random.SeedSequence) -> Plant:
+        robot = self.config.robot
+        model, drive = true_arm(self.config, self.file)
+        payload = self.file.payload(robot.payload)
+        own, others = seed.spawn(2)
+        if robot.plant is not None:
+            plant = _load(robot.plant, model, drive, np.random.default_rng(own))
+            if not isinstance(plant, Plant):
+                raise ConfigurationError(f"{robot.plant.type!r} lacks methods or arrays of sim_backend.plant.Plant")
+            self.effects: tuple[Effect, ...] = ()
+        else:
+            self.effects = tuple(_load(effect) for effect in robot.effects)
+            plant = ElasticArm(model, drive, substeps=robot.substeps, effects=self.effects, random=others)
+        plant.mount(payload)
+        self.payload_name = robot.payload
+        return plant
+
+    def _begin(self, position: np.ndarray) -> None:
+        """At rest at `position`, under control, with a cold session."""
+        self.plant.reset(position)
+        self._last_setpoint[:] = position
+        self.controller.reset(position, self.model.update_gravity(position), self.plant.motor_position)
+        self.cold_start()
+        for _ in range(round(self.config.controller.settle_s / CYCLE_S)):
+            self._millisecond(position)
+
+    def cold_start(self) -> None:
+        """A new session with its counters at zero, as after switching the cabinet on; no program runs."""
+        fri = self.config.fri
+        limits = KrcLimits(
+            np.array(fri.position_min),
+            np.array(fri.position_max),
+            np.array(fri.velocity),
+            np.array(fri.acceleration),
+        )
+        self.session = KrcSession(
+            limits,
+            self._last_setpoint,
+            self.config.policy,
+            power=ALL_DRIVES if self.powered else 0,
+            uptime_s=fri.uptime_s + self.milliseconds * CYCLE_S,
+        )
+        self.interpreter: Interpreter | None = None
+        self.program: KrlProgram | None = None
+        self._commanding = False
+        self.monitor.period_s = self.session.sample_time_s
+
+    def start_program(self, name: str | None = None, period_ms: int | None = None) -> None:
+        """Select and start a KRL program; None keeps what was configured or chosen last."""
+        name = self.program_name if name is None else name
+        period_ms = self.period_ms if period_ms is None else period_ms
+        if name not in PROGRAMS:
+            raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(PROGRAMS)}")
+        if not 1 <= period_ms <= 100:
+            raise ConfigurationError(f"period {period_ms} ms is outside 1 to 100 ms")
+        self.stop_program()
+        self.program_name, self.period_ms = name, period_ms
+        self.program = PROGRAMS[name](period_ms)
+        self.interpreter = Interpreter(self.session, self.program)
+
+    def stop_program(self) -> None:
+        """Cancel the KRL program: FRI closes."""
+        self.session.fri_close()
+        self.interpreter = None
+        self.program = None
+
+    @property
+    def running(self) -> bool:
+        """Whether a KRL program is at work."""
+        return self.program is not None and not self.program.finished
+
+    def power(self, on: bool) -> None:
+        """Drives on: brakes open, the setpoint is where the arm stands. Off: brakes closed.
+
+        Raises RobotError when the drives are to come on while the setpoint still moves.
+        """
+        if on == self.powered:
+            return
+        session = self.session
+        if on and session.ramping:
+            raise RobotError("drives cannot come on while the controller is braking; wait until it stands")
+        self.powered = on
+        self.plant.brake(not on)
+        if on:
+            if session.state is not State.CMD:
+                session.resync(self.reading.position)
+            self._last_setpoint[:] = session.setpoint
+            self.controller.reset(
+                self._last_setpoint,
+                self.model.update_gravity(self._last_setpoint),
+                self.reading.motor_position,
+            )
+        self.tell_drives()
+
+    def tell_drives(self) -> None:
+        """Drive bits into the session."""
+        self.session.set_drives(ALL_DRIVES if self.powered else 0, self.error_bits, self.warning_bits)
+
+    def packet(self) -> bytes:
+        """Begin a cycle: the measurement to send."""
+        sample, model, reading = self.sample, self.model, self.reading
+        position = reading.position
+        sample.msr_jnt_pos[:] = position
+        sample.msr_jnt_trq[:] = reading.joint_torque
+        sample.est_ext_jnt_trq[:] = model.external_torque
+        sample.gravity[:] = model.gravity
+        if self._model_age <= 0:
+            self._model_age = self.config.controller.model_period_ms
+            model.update_model(position)
+            sample.mass_matrix[:] = model.mass_matrix
+            sample.jacobian[:] = model.jacobian
+            model.flange(self._last_setpoint, sample.cmd_cart_pos)
+        model.flange(position, sample.msr_cart_pos)
+        session = self.session
+        commanding = session.state == State.CMD and session.power != 0
+        if commanding and not self._commanding:
+            self.monitor.period_s = session.sample_time_s
+            self.monitor.rest(self._last_setpoint, self.cycle - 1)
+        self._commanding = commanding
+        self.packets += 1
+        datagram = session.packet(sample)
+        self._sequence = datagram[:2]
+        return datagram
+
+    def arrived(self, datagram: bytes) -> None:
+        """A command has come over the network, before any fault of ours; judges it, does not act on it."""
+        self.received += 1
+        if self._commanding and len(datagram) == CMD_SIZE and datagram[2:4] == self._sequence:
+            self.monitor.take(np.frombuffer(datagram, "<f4", self.joints, _JNT_POS), self.cycle)
+
+    def receive(self, datagram: bytes, age_s: float) -> None:
+        """A command reaches the session `age_s` after its packet left."""
+        self.session.receive(datagram, age_s)
+
+    def close(self) -> None:
+        """End the cycle: judge the answers, simulate its milliseconds, let the KRL program run."""
+        setpoint = self.session.close_cycle()
+        positions = setpoint.positions
+        for row in positions:
+            self._millisecond(row)
+        last = positions[-1]
+        still = bool((last == self._last_setpoint).all())
+        self._last_setpoint[:] = last
+        self._idle_cycles = self._idle_cycles + 1 if still else 0
+        self.moving = self._idle_cycles * len(positions) < _STILL_MS
+        self._model_age -= len(positions)
+        period_s = len(positions) * CYCLE_S
+        self.model.update_external(self.reading.position, self.reading.joint_torque, period_s)
+        if self.interpreter is not None:
+            self.interpreter.advance(len(positions))
+        self.cycle += 1
+
+    def _millisecond(self, setpoint: np.ndarray) -> None:
+        plant, reading = self.plant, self.reading
+        time_s = self.milliseconds * CYCLE_S
+        self.sensors.read(plant)
+        for effect in self.effects:
+            effect.sense(time_s, plant, reading)
+        gravity = self.model.update_gravity(setpoint)
+        if self.powered:
+            torque = self.controller.cycle(setpoint, gravity, reading.motor_position, reading.joint_torque)
+        else:
+            torque = self._zero
+        self.sensors.read_motor(plant.motor_torque, torque)
+        for effect in self.effects:
+            effect.sense_motor(time_s, plant, reading)
+        plant.step(torque)
+        self.milliseconds += 1
+        if self.config.krl_reals.enabled:
+            self.krl_reals.millisecond(reading.motor_torque, self.session.to_real, self.session.to_int)
+        self.trace.millisecond(time_s, reading.motor_torque, reading.position)

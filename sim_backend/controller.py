@@ -1,0 +1,179 @@
+"""The controller's joint position control and the model that it believes in.
+
+Every millisecond, per joint, from the setpoint `q_d` and the controller's own gravity torque `g`::
+
+    theta_d = q_d + g / K                                               (torsion under load)
+    tau_m   = g + friction(theta_d') + Kp (theta_d - theta) + Kd (theta_d' - theta') + Kt (g - tau_j)
+
+limited to what the motor gives. This is the state feedback of motor position, motor velocity and joint torque of
+Albu-Schaeffer, Ott and Hirzinger (2007): `Kt` makes the motor inertia appear smaller by `1 + Kt`, which lets the
+motor side damp the oscillation of the link on its elastic joint. Friction compensation follows the commanded speed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+from numba import njit
+
+from sim_backend.configuration import ControllerConfig, LoadData
+from sim_backend.plant import CYCLE_S
+from sim_backend.rigid_body import Payload, with_payload
+
+__all__ = ["ControllerModel", "PositionController"]
+
+
+@njit(cache=True)
+def _feedback(
+    setpoint: np.ndarray,
+    gravity: np.ndarray,
+    motor_position: np.ndarray,
+    joint_torque: np.ndarray,
+    gains: np.ndarray,
+    memory: np.ndarray,
+    settings: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """One cycle of the law above.
+
+    gains : rows K, Kp, Kd, Kt, viscous, Coulomb, limit. memory : rows theta_d, theta, theta_d' and theta' filtered
+    settings : cycle [s], filter constants of commanded and measured speed, Coulomb speed
+    """
+    cycle, keep_command, keep_speed, slow = settings[0], settings[1], settings[2], settings[3]
+    for i in range(setpoint.shape[0]):
+        wanted = setpoint[i] + gravity[i] / gains[0, i]
+        memory[2, i] = keep_command * memory[2, i] + (1.0 - keep_command) * (wanted - memory[0, i]) / cycle
+        memory[3, i] = keep_speed * memory[3, i] + (1.0 - keep_speed) * (motor_position[i] - memory[1, i]) / cycle
+        memory[0, i] = wanted
+        memory[1, i] = motor_position[i]
+        speed = memory[2, i]
+        torque = (
+            gravity[i]
+            + gains[4, i] * speed
+            + gains[5, i] * min(1.0, max(-1.0, speed / slow))
+            + gains[1, i] * (wanted - motor_position[i])
+            + gains[2, i] * (speed - memory[3, i])
+            + gains[3, i] * (gravity[i] - joint_torque[i])
+        )
+        out[i] = min(gains[6, i], max(-gains[6, i], torque))
+
+
+def _keep(cutoff_hz: float) -> float:
+    """Share of its old value that a first-order low-pass keeps in one cycle."""
+    return math.exp(-2.0 * math.pi * cutoff_hz * CYCLE_S)
+
+
+class PositionController:
+    """State feedback on the motors; arrays are (n,) float64."""
+
+    def __init__(self, config: ControllerConfig) -> None:
+        self._gains = np.array(
+            [
+                config.stiffness,
+                config.position_gain,
+                config.velocity_gain,
+                config.torque_gain,
+                config.viscous,
+                config.coulomb,
+                config.torque_limit,
+            ]
+        )
+        self._settings = np.array(
+            [CYCLE_S, _keep(config.command_cutoff_hz), _keep(config.velocity_cutoff_hz), config.coulomb_speed]
+        )
+        self._memory = np.zeros((4, self._gains.shape[1]))
+        self.torque = np.zeros(self._gains.shape[1])
+
+    def reset(self, setpoint: np.ndarray, gravity: np.ndarray, motor_position: np.ndarray) -> None:
+        """Begin from rest: no speed remembered."""
+        self._memory[0] = setpoint + gravity / self._gains[0]
+        self._memory[1] = motor_position
+        self._memory[2:] = 0.0
+        self.torque[:] = 0.0
+
+    def cycle(
+        self, setpoint: np.ndarray, gravity: np.ndarray, motor_position: np.ndarray, joint_torque: np.ndarray
+    ) -> np.ndarray:
+        """Motor torque of the coming millisecond, referred to the joint [Nm]; the array is reused."""
+        _feedback(
+            setpoint,
+            gravity,
+            motor_position,
+            joint_torque,
+            self._gains,
+            self._memory,
+            self._settings,
+            self.torque,
+        )
+        return self.torque
+
+
+class ControllerModel:
+    """Rigid-body model inside the controller: CAD-like arm and load data.
+
+    `gravity` is renewed by every `update_gravity`; `mass_matrix` (n, n), `jacobian` (6, n) of the flange with rows
+    X Y Z RZ RY RX in base axes at the flange, by every `update_model`; `flange` (12,) is the pose, 3x4 row-major.
+    """
+
+    def __init__(self, model: pin.Model, load: LoadData, external_cutoff_hz: float, flange: str = "flange") -> None:
+        self._bare = model
+        self._frame = model.getFrameId(flange) if model.existFrame(flange) else model.nframes - 1
+        n = model.nv
+        self.gravity = np.zeros(n)
+        self.mass_matrix = np.zeros((n, n))
+        self.jacobian = np.zeros((6, n))
+        self.external_torque = np.zeros(n)
+        self._cutoff_hz = external_cutoff_hz
+        self._speed = np.zeros(n)
+        self._last_speed = np.zeros(n)
+        self._last_position: np.ndarray | None = None
+        self.set_load(load)
+
+    def set_load(self, load: LoadData) -> None:
+        """Use `load` from now on, whatever hangs on the flange."""
+        self.load = load
+        body = Payload.from_centre_of_mass(load.mass, load.com, load.inertia) if load.mass > 0.0 else None
+        self.model = with_payload(self._bare, body)
+        self._data = self.model.createData()
+
+    def reset(self) -> None:
+        """Forget the motion: the external torque estimate begins anew."""
+        self._last_position = None
+        self._speed[:] = 0.0
+        self._last_speed[:] = 0.0
+        self.external_torque[:] = 0.0
+
+    def update_gravity(self, position: np.ndarray) -> np.ndarray:
+        """Gravity torque at `position` (n,) [Nm]; a new array."""
+        self.gravity = pin.computeGeneralizedGravity(self.model, self._data, position)
+        return self.gravity
+
+    def update_model(self, position: np.ndarray) -> None:
+        """Mass matrix and Jacobian at `position`."""
+        self.mass_matrix = pin.crba(self.model, self._data, position)
+        jacobian = pin.computeFrameJacobian(
+            self.model, self._data, position, self._frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )
+        self.jacobian[:3] = jacobian[:3]
+        self.jacobian[3:] = jacobian[:2:-1]
+
+    def update_external(self, position: np.ndarray, joint_torque: np.ndarray, period_s: float) -> None:
+        """Estimated external torque: what the joint sensors hold beyond the model, through a low-pass."""
+        if self._last_position is None:
+            self._last_position = position.copy()
+        keep = math.exp(-2.0 * math.pi * self._cutoff_hz * period_s)
+        self._speed += (1.0 - keep) * ((position - self._last_position) / period_s - self._speed)
+        acceleration = (self._speed - self._last_speed) / period_s
+        self._last_position[:] = position
+        self._last_speed[:] = self._speed
+        modelled = pin.nonLinearEffects(self.model, self._data, position, self._speed)
+        modelled += self.mass_matrix @ acceleration
+        self.external_torque += (1.0 - keep) * (joint_torque - modelled - self.external_torque)
+
+    def flange(self, position: np.ndarray, out: np.ndarray) -> None:
+        """Pose of the flange in the base frame into `out` (12,), 3x4 row-major [R | p]."""
+        pin.forwardKinematics(self.model, self._data, position)
+        pose = pin.updateFramePlacement(self.model, self._data, self._frame)
+        out[:] = pose.homogeneous[:3].reshape(12)

@@ -1,0 +1,271 @@
+"""The emulator's main loop: the FRI socket, the pendant, and the clock, which is either its own or the wall's."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+
+from fri.controller_end import ControllerEnd
+from fri.states import State
+from sim_backend.cabinet import Cabinet
+from sim_backend.configuration import EmulatorConfig
+from sim_backend.faults import FaultyWire, Parcel
+from sim_backend.operator import Operator
+from sim_backend.pendant import PendantServer
+from sim_backend.plant import CYCLE_S
+
+__all__ = ["Service"]
+
+log = logging.getLogger(__name__)
+
+_RESEND_S = 0.2
+_IDLE_S = 0.2
+# A damaged datagram that the PC takes for good is answered at once or not at all.
+_PERHAPS_S = 0.02
+_PACED_AFTER = 2000
+_PENDANT_EVERY = 50
+
+
+class Service:
+    """One emulator: cabinet, operator, FRI socket and pendant.
+
+    follow : file descriptor whose end of file ends the emulator (a pipe from the parent), None without one
+    """
+
+    def __init__(
+        self,
+        config: EmulatorConfig,
+        remote: tuple[str, int],
+        pendant_port: int = 0,
+        *,
+        follow: int | None = None,
+    ) -> None:
+        self.config = config
+        self.cabinet = Cabinet(config)
+        self.wire = FaultyWire(self.cabinet.wire_seed, self.cabinet.period_ms * CYCLE_S)
+        self.operator = Operator(self.cabinet, self.wire)
+        self.end = ControllerEnd(remote, (config.fri.local_host, config.fri.local_port))
+        self.pendant = PendantServer(pendant_port, self.operator.handle)
+        self._foreign: dict[str, socket.socket] = {}
+        self._follow = follow
+        self._parent = os.getppid()
+        self._ended = False
+        self._heard = False
+        self._impatient = False
+        self._unanswerable = 0
+        self._poller = select.poll()
+        self._fri = self.end.fileno()
+        self._poller.register(self._fri, select.POLLIN)
+        self._poller.register(self.pendant.socket.fileno(), select.POLLIN)
+        if follow is not None:
+            self._poller.register(follow, select.POLLIN)
+
+    @property
+    def running(self) -> bool:
+        """False once the emulator shall end."""
+        return not (self._ended or self.operator.ended)
+
+    def stop(self) -> None:
+        """End after the present cycle; may be called by a signal handler."""
+        self._ended = True
+
+    def close(self) -> None:
+        """Release the sockets."""
+        self.end.close()
+        self.pendant.close()
+        for other in self._foreign.values():
+            other.close()
+
+    def run(self, lock_step: bool) -> None:
+        """Run until told to end."""
+        # What start-up made stays; collecting it again would only cost time within a cycle.
+        gc.collect()
+        gc.freeze()
+        cycle: Callable[[], None] = self._lock_step if lock_step else self._real_time
+        self._deadline = time.monotonic()
+        while self.running:
+            cycle()
+
+    def _serve(self, timeout_s: float) -> bool:
+        """Wait for something at most `timeout_s`, serve pendant and parent; True if an FRI datagram is there."""
+        ready = self._poller.poll(timeout_s * 1000.0)
+        fri = False
+        for descriptor, _ in ready:
+            if descriptor == self._fri:
+                fri = True
+            elif descriptor == self._follow:
+                if not os.read(descriptor, 4096):
+                    self._ended = True
+            else:
+                self.pendant.serve()
+        # A parent that died may have left its end of the pipe to a forked child.
+        if not ready and self._follow is not None and os.getppid() != self._parent:
+            self._ended = True
+        return fri
+
+    def _lock_step(self) -> None:
+        cabinet, operator = self.cabinet, self.operator
+        if cabinet.session.state is State.OFF or operator.silent:
+            self._silent_cycle()
+            return
+        datagram = cabinet.packet()
+        age_s = self.config.fri.answer_delay_s
+        if self.wire.quiet:
+            self.end.send(datagram)
+            self._await(datagram, age_s)
+        else:
+            self._send_faulty(datagram, age_s)
+            for arrived in self.wire.due(cabinet.cycle):
+                cabinet.receive(*arrived)
+        if self.running:
+            cabinet.close()
+            operator.step()
+
+    def _silent_cycle(self) -> None:
+        """A cycle in which nothing is sent: time goes on only where something waits for it."""
+        cabinet, operator = self.cabinet, self.operator
+        if not operator.busy:
+            self._serve(_IDLE_S)
+            return
+        if cabinet.cycle % _PENDANT_EVERY == 0:
+            self._serve(0.0)
+        if cabinet.session.state is not State.OFF:
+            # Made as ever, but it does not leave: the PC will find the gap in the counter.
+            cabinet.packet()
+        cabinet.close()
+        operator.step()
+
+    def _send_faulty(self, datagram: bytes, age_s: float) -> None:
+        cabinet = self.cabinet
+        self.wire.period_s = cabinet.session.sample_time_s
+        parcels = self.wire.outgoing(datagram, cabinet.packets, cabinet.cycle)
+        answerable = False
+        for parcel in parcels:
+            self._send_parcel(parcel)
+            if parcel.awaited == "yes":
+                answerable = True
+                self._await(parcel.datagram, age_s)
+            elif parcel.awaited == "perhaps":
+                self._await(parcel.datagram, age_s, limit_s=_PERHAPS_S)
+        self._unanswerable = 0 if answerable else self._unanswerable + 1
+        if not answerable:
+            # Nothing to wait for; a link that is dead for good must not race through its time.
+            paced = self._unanswerable > _PACED_AFTER
+            if paced or cabinet.cycle % _PENDANT_EVERY == 0:
+                self._serve(CYCLE_S if paced else 0.0)
+
+    def _send_parcel(self, parcel: Parcel) -> None:
+        if parcel.host is None:
+            self.end.send(parcel.datagram)
+        else:
+            self._send_foreign(parcel.host, parcel.datagram, self.end.remote)
+
+    def _send_foreign(self, host: str, datagram: bytes, to: tuple[str, int]) -> None:
+        if host not in self._foreign:
+            other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            other.bind((host, 0))
+            self._foreign[host] = other
+        self._foreign[host].sendto(datagram, to)
+
+    def _take(self, age_s: float) -> bytes | None:
+        """One datagram of the PC, handed on."""
+        datagram = self.end.receive(0.0)
+        if datagram is None:
+            return None
+        self._heard = True
+        cabinet = self.cabinet
+        cabinet.arrived(datagram)
+        if self.wire.quiet:
+            cabinet.receive(datagram, age_s)
+        else:
+            for host, other in self.wire.incoming(datagram, age_s, cabinet.cycle):
+                if host is not None:
+                    self._send_foreign(host, other, self.end.address)
+        return datagram
+
+    def _await(self, sent: bytes, age_s: float, limit_s: float | None = None) -> None:
+        """Lock step: wait until the PC has answered `sent`.
+
+        In monitor mode for as long as it takes, in command mode for the configured patience. The first packet is
+        repeated until the PC is heard. An answer that reflects something else is followed by a short wait only.
+        """
+        wanted = sent[:2]
+        commanding = self.cabinet.session.state is State.CMD
+        if limit_s is None and commanding:
+            limit_s = _PERHAPS_S if self._impatient else self.config.fri.patience_s
+        if limit_s is None and self._serve_until_heard(sent):
+            return
+        deadline = None if limit_s is None else time.monotonic() + limit_s
+        while self.running:
+            timeout_s = _IDLE_S if deadline is None else min(_IDLE_S, deadline - time.monotonic())
+            if timeout_s <= 0.0:
+                self._impatient = commanding
+                return
+            if not self._serve(timeout_s):
+                if self.cabinet.session.state is State.OFF or self.operator.silent:
+                    return
+                continue
+            datagram = self._take(age_s)
+            if datagram is None:
+                continue
+            if datagram[2:4] == wanted:
+                self._impatient = False
+                return
+            deadline = time.monotonic() + _PERHAPS_S
+
+    def _serve_until_heard(self, sent: bytes) -> bool:
+        """Repeat the very first packet until anything comes back; True if the wait is over for good."""
+        while self.running and not self._heard:
+            if self._serve(_RESEND_S):
+                return False
+            if self.cabinet.session.state is State.OFF or self.operator.silent:
+                return True
+            self.end.send(sent)
+        return not self.running
+
+    def _real_time(self) -> None:
+        cabinet, operator = self.cabinet, self.operator
+        period_s = cabinet.session.sample_time_s
+        now = time.monotonic()
+        self._deadline += period_s
+        if self._deadline < now - period_s:
+            # Too late to catch up: a controller never sends two packets at once.
+            self._deadline = now + period_s
+        sending = cabinet.session.state is not State.OFF
+        silent = sending and operator.silent
+        if sending:
+            datagram = cabinet.packet()
+            if not silent:
+                if self.wire.quiet:
+                    self.end.send(datagram)
+                else:
+                    for parcel in self.wire.outgoing(datagram, cabinet.packets, cabinet.cycle):
+                        self._send_parcel(parcel)
+        sent = time.monotonic()
+        self._collect(sent)
+        if sending:
+            for arrived in self.wire.due(cabinet.cycle):
+                cabinet.receive(*arrived)
+        cabinet.close()
+        operator.step()
+
+    def _collect(self, sent: float) -> None:
+        """Real time: serve everybody until the deadline."""
+        descriptors = [self._fri, self.pendant.socket.fileno()]
+        if self._follow is not None:
+            descriptors.append(self._follow)
+        while (remaining := self._deadline - time.monotonic()) > 0.0:
+            ready, _, _ = select.select(descriptors, [], [], remaining)
+            if self._fri in ready:
+                self._take(time.monotonic() - sent)
+            if len(ready) > (self._fri in ready):
+                self._serve(0.0)
+            if not self.running:
+                return
+        if self.cabinet.cycle % _PENDANT_EVERY == 0 and self._follow is not None:
+            self._ended = self._ended or os.getppid() != self._parent
