@@ -73,12 +73,15 @@ class _Axes:
     """Directions of the axes up to r2, whatever q: what the special rules ask for.
 
     r1 : first revolute joint (n if none). r2 : first revolute joint not parallel to it (n if none).
-    along : (n,) cosine between z_j and z_r1, for j < r2. axis : (n, 3) z_r1 in frame j, for r1 <= j < r2.
+    r3 : first revolute joint after r2 not parallel to r2 (n if none).
+    along : (n,) cosine between z_j and z_r1, for j <= r2. second : (n,) the same with z_r2, for r2 <= j < r3. axis : (n, 3) z_r1 in frame j, for r1 <= j < r2.
     """
 
     r1: int
     r2: int
+    r3: int
     along: Floats
+    second: Floats
     axis: Floats
 
     @classmethod
@@ -93,7 +96,10 @@ class _Axes:
         z1 = frames[r1][:, 2] if r1 < n else np.zeros(3)
         along = np.array([float(frame[:, 2] @ z1) for frame in frames])
         r2 = next((j for j in range(r1 + 1, n) if not chain.prismatic[j] and abs(along[j]) < 1 - _SAME), n)
-        return cls(r1, r2, along, np.array([frame.T @ z1 for frame in frames]))
+        z2 = frames[r2][:, 2] if r2 < n else np.zeros(3)
+        second = np.array([float(frame[:, 2] @ z2) for frame in frames])
+        r3 = next((j for j in range(r2 + 1, n) if not chain.prismatic[j] and abs(second[j]) < 1 - _SAME), n)
+        return cls(r1, r2, r3, along, second, np.array([frame.T @ z1 for frame in frames]))
 
 
 class _Rigid:
@@ -184,26 +190,31 @@ class _Rigid:
                 return False
         return True
 
-    def constant_forms(self) -> list[tuple[Floats, Floats]]:
-        """Relations (coefficients (f,) on the functions, constant form (n, n + 1)) that hold identically.
+    def constant_forms(self) -> list[tuple[int, Floats, Floats]]:
+        """Relations (pivot, coefficients (f,) on the functions, constant form (n, n + 1)) that hold identically.
 
-        A constant form stands for the energy qd' A qd / 2 and the constant forces b: [A, b].
+        A constant form stands for the energy qd' A qd / 2 and the constant forces b: [A, b]. The pivot is the
+        function of the highest link in the relation.
         """
         chain, axes, n = self.chain, self.axes, self.chain.n
-        where = {item: row for row, item in enumerate(self.kept)}
-        gravity = self._gravity_along()
         relations = []
+
+        def relate(j: int, coefficients: Floats, form: Floats) -> None:
+            own = np.array([link == j for link, _ in self.kept])
+            relations.append((int(np.argmax(np.abs(coefficients) * own)), coefficients, form))
+
         for j in range(n):
             form = np.zeros((n, n + 1))
-            if not chain.prismatic[j] and axes.r1 <= j < axes.r2:
-                turning = np.array(
-                    [0.0 if chain.prismatic[k] or k > j or k < axes.r1 else axes.along[k] for k in range(n)]
-                )
+            if not chain.prismatic[j] and j < axes.r3:
+                # The link's speed about z_j: the joints parallel to r1, then those parallel to r2.
+                turning = np.zeros(n)
+                for k in range(axes.r1, j + 1):
+                    if not chain.prismatic[k]:
+                        turning[k] = axes.along[k] if k < axes.r2 else axes.second[k]
+                if j >= axes.r2:
+                    turning[: axes.r2] *= axes.along[axes.r2]
                 form[:, :n] = np.outer(turning, turning)
-                relations.append((self._unit(where[j, _ZZ]), form))
-            elif j == axes.r2 and abs(axes.along[j]) < _SAME:
-                form[j, j] = 1.0
-                relations.append((self._unit(where[j, _ZZ]), form))
+                relate(j, self._function(j, _ZZ), form)
             elif chain.prismatic[j] and j < axes.r1:
                 turn, directions = np.eye(3), np.zeros((n, 3))
                 for k in range(j + 1):
@@ -211,32 +222,37 @@ class _Rigid:
                     directions[k] = turn[:, 2]
                 form[:, :n] = directions @ directions.T
                 form[:, n] = -directions @ chain.gravity
-                relations.append((self._unit(where[j, _M]), form))
-            elif chain.prismatic[j] and axes.r1 < j < axes.r2 and abs(axes.along[j]) > 1 - _SAME:
-                relations.append((self._mass_beyond(where[j, _M], j), self._axial(j, gravity)))
+                relate(j, self._function(j, _M), form)
+            elif chain.prismatic[j] and axes.r1 < j < axes.r2:
+                if abs(axes.along[j]) > 1 - _SAME:
+                    relate(j, self._beyond(j, _M), self._axial(j))
+                else:
+                    across = np.array([-axes.axis[j][1], axes.axis[j][0]])
+                    sine = float(np.hypot(*across))
+                    both = np.where(chain.prismatic, 0.0, axes.along)
+                    both[: axes.r1], both[j:] = 0.0, 0.0
+                    form[j, :n] = form[:n, j] = sine * both
+                    moments = across[0] * self._beyond(j, _MX) + across[1] * self._beyond(j, _MY)
+                    relate(j, moments / sine, form)
         return relations
 
-    def _unit(self, row: int) -> Floats:
-        vector = np.zeros(len(self.kept))
-        vector[row] = 1.0
-        return vector
+    def _function(self, j: int, position: int) -> Floats:
+        """A parameter of link j on the base functions."""
+        return self.regrouping[:, 10 * j + position]
 
-    def _mass_beyond(self, row: int, j: int) -> Floats:
-        """The function of M_j less that of the same point mass fixed to link j-1, on the base functions."""
-        point = np.zeros(10)
-        point[_M] = 1.0
-        carried = frame_change(self.chain.placement(j)) @ point
-        lower = self.regrouping[:, 10 * (j - 1) : 10 * j] @ carried
-        return self._unit(row) - lower
+    def _beyond(self, j: int, position: int) -> Floats:
+        """The function of a parameter of link j less that of the same, fixed to link j-1 at q_j = 0."""
+        carried = frame_change(self.chain.placement(j))[:, position]
+        return self._function(j, position) - self.regrouping[:, 10 * (j - 1) : 10 * j] @ carried
 
-    def _axial(self, j: int, gravity: float) -> Floats:
+    def _axial(self, j: int) -> Floats:
         """Energy of a unit mass from its speed along z_r1 at link j less that at link j-1, and its weight."""
         chain, axes, n = self.chain, self.axes, self.chain.n
         speed = np.array([axes.along[k] if chain.prismatic[k] and k <= j else 0.0 for k in range(n)])
         before = np.where(np.arange(n) < j, speed, 0.0)
         form = np.zeros((n, n + 1))
         form[:, :n] = np.outer(speed, speed) - np.outer(before, before)
-        form[j, n] = -gravity * axes.along[j]
+        form[j, n] = -self._gravity_along() * axes.along[j]
         return form
 
     def _gravity_along(self) -> float:
@@ -250,24 +266,29 @@ def _coordinates(structure: ModelStructure, rigid: _Rigid, payload: str | None, 
     """(g, n_columns): every column of the rows of one condition and side on functions that are independent.
 
     Functions: the rigid base functions, constant quadratic forms (n, n), constant forces (n), and for each joint
-    qd and sign(qd); then three for each coupling.
+    qd and sign(qd); then two for each coupling.
     """
     chain = structure.chain
     n, f, size = chain.n, len(rigid.kept), len(PER_LINK)
     forms = rigid.constant_forms()
-    base, count = f, f + n * (n + 1) + 2 * n + 3 * len(structure.couplings)
+    base, count = f, f + n * (n + 1) + 2 * n + 2 * len(structure.couplings)
     matrix = np.zeros((count, structure.n_columns))
     for column in range(structure.n_columns):
         source = structure.rigid_of(column, payload) if side != "difference" else None
         if source is not None:
             matrix[:f, column] = rigid.regrouping[:, 10 * source[0] + source[1]]
-    _rewrite(matrix[:f], matrix[base : base + n * (n + 1)], forms, n)
+    _rewrite(matrix[:f], matrix[base : base + n * (n + 1)], forms)
     for column in range(structure.n_columns):
         link, position = divmod(column, size)
         if link >= structure.n_links:
             coupled, part = divmod(column - size * structure.n_links, 3)
-            if any(structure.signal_of(column, side, joint) is not None for joint in range(n)):
-                matrix[base + n * (n + 1) + 2 * n + 3 * coupled + part, column] = 1.0
+            joints = [j for j in range(n) if structure.signal_of(column, side, j) is not None]
+            if joints and part == 0:
+                # Row a has qdd_b and row b has qdd_a: the energy qd_a qd_b.
+                a, b = joints
+                matrix[base + a * (n + 1) + b, column] = matrix[base + b * (n + 1) + a, column] = 1.0
+            elif joints:
+                matrix[base + n * (n + 1) + 2 * n + 2 * coupled + part - 1, column] = 1.0
         elif link < n and position >= len(INERTIAL):
             signal = structure.signal_of(column, side, link)
             if signal is not None:
@@ -284,14 +305,14 @@ def _signal_row(base: int, n: int, joint: int, signal: int) -> int:
     return base + n * (n + 1) + (signal - 1) * n + joint
 
 
-def _rewrite(functions: Floats, constants: Floats, forms: list[tuple[Floats, Floats]], n: int) -> None:
+def _rewrite(functions: Floats, constants: Floats, forms: list[tuple[int, Floats, Floats]]) -> None:
     """Express the functions that have a constant form by it (in place).
 
     A relation says coefficients . functions = form; the function of its highest link is replaced by the form and the
     functions of lower links, so the relations are taken from the last link to the first.
     """
-    for coefficients, form in reversed(forms):
-        pivot = int(np.argmax(np.abs(coefficients) == 1.0))
+    for pivot, coefficients, form in reversed(forms):
         amount = functions[pivot] / coefficients[pivot]
         functions -= np.outer(coefficients, amount)
+        functions[pivot] = 0.0
         constants += np.outer(form.ravel(), amount)
