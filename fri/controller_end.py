@@ -1,22 +1,91 @@
-"""UDP socket of the controller's end (signatures; bodies follow)."""
+"""The controller's socket: sends first, collects the answers of one PC.
+
+``lock_step`` and ``real_time`` run whole cycles of a session. An emulator that damages, delays or loses
+datagrams on purpose uses ``send`` and ``receive`` and stands in between itself.
+"""
 
 from __future__ import annotations
 
+import select
+import socket
 from collections.abc import Callable
+from time import monotonic
+from types import TracebackType
 
-from fri.krc import KrcSession, Sample, Setpoint
+from fri.errors import NetworkError
+from fri.krc import KrcSession, Setpoint
+from fri.sample import Sample
+from fri.states import State
+
+__all__ = ["ControllerEnd"]
+
+_BUFFER_SIZE = 2048
+_SLICE_S = 0.05
+_RESEND_S = 0.2
 
 
 class ControllerEnd:
-    """UDP client of the controller: sends first, collects the answers of one PC.
+    """UDP client of the controller; a context manager that closes the socket.
 
-    Low level, for an emulator that injects faults itself: ``send``, ``receive``. High level: ``lock_step``, ``real_time``.
+    Parameters
+    ----------
+    remote : tuple of str and int
+        Address and port of the PC. Datagrams of anybody else are counted in `foreign` and dropped.
+    local : tuple of str and int
+        Address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``.
+
+    Raises
+    ------
+    NetworkError
+        The local address cannot be bound.
     """
 
-    def __init__(self, remote: tuple[str, int], local: tuple[str, int] = ("127.0.0.1", 0)) -> None: ...
-    def send(self, datagram: bytes) -> None: ...
+    def __init__(self, remote: tuple[str, int], local: tuple[str, int] = ("127.0.0.1", 0)) -> None:
+        self.remote = remote
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(local)
+        except OSError as error:
+            self._socket.close()
+            raise NetworkError(
+                f"cannot bind UDP {local[0]}:{local[1]} for the controller: {error.strerror}; "
+                "choose a free port or 0"
+            ) from error
+        self._socket.setblocking(False)
+        self.address: tuple[str, int] = self._socket.getsockname()
+        self.foreign = 0
+        self.send_errors = 0
+        self.heard = False
+
+    def fileno(self) -> int:
+        """File descriptor, so that the socket can be waited for together with others."""
+        return self._socket.fileno()
+
+    def send(self, datagram: bytes) -> None:
+        """Send one datagram to the PC; what the network refuses is counted in `send_errors`."""
+        try:
+            self._socket.sendto(datagram, self.remote)
+        except OSError:
+            self.send_errors += 1
+
     def receive(self, timeout_s: float) -> bytes | None:
-        """Next datagram of the PC, or None after `timeout_s` (0: what is there already)."""
+        """Next datagram of the PC, or None after `timeout_s` [s]; 0 takes what is there."""
+        deadline = monotonic() + timeout_s
+        while True:
+            try:
+                datagram, source = self._socket.recvfrom(_BUFFER_SIZE)
+            except BlockingIOError:
+                remaining = deadline - monotonic()
+                if remaining <= 0.0:
+                    return None
+                select.select((self._socket,), (), (), remaining)
+                continue
+            if source == self.remote:
+                self.heard = True
+                return datagram
+            self.foreign += 1
+            if monotonic() >= deadline:
+                return None
 
     def lock_step(
         self,
@@ -26,12 +95,62 @@ class ControllerEnd:
         patience_s: float = 10.0,
         idle: Callable[[], bool] | None = None,
     ) -> Setpoint | None:
-        """One cycle: send, wait for the answer (MON: for ever; CMD: patience_s, then a miss), close the cycle.
+        """One cycle in which virtual time stands still until the PC has answered.
 
-        The very first packet is sent again every 0.2 s until anything was answered. `idle` is called every 50 ms of waiting; True gives up (None).
+        In monitor mode it waits for ever, in command mode `patience_s` [s] of real time, then the answer is
+        missing. A malformed answer ends the wait too. Until the PC was heard for the first time the packet is
+        sent again every 0.2 s. `idle` is called every 50 ms of waiting; if it returns True the cycle is given
+        up: the result is None and the session must be closed.
         """
+        if session.state is State.OFF:
+            return session.close_cycle()
+        packet = session.packet(sample)
+        self.send(packet)
+        commanding = session.state is State.CMD
+        started = sent = monotonic()
+        while not (session.answered or session.malformed_now):
+            datagram = self.receive(_SLICE_S)
+            if datagram is not None:
+                session.receive(datagram)
+                continue
+            if idle is not None and idle():
+                return None
+            now = monotonic()
+            if commanding and now - started >= patience_s:
+                break
+            if not self.heard and now - sent >= _RESEND_S:
+                self.send(packet)
+                sent = now
+        return session.close_cycle()
 
     def real_time(self, session: KrcSession, sample: Sample, deadline: float) -> Setpoint:
-        """One cycle in real time: send now, collect answers until `deadline` (time.monotonic), close the cycle."""
+        """One cycle in real time: send now, collect answers until `deadline` (``time.monotonic``), close."""
+        if session.state is State.OFF:
+            while self.receive(max(0.0, deadline - monotonic())) is not None:
+                continue
+            return session.close_cycle()
+        sent = monotonic()
+        self.send(session.packet(sample))
+        while True:
+            datagram = self.receive(max(0.0, deadline - monotonic()))
+            if datagram is None:
+                return session.close_cycle()
+            now = monotonic()
+            session.receive(datagram, now - sent)
+            if now >= deadline:
+                return session.close_cycle()
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def __enter__(self) -> ControllerEnd:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

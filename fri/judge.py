@@ -1,7 +1,8 @@
 """The controller's judgement of a command: flags, finiteness, mirror, limits.
 
-An objection is the kind and the sentence with which command mode ends; nothing is ever clipped. The arithmetic is on
-plain floats of seven joints, which is faster here than arrays, and every comparison is written so that NaN fails it.
+An objection is the kind and the sentence with which command mode ends; nothing is ever clipped. The
+arithmetic is on plain floats of seven joints, which is faster here than arrays, and every comparison is
+written so that NaN fails it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _OTHER_FIELDS = (
 
 
 class CommandJudge:
-    """Judges commands against the limits of an arm; ``tighten`` sets the period and the factors on the speed."""
+    """Judges commands against the limits of an arm; ``tighten`` sets period and speed factors."""
 
     def __init__(self, limits: KrcLimits, policy: KrcPolicy) -> None:
         self._limits = limits
@@ -50,7 +51,7 @@ class CommandJudge:
         self._steps = (self._limits.v_max * factor * period_s + self._policy.limit_tolerance).tolist()
 
     def flags(self, command: CmdBuffer, monitored: int | None, control: Control) -> Objection | None:
-        """Flags as in monitor mode (`monitored`), fit for the control mode, and numbers in every flagged field."""
+        """Flags as in monitor mode (`monitored`) and fit for the control mode; flagged fields are numbers."""
         flags = command.cmd_flags
         if monitored is not None and flags != monitored:
             return (
@@ -104,7 +105,8 @@ class CommandJudge:
     def step(
         self, command: CmdBuffer, target: np.ndarray, previous: np.ndarray, missed: int
     ) -> Objection | None:
-        """Position, speed and, where the policy asks for it, acceleration of the way from `target` to the command.
+        """Position, speed and, where the policy asks for it, acceleration of the way from `target` to the
+        command.
 
         `previous` is the setpoint before `target`, `missed` the cycles bridged since the last command.
         """
@@ -118,8 +120,8 @@ class CommandJudge:
             if not -steps[joint] <= step <= steps[joint]:
                 return (
                     EventKind.VELOCITY,
-                    f"excessive commanded joint speed: {JOINT_NAMES[joint]} {abs(step) / self._period:.4f} rad/s "
-                    f"exceeds {steps[joint] / self._period:.4f} rad/s ({self._reason})",
+                    f"excessive commanded joint speed: {JOINT_NAMES[joint]} {abs(step) / self._period:.4f} "
+                    f"rad/s exceeds {steps[joint] / self._period:.4f} rad/s ({self._reason})",
                 )
         if self._policy.acceleration_factor is None:
             return None
@@ -137,6 +139,6 @@ class CommandJudge:
             return None
         return (
             EventKind.ACCELERATION,
-            f"{JOINT_NAMES[joint]} commanded acceleration {change[joint] / self._period**2:.2f} rad/s^2 exceeds "
-            f"{allowed[joint] / self._period**2:.2f} rad/s^2",
+            f"{JOINT_NAMES[joint]} commanded acceleration {change[joint] / self._period**2:.2f} rad/s^2 "
+            f"exceeds {allowed[joint] / self._period**2:.2f} rad/s^2",
         )

@@ -2,15 +2,17 @@
 
 One cycle is ``packet`` (the 916 bytes to send), any number of ``receive`` (datagrams that came back) and
 ``close_cycle`` (the setpoints of the next period). Everything else happens between cycles: the KRL calls
-``fri_open``, ``fri_start``, ``fri_stop``, ``fri_close``, the drives, the KRL variables. The same calls give the same bytes.
+``fri_open``, ``fri_start``, ``fri_stop``, ``fri_close``, the drives, the KRL variables. The same calls give
+the same bytes.
 
-What the protocol fixes is fixed here: the controller sends first; in command mode ``cmd_jnt_pos`` remains KRL's own
-setpoint and ``cmd_jnt_pos_fri_offset`` is what FRI adds, so that absolute and superposing clients both work; missing
-answers are bridged by extrapolation and then end command mode, as do wrong commands and limits, never by clipping;
-commands are interpolated to 1 ms, which delays them by one period. Thresholds are the policy's (``fri.policy``).
+What the protocol fixes is fixed here: the controller sends first; in command mode ``cmd_jnt_pos`` remains
+KRL's own setpoint and ``cmd_jnt_pos_fri_offset`` is what FRI adds, so that absolute and superposing clients
+both work; missing answers are bridged by extrapolation and then end command mode, as do wrong commands and
+limits, never by clipping; commands are interpolated to 1 ms, which delays them by one period. Thresholds are
+the policy's (``fri.policy``).
 
-Two readings of ours: the offset refers to the setpoint accepted last, the end of the interpolation; and after a
-fallback KRL must set its own setpoint anew (``resync``) before command mode can be entered again.
+Two readings of ours: the offset refers to the setpoint accepted last, the end of the interpolation; and after
+a fallback KRL must set its own setpoint anew (``resync``) before command mode can be entered again.
 """
 
 from __future__ import annotations
@@ -92,9 +94,12 @@ class KrcSession:
     cycle : int
         Packets made so far.
     to_real, to_int : np.ndarray
-        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL. `to_bool` is a mask, bit 0 is ``[1]``.
-    answered, malformed_now : bool
-        Whether this cycle has its valid answer; whether a malformed datagram came in it.
+        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL. `to_bool` is a mask, bit 0 is
+        ``[1]``.
+    answered : bool
+        Whether this cycle has its valid answer.
+    needs_resync : bool
+        Whether KRL's setpoint must be set anew before a start, after a fallback.
     last_event : Event or None
     events : deque of Event
         The last 256.
@@ -140,7 +145,8 @@ class KrcSession:
         self._offset: np.ndarray = record["cmd_jnt_pos_fri_offset"]
         record["cmd_cart_pos_fri_offset"] = IDENTITY_POSE
 
-        # KRL's setpoint is kept as the float32 that is sent, so that setpoint plus offset is exact for clients.
+        # KRL's setpoint is kept as the float32 that is sent, so that setpoint plus offset is exact for
+        # clients.
         self._krl = _as_sent(q)
         self._target = self._krl.copy()
         self._previous = self._target
@@ -161,7 +167,6 @@ class KrcSession:
         self.needs_resync = False
         self._open = False
         self.answered = False
-        self.malformed_now = False
         self._fault: Fault | None = None
         self._delay_ns = 0
         self._incoming = CmdBuffer()
@@ -198,6 +203,11 @@ class KrcSession:
         self._tell_judge()
 
     @property
+    def malformed_now(self) -> bool:
+        """Whether a malformed datagram came in this cycle."""
+        return self._fault is not None
+
+    @property
     def ramping(self) -> bool:
         """Whether the arm is still braking after command mode."""
         return self._ramp is not None
@@ -214,7 +224,7 @@ class KrcSession:
 
     @property
     def command(self) -> np.ndarray:
-        """The last valid answer, shape (), dtype `CMD`; zeros before the first. Do not keep it over a cycle."""
+        """The last valid answer, shape (), dtype `CMD`; zeros before the first. Valid for one cycle."""
         return self._command.record
 
     @property
@@ -242,7 +252,7 @@ class KrcSession:
         return {"packets": self.cycle, "missed": self.miss_counter, **self._counts}
 
     def fri_open(self, sample_time_ms: int) -> State:
-        """``friOpen(T)``: start sending every T = 1..100 ms; statistics begin anew."""
+        """``friOpen(T)``: send every T = 1..100 ms; statistics and the variables from the PC begin anew."""
         if not 1 <= sample_time_ms <= 100:
             raise ValueError(f"friOpen sample time {sample_time_ms} ms is outside 1..100 ms")
         if not self._transition(Trigger.FRI_OPEN):
@@ -254,6 +264,8 @@ class KrcSession:
         self.quality = Quality.UNACCEPTABLE
         self._dwell = 0
         self._monitor_flags = None
+        # A request of the PC from before must not be obeyed now.
+        self._command = CmdBuffer()
         self._note(EventKind.OPENED, f"opened with {self.sample_time_ms} ms")
         return self.state
 
@@ -295,7 +307,10 @@ class KrcSession:
         return self.state
 
     def set_strategy(self, strategy: int) -> None:
-        """``$STIFFNESS.STRATEGY`` with commit: 10 position, 20 Cartesian, 30 joint impedance; not in command mode."""
+        """``$STIFFNESS.STRATEGY`` with commit: 10 position, 20 Cartesian, 30 joint impedance.
+
+        RuntimeError in command mode.
+        """
         if self.state is State.CMD:
             raise RuntimeError(
                 f"strategy {strategy} cannot be committed in command mode; call fri_stop first"
@@ -323,7 +338,10 @@ class KrcSession:
             self._previous = self._target
 
     def drop(self, kind: EventKind, text: str) -> None:
-        """End command mode as the controller does: monitor mode, the arm braked, KRL out of step. No-op otherwise."""
+        """End command mode as the controller does: monitor mode, the arm braked, KRL out of step.
+
+        Outside command mode it does nothing.
+        """
         if not self._transition(Trigger.FAULT):
             return
         self._start_pending = False
@@ -367,7 +385,6 @@ class KrcSession:
         self._sequence = (self._sequence + 1) & 0xFFFF
         self._open = True
         self.answered = False
-        self.malformed_now = False
         self._fault = None
         statistics = self._statistics
         period = self.sample_time_ms * 1e-3
@@ -411,7 +428,6 @@ class KrcSession:
         fault = incoming.load(datagram)
         if fault is not None:
             self._counts["malformed"] += 1
-            self.malformed_now = True
             self._fault = fault
             return False
         self._reflected = incoming.send_seq
@@ -540,7 +556,8 @@ class KrcSession:
             self.drop(
                 EventKind.QUALITY,
                 f"quality {self.quality.name} in command mode is below {self.policy.hold_quality.name}: "
-                f"answer rate {self._statistics.answer_rate:.2f}, latency {self._statistics.latency * 1e3:.2f} ms",
+                f"answer rate {self._statistics.answer_rate:.2f}, "
+                f"latency {self._statistics.latency * 1e3:.2f} ms",
             )
         if self.state is not State.CMD or target is None:
             return self._coast()
@@ -554,7 +571,8 @@ class KrcSession:
         if self._missed > self.policy.bridged_cycles:
             self.drop(
                 EventKind.MISSES,
-                f"{self._missed} answers in a row are missing, at most {self.policy.bridged_cycles} are bridged",
+                f"{self._missed} answers in a row are missing, "
+                f"at most {self.policy.bridged_cycles} are bridged",
             )
             return None
         target = self._target + (self._target - self._previous)

@@ -1,11 +1,12 @@
 """The two datagrams of FRI 1.0 as numpy dtypes, and their validation.
 
 The controller (KRC) sends the 916-byte measurement `MSR`, the PC answers with the 376-byte command `CMD`.
-Both are little-endian with natural 4-byte alignment and no implicit padding. There is one definition, this one;
-offsets and sizes are asserted on import. Joints run in kinematic order A1 A2 E1 A3 A4 A5 A6, units are SI.
+Both are little-endian with natural 4-byte alignment and no implicit padding. There is one definition, this
+one; offsets and sizes are asserted on import. Joints run in kinematic order A1 A2 E1 A3 A4 A5 A6, units are
+SI.
 
-``MsrBuffer`` and ``CmdBuffer`` are receive buffers with their field views bound once: a datagram is received into
-them without allocation and judged by ``fault``.
+``MsrBuffer`` and ``CmdBuffer`` are receive buffers with their field views bound once: a datagram is received
+into them without allocation and judged by ``fault``.
 """
 
 from __future__ import annotations
@@ -213,8 +214,8 @@ def new_cmd() -> np.ndarray:
 class MsrBuffer:
     """Receive buffer for measurements.
 
-    ``buffer`` takes the datagram (``recvfrom_into``), ``record`` (shape (), dtype `MSR`) and the views are bound to
-    its memory once. The header integers of the last valid packet are plain attributes.
+    ``buffer`` takes the datagram (``recvfrom_into``), ``record`` (shape (), dtype `MSR`) and the views are
+    bound to its memory once. The header integers of the last valid packet are plain attributes.
     """
 
     _head = struct.Struct("<4H").unpack_from

@@ -1,8 +1,9 @@
 """What the controller enforces: the limits of the arm, and our choices where KUKA's documents are silent.
 
-The documents fix that the timing is rated over the last 100 packets, that command mode needs good timing "for some
-time", that single dropouts are bridged by extrapolation, and that limits and errors end command mode. They give no
-thresholds. Every number of ``KrcPolicy`` is therefore ours, chosen to be plausible and configurable.
+The documents fix that the timing is rated over the last 100 packets, that command mode needs good timing "for
+some time", that single dropouts are bridged by extrapolation, and that limits and errors end command mode.
+They give no thresholds. Every number of ``KrcPolicy`` is therefore ours, chosen to be plausible and
+configurable.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ class KrcPolicy:
     drop_on_malformed : bool
         Whether a malformed datagram ends command mode (otherwise it is only a missing answer).
     drop_on_drives_off : bool
-        Whether switching the drives off during command mode ends it. Entering it with the drives off is normal.
+        Whether switching the drives off during command mode ends it. Entering it with the drives off is
+        normal.
     mirror_tolerance : float
         Largest distance [rad] of the first command, and of any command with the drives off, from the mirror.
     limit_tolerance : float
@@ -117,8 +119,8 @@ class KrcPolicy:
 class KrcLimits:
     """Limits of the arm that the controller enforces, each (7,) in wire order.
 
-    q_min, q_max : positions [rad]; v_max : speeds [rad/s]; a_max : accelerations [rad/s^2], used for the stop and,
-    where the policy asks for it, for commands.
+    q_min, q_max : positions [rad]; v_max : speeds [rad/s]; a_max : accelerations [rad/s^2], used for the stop
+    and, where the policy asks for it, for commands.
     """
 
     q_min: np.ndarray
@@ -140,7 +142,8 @@ class KrcLimits:
                 )
             if not (self.v_max[joint] > 0.0 and self.a_max[joint] > 0.0):
                 raise ConfigurationError(
-                    f"{name} v_max {self.v_max[joint]} rad/s and a_max {self.a_max[joint]} rad/s^2 must be positive"
+                    f"{name} v_max {self.v_max[joint]} rad/s and a_max {self.a_max[joint]} rad/s^2 "
+                    "must be positive"
                 )
 
 

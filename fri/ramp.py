@@ -1,7 +1,7 @@
 """The controller's own stop: every joint brakes to rest with bounded acceleration and jerk.
 
-Deceleration rises linearly to its bound, stays, and falls linearly to zero (seven-segment profile without its first
-half). For a speed v, a bound a and a jerk j the ends of the segments are at
+Deceleration rises linearly to its bound, stays, and falls linearly to zero (seven-segment profile without its
+first half). For a speed v, a bound a and a jerk j the ends of the segments are at
 
     t_j = min(a / j, sqrt(v / j)),   t_j + max(0, v / a - t_j),   and t_j later.
 """
@@ -23,7 +23,8 @@ class StopRamp:
     a, j : np.ndarray
         (7,) bounds of deceleration [rad/s^2] and jerk [rad/s^3].
     q_min, q_max : np.ndarray
-        (7,) ends of travel [rad]; the ramp does not leave them, or does not go further out if it begins outside.
+        (7,) ends of travel [rad]; the ramp does not leave them, or does not go further out if it begins
+        outside.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class StopRamp:
         self.duration_s = float(np.max(2.0 * self._rise + self._hold))
 
     def position(self, t: np.ndarray) -> np.ndarray:
-        """Positions (n, 7) [rad] at the times `t` (n,) [s] after the beginning; at rest from `duration_s` on."""
+        """Positions (n, 7) [rad] at the times `t` (n,) [s]; at rest from `duration_s` on."""
         t = np.asarray(t, dtype=float)[:, np.newaxis]
         rising = np.clip(t, 0.0, self._rise)
         holding = np.clip(t - self._rise, 0.0, self._hold)

@@ -1,15 +1,16 @@
 """The PC's end of the link: receive measurements, answer each one once.
 
-The PC is the server: it binds its port, the controller sends first, and every packet is answered to the address it
-came from. What arrives is checked (length, id, size field, enumerations, finite joint values) and counted; only
-packets of the controller are answered. Outside commanding the answer is the mirror of the controller's setpoint,
+The PC is the server: it binds its port, the controller sends first, and every packet is answered to the
+address it came from. What arrives is checked (length, id, size field, enumerations, finite joint values) and
+counted; only packets of the controller are answered. Outside commanding the answer is the mirror of the
+controller's setpoint,
 
     jnt_pos = cmd_jnt_pos + cmd_jnt_pos_fri_offset,
 
 with the flags of the control mode and no additional torque. Flags change in monitor mode only.
 
-The path of a packet allocates nothing that lasts, logs nothing and makes one system call to receive and one to
-answer; what is rare (another sender, a restart) is kept in ``events`` for the caller to report.
+The path of a packet allocates nothing that lasts, logs nothing and makes one system call to receive and one
+to answer; what is rare (another sender, a restart) is kept in ``events`` for the caller to report.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ __all__ = ["DEFAULT_PORT", "LinkEvent", "LinkEventKind", "RemoteEnd"]
 DEFAULT_PORT = 49938
 
 _CMD = int(State.CMD)
-# Another port of the controller's host is the controller started again only if the known port has been quiet so long.
+# Another port of the controller's host is the controller started again only if the known port has been quiet
+# so long.
 _PORT_GRACE_S = 0.1
 # So many different foreign hosts are named in events; further ones are counted only.
 _NAMED_FOREIGN = 16
@@ -94,8 +96,8 @@ class RemoteEnd:
     command : np.ndarray
         The command, shape (), dtype `CMD`; after ``answer`` it is exactly what was sent.
     krl_real, krl_int : np.ndarray
-        (16,) views into `command`: ``$FRI_FRM_REA[n]`` is ``krl_real[n - 1]``. They stay until changed and are
-        cleared when the controller restarts, so that a request made to the run before is not made again.
+        (16,) views into `command`: ``$FRI_FRM_REA[n]`` is ``krl_real[n - 1]``. They stay until changed and
+        are cleared when the controller restarts, so that a request made to the run before is not made again.
     sequence : int
         Unwrapped number of the last measurement; state, quality, power, control, error (int), timestamp_s and
         sample_time_s are its fields, received_ns the monotonic time of its arrival.
@@ -103,9 +105,10 @@ class RemoteEnd:
         Whether its answer moves the arm: state CMD and drives on.
     events : deque of LinkEvent
         The last 64 rare events.
-    received, answered, lost, repeated, reordered, suspect, malformed, foreign, restarts, port_changes, unreflected, send_errors : int
-        Counters. `lost` includes what came too late (`reordered`); `unreflected` counts answers of ours that the
-        controller had not seen when it sent its next packet.
+    received, answered, lost, repeated, reordered, suspect, malformed, foreign, restarts, port_changes,
+    unreflected, send_errors : int
+        Counters. `lost` includes what came too late (`reordered`); `unreflected` counts answers of ours that
+        the controller had not seen when it sent its next packet.
 
     Raises
     ------
@@ -269,7 +272,8 @@ class RemoteEnd:
         Parameters
         ----------
         jnt_pos : array_like or None
-            (7,) setpoint [rad]. It is used only while `commanding`; otherwise, and with None, the mirror goes out.
+            (7,) setpoint [rad]. It is used only while `commanding`; otherwise, and with None, the mirror goes
+            out.
         add_jnt_trq : array_like or None
             (7,) additional torque [Nm], likewise; None is zero.
 

@@ -1,9 +1,10 @@
 """The controller's 16-bit packet counter as a 64-bit one, and what became of the packets in between.
 
-A jump of the counter is either a gap (packets were lost), a late packet (the network changed the order), a damaged
-packet, or a controller that was started again. The controller's timestamp tells them apart: over a gap, counter and clock
-advance together. A jump that fits nothing is held back until the next packet confirms it, so that a single
-damaged packet is not taken for a restart.
+A jump of the counter is either a gap (packets were lost), a late packet (the network changed the order), a
+damaged packet, or a controller that was started again. The controller's timestamp tells them apart: over a
+gap, counter and clock advance together. A jump that fits nothing, or spans more than half the counter's
+range, is held back until the next packet confirms it, so that a single damaged packet is not taken for a
+restart or a long silence.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from enum import Enum
 __all__ = ["Arrival", "SequenceTracker"]
 
 _WRAP = 0x10000
-# Disagreement of counter and clock over a jump that still counts as agreement [packets], plus 5 % of the jump.
+# Disagreement of counter and clock over a jump that still counts as agreement [packets], plus 2 % of it.
 _SLACK = 16
+# A packet older than so many is not late, it is another count.
+_LATEST = 1000
 # So many old packets in a row, in order, are a controller that counts from an earlier number.
 _OLD_RUN = 8
 _FLOAT32_EPS = 1.2e-7
@@ -49,6 +52,7 @@ class SequenceTracker:
         "_old",
         "_old_run",
         "_suspect",
+        "_suspect_timestamp",
         "_timestamp",
         "lost",
         "reordered",
@@ -70,11 +74,13 @@ class SequenceTracker:
         self._old = 0
         self._old_run = 0
         self._suspect = -1
+        self._suspect_timestamp = 0.0
 
     def feed(self, send_seq: int, timestamp: float, sample_time: float, new_source: bool = False) -> Arrival:
         """Take in one packet's counter (0..65535), timestamp [s] and sample time [s].
 
-        `new_source` says that it came from another port than the last one: an older count is then a restart at once.
+        `new_source` says that it came from another port than the last one: an older count is then a restart
+        at once.
         """
         last = self._last
         if last < 0:
@@ -83,7 +89,7 @@ class SequenceTracker:
             self._timestamp = timestamp
             return Arrival.NEW
         delta = ((send_seq - last + 0x8000) & 0xFFFF) - 0x8000
-        if delta == 1:
+        if delta == 1 and self._suspect < 0:
             return self._advance(1, send_seq, timestamp)
         return self._jump(delta, send_seq, timestamp, sample_time, new_source)
 
@@ -101,36 +107,48 @@ class SequenceTracker:
     ) -> Arrival:
         elapsed = timestamp - self._timestamp
         cycles = elapsed / sample_time
-        resolution = 2.0 * _FLOAT32_EPS * max(abs(timestamp), abs(self._timestamp)) / sample_time
         # The counter fixes the step up to multiples of its wrap; the clock picks the multiple.
         step = delta if elapsed == 0.0 else delta + _WRAP * round((cycles - delta) / _WRAP)
-        agrees = elapsed == 0.0 or abs(step - cycles) <= _SLACK + 0.05 * abs(cycles) + resolution
-        if agrees and step > 0:
+        agrees = elapsed == 0.0 or abs(step - cycles) <= self._slack(cycles, timestamp, sample_time)
+        if agrees and 0 < step < _WRAP // 2:
             return self._advance(step, send_seq, timestamp)
         if new_source:
             return self._restart(send_seq, timestamp)
         if agrees and step == 0:
             self.repeated += 1
-            return self._old_packet(send_seq, timestamp, Arrival.REPEATED)
-        if agrees:
+            return Arrival.REPEATED
+        if agrees and -_LATEST <= step < 0:
             self.reordered += 1
-            return self._old_packet(send_seq, timestamp, Arrival.REORDERED)
-        if self._suspect >= 0 and 0 <= ((send_seq - self._suspect) & 0xFFFF) <= _SLACK:
-            return self._restart(send_seq, timestamp)
-        self._suspect = send_seq
-        self.suspect += 1
-        return Arrival.SUSPECT
+            return self._old_packet(send_seq, timestamp)
+        return self._doubt(step if agrees and step > 0 else 0, send_seq, timestamp, sample_time)
 
-    def _old_packet(self, send_seq: int, timestamp: float, arrival: Arrival) -> Arrival:
-        """Count old packets in a row; a repeat of the newest packet itself is no sign of a restart."""
-        if arrival is Arrival.REPEATED:
-            return arrival
+    def _slack(self, cycles: float, timestamp: float, sample_time: float) -> float:
+        """Disagreement of counter and clock [packets] that still counts as agreement."""
+        resolution = _FLOAT32_EPS * max(abs(timestamp), abs(self._timestamp)) / sample_time
+        return _SLACK + 0.02 * abs(cycles) + 2.0 * resolution
+
+    def _old_packet(self, send_seq: int, timestamp: float) -> Arrival:
+        """Count late packets in a row: in order, they may be a controller that counts anew."""
         follows = self._old_run > 0 and ((send_seq - self._old) & 0xFFFF) <= 1
         self._old_run = self._old_run + 1 if follows else 1
         self._old = send_seq
         if self._old_run >= _OLD_RUN:
             return self._restart(send_seq, timestamp)
-        return arrival
+        return Arrival.REORDERED
+
+    def _doubt(self, step: int, send_seq: int, timestamp: float, sample_time: float) -> Arrival:
+        """Hold back a packet after a jump of `step` (0: a restart) until the next one confirms it."""
+        if self._suspect >= 0:
+            since = (send_seq - self._suspect) & 0xFFFF
+            cycles = (timestamp - self._suspect_timestamp) / sample_time
+            if since <= _SLACK and abs(since - cycles) <= self._slack(cycles, timestamp, sample_time):
+                if step > 0:
+                    return self._advance(step, send_seq, timestamp)
+                return self._restart(send_seq, timestamp)
+        self._suspect = send_seq
+        self._suspect_timestamp = timestamp
+        self.suspect += 1
+        return Arrival.SUSPECT
 
     def _restart(self, send_seq: int, timestamp: float) -> Arrival:
         self.restarts += 1

@@ -1,0 +1,178 @@
+"""The PC's side of the published KRL programs: how to ask for command mode, and how to see that it was
+granted.
+
+The objects have no state. They write requests into the command that goes out next (``RemoteEnd.command``) and
+read the last measurement (``RemoteEnd.msr``). A request stays in the command until another one replaces it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from fri.states import STRATEGY_BY_CONTROL, Control, State
+
+__all__ = ["HANDSHAKES", "Handshake", "RcprgHandshake", "RosHandshake", "StanfordHandshake", "find_handshake"]
+
+
+class Handshake(Protocol):
+    """PC side of a KRL program. `cmd` and `msr` are records of shape (), dtypes `CMD` and `MSR`."""
+
+    name: str
+    can_close: bool
+
+    def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
+        """Ask for command mode in `control`."""
+
+    def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """Ask for monitor mode; also acknowledges a fallback, after which a start may be asked for anew."""
+
+    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """Ask for the end of the program; where `can_close` is False this only asks for monitor mode."""
+
+    def opened(self, msr: np.ndarray) -> bool:
+        """Whether the program runs and takes requests."""
+
+    def started(self, msr: np.ndarray) -> bool:
+        """Whether a start was granted and command mode is on."""
+
+    def stopped(self, msr: np.ndarray) -> bool:
+        """Whether a stop was granted and monitor mode is on."""
+
+    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """Take back an acknowledged request, where the program needs that; once a cycle while waiting."""
+
+
+class StanfordHandshake:
+    """Stanford's FRIControl: ``$FRI_FRM_INT[15..16]``, ``$FRI_TO_INT[15..16]``."""
+
+    name = "stanford"
+    can_close = True
+
+    def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
+        """Strategy in [15], 10 in [16]."""
+        cmd["krl_int"][14] = STRATEGY_BY_CONTROL[control]
+        cmd["krl_int"][15] = 10
+
+    def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """20 in [16]."""
+        cmd["krl_int"][15] = 20
+
+    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """The program's abort code in [16]."""
+        cmd["krl_int"][15] = msr["krl_int"][14]
+
+    def opened(self, msr: np.ndarray) -> bool:
+        """10 or 20 in [16]."""
+        return bool(msr["krl_int"][15] in (10, 20))
+
+    def started(self, msr: np.ndarray) -> bool:
+        """20 in [16], state CMD."""
+        return bool(msr["krl_int"][15] == 20 and msr["state"] == State.CMD)
+
+    def stopped(self, msr: np.ndarray) -> bool:
+        """10 in [16], state MON."""
+        return bool(msr["krl_int"][15] == 10 and msr["state"] == State.MON)
+
+    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """Nothing: requests are states."""
+
+
+class RosHandshake:
+    """CentroEPiaggio's ros_control: ``$FRI_FRM_INT[1..2]``, ``$FRI_TO_INT[2]``."""
+
+    name = "ros_control"
+    can_close = False
+
+    def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
+        """Strategy in [1], 1 in [2]."""
+        cmd["krl_int"][0] = STRATEGY_BY_CONTROL[control]
+        cmd["krl_int"][1] = 1
+
+    def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """0 in [2]."""
+        cmd["krl_int"][1] = 0
+
+    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """The program has no close: as ``request_stop``."""
+        self.request_stop(cmd, msr)
+
+    def opened(self, msr: np.ndarray) -> bool:
+        """The program marks nothing but its state: 10, 1 or 0 in [2]."""
+        return bool(msr["krl_int"][1] in (0, 1, 10))
+
+    def started(self, msr: np.ndarray) -> bool:
+        """1 in [2], state CMD."""
+        return bool(msr["krl_int"][1] == 1 and msr["state"] == State.CMD)
+
+    def stopped(self, msr: np.ndarray) -> bool:
+        """0 or 10 in [2], state MON."""
+        return bool(msr["krl_int"][1] in (0, 10) and msr["state"] == State.MON)
+
+    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """Nothing: requests are states."""
+
+
+class RcprgHandshake:
+    """RCPRG's fri_start: ``$FRI_FRM_BOOL[1]`` with ``$FRI_FRM_INT[1]``, ``$FRI_TO_BOOL[1]``.
+
+    The published program carries a request out again and again while the bit is set, even after a fallback,
+    so the bit must be taken back with ``settle``. The control mode is the program's own.
+    """
+
+    name = "rcprg"
+    can_close = False
+
+    def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
+        """1 in [1], request bit set."""
+        self._request(cmd, 1)
+
+    def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """2 in [1], request bit set."""
+        self._request(cmd, 2)
+
+    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """The program has no close: as ``request_stop``."""
+        self.request_stop(cmd, msr)
+
+    def opened(self, msr: np.ndarray) -> bool:
+        """The program takes requests as soon as packets come."""
+        return bool(msr["state"] != State.OFF)
+
+    def started(self, msr: np.ndarray) -> bool:
+        """State CMD."""
+        return bool(msr["state"] == State.CMD)
+
+    def stopped(self, msr: np.ndarray) -> bool:
+        """State MON."""
+        return bool(msr["state"] == State.MON)
+
+    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """Clear the request bit when the program acknowledges."""
+        if msr["krl_bool"] & 1:
+            cmd["krl_bool"] &= 0xFFFE
+
+    @staticmethod
+    def _request(cmd: np.ndarray, request: int) -> None:
+        cmd["krl_int"][0] = request
+        cmd["krl_bool"] |= 1
+
+
+#: The handshakes by the name of the KRL program.
+HANDSHAKES: Mapping[str, Handshake] = MappingProxyType(
+    {handshake.name: handshake for handshake in (StanfordHandshake(), RosHandshake(), RcprgHandshake())}
+)
+
+
+def find_handshake(name: str) -> Handshake:
+    """Handshake of the KRL program `name`, or ConfigurationError."""
+    try:
+        return HANDSHAKES[name]
+    except KeyError:
+        raise ConfigurationError(
+            f"KRL program {name!r} is not known; known are {', '.join(sorted(HANDSHAKES))}"
+        ) from None
