@@ -54,12 +54,10 @@ def read_session(path: str | Path, joint_names: Sequence[str] | None = None) -> 
     source = str(scan.path)
     joints = {topic: _JointTopic(source, topic) for topic in _NEEDED}
     texts: dict[str, list[tuple[int, str]]] = {topic: [] for topic in _TEXT_TOPICS}
-    fixed = {
-        "/fri/status": _FixedTopic(fri_status_layout()),
-        "/fri/controller_model": _FixedTopic(controller_model_layout()),
-    }
-    readable: dict[int, bool] = {}
     notes: list[str] = []
+    layouts = {"/fri/status": fri_status_layout(), "/fri/controller_model": controller_model_layout()}
+    fixed = {topic: _FixedTopic(topic, layout, notes) for topic, layout in layouts.items()}
+    readable: dict[int, bool] = {}
     for block in scan.blocks():
         for number in np.unique(block.channel).tolist():
             channel = scan.channels.get(number)
@@ -129,6 +127,7 @@ def _session(
                 f"{stamp(before.log_time)}; "
                 "log times must be strictly increasing"
             )
+    status, model = fixed["/fri/status"].status(), fixed["/fri/controller_model"].controller_model()
     missing = Missing(
         ended=end is not None,
         closed=scan.closed,
@@ -148,8 +147,8 @@ def _session(
         motor=columns["/motor_states"],
         command=columns["/joint_command"],
         phases=phases,
-        status=fixed["/fri/status"].status(),
-        controller_model=fixed["/fri/controller_model"].controller_model(),
+        status=status,
+        controller_model=model,
         robot_description=description[0][1] if description else None,
         attachments={name: data for name, (_, _, data) in scan.attachments.items()},
         missing=missing,
@@ -340,7 +339,8 @@ class _JointTopic:
             row, column = np.argwhere(~finite)[0].tolist()
             raise DataError(
                 f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: `{name}` of joint "
-                f"{self.names[column]} is {values[row, column]} ({int((~finite).sum())} such values); it must be finite"
+                f"{self.names[column]} is {values[row, column]} ({int((~finite).sum())} such values); "
+                "it must be finite"
             )
 
     def _check_rising(
@@ -361,7 +361,9 @@ class _JointTopic:
 class _FixedTopic:
     """Collects messages of a definition of our own, which all have one layout."""
 
+    topic: str
     layout: Layout
+    notes: list[str]
     rows: list[NDArray[np.uint8]] = field(default_factory=list)
     log_time: list[NDArray[np.int64]] = field(default_factory=list)
     publish_time: list[NDArray[np.int64]] = field(default_factory=list)
@@ -385,6 +387,13 @@ class _FixedTopic:
             if name not in ("sec", "nanosec")
         }
         columns["log_time"] = np.concatenate(self.log_time)
+        for name, values in columns.items():
+            bad = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+            if len(bad):
+                first = stamp(int(columns["log_time"][bad[0]]))
+                self.notes.append(
+                    f"{self.topic}: `{name}` is not finite in {len(bad)} samples, first at {first}"
+                )
         columns["publish_time"] = np.concatenate(self.publish_time)
         return columns
 

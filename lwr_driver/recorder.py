@@ -1,0 +1,405 @@
+"""The recorder: a process of its own that turns the ring of the FRI loop into session logs.
+
+`Recorder` is the handle in the process that drives the experiment. It starts the other process as a fresh
+interpreter (nothing inherited but one socket), which attaches to the ring and drains it all the time; rows
+that arrive while no session is open are dropped. Requests and answers go over the socket. The recorder
+outlives Ctrl-C, and when the process that started it vanishes, or the FRI loop does, it ends the open session
+with exit status `fail` and a reason.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+from fri.errors import ConfigurationError, DataError, LwrError
+from lwr_driver.recording import Recorded, Recording, SessionRequest, utc_offset_ns
+from lwr_driver.ring import Ring
+from lwr_driver.session.writer import ExitStatus
+
+__all__ = ["Recorded", "Recorder", "SessionRequest"]
+
+_PAUSE_S = 0.02
+_BUSY_ROWS = 1000
+_START_TIMEOUT_S = 60.0
+_REPLY_TIMEOUT_S = 60.0
+_NICE = 5
+_ROOT = Path(__file__).resolve().parents[1]
+_BOOT = "import sys; from lwr_driver.recorder import main; main(sys.argv[1:])"
+
+
+@dataclass(frozen=True)
+class _Open:
+    request: SessionRequest
+
+
+@dataclass(frozen=True)
+class _Close:
+    exit_status: ExitStatus
+    reason: str
+    upto: int
+
+
+@dataclass(frozen=True)
+class _Phases:
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Stop:
+    pass
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """An error as data: name of the exception's class and its message."""
+
+    kind: str
+    message: str
+
+    @classmethod
+    def of(cls, error: BaseException) -> _Failure:
+        return cls(type(error).__name__, str(error) or repr(error))
+
+    def error(self) -> LwrError:
+        return (
+            ConfigurationError(self.message) if self.kind == "ConfigurationError" else DataError(self.message)
+        )
+
+
+@dataclass(frozen=True)
+class _Event:
+    """Something that went wrong between requests: the failure, and how the session ended through it."""
+
+    failure: _Failure
+    recorded: Recorded | None
+
+
+class Recorder:
+    """Handle of the recorder process. A context manager; leaving it ends an open session with `fail`.
+
+    ring : made by this process
+    heartbeat_timeout_s : silence of the loop after which it counts as dead; None watches its process only
+    nice : how far the recorder steps back behind other processes
+
+    Every call may raise DataError if the recorder process died; what it wrote before can be read and
+    recovered.
+    """
+
+    def __init__(self, ring: Ring, *, heartbeat_timeout_s: float | None = 2.0, nice: int = _NICE) -> None:
+        self.ring = ring
+        self._events: list[_Event] = []
+        self._path: Path | None = None
+        self._reply_timeout_s = _REPLY_TIMEOUT_S
+        mine, theirs = Pipe(duplex=True)
+        self._connection = mine
+        places = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        timeout = "none" if heartbeat_timeout_s is None else repr(float(heartbeat_timeout_s))
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _BOOT, str(theirs.fileno()), ring.name, timeout, str(nice)],
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(places)},
+                start_new_session=True,
+            )
+        except OSError as error:
+            mine.close()
+            raise ConfigurationError(f"the recorder process cannot be started: {error}") from error
+        finally:
+            theirs.close()
+        try:
+            self._receive(_START_TIMEOUT_S)
+        except BaseException:
+            self._process.kill()
+            self._process.wait()
+            mine.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Process id of the recorder."""
+        return self._process.pid
+
+    @property
+    def path(self) -> Path | None:
+        """File of the open session."""
+        return self._path
+
+    @property
+    def lag(self) -> int:
+        """Rows that the loop has published and the recorder has not yet taken."""
+        return self.ring.head - self.ring.tail
+
+    def open(self, request: SessionRequest) -> None:
+        """Begin a session; every row published after the return is in it.
+
+        Raises ConfigurationError if the file cannot be created (it exists, the folder is read-only).
+        """
+        self._events.clear()
+        self._ask(_Open(request))
+        self._path = request.path
+
+    def add_phases(self, names: Sequence[str]) -> int:
+        """Add phase names to the open session; returns the number of the first, for the rows' `phase`."""
+        first: int = self._ask(_Phases(tuple(names)))
+        return first
+
+    def close(
+        self, exit_status: ExitStatus = "success", reason: str = "", *, upto: int | None = None
+    ) -> Recorded:
+        """End the session with all rows published until now, or until row number `upto`.
+
+        A session that has ended already by a failure (disk full, loop dead) is returned as it ended then.
+        """
+        answer: Recorded = self._ask(_Close(exit_status, reason, self.ring.head if upto is None else upto))
+        self._path = None
+        return answer
+
+    def check(self) -> None:
+        """Raise what went wrong since the session was opened, such as a full disk; never waits."""
+        self._drain()
+        if self._events:
+            raise self._events[0].failure.error()
+        if self._process.poll() is not None:
+            raise self._died()
+
+    def stop(self, timeout_s: float = 30.0) -> None:
+        """End an open session with `fail`, then the process. Safe to call twice."""
+        if self._connection.closed:
+            return
+        with contextlib.suppress(OSError, DataError):
+            self._connection.send(_Stop())
+        self._connection.close()
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _ask(self, message: object) -> Any:
+        try:
+            self._connection.send(message)
+        except (OSError, ValueError) as error:
+            raise self._died() from error
+        return self._receive(self._reply_timeout_s)
+
+    def _receive(self, timeout_s: float) -> Any:
+        deadline = time.monotonic() + timeout_s
+        try:
+            while self._connection.poll(max(0.0, deadline - time.monotonic())):
+                answer = self._connection.recv()
+                if isinstance(answer, _Event):
+                    self._events.append(answer)
+                    continue
+                if isinstance(answer, _Failure):
+                    raise answer.error()
+                return answer
+        except (EOFError, OSError) as error:
+            raise self._died() from error
+        raise DataError(
+            f"the recorder process {self._process.pid} has not answered for {timeout_s:.0f} s; "
+            "the disk may be stuck, end the motion"
+        )
+
+    def _drain(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while self._connection.poll(0):
+                answer = self._connection.recv()
+                if isinstance(answer, _Event):
+                    self._events.append(answer)
+
+    def _died(self) -> DataError:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        code = self._process.returncode
+        how = (
+            "is gone"
+            if code is None
+            else f"was killed by signal {-code}"
+            if code < 0
+            else f"ended with code {code}"
+        )
+        where = (
+            f"; {self._path} is readable up to its last chunk, `lwr-run recover` makes it whole"
+            if self._path
+            else ""
+        )
+        return DataError(f"the recorder process {self._process.pid} {how}{where}")
+
+
+class _Server:
+    """The other side: drains the ring and answers requests, in the recorder process."""
+
+    def __init__(self, connection: Connection, ring: Ring, heartbeat_timeout_s: float | None) -> None:
+        self._connection = connection
+        self._ring = ring
+        self._timeout_ns = None if heartbeat_timeout_s is None else round(heartbeat_timeout_s * 1e9)
+        self._utc_offset = utc_offset_ns()
+        self._recording: Recording | None = None
+        self._ended: Recorded | None = None
+        self._overruns = 0
+        self.told_to_end = ""
+
+    def run(self) -> None:
+        """Serve until told to stop or until nobody is left to serve."""
+        self._connection.send("ready")
+        busy = False
+        while True:
+            if self.told_to_end:
+                self._end_by_failure(self.told_to_end)
+                return
+            try:
+                if self._connection.poll(0 if busy else _PAUSE_S) and not self._answer(
+                    self._connection.recv()
+                ):
+                    return
+            except (EOFError, OSError):
+                self._drain(None)
+                self._end_by_failure("the process that drove the experiment died")
+                return
+            busy = self._drain(None) >= _BUSY_ROWS
+            self._watch_writer()
+
+    def _answer(self, request: object) -> bool:
+        try:
+            if isinstance(request, _Open):
+                self._connection.send(self._open(request.request))
+            elif isinstance(request, _Phases):
+                if self._recording is None:
+                    raise DataError("no session is open, so phases have no place")
+                self._connection.send(self._recording.add_phases(request.names))
+            elif isinstance(request, _Close):
+                self._connection.send(self._close(request))
+            else:
+                self._drain(None)
+                self._end_by_failure("the recorder was stopped before the session was closed")
+                return False
+        except (LwrError, OSError, ValueError, TypeError, KeyError) as error:
+            self._connection.send(_Failure.of(error))
+        return True
+
+    def _open(self, request: SessionRequest) -> str:
+        if self._recording is not None:
+            raise DataError(f"session {self._recording.request.path} is still open; close it first")
+        self._drain(None)
+        self._ended = None
+        self._overruns = self._ring.overruns
+        self._recording = Recording(request, self._utc_offset)
+        return "open"
+
+    def _close(self, request: _Close) -> Recorded:
+        if self._recording is not None:
+            self._drain(request.upto)
+        if self._recording is not None:
+            recorded = self._recording.close(request.exit_status, request.reason, self._lost_rows())
+            self._recording = None
+            return recorded
+        if self._ended is None:
+            raise DataError("no session is open")
+        return self._ended
+
+    def _lost_rows(self) -> int:
+        return self._ring.overruns - self._overruns
+
+    def _drain(self, upto: int | None) -> int:
+        """Record all rows there are, or those before row number `upto`; returns how many."""
+        rows = self._ring.take(upto)
+        if len(rows) and self._recording is not None:
+            try:
+                self._recording.write(rows)
+            except (LwrError, OSError, ValueError) as error:
+                self._ring.release(len(rows))
+                self._end_by_failure(str(error), _Failure.of(error))
+                return len(rows)
+        self._ring.release(len(rows))
+        return len(rows)
+
+    def _watch_writer(self) -> None:
+        writer = self._ring.writer_pid
+        if not writer or self._recording is None:
+            return
+        if not _alive(writer):
+            self._drain(None)
+            self._end_by_failure(f"the FRI loop (process {writer}) died")
+        elif self._timeout_ns is not None:
+            silence = time.monotonic_ns() - self._ring.heartbeat_ns
+            if silence > self._timeout_ns:
+                self._drain(None)
+                self._end_by_failure(
+                    f"the FRI loop (process {writer}) has given no sign of life for {silence * 1e-9:.1f} s"
+                )
+
+    def _end_by_failure(self, reason: str, failure: _Failure | None = None) -> None:
+        recording, self._recording = self._recording, None
+        if recording is None:
+            return
+        self._ended = recording.close("fail", reason, self._lost_rows())
+        event = _Event(failure or _Failure("DataError", f"{recording.request.path}: {reason}"), self._ended)
+        with contextlib.suppress(OSError, ValueError):
+            self._connection.send(event)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Entry of the recorder process: socket, ring name, heartbeat timeout, nice value."""
+    descriptor, name, timeout, nice = arguments
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    connection = Connection(int(descriptor))
+    _step_back(int(nice))
+    try:
+        ring = Ring.attach(name)
+    except LwrError as error:
+        connection.send(_Failure.of(error))
+        return
+    server = _Server(connection, ring, None if timeout == "none" else float(timeout))
+
+    def end(number: int, frame: FrameType | None) -> None:
+        server.told_to_end = f"the recorder was ended by {signal.Signals(number).name}"
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        server.run()
+    finally:
+        ring.close()
+
+
+def _step_back(nice: int) -> None:
+    """Ordinary scheduling, also if the parent is a real-time process, and behind the others."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError):
+        os.nice(nice)
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process runs; one that waits to be reaped does not."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return True
+    return state not in ("Z", "X")
