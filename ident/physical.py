@@ -1,17 +1,19 @@
 """Standard parameters of bodies that can exist, as near as possible to identified base parameters.
 
-A set of base parameters fixes only combinations of the standard ones; what it leaves free is chosen here. With
-P(x) the pseudo-inertia of a body (`parameters.pseudo_inertia`) the program is, over the inertial parameters x::
+A set of base parameters fixes only combinations of the standard ones; what it leaves free is chosen here.
+With P(x) the pseudo-inertia of a body (`parameters.pseudo_inertia`) the program is, over the inertial
+parameters x::
 
     minimise    (K x - chi)' W (K x - chi) / 2  +  w sum_bodies tr[(P0^-1 (P(x) - P0))^2] / 2
     subject to  P(x) >= margin P0   for every body
 
-First with K x = chi exactly: then the torques are those that were identified, and only the free combinations follow
-the reference bodies P0. Where no real bodies have these base parameters, the base parameters give way, each by its own
-standard deviation (W is the inverse covariance), and the result says by how much.
+First with K x = chi exactly: then the torques are those that were identified, and only the free combinations
+follow the reference bodies P0. Where no real bodies have these base parameters, the base parameters give way,
+each by its own standard deviation (W is the inverse covariance), and the result says by how much.
 
-Reference: Sousa and Cortesao, Physical feasibility of robot base inertial parameter identification, 2014 (the linear
-matrix inequality); Wensing, Kim and Slotine 2018 (pseudo-inertia); Lee, Wensing and Park 2020 (the metric of P0).
+Reference: Sousa and Cortesao, Physical feasibility of robot base inertial parameter identification, 2014 (the
+linear matrix inequality); Wensing, Kim and Slotine 2018 (pseudo-inertia); Lee, Wensing and Park 2020 (the
+metric of P0).
 """
 
 from __future__ import annotations
@@ -70,12 +72,13 @@ def project(
 
     matrix : (b, 10 k), K: base parameters of the bodies' inertial parameters. base : (b,), chi.
     reference : (k, 10) bodies P0, each of which can exist.
-    covariance : (b, b) of `base`; without it a parameter's scale is what the reference bodies contribute to it.
+    covariance : (b, b) of `base`; without it a parameter's scale is what the reference bodies contribute to
+        it.
     margin : smallest pseudo-inertia allowed, as a share of that of the reference body.
     firmness : weight w of the reference bodies where the base parameters must give way.
 
-    Raises ConfigurationError for shapes that do not fit or a reference body that cannot exist, DataError when the
-    solver finds no bodies.
+    Raises ConfigurationError for shapes that do not fit or a reference body that cannot exist, DataError when
+    the solver finds no bodies.
     """
     bodies = np.atleast_2d(np.asarray(reference, dtype=np.float64))
     k_matrix, chi = np.asarray(matrix, dtype=np.float64), np.asarray(base, dtype=np.float64)
@@ -110,8 +113,8 @@ def reference_bodies(
 ) -> Floats:
     """Bodies (k, 10) that can exist, near the given ones: CAD models and published parameters often cannot.
 
-    Masses are raised to `smallest_mass_kg` and the principal second moments of mass about the centre of mass to
-    mass x `gyration_m`^2.
+    Masses are raised to `smallest_mass_kg` and the principal second moments of mass about the centre of mass
+    to mass x `gyration_m`^2.
     """
     found = []
     for body in np.atleast_2d(np.asarray(bodies, dtype=np.float64)):
@@ -131,7 +134,7 @@ def reference_bodies(
 
 def _roots(bodies: Floats) -> Floats:
     try:
-        return np.linalg.cholesky(parameters.pseudo_inertia(bodies))
+        return np.asarray(np.linalg.cholesky(parameters.pseudo_inertia(bodies)), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         bad = [verdict for verdict in parameters.consistency(bodies) if not verdict.consistent]
         reason = bad[0].reason if bad else "a pseudo-inertia is singular"
@@ -162,7 +165,7 @@ def _scale(slope: Floats, covariance: ArrayLike | None) -> Floats:
 
 
 def _root_weight(scale: Floats, covariance: ArrayLike | None) -> Floats:
-    """Matrix whose square is the weight W; directions without variance are held to a millionth of the scale."""
+    """Matrix whose square is the weight W; directions without variance are held to 1e-6 of the scale."""
     if covariance is None:
         return np.diag(1.0 / np.where(scale > 0.0, scale, 1.0))
     matrix = np.asarray(covariance, dtype=np.float64)
@@ -194,8 +197,7 @@ def _solve_exact(slope: Floats, missing: Floats, bodies: int, margin: float) -> 
     a = sparse.vstack([sparse.csc_matrix(rows), cone_a], format="csc")
     b = np.concatenate([target, cone_b])
     cones = [clarabel.ZeroConeT(len(target)), *[clarabel.PSDTriangleConeT(4)] * bodies]
-    solution = _solve(sparse.identity(size, format="csc"), np.zeros(size), a, b, cones)
-    return solution
+    return _solve(sparse.identity(size, format="csc"), np.zeros(size), a, b, cones)
 
 
 def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, firmness: float) -> Floats:

@@ -1,7 +1,7 @@
 """Stand-alone inverse dynamics in C and in numpy, generated from the expressions of a model.
 
-The program needs nothing of this project: C99 with <math.h>, or Python with numpy. It computes the same torques as the
-model to rounding, and lists how many operations that takes.
+The program needs nothing of this project: C99 with <math.h>, or Python with numpy. It computes the same
+torques as the model to rounding, and lists how many operations that takes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ _LONGEST_INLINE = 3
 class Program:
     """The inverse dynamics of a model as a graph: outputs by name, and what they cost.
 
-    outputs : "tau_joint", "tau_motor" (or "tau_difference"), n expressions each, and "gravity" (joint side, at rest).
+    outputs : "tau_joint", "tau_motor" (or "tau_difference"), n expressions each, and "gravity" (joint side,
+        at rest).
     """
 
     model: StandardModel
@@ -61,7 +62,10 @@ class Program:
 
 
 def to_c(model: StandardModel, name: str = "arm") -> str:
-    """C99 source with `<name>_inverse_dynamics` and `<name>_gravity`. Raises ConfigurationError for a bad name."""
+    """C99 source with `<name>_inverse_dynamics` and `<name>_gravity`.
+
+    Raises ConfigurationError for a name that no C function can have.
+    """
     _require_identifier(name)
     program = Program.of(model)
     n = model.chain.n
@@ -250,7 +254,8 @@ def _head(program: Program) -> list[str]:
         "Generated code: change the model, not this file.",
         f"Joints, base to tip: {' '.join(model.chain.joint_names)}. SI units: rad, rad/s, rad/s^2, Nm.",
         *(f"{output}: {_MEANING[output]}" for output in program.outputs),
-        f"{count['multiplications']} multiplications, {count['additions']} additions, {count['functions']} functions.",
+        f"{count['multiplications']} multiplications, {count['additions']} additions, "
+        f"{count['functions']} functions.",
         *model.notes,
     ]
 

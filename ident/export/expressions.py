@@ -1,13 +1,14 @@
 """A small graph of expressions that simplifies itself as it is built.
 
-Equal expressions are one node (hash consing), so common subexpressions are found by construction. Constants are folded;
-terms with a zero, factors of one and double signs vanish; signs move outwards, so that `a - b` and `b - a` share a node.
+Equal expressions are one node (hash consing), so common subexpressions are found by construction. Constants
+are folded; terms with a zero, factors of one and double signs vanish; signs move outwards, so that `a - b`
+and `b - a` share a node.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 __all__ = ["Expression", "Graph", "Vector", "cross", "dot"]
@@ -46,7 +47,7 @@ Node = tuple[str | int | float, ...]
 
 
 class Graph:
-    """All expressions of one program. `nodes[i]` is (kind, operands...), operands always before the node itself."""
+    """All expressions of one program. `nodes[i]` is (kind, operands...), operands before the node itself."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -174,7 +175,7 @@ def _sign(value: float) -> float:
     return float((value > 0.0) - (value < 0.0))
 
 
-_CALLS = {
+_CALLS: dict[str, Callable[..., float]] = {
     "sin": math.sin,
     "cos": math.cos,
     "sign": _sign,

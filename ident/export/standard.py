@@ -25,9 +25,11 @@ class CoupledDrives:
 
 @dataclass(frozen=True, eq=False)
 class StandardModel:
-    """Numbers for every standard parameter of a chain, with the payload (if any) already part of the last link.
+    """Numbers for every standard parameter of a chain, with the payload (if any) already part of the last
+    link.
 
-    inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia Fvl Fcl offl Fvm Fcm offm.
+    inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia Fvl Fcl offl Fvm Fcm
+        offm.
     sides : what the model describes: joint torque, motor torque, or only their difference.
     coulomb_kind, coulomb_width : the function that stands for sign(qd).
     consistent : whether every link is a body that can exist (needed for URDF and MJCF, not for code).

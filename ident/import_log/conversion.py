@@ -259,8 +259,8 @@ def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, 
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise DataError(
-            f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} ({int(bad.sum())} such "
-            "values); leave these rows out with `--rows`, a session holds measured values only"
+            f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} "
+            f"({int(bad.sum())} such values); leave these rows out with `--rows`, a session holds measured values only"
         )
 
 
@@ -290,7 +290,7 @@ def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
         position = values("motor_position")
         if position is not None and not np.array_equal(channels["motor_position"].times, motor.times):
             raise DataError(
-                f"{writer.path}: `motor_position` and `motor_torque` have different times; they are one channel"
+                f"{writer.path}: `motor_position` and `motor_torque` have different times; one channel"
             )
         writer.write_motor_states(motor.times, motor.values, position, publish_time=motor.published)
     if "command" in channels:

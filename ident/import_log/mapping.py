@@ -1,4 +1,5 @@
-"""The mapping file: which columns of a recording are which channel, in which units, before or behind the gear.
+"""The mapping file: which columns of a recording are which channel, in which units, before or behind the
+gear.
 
 Conventions of the conversion, with R the matrix of the transmission, q_motor = R q (n x n)::
 
