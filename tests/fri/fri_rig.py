@@ -15,7 +15,7 @@ V_MAX = np.array([120.0, 120.0, 160.0, 160.0, 250.0, 220.0, 220.0]) * DEG
 A_MAX = np.array([1200.0, 1200.0, 1600.0, 1600.0, 2500.0, 4400.0, 4400.0]) * DEG
 LIMITS = KrcLimits(-Q_MAX, Q_MAX, V_MAX, A_MAX)
 Q_START = np.array([0.5, -0.4, 0.3, 1.2, -0.2, 0.7, 0.1])
-QUICK = {"window": 10, "minimum_packets": 10, "start_dwell": 5}
+QUICK = {"window": 40, "minimum_packets": 10, "start_dwell": 5}
 
 
 class Rig:
