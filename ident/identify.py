@@ -197,9 +197,9 @@ def identify(
     if settings.model == 3:
         chosen = [session for session, has in zip(chosen, with_motor, strict=True) if has]
     payloads = [_payload(session) for session in chosen]
-    names = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
+    carried = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
     structure = ModelStructure(
-        chain, settings.model, names, settings.without, settings.couplings, settings.coulomb
+        chain, settings.model, carried, settings.without, settings.couplings, settings.coulomb
     )
     prepared = [
         prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)

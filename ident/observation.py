@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from ident.estimators.problem import Problem, RowGroup
+from ident.estimators.problem import Nuisance, Problem, RowGroup
 from ident.signals.filters import ParallelFilter
 from ident.signals.prepare import Passage, PreparedSession, TorqueChannel
 from ident.structure import ModelStructure, Side
@@ -44,15 +44,21 @@ def observe(
     chosen = np.flatnonzero(structure.active) if columns is None else np.asarray(columns, dtype=np.int64)
     titles = [structure.names[c] for c in chosen] if names is None else list(names)
     groups: list[RowGroup] = []
+    nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
+        slopes: dict[int, FloatArray] = {}
         for side in structure.sides:
             parts = [
                 part
                 for passage in session.passages
                 if (part := _side(passage, side, structure, payload, chosen, session)) is not None
             ]
-            if parts:
-                groups += _groups(session, number, side, parts)
+            for group, slope in _groups(session, number, side, parts) if parts else []:
+                if side != "joint":
+                    slopes[len(groups)] = slope
+                groups.append(group)
+        if session.delay is not None and slopes:
+            nuisances.append(Nuisance(f"motor delay of {session.name}", session.delay.std, slopes))
     if not groups:
         raise DataError(
             f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a joint stood "
@@ -64,15 +70,20 @@ def observe(
         sessions[0].row_time_s,
         tuple(units),
         tuple(session.name for session in sessions),
+        tuple(nuisances),
     )
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Rows of one passage and side: matrix (n, K, C), target (K, n), valid (K, n), row numbers (K,)."""
+    """Rows of one passage and side.
+
+    matrix (n, K, C), target (K, n), its time derivative (K, n), valid (K, n), row numbers (K,).
+    """
 
     matrix: FloatArray
     target: FloatArray
+    slope: FloatArray
     valid: NDArray[np.bool_]
     index: NDArray[np.int64]
 
@@ -87,11 +98,12 @@ def _side(
 ) -> _Part | None:
     if side == "joint":
         matrix, target = _filtered(passage.joint, passage.rows, side, structure, payload, columns, session)
-        return _Part(matrix, target, passage.joint_valid, passage.index)
+        return _Part(matrix, target, np.zeros_like(target), passage.joint_valid, passage.index)
     if passage.motor is None or passage.motor_valid is None:
         return None
     matrix, target = _filtered(passage.motor, passage.rows, side, structure, payload, columns, session)
     valid = passage.motor_valid
+    slope = _slope(passage.motor, passage.rows, session)
     if side == "difference":
         settings = session.settings
         parallel = ParallelFilter(
@@ -99,7 +111,20 @@ def _side(
         )
         target = target - parallel.apply(passage.joint.torque)
         valid = valid & passage.joint_valid
-    return _Part(matrix, target, valid, passage.index)
+    return _Part(matrix, target, slope, valid, passage.index)
+
+
+def _slope(channel: TorqueChannel, rows: FloatArray, session: PreparedSession) -> FloatArray:
+    """Time derivative (K, n) of the filtered torque: what a delay that is wrong by one second would add."""
+    settings = session.settings
+    step = 0.04 / settings.decimate_hz
+    ahead, behind = (
+        ParallelFilter(channel.times, rows + shift, settings.decimate_hz, settings.attenuation_db).apply(
+            channel.torque
+        )
+        for shift in (step, -step)
+    )
+    return (ahead - behind) / (2.0 * step)
 
 
 def _filtered(
@@ -140,32 +165,42 @@ def _filtered(
     return matrix, target
 
 
-def _groups(session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]) -> list[RowGroup]:
-    groups = []
+def _groups(
+    session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]
+) -> list[tuple[RowGroup, FloatArray]]:
+    """Row group and slope of each joint that has rows."""
+    result = []
+    average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
     for joint, name in enumerate(session.joint_names):
         keep = [part.valid[:, joint] for part in parts]
         matrix = np.concatenate([part.matrix[joint][k] for part, k in zip(parts, keep, strict=True)])
         target = np.concatenate([part.target[k, joint] for part, k in zip(parts, keep, strict=True)])
+        slope = np.concatenate([part.slope[k, joint] for part, k in zip(parts, keep, strict=True)])
         index = np.concatenate([part.index[k] for part, k in zip(parts, keep, strict=True)])
-        if not len(target):
-            continue
-        group = RowGroup(name, side, number, matrix, target, index)
-        if session.settings.average_periods and session.period_rows is not None and session.periods > 1:
-            group = _averaged(group, session.period_rows, session.periods)
-        if len(group.target):
-            groups.append(group)
-    return groups
+        if average and session.period_rows is not None:
+            matrix, target, slope, index = _averaged(
+                matrix, target, slope, index, session.period_rows, session.periods
+            )
+        if len(target):
+            result.append((RowGroup(name, side, number, matrix, target, index), slope))
+    return result
 
 
-def _averaged(group: RowGroup, period_rows: int, periods: int) -> RowGroup:
+def _averaged(
+    matrix: FloatArray,
+    target: FloatArray,
+    slope: FloatArray,
+    index: NDArray[np.int64],
+    period_rows: int,
+    periods: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]:
     """Mean of the rows of equal phase over all periods; a phase that one period lacks is left out."""
-    phase = group.time_index % period_rows
+    phase = index % period_rows
     order = np.argsort(phase, kind="stable")
     values, starts, counts = np.unique(phase[order], return_index=True, return_counts=True)
-    del values
     full = counts == periods
     if not full.any():
-        return group
-    sums = np.add.reduceat(group.matrix[order], starts, axis=0)[full] / periods
-    means = np.add.reduceat(group.target[order], starts)[full] / periods
-    return RowGroup(group.joint, group.side, group.record, sums, means, phase[order][starts][full])
+        return matrix[:0], target[:0], slope[:0], index[:0]
+    stacked = np.column_stack([matrix, target, slope])[order]
+    means = np.add.reduceat(stacked, starts, axis=0)[full] / periods
+    return means[:, :-2], means[:, -2], means[:, -1], values[full]

@@ -52,7 +52,7 @@ class InstrumentalVariables:
                     f"the instruments do not span the parameters (condition {condition:.1e}); simulate the same "
                     "motion that was recorded, all joints moving"
                 )
-            bread = np.linalg.inv(scaled) / np.outer(scale, scale)
+            bread = np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale), dtype=np.float64)
             new = bread @ moment
             change = float(np.max(np.abs(new - values) / np.linalg.norm(root, axis=1)))
             values = new
@@ -64,7 +64,7 @@ class InstrumentalVariables:
                 break
         # The last weights belong to the last values: one more solution with both in step.
         cross, moment = _moments(problem, matrices, weights)
-        bread = np.linalg.inv(cross)
+        bread = np.asarray(np.linalg.inv(cross), dtype=np.float64)
         values = bread @ moment
         square = sum(
             weights[number] * (z.T @ z) for z, number in zip(matrices, problem.class_of_group, strict=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
@@ -194,7 +195,7 @@ def _posterior(
     diagonal = np.abs(np.diag(factor))[:p]
     if np.any(diagonal <= 1e-10 * np.linalg.norm(factor[:, :p], axis=0)):
         problem.require_rank()
-    root = np.linalg.solve(factor[:p, :p], np.eye(p))
+    root = np.asarray(solve_triangular(factor[:p, :p], np.eye(p)), dtype=np.float64)
     return root @ factor[:p, p], root
 
 

@@ -8,7 +8,7 @@ million, and a residual sum of squares is ||R [-chi; 1]||^2 without cancellation
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from fri.errors import DataError
 
-__all__ = ["FloatArray", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
+__all__ = ["FloatArray", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
 
 FloatArray = NDArray[np.float64]
 
@@ -123,6 +123,19 @@ class TriangularFactor:
 
 
 @dataclass(frozen=True)
+class Nuisance:
+    """A quantity that was estimated before and acts on the rows, such as the delay of a channel.
+
+    std : its standard deviation. columns : by number of the row group, d(target) / d(quantity), (m,).
+    Its uncertainty is added to the covariance of every estimate.
+    """
+
+    name: str
+    std: float
+    columns: Mapping[int, FloatArray]
+
+
+@dataclass(frozen=True)
 class RowClass:
     """All groups of one joint and side: they share a variance (equation 13)."""
 
@@ -143,6 +156,7 @@ class Problem:
 
     names : p parameter names. groups : the rows. sample_time_s : time between neighbouring time indices [s].
     units : p units, for tables; may be empty. record_names : one name a record, for messages.
+    nuisances : quantities known with an uncertainty that the covariance must carry.
     """
 
     names: tuple[str, ...]
@@ -150,6 +164,7 @@ class Problem:
     sample_time_s: float
     units: tuple[str, ...] = ()
     record_names: tuple[str, ...] = ()
+    nuisances: tuple[Nuisance, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.groups:
@@ -214,6 +229,7 @@ class Problem:
             self.sample_time_s,
             tuple(self.units[c] for c in chosen) if self.units else (),
             self.record_names,
+            self.nuisances,
         )
 
     def require_rank(self) -> float:

@@ -116,6 +116,12 @@ def estimate_from(
         if settings.kind == "bootstrap":
             block = settings.block_s if settings.block_s is not None else 2.0 * bandwidth
             covariances["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
+    shared = _nuisance_covariance(problem, bread, weights, matrices)
+    if shared is not None:
+        covariances = {
+            name: replace(covariance, matrix=covariance.matrix + shared)
+            for name, covariance in covariances.items()
+        }
     return Estimate(
         method=method,
         names=problem.names,
@@ -130,6 +136,24 @@ def estimate_from(
         notes=notes,
         units=problem.units,
     )
+
+
+def _nuisance_covariance(
+    problem: Problem, bread: FloatArray, weights: FloatArray, matrices: Sequence[FloatArray] | None
+) -> FloatArray | None:
+    """sum of (d chi / d quantity) std^2 (d chi / d quantity)^T over the nuisances, or None without any."""
+    active = [nuisance for nuisance in problem.nuisances if nuisance.std > 0]
+    if not active:
+        return None
+    shifts = []
+    for nuisance in active:
+        moment = np.zeros(len(problem.names))
+        for number, column in nuisance.columns.items():
+            matrix = problem.groups[number].matrix if matrices is None else matrices[number]
+            moment += weights[problem.class_of_group[number]] * (matrix.T @ column)
+        shifts.append(nuisance.std * (bread @ moment))
+    stacked = np.array(shifts)
+    return stacked.T @ stacked
 
 
 def with_notes(estimate: Estimate, *notes: str) -> Estimate:

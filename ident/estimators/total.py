@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from fri.errors import DataError
@@ -105,7 +106,7 @@ class TotalLeastSquares:
         return share * rms
 
 
-def _solve(r: FloatArray, clean: FloatArray, noisy: FloatArray, level: FloatArray) -> FloatArray:
+def _solve(r: FloatArray, clean: NDArray[np.intp], noisy: NDArray[np.intp], level: FloatArray) -> FloatArray:
     """Mixed LS-TLS from the weighted triangular factor (p + 1, p + 1)."""
     p = r.shape[1] - 1
     order = np.concatenate([clean, noisy, [p]]).astype(np.int64)

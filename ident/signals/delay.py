@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from fri.errors import DataError
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.problem import Problem, RowGroup
 from ident.estimators.weighted import WeightedLeastSquares
-from ident.signals.filters import ParallelFilter
+from ident.signals.filters import ParallelFilter, interpolate_uniform
 
 __all__ = ["Delay", "DelayData", "estimate_delay"]
 
@@ -94,11 +95,13 @@ def estimate_delay(
         )
     delay = float(grid[best])
     std = 0.0
-    for _ in range(_STEPS):
-        step, std = _newton(parts, joint_names, delay)
-        delay = float(np.clip(delay + np.clip(step, -0.01, 0.01), -search_s, search_s))
-        if abs(step) < 1e-3 * std or abs(step) < 1e-9:
-            break
+    for stage in ("coarse", "fine"):
+        for _ in range(_STEPS):
+            step, std = _newton(parts, joint_names, delay, fine=stage == "fine")
+            delay = float(np.clip(delay + np.clip(step, -0.01, 0.01), -search_s, search_s))
+            if abs(step) < 0.05 * std or abs(step) < 1e-9:
+                break
+    std = float(np.hypot(std, _sampling_error(parts)))
     logger.info("motor channel is %.3f ms late (standard deviation %.3f ms)", 1e3 * delay, 1e3 * std)
     return Delay(delay, std, "estimated from the torque difference")
 
@@ -107,12 +110,14 @@ def estimate_delay(
 class _Filtered:
     """Filtered columns of one stretch at its output times, and the filtered motor torque as a smooth curve."""
 
+    data: DelayData
+    cutoff_hz: float
     outputs: FloatArray
     joint_torque: FloatArray
     columns: FloatArray
     moving: NDArray[np.bool_]
-    curve: object
-    slope: object
+    curve: Any
+    slope: Any
 
     @classmethod
     def of(cls, data: DelayData, cutoff_hz: float, search_s: float, standstill: float) -> _Filtered | None:
@@ -127,13 +132,32 @@ class _Filtered:
             first - search_s - 0.5 / cutoff_hz, last + search_s + 0.5 / cutoff_hz, 0.125 / cutoff_hz
         )
         joint = ParallelFilter(data.times, outputs, cutoff_hz)
-        stacked = np.stack([data.qdd, data.qd, np.sign(data.qd), np.ones_like(data.qd)], axis=2)
+        stacked = _columns(data.qd, data.qdd)
         smooth = ParallelFilter(data.motor_times, fine, cutoff_hz).apply(data.motor_torque)
         curve = make_interp_spline(fine, smooth, k=5)
         moving = joint.share(np.abs(data.qd) < standstill) < 0.05
-        return cls(
-            outputs, joint.apply(data.joint_torque), joint.apply(stacked), moving, curve, curve.derivative()
-        )
+        torque, columns = joint.apply(data.joint_torque), joint.apply(stacked)
+        return cls(data, cutoff_hz, outputs, torque, columns, moving, curve, curve.derivative())
+
+    def columns_at(self, delay: float) -> FloatArray:
+        """The columns filtered at the motor channel's own sample times less the delay.
+
+        A slow channel sees the reversal of Coulomb friction only at its samples; so must the columns.
+        """
+        data = self.data
+        dt = float(data.times[1] - data.times[0])
+        if float(np.median(np.diff(data.motor_times))) < 1.5 * dt:
+            return self.columns
+        times = data.motor_times - delay
+        inside = (times >= data.times[0]) & (times <= data.times[-1])
+        state = interpolate_uniform(np.hstack([data.qd, data.qdd]), float(data.times[0]), dt, times[inside])
+        qd, qdd = np.split(state, 2, axis=1)
+        return ParallelFilter(times[inside], self.outputs, self.cutoff_hz).apply(_columns(qd, qdd))
+
+
+def _columns(qd: FloatArray, qdd: FloatArray) -> FloatArray:
+    """qdd, qd, sign(qd) and 1: (n, J, 4)."""
+    return np.stack([qdd, qd, np.sign(qd), np.ones_like(qd)], axis=2)
 
 
 def _cost(parts: Sequence[_Filtered], delay: float) -> float:
@@ -146,7 +170,7 @@ def _cost(parts: Sequence[_Filtered], delay: float) -> float:
         matrix = np.vstack([part.columns[r, joint] for part, r in zip(parts, rows, strict=True)])
         target = np.concatenate(
             [
-                (part.curve(part.outputs + delay)[:, joint] - part.joint_torque[:, joint])[r]  # type: ignore[operator]
+                (part.curve(part.outputs + delay)[:, joint] - part.joint_torque[:, joint])[r]
                 for part, r in zip(parts, rows, strict=True)
             ]
         )
@@ -155,7 +179,21 @@ def _cost(parts: Sequence[_Filtered], delay: float) -> float:
     return total
 
 
-def _newton(parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float) -> tuple[float, float]:
+def _sampling_error(parts: Sequence[_Filtered]) -> float:
+    """Standard error [s] that a slow channel leaves: each reversal is seen to one sample, evenly distributed."""
+    reversals, period = 0, 0.0
+    for part in parts:
+        period = float(np.median(np.diff(part.data.motor_times)))
+        if period < 1.5 * float(part.data.times[1] - part.data.times[0]):
+            return 0.0
+        qd = part.data.qd[:, part.moving.any(axis=0)]
+        reversals += int(np.sum(np.diff(np.sign(qd), axis=0) != 0))
+    return period / float(np.sqrt(12.0 * max(reversals, 1)))
+
+
+def _newton(
+    parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float, *, fine: bool
+) -> tuple[float, float]:
     """Gauss-Newton step of the delay [s] and its standard deviation [s]."""
     groups, names = [], []
     active = [
@@ -167,6 +205,7 @@ def _newton(parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float
         raise DataError(
             "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
         )
+    columns = [part.columns_at(delay) if fine else part.columns for part in parts]
     for place, joint in enumerate(active):
         names += [f"{symbol} {joint_names[joint]}" for symbol in ("Ia", "Fvm", "Fcm", "offm")]
         for record, part in enumerate(parts):
@@ -175,9 +214,9 @@ def _newton(parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float
                 continue
             times = part.outputs[rows] + delay
             matrix = np.zeros((len(rows), 4 * len(active) + 1))
-            matrix[:, 4 * place : 4 * place + 4] = part.columns[rows, joint]
-            matrix[:, -1] = -part.slope(times)[:, joint]  # type: ignore[operator]
-            target = part.curve(times)[:, joint] - part.joint_torque[rows, joint]  # type: ignore[operator]
+            matrix[:, 4 * place : 4 * place + 4] = columns[record][rows, joint]
+            matrix[:, -1] = -part.slope(times)[:, joint]
+            target = part.curve(times)[:, joint] - part.joint_torque[rows, joint]
             groups.append(RowGroup(joint_names[joint], "difference", record, matrix, target, rows))
     step = float(parts[0].outputs[1] - parts[0].outputs[0])
     problem = Problem((*names, "delay"), tuple(groups), step)
