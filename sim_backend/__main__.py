@@ -54,13 +54,17 @@ def run(
 
 @click.command()
 @click.argument("config", default="emulator/default.yaml")
-@click.option("--lock-step/--real-time", default=False, help="Own clock, one cycle per answer; or the wall's.")
+@click.option(
+    "--lock-step/--real-time", default=False, help="Own clock, one cycle per answer; or the wall's."
+)
 @click.option("--fri-host", default="127.0.0.1", show_default=True, help="Where the PC's end listens.")
 @click.option("--fri-port", default=49938, show_default=True, help="Its port.")
 @click.option("--pendant-port", default=0, help="Port of the pendant on 127.0.0.1; 0 takes a free one.")
 @click.option("--period-ms", type=float, help="FRI cycle, 1 to 100 ms, instead of the configured one.")
 @click.option("--seed", type=int, help="Seed of everything random, instead of the configured one.")
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Replace a key, e.g. robot.payload=none.")
+@click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Replace a key, e.g. robot.payload=none."
+)
 @click.option("--follow-stdin", is_flag=True, help="End when standard input ends.")
 @click.option("--announce", is_flag=True, help="Print the pendant's port as one line of JSON.")
 @click.option("-v", "--verbose", is_flag=True, help="Log what happens to standard error.")

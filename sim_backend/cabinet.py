@@ -1,8 +1,9 @@
 """The control cabinet: arm, sensors, position controller, FRI session and KRL program, without any socket.
 
-Deterministic: what it does follows from the configuration, the seed, the datagrams and the operator's actions, each
-at its cycle. One FRI cycle is `packet`, any number of `receive`, and `close`, which simulates the cycle's
-milliseconds. The packet carries the sensors' values of the millisecond that has just ended, all of one instant.
+Deterministic: what it does follows from the configuration, the seed, the datagrams and the operator's
+actions, each at its cycle. One FRI cycle is `packet`, any number of `receive`, and `close`, which simulates
+the cycle's milliseconds. The packet carries the sensors' values of the millisecond that has just ended, all
+of one instant.
 """
 
 from __future__ import annotations
@@ -95,7 +96,9 @@ class Cabinet:
         if robot.plant is not None:
             plant = _load(robot.plant, model, drive, np.random.default_rng(own))
             if not isinstance(plant, Plant):
-                raise ConfigurationError(f"{robot.plant.type!r} lacks methods or arrays of sim_backend.plant.Plant")
+                raise ConfigurationError(
+                    f"{robot.plant.type!r} lacks methods or arrays of sim_backend.plant.Plant"
+                )
             self.effects: tuple[Effect, ...] = ()
         else:
             self.effects = tuple(_load(effect) for effect in robot.effects)

@@ -70,7 +70,8 @@ class RobotConfig:
     stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
     substeps : steps of the joint dynamics within 1 ms
     effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
-    plant : other physics altogether, called with `model, drive, random, **options` (see `sim_backend.plant.Plant`)
+    plant : other physics altogether, called with `model, drive, random, **options` (see
+    `sim_backend.plant.Plant`)
     """
 
     urdf: str = "lwr4plus.urdf"
@@ -91,7 +92,9 @@ class RobotConfig:
 
 @dataclass(frozen=True)
 class LoadData:
-    """Load data in the controller: mass [kg], centre of mass in the frame of link 7 [m], inertia about it [kg m^2]."""
+    """Load data in the controller: mass [kg], centre of mass in the frame of link 7 [m], inertia about it
+    [kg m^2].
+    """
 
     mass: float = 0.0
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -107,9 +110,10 @@ class ControllerConfig:
 
     urdf : the controller's model of the arm, CAD-like; its inertias differ from the truth
     load : load data at the start. stiffness : what the controller takes the joint stiffness for [Nm/rad]
-    position_gain [Nm/rad], velocity_gain [Nm s/rad], torque_gain [-] : feedback of motor position and velocity and of
-    the joint torque. viscous [Nm s/rad], coulomb [Nm] : friction it compensates, from the commanded velocity, which
-    counts as slow below coulomb_speed [rad/s]. torque_limit [Nm] of the motors, referred to the joint
+    position_gain [Nm/rad], velocity_gain [Nm s/rad], torque_gain [-] : feedback of motor position and
+    velocity and of the joint torque. viscous [Nm s/rad], coulomb [Nm] : friction it compensates, from the
+    commanded velocity, which counts as slow below coulomb_speed [rad/s]. torque_limit [Nm] of the motors,
+    referred to the joint
     velocity_cutoff_hz : filter on the motor velocity; command_cutoff_hz : filter on the commanded velocity
     model_period_ms : how often the Jacobian and the mass matrix in the packet are renewed
     external_cutoff_hz : filter of the estimated external torque
@@ -143,9 +147,7 @@ class ControllerConfig:
             "model_period_ms",
             "external_cutoff_hz",
         )
-        _non_negative(
-            self, "position_gain", "velocity_gain", "torque_gain", "viscous", "coulomb", "settle_s"
-        )
+        _non_negative(self, "position_gain", "velocity_gain", "torque_gain", "viscous", "coulomb", "settle_s")
 
 
 @dataclass(frozen=True)
@@ -181,9 +183,11 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class KrlRealsConfig:
-    """Motor torques in KRL reals: `$FRI_TO_REA[reals]`, loop counter in `$FRI_TO_INT[counter_int]`; indices from 1.
+    """Motor torques in KRL reals: `$FRI_TO_REA[reals]`, loop counter in `$FRI_TO_INT[counter_int]`; indices
+    from 1.
 
-    tick_ms : the interpreter's loop; between ticks the value holds. delay_ms : age of the value when it is written
+    tick_ms : the interpreter's loop; between ticks the value holds. delay_ms : age of the value when it is
+    written
     """
 
     enabled: bool = True
@@ -274,7 +278,9 @@ class EmulatorConfig:
 
     def __post_init__(self) -> None:
         if self.schema_version != 1:
-            raise ConfigurationError(f"schema_version {self.schema_version} is unknown; this software reads 1")
+            raise ConfigurationError(
+                f"schema_version {self.schema_version} is unknown; this software reads 1"
+            )
         if self.seed < 0:
             raise ConfigurationError(f"seed {self.seed} is negative")
 

@@ -5,9 +5,10 @@ Every millisecond, per joint, from the setpoint `q_d` and the controller's own g
     theta_d = q_d + g / K                                               (torsion under load)
     tau_m   = g + friction(theta_d') + Kp (theta_d - theta) + Kd (theta_d' - theta') + Kt (g - tau_j)
 
-limited to what the motor gives. This is the state feedback of motor position, motor velocity and joint torque of
-Albu-Schaeffer, Ott and Hirzinger (2007): `Kt` makes the motor inertia appear smaller by `1 + Kt`, which lets the
-motor side damp the oscillation of the link on its elastic joint. Friction compensation follows the commanded speed.
+limited to what the motor gives. This is the state feedback of motor position, motor velocity and joint torque
+of Albu-Schaeffer, Ott and Hirzinger (2007): `Kt` makes the motor inertia appear smaller by `1 + Kt`, which
+lets the motor side damp the oscillation of the link on its elastic joint. Friction compensation follows the
+commanded speed.
 """
 
 from __future__ import annotations
@@ -38,14 +39,17 @@ def _feedback(
 ) -> None:
     """One cycle of the law above.
 
-    gains : rows K, Kp, Kd, Kt, viscous, Coulomb, limit. memory : rows theta_d, theta, theta_d' and theta' filtered
+    gains : rows K, Kp, Kd, Kt, viscous, Coulomb, limit. memory : rows theta_d, theta, theta_d' and theta'
+    filtered
     settings : cycle [s], filter constants of commanded and measured speed, Coulomb speed
     """
     cycle, keep_command, keep_speed, slow = settings[0], settings[1], settings[2], settings[3]
     for i in range(setpoint.shape[0]):
         wanted = setpoint[i] + gravity[i] / gains[0, i]
         memory[2, i] = keep_command * memory[2, i] + (1.0 - keep_command) * (wanted - memory[0, i]) / cycle
-        memory[3, i] = keep_speed * memory[3, i] + (1.0 - keep_speed) * (motor_position[i] - memory[1, i]) / cycle
+        memory[3, i] = (
+            keep_speed * memory[3, i] + (1.0 - keep_speed) * (motor_position[i] - memory[1, i]) / cycle
+        )
         memory[0, i] = wanted
         memory[1, i] = motor_position[i]
         speed = memory[2, i]
@@ -58,6 +62,33 @@ def _feedback(
             + gains[3, i] * (gravity[i] - joint_torque[i])
         )
         out[i] = min(gains[6, i], max(-gains[6, i], torque))
+
+
+@njit(cache=True)
+def _external(
+    joint_torque: np.ndarray,
+    bias: np.ndarray,
+    mass: np.ndarray,
+    change: np.ndarray,
+    keep: float,
+    estimate: np.ndarray,
+) -> None:
+    """Low-pass of `joint_torque - mass @ change - bias` into `estimate`."""
+    for i in range(estimate.shape[0]):
+        modelled = bias[i]
+        for j in range(estimate.shape[0]):
+            modelled += mass[i, j] * change[j]
+        estimate[i] = keep * estimate[i] + (1.0 - keep) * (joint_torque[i] - modelled)
+
+
+@njit(cache=True)
+def _difference(position: np.ndarray, period: float, keep: float, memory: np.ndarray) -> None:
+    """Filtered speed and its rate. memory : rows position before, speed, acceleration."""
+    for i in range(position.shape[0]):
+        speed = keep * memory[1, i] + (1.0 - keep) * (position[i] - memory[0, i]) / period
+        memory[2, i] = (speed - memory[1, i]) / period
+        memory[1, i] = speed
+        memory[0, i] = position[i]
 
 
 def _keep(cutoff_hz: float) -> float:
@@ -113,11 +144,14 @@ class PositionController:
 class ControllerModel:
     """Rigid-body model inside the controller: CAD-like arm and load data.
 
-    `gravity` is renewed by every `update_gravity`; `mass_matrix` (n, n), `jacobian` (6, n) of the flange with rows
-    X Y Z RZ RY RX in base axes at the flange, by every `update_model`; `flange` (12,) is the pose, 3x4 row-major.
+    `gravity` is renewed by every `update_gravity`; `mass_matrix` (n, n), `jacobian` (6, n) of the flange with
+    rows X Y Z RZ RY RX in base axes at the flange, by every `update_model`; `flange` (12,) is the pose, 3x4
+    row-major.
     """
 
-    def __init__(self, model: pin.Model, load: LoadData, external_cutoff_hz: float, flange: str = "flange") -> None:
+    def __init__(
+        self, model: pin.Model, load: LoadData, external_cutoff_hz: float, flange: str = "flange"
+    ) -> None:
         self._bare = model
         self._frame = model.getFrameId(flange) if model.existFrame(flange) else model.nframes - 1
         n = model.nv
@@ -126,9 +160,9 @@ class ControllerModel:
         self.jacobian = np.zeros((6, n))
         self.external_torque = np.zeros(n)
         self._cutoff_hz = external_cutoff_hz
-        self._speed = np.zeros(n)
-        self._last_speed = np.zeros(n)
-        self._last_position: np.ndarray | None = None
+        self._memory = np.zeros((3, n))
+        self._keep: tuple[float, float] = (0.0, 0.0)
+        self._begun = False
         self.set_load(load)
 
     def set_load(self, load: LoadData) -> None:
@@ -137,13 +171,6 @@ class ControllerModel:
         body = Payload.from_centre_of_mass(load.mass, load.com, load.inertia) if load.mass > 0.0 else None
         self.model = with_payload(self._bare, body)
         self._data = self.model.createData()
-
-    def reset(self) -> None:
-        """Forget the motion: the external torque estimate begins anew."""
-        self._last_position = None
-        self._speed[:] = 0.0
-        self._last_speed[:] = 0.0
-        self.external_torque[:] = 0.0
 
     def update_gravity(self, position: np.ndarray) -> np.ndarray:
         """Gravity torque at `position` (n,) [Nm]; a new array."""
@@ -161,16 +188,16 @@ class ControllerModel:
 
     def update_external(self, position: np.ndarray, joint_torque: np.ndarray, period_s: float) -> None:
         """Estimated external torque: what the joint sensors hold beyond the model, through a low-pass."""
-        if self._last_position is None:
-            self._last_position = position.copy()
-        keep = math.exp(-2.0 * math.pi * self._cutoff_hz * period_s)
-        self._speed += (1.0 - keep) * ((position - self._last_position) / period_s - self._speed)
-        acceleration = (self._speed - self._last_speed) / period_s
-        self._last_position[:] = position
-        self._last_speed[:] = self._speed
-        modelled = pin.nonLinearEffects(self.model, self._data, position, self._speed)
-        modelled += self.mass_matrix @ acceleration
-        self.external_torque += (1.0 - keep) * (joint_torque - modelled - self.external_torque)
+        if not self._begun:
+            self._memory[0] = position
+            self._begun = True
+        if self._keep[0] != period_s:
+            self._keep = (period_s, math.exp(-2.0 * math.pi * self._cutoff_hz * period_s))
+        keep = self._keep[1]
+        memory = self._memory
+        _difference(position, period_s, keep, memory)
+        bias = pin.nonLinearEffects(self.model, self._data, position, memory[1])
+        _external(joint_torque, bias, self.mass_matrix, memory[2], keep, self.external_torque)
 
     def flange(self, position: np.ndarray, out: np.ndarray) -> None:
         """Pose of the flange in the base frame into `out` (12,), 3x4 row-major [R | p]."""

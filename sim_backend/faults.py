@@ -1,8 +1,8 @@
 """Faults on the wire, made by the emulator on its own side of the socket, from seeded streams.
 
-Two directions: measurements on their way `to_pc`, commands on their way `to_krc`. Times are in FRI cycles, so lock
-step and real time misbehave alike. What a measurement suffers decides whether its answer can come at all; lock step
-needs to know that (`Parcel.awaited`).
+Two directions: measurements on their way `to_pc`, commands on their way `to_krc`. Times are in FRI cycles, so
+lock step and real time misbehave alike. What a measurement suffers decides whether its answer can come at
+all; lock step needs to know that (`Parcel.awaited`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from fri.errors import ConfigurationError
 
 __all__ = ["FaultyWire", "Incoming", "Parcel", "WireFault"]
 
-Kind = Literal[
-    "loss", "burst", "delay", "jitter", "duplicate", "reorder", "truncate", "corrupt", "foreign"
-]
+Kind = Literal["loss", "burst", "delay", "jitter", "duplicate", "reorder", "truncate", "corrupt", "foreign"]
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,9 @@ class WireFault:
     """One fault on the wire.
 
     loss : a datagram disappears. burst : so do the `length` - 1 after it
-    delay : it comes `length` cycles later. jitter : to_krc it ages by up to `length` cycles, evenly distributed; to_pc
-    it comes 1 to `length` cycles later. reorder : the next one overtakes it. duplicate : it comes twice
+    delay : it comes `length` cycles later. jitter : to_krc it ages by up to `length` cycles, evenly
+    distributed; to_pc it comes 1 to `length` cycles later. reorder : the next one overtakes it. duplicate :
+    it comes twice
     truncate : its end is missing. corrupt : `bits` random bits are flipped
     foreign : another host (`host`) sends a datagram of its own beside it, `imitate`: a changed copy of ours
     probability : per datagram. cycles : the fault ends after so many, None never
@@ -55,10 +54,11 @@ class WireFault:
 
 
 class Parcel(NamedTuple):
-    """One datagram to the PC. `host` sends it, None ourselves; `sequence` is its unwrapped counter, -1 if foreign.
+    """One datagram to the PC. `host` sends it, None ourselves; `sequence` is its unwrapped counter, -1 if
+    foreign.
 
-    awaited : `yes`: a measurement that the PC has not seen, so an answer can come; `perhaps`: a damaged one that the
-    PC may or may not take for good; `no`: one that it has seen, or a foreign one
+    awaited : `yes`: a measurement that the PC has not seen, so an answer can come; `perhaps`: a damaged one
+    that the PC may or may not take for good; `no`: one that it has seen, or a foreign one
     """
 
     host: str | None
@@ -103,9 +103,7 @@ class FaultyWire:
     @property
     def quiet(self) -> bool:
         """Whether there is neither a fault nor anything left over from one."""
-        return not (
-            self._active or self._to_pc or self._to_krc or self._beside
-        )
+        return not (self._active or self._to_pc or self._to_krc or self._beside)
 
     @property
     def active(self) -> dict[int, WireFault]:
@@ -113,7 +111,9 @@ class FaultyWire:
         return {number: active.fault for number, active in self._active.items()}
 
     def inject(self, fault: WireFault, cycle: int) -> int:
-        """Begin `fault` at `cycle`; returns its number. The nth fault has the nth random stream of the seed."""
+        """Begin `fault` at `cycle`; returns its number. The nth fault has the nth random stream of the
+        seed.
+        """
         number = next(self._numbers)
         stream = np.random.default_rng(self._random.spawn(1)[0])
         self._active[number] = _Active(fault, stream, cycle)
@@ -138,12 +138,12 @@ class FaultyWire:
     def outgoing(self, datagram: bytes, sequence: int, cycle: int) -> list[Parcel]:
         """What leaves in `cycle`, in order, given the measurement made for it and its unwrapped send counter.
 
-        Repeated, damaged and foreign datagrams go ahead of a measurement that will be answered, and wait for one: so
-        all that they cause at the PC is over when its answer comes, and lock step repeats itself.
+        Repeated, damaged and foreign datagrams go ahead of a measurement that will be answered, and wait for
+        one: so all that they cause at the PC is over when its answer comes, and lock step repeats itself.
         """
         own, beside = self._spoil("to_pc", datagram, cycle)
         for late, copy in own:
-            heapq.heappush(self._to_pc, (cycle + late, sequence, copy))
+            heapq.heappush(self._to_pc, (cycle + int(late), sequence, copy))
         for host, copy in beside:
             whole = host is None and len(copy) == len(datagram)
             number = sequence if host is None else -1
@@ -163,7 +163,8 @@ class FaultyWire:
         return parcels
 
     def incoming(self, datagram: bytes, age_s: float, cycle: int) -> list[tuple[str | None, bytes]]:
-        """Take a command that has arrived in `cycle`; returns what foreign hosts send to the controller beside it.
+        """Take a command that has arrived in `cycle`; returns what foreign hosts send to the controller
+        beside it.
 
         `due` gives what reaches the session.
         """
@@ -220,7 +221,8 @@ class FaultyWire:
                 case "jitter":
                     late = None if late is None else late + float(random.uniform(0.0, fault.length))
                 case "reorder":
-                    # Ours always come first in their cycle, so the one overtaken must be two cycles late to the PC.
+                    # Ours always come first in their cycle, so the one overtaken must be two cycles late to
+                    # the PC.
                     late = None if late is None else late + (2.0 if direction == "to_pc" else 1.0)
                 case "duplicate":
                     copies = 2

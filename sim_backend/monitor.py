@@ -1,8 +1,9 @@
-"""The command monitor: every position command that arrived in command mode, as float32, against the arm's limits.
+"""The command monitor: every position command that arrived in command mode, as float32, against the arm's
+limits.
 
-Velocity, acceleration and jerk are divided differences over the cycles in which commands arrived, so a missing one
-does not count against the sender: by the mean value theorem a motion within limits stays within them. What float32
-rounding alone can produce is subtracted before a value is compared with its limit.
+Velocity, acceleration and jerk are divided differences over the cycles in which commands arrived, so a
+missing one does not count against the sender: by the mean value theorem a motion within limits stays within
+them. What float32 rounding alone can produce is subtracted before a value is compared with its limit.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def _judge(
     ratio: np.ndarray,
     violations: np.ndarray,
 ) -> int:
-    """Take in `command` (n,) at `time_s` after the last four `values` (4, n) at `times` (4,) [s]; counts violations."""
+    """Take in `command` (n,) at `time_s` after the last four `values` (4, n) at `times` (4,) [s]; counts
+    violations.
+    """
     n = values.shape[1]
     if time_s > times[3]:
         for k in range(3):
@@ -52,7 +55,9 @@ def _judge(
             rounding[k] = 2.0**-25 * 2.0 ** np.ceil(np.log2(max(abs(values[k, i]), 1e-30)))
         middle = 0.5 * (q_min[i] + q_max[i])
         half = 0.5 * (q_max[i] - q_min[i])
-        count += _keep(0, i, values[3, i], abs(values[3, i] - middle) - rounding[3], half, worst, ratio, violations)
+        count += _keep(
+            0, i, values[3, i], abs(values[3, i] - middle) - rounding[3], half, worst, ratio, violations
+        )
         scale = 1.0
         for order in range(1, 4):
             scale *= order
@@ -102,7 +107,8 @@ def _keep(
 class CommandMonitor:
     """Worst values per joint since the last `reset`.
 
-    ratio : (4, 7) worst value beyond rounding as a share of its limit, rows as in `QUANTITIES`; above 1 is outside
+    ratio : (4, 7) worst value beyond rounding as a share of its limit, rows as in `QUANTITIES`; above 1 is
+    outside
     worst : (4, 7) the worst values themselves, sign kept. violations : (4, 7) counts
     """
 
@@ -164,7 +170,9 @@ class CommandMonitor:
         )
 
     def summary(self) -> dict[str, Any]:
-        """For the status reply: per quantity the worst values (7,), their shares of the limits, and the counts."""
+        """For the status reply: per quantity the worst values (7,), their shares of the limits, and the
+        counts.
+        """
         return {
             "commands": self.commands,
             "violations": int(self.violations.sum()),

@@ -1,7 +1,8 @@
 """The emulated operator: everything that can be done at the cabinet, by hand over the pendant or by schedule.
 
-A command is a public method of `Operator` whose name is in `COMMANDS`. The same commands can be scheduled by cycle or
-by state in the configuration (`schedule`), so that a fault strikes in a chosen phase and repeats with the seed.
+A command is a public method of `Operator` whose name is in `COMMANDS`. The same commands can be scheduled by
+cycle or by state in the configuration (`schedule`), so that a fault strikes in a chosen phase and repeats
+with the seed.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ _SILENCE_CYCLES = 2000
 class ScheduleEntry:
     """A command to be done later, once.
 
-    when : `start` of the emulator, `now` (as it is scheduled), FRI state `monitor` or `command` entered, or the
-    commanded position begins `moving` in command mode; `occurrence` : for the nth time
+    when : `start` of the emulator, `now` (as it is scheduled), FRI state `monitor` or `command` entered, or
+    the commanded position begins `moving` in command mode; `occurrence` : for the nth time
     after_cycles : so many FRI cycles after that
     """
 
@@ -54,7 +55,8 @@ class ScheduleEntry:
             raise ConfigurationError(f"command {self.command!r} is unknown; known: {', '.join(COMMANDS)}")
         if self.after_cycles < 0 or self.occurrence < 1:
             raise ConfigurationError(
-                f"after_cycles {self.after_cycles} must be at least 0, occurrence {self.occurrence} at least 1"
+                f"after_cycles {self.after_cycles} must be at least 0, "
+                f"occurrence {self.occurrence} at least 1"
             )
 
 
@@ -164,9 +166,10 @@ class Operator:
     def status(self) -> dict[str, Any]:
         """Everything the pendant shows.
 
-        time_s, cycle : virtual clock since the start. state, quality, control : names. power, error, warning : drive
-        bits. position, motor_position, joint_torque, motor_torque, setpoint : (7,). payload, load : what hangs there,
-        what the controller believes. monitor : see `CommandMonitor.summary`. session : counters. events : last ones
+        time_s, cycle : virtual clock since the start. state, quality, control : names. power, error, warning
+        : drive bits. position, motor_position, joint_torque, motor_torque, setpoint : (7,). payload, load :
+        what hangs there, what the controller believes. monitor : see `CommandMonitor.summary`. session :
+        counters. events : last ones
         """
         cabinet = self.cabinet
         session, reading = cabinet.session, cabinet.reading
@@ -293,7 +296,9 @@ class Operator:
         self.cabinet.stop_program()
 
     def restart(self, silent_cycles: int = 1000, drives_on: bool = True) -> None:
-        """Cold start: drives off, silence, then a new session, program and (unless told otherwise) the drives."""
+        """Cold start: drives off, silence, then a new session, program and (unless told otherwise) the
+        drives.
+        """
         cabinet = self.cabinet
         cabinet.session.drop(EventKind.EXTERNAL, "controller restarted")
         cabinet.power(False)

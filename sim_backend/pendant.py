@@ -1,8 +1,8 @@
 """The teach pendant over UDP: what an operator at the emulated controller can see and do.
 
-Requests and replies are JSON datagrams on 127.0.0.1. Request: ``{"id": n, "command": name, "arguments": {...}}``;
-reply: ``{"id": n, "ok": true, "result": ...}`` or ``{"id": n, "ok": false, "error": text}``. A request that is repeated
-because its reply was late is answered again but carried out once.
+Requests and replies are JSON datagrams on 127.0.0.1. Request: ``{"id": n, "command": name, "arguments":
+{...}}``; reply: ``{"id": n, "ok": true, "result": ...}`` or ``{"id": n, "ok": false, "error": text}``. A
+request that is repeated because its reply was late is answered again but carried out once.
 
 `Pendant` is the client. The commands are the methods of `sim_backend.operator.Operator`.
 """
@@ -31,8 +31,8 @@ _REMEMBERED = 64
 class Pendant:
     """Client of one emulator's pendant; a context manager.
 
-    Every call returns the result, or raises RobotError with the emulator's reason, or NetworkError when the emulator
-    does not answer within `timeout_s`.
+    Every call returns the result, or raises RobotError with the emulator's reason, or NetworkError when the
+    emulator does not answer within `timeout_s`.
     """
 
     def __init__(self, port: int, *, host: str = "127.0.0.1", timeout_s: float = 10.0) -> None:
@@ -74,7 +74,8 @@ class Pendant:
                 return reply["result"]
             raise RobotError(f"emulator refused `{command}`: {reply['error']}")
         raise NetworkError(
-            f"emulator at {self.address[0]}:{self.address[1]} did not answer `{command}` within {self.timeout_s:g} s"
+            f"emulator at {self.address[0]}:{self.address[1]} did not answer `{command}` "
+            f"within {self.timeout_s:g} s"
         )
 
     def _reply(self, number: int, timeout_s: float) -> dict[str, Any] | None:
@@ -103,7 +104,8 @@ class Pendant:
     ) -> None:
         """Hang a payload on the flange: by its name in the parameter file, or by its properties.
 
-        mass [kg], com in the frame of link 7 [m], inertia XX XY XZ YY YZ ZZ about the centre of mass [kg m^2].
+        mass [kg], com in the frame of link 7 [m], inertia XX XY XZ YY YZ ZZ about the centre of mass [kg
+        m^2].
         """
         self.request("mount", payload=payload, mass=mass, com=list(com), inertia=list(inertia))
 
@@ -220,7 +222,8 @@ class PendantServer:
         except OSError as error:
             self.socket.close()
             raise ConfigurationError(
-                f"pendant port {port} on 127.0.0.1 cannot be bound: {error}; choose another with --pendant-port"
+                f"pendant port {port} on 127.0.0.1 cannot be bound: {error}; "
+                "choose another with --pendant-port"
             ) from error
         self.socket.setblocking(False)
         self.port: int = self.socket.getsockname()[1]

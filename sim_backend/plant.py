@@ -1,7 +1,7 @@
 """The arm itself: elastic joints, friction and rigid links, advanced 1 ms at a time.
 
-`Plant` is all that the rest of the emulator knows of the physics, so a test can put other physics in its place.
-`ElasticArm` is the plant of the default emulator; an `Effect` adds to it what its equations leave out.
+`Plant` is all that the rest of the emulator knows of the physics, so a test can put other physics in its
+place. `ElasticArm` is the plant of the default emulator; an `Effect` adds to it what its equations leave out.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ CYCLE_S = 1e-3
 class Plant(Protocol):
     """An arm of n joints with motors; arrays are (n,) float64 in SI units and keep their identity.
 
-    `position`, `velocity`: links; `motor_position`, `motor_velocity`: motors, referred to the joint; `joint_torque`:
-    through the joint, positive where it holds the link against gravity; `motor_torque`: what the motor really gives,
-    referred to the joint.
+    `position`, `velocity`: links; `motor_position`, `motor_velocity`: motors, referred to the joint;
+    `joint_torque`: through the joint, positive where it holds the link against gravity; `motor_torque`: what
+    the motor really gives, referred to the joint.
     """
 
     position: np.ndarray
@@ -57,9 +57,9 @@ class Plant(Protocol):
 class Loads:
     """What an effect may change for the coming cycle; (n,) each.
 
-    `motor_torque` and `link_torque` [Nm] are added on the two sides of the elastic joint, positive in the direction
-    of motion (a resisting torque is negative). The friction rows are those of the equations, already holding the
-    nominal values; changing them keeps exact sticking.
+    `motor_torque` and `link_torque` [Nm] are added on the two sides of the elastic joint, positive in the
+    direction of motion (a resisting torque is negative). The friction rows are those of the equations,
+    already holding the nominal values; changing them keeps exact sticking.
     """
 
     motor_torque: np.ndarray
@@ -95,7 +95,9 @@ class Effect:
         """Change the torques and the friction of the cycle that begins at `time_s`."""
 
     def sense(self, time_s: float, plant: Plant, reading: Reading) -> None:
-        """Change position and joint torque as the sensors report them at `time_s`; the controller sees them too."""
+        """Change position and joint torque as the sensors report them at `time_s`; the controller sees them
+        too.
+        """
 
     def sense_motor(self, time_s: float, plant: Plant, reading: Reading) -> None:
         """Change the motor torque as it is reported at `time_s`."""
@@ -103,7 +105,9 @@ class Effect:
 
 @dataclass(frozen=True)
 class Drive:
-    """Joint and friction parameters, (n,) each: the last seven of a link's standard parameters, and the elasticity."""
+    """Joint and friction parameters, (n,) each: the last seven of a link's standard parameters, and the
+    elasticity.
+    """
 
     Ia: np.ndarray
     Fvl: np.ndarray
@@ -120,8 +124,8 @@ class Drive:
 class ElasticArm:
     """Two masses per joint (see `stiction`), rigid links and payload by pinocchio.
 
-    The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at the midpoint
-    that the present motion leads to; the joints advance in `substeps` steps within the cycle.
+    The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at the
+    midpoint that the present motion leads to; the joints advance in `substeps` steps within the cycle.
     """
 
     def __init__(
@@ -171,7 +175,9 @@ class ElasticArm:
         self._data = model.createData()
 
     def reset(self, position: np.ndarray) -> None:
-        """Links at rest at `position` (n,); the motors where the joints' torsion carries gravity and offset."""
+        """Links at rest at `position` (n,); the motors where the joints' torsion carries gravity and
+        offset.
+        """
         self.position[:] = position
         self.velocity[:] = 0.0
         self.motor_velocity[:] = 0.0

@@ -38,8 +38,8 @@ class EmulatorProcess:
     settings : overrides of configuration keys by their dotted names, e.g. ``{"robot.payload": "paper_load"}``
     start_s : longest time until the emulator answers on its pendant
 
-    The child ends when `stop` is called, when the `with` block is left, and when this process dies in any way: it
-    watches a pipe that the operating system closes then.
+    The child ends when `stop` is called, when the `with` block is left, and when this process dies in any
+    way: it watches a pipe that the operating system closes then.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Motor torques on their two ways out of the controller: KRL reals, and the controller's own trace file.
 
-The FRI packet has no motor torque. A KRL loop can write one per joint into `$FRI_TO_REA`, with a loop counter beside
-it; between the loop's ticks the values hold. Or the controller records on its own, at 1 kHz on its own clock, and the
-file is fetched after the motion.
+The FRI packet has no motor torque. A KRL loop can write one per joint into `$FRI_TO_REA`, with a loop counter
+beside it; between the loop's ticks the values hold. Or the controller records on its own, at 1 kHz on its own
+clock, and the file is fetched after the motion.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ __all__ = ["ControllerTrace", "KrlReals", "trace_columns"]
 
 
 def trace_columns(joint_names: tuple[str, ...]) -> tuple[str, ...]:
-    """Header of a trace file: time [s], motor torques referred to the joint [Nm], measured positions [rad]."""
+    """Header of a trace file: time [s], motor torques referred to the joint [Nm], measured positions
+    [rad].
+    """
     return ("time_s", *(f"tau_m_{name}" for name in joint_names), *(f"q_{name}" for name in joint_names))
 
 
@@ -63,7 +65,9 @@ class KrlReals:
 
 
 class ControllerTrace:
-    """The controller's recording: time on its own clock, motor torque and position of each joint, at 1 kHz."""
+    """The controller's recording: time on its own clock, motor torque and position of each joint, at 1
+    kHz.
+    """
 
     def __init__(self, config: TraceConfig, joint_names: tuple[str, ...]) -> None:
         self.config = config

@@ -1,7 +1,7 @@
 """Rigid-body models: a chain from a URDF, its inertias from standard parameters, and the payload in frame 7.
 
-Standard parameters of a link are referred to its own frame (the modified Denavit-Hartenberg frame): `XX XY XZ YY YZ
-ZZ` the inertia about the frame's origin, `MX MY MZ` the first moments, `M` the mass.
+Standard parameters of a link are referred to its own frame (the modified Denavit-Hartenberg frame): `XX XY XZ
+YY YZ ZZ` the inertia about the frame's origin, `MX MY MZ` the first moments, `M` the mass.
 """
 
 from __future__ import annotations
@@ -63,19 +63,19 @@ class Payload:
 
 
 def _inertia(values: Mapping[str, float]) -> pin.Inertia:
+    # Not through pinocchio's checked constructor: only the whole arm's mass matrix has to be positive
+    # definite.
     mass = values["M"]
-    about_origin = np.array(
-        [
-            [values["XX"], values["XY"], values["XZ"]],
-            [values["XY"], values["YY"], values["YZ"]],
-            [values["XZ"], values["YZ"], values["ZZ"]],
-        ]
-    )
     if mass == 0.0:
-        return pin.Inertia(0.0, np.zeros(3), about_origin)
-    centre = np.array([values["MX"], values["MY"], values["MZ"]]) / mass
-    skew = pin.skew(centre)
-    return pin.Inertia(mass, centre, about_origin + mass * skew @ skew)
+        if any(values[name] for name in ("MX", "MY", "MZ")):
+            raise ConfigurationError(
+                "a link has first moments but no mass; regrouped parameters cannot be simulated"
+            )
+        mass = 1e-12
+    order = ("XX", "XY", "YY", "XZ", "YZ", "ZZ")
+    return pin.Inertia.FromDynamicParameters(
+        np.array([mass, *(values[name] for name in ("MX", "MY", "MZ", *order))])
+    )
 
 
 def chain(urdf: Path) -> pin.Model:
@@ -89,7 +89,8 @@ def chain(urdf: Path) -> pin.Model:
         raise ConfigurationError(f"{urdf}: cannot be read as a URDF: {error}") from error
     if model.nq != model.nv or model.njoints != model.nv + 1:
         raise ConfigurationError(
-            f"{urdf}: {model.njoints - 1} joints with {model.nv} degrees of freedom; only revolute joints are simulated"
+            f"{urdf}: {model.njoints - 1} joints with {model.nv} degrees of freedom; "
+            "only chains of revolute joints are simulated"
         )
     return model
 
@@ -109,7 +110,8 @@ def with_inertias(model: pin.Model, parameters: Mapping[str, float]) -> pin.Mode
     floor = mass_matrix_floor(changed)
     if floor <= 0.0:
         raise ConfigurationError(
-            f"smallest eigenvalue of the mass matrix is {floor:.3g} kg m^2; the link inertias are not physical"
+            f"smallest eigenvalue of the mass matrix is {floor:.3g} kg m^2; "
+            "the link inertias are not physical"
         )
     return changed
 

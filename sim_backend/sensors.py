@@ -48,9 +48,9 @@ def _read_motor(
 class Sensors:
     """Reads a plant once per millisecond, in two steps.
 
-    The controller needs position and joint torque to decide the motor torque of the next millisecond; only with that
-    is the motor torque at this instant known, midway between the torques held before and after it. `reading` holds
-    the last values; its arrays keep their identity.
+    The controller needs position and joint torque to decide the motor torque of the next millisecond; only
+    with that is the motor torque at this instant known, midway between the torques held before and after it.
+    `reading` holds the last values; its arrays keep their identity.
     """
 
     def __init__(self, config: SensorConfig, joints: int, random: np.random.SeedSequence) -> None:
@@ -75,7 +75,9 @@ class Sensors:
         self.reading = Reading(*self._rows)
 
     def read(self, plant: Plant) -> Reading:
-        """Position, motor position and joint torque at this instant; the motor torque is still the last one."""
+        """Position, motor position and joint torque at this instant; the motor torque is still the last
+        one.
+        """
         if self._next == _BLOCK:
             for row, stream in enumerate(self._streams):
                 self._noise[:, row] = stream.standard_normal(self._noise.shape[::2])
@@ -83,11 +85,11 @@ class Sensors:
         self._row = self._noise[self._next]
         self._next += 1
         position = plant.position if self._link_side else plant.motor_position
-        _read(
-            position, plant.motor_position, plant.joint_torque, self._settings, self._row, self._rows
-        )
+        _read(position, plant.motor_position, plant.joint_torque, self._settings, self._row, self._rows)
         return self.reading
 
     def read_motor(self, before: np.ndarray, after: np.ndarray) -> None:
-        """Motor torque at this instant, from the torques (n,) held in the milliseconds before and after it."""
+        """Motor torque at this instant, from the torques (n,) held in the milliseconds before and after
+        it.
+        """
         _read_motor(before, after, self._settings, self._row, self._rows)

@@ -1,4 +1,6 @@
-"""The emulator's main loop: the FRI socket, the pendant, and the clock, which is either its own or the wall's."""
+"""The emulator's main loop: the FRI socket, the pendant, and the clock, which is either its own or the
+wall's.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +94,9 @@ class Service:
             cycle()
 
     def _serve(self, timeout_s: float) -> bool:
-        """Wait for something at most `timeout_s`, serve pendant and parent; True if an FRI datagram is there."""
+        """Wait for something at most `timeout_s`, serve pendant and parent; True if an FRI datagram is
+        there.
+        """
         ready = self._poller.poll(timeout_s * 1000.0)
         fri = False
         for descriptor, _ in ready:
@@ -191,8 +195,9 @@ class Service:
     def _await(self, sent: bytes, age_s: float, limit_s: float | None = None) -> None:
         """Lock step: wait until the PC has answered `sent`.
 
-        In monitor mode for as long as it takes, in command mode for the configured patience. The first packet is
-        repeated until the PC is heard. An answer that reflects something else is followed by a short wait only.
+        In monitor mode for as long as it takes, in command mode for the configured patience. The first packet
+        is repeated until the PC is heard. An answer that reflects something else is followed by a short wait
+        only.
         """
         wanted = sent[:2]
         commanding = self.cabinet.session.state is State.CMD

@@ -6,12 +6,12 @@ Per joint, with motor position `theta` referred to the joint and link position `
     M(q) q''   = tau_j - bias   - Fvl q'     - offl - Fcl Sgn(q')        (row-wise over the joints)
     tau_j      = K (theta - q) + D (theta' - q')
 
-`Sgn` is the set-valued sign: any value in [-1, 1] at rest, so a joint sticks exactly and stays bit for bit where it
-is while the other torques remain below breakaway. The smooth terms are taken at the midpoint (second order,
-conserves the energy of the undamped system), the Coulomb terms at the end of the step (Moreau 1988; Acary and
-Brogliato 2008, Moreau-Jean scheme). One step is a convex problem with a unique solution; it is found by the
-primal-dual active set method, in almost every step at the first try with the signs of the step before, and by
-coordinate descent where the active sets cycle.
+`Sgn` is the set-valued sign: any value in [-1, 1] at rest, so a joint sticks exactly and stays bit for bit
+where it is while the other torques remain below breakaway. The smooth terms are taken at the midpoint (second
+order, conserves the energy of the undamped system), the Coulomb terms at the end of the step (Moreau 1988;
+Acary and Brogliato 2008, Moreau-Jean scheme). One step is a convex problem with a unique solution; it is
+found by the primal-dual active set method, in almost every step at the first try with the signs of the step
+before, and by coordinate descent where the active sets cycle.
 """
 
 from __future__ import annotations
@@ -70,7 +70,9 @@ def _try_modes(
     motor_speed: np.ndarray,
     link_speed: np.ndarray,
 ) -> bool:
-    """End speeds under the assumed modes (-1, 0, +1); corrects the modes and tells whether they were right."""
+    """End speeds under the assumed modes (-1, 0, +1); corrects the modes and tells whether they were
+    right.
+    """
     n = mass.shape[0]
     for i in range(n):
         if link_mode[i] == 0:
@@ -191,7 +193,8 @@ def advance(
     """Advance all joints by `period` in `steps` equal steps, in place; returns how often descent was needed.
 
     state : (4, n) motor position, motor velocity, link position, link velocity [rad, rad/s]
-    modes : (2, n) int64, sign of the sliding on motor and link side, 0 = sticking; the guess for the next step
+    modes : (2, n) int64, sign of the sliding on motor and link side, 0 = sticking; the guess for the next
+    step
     mass : (n, n) link inertia [kg m^2], constant during the call; only the symmetric matrix
     bias : (n,) gravity and velocity torques less external torques on the links [Nm]
     motor_drive : (n,) motor torque referred to the joint [Nm], held
