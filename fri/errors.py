@@ -16,6 +16,8 @@ A message has subject, value, limit and advice, for example
 
 from __future__ import annotations
 
+from typing import Any
+
 __all__ = [
     "ConfigurationError",
     "DataError",
@@ -28,9 +30,13 @@ __all__ = [
 
 
 class LwrError(Exception):
-    """Base of every error this project raises on purpose."""
+    """Base of every error this project raises on purpose.
+
+    rows : the last cycles of the link before the error, where there were any (dtype `lwr_driver.ring.ROW`)
+    """
 
     exit_code = 1
+    rows: Any = None
 
 
 class ConfigurationError(LwrError, ValueError):

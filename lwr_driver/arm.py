@@ -1,6 +1,7 @@
 """The arm as a description: names, limits, gears, stiffness and the URDF, checked once when it is loaded.
 
-Nothing here needs pinocchio: the real-time process reads its limits from the same object, and must stay light.
+Nothing here needs pinocchio: the real-time process reads its limits from the same object, and must stay
+light.
 """
 
 from __future__ import annotations
@@ -95,7 +96,9 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class LinkInertia:
-    """Inertial entry of one URDF link: mass [kg], centre of mass [m] and inertia about it [kg m²], link axes."""
+    """Inertial entry of one URDF link: mass [kg], centre of mass [m] and inertia about it [kg m²], link
+    axes.
+    """
 
     link: str
     mass: float
@@ -105,9 +108,9 @@ class LinkInertia:
     def defect(self, tolerance: float = 1e-9) -> str | None:
         """Why no rigid body has this inertia, or None if one does.
 
-        A body of positive density has a positive definite pseudo-inertia (Wensing, Kim and Slotine 2018): mass
-        above zero and Σ = ½ tr(I) 1 - I positive semidefinite, which contains the triangle inequality of the
-        principal moments.
+        A body of positive density has a positive definite pseudo-inertia (Wensing, Kim and Slotine 2018):
+        mass above zero and Σ = ½ tr(I) 1 - I positive semidefinite, which contains the triangle inequality of
+        the principal moments.
         """
         if not self.mass > 0.0:
             return f"mass {self.mass} kg is not above zero"
@@ -116,7 +119,8 @@ class LinkInertia:
             return f"principal moment {moments[0]:.3g} kg m² is not above zero"
         slack = float(moments[0] + moments[1] - moments[2])
         if slack < -tolerance * float(moments[2]):
-            return f"principal moments {moments[0]:.4g}, {moments[1]:.4g}, {moments[2]:.4g} kg m² break I1 + I2 >= I3"
+            listed = ", ".join(f"{moment:.4g}" for moment in moments)
+            return f"principal moments {listed} kg m² break I1 + I2 >= I3"
         return None
 
 
@@ -164,8 +168,8 @@ class Arm:
     def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
         """Read and check an arm file and the URDF that it names.
 
-        Raises ConfigurationError if a limit is not sane, the joint names differ from the URDF's chain, a link's
-        inertia belongs to no rigid body, or the URDF has no collision geometry.
+        Raises ConfigurationError if a limit is not sane, the joint names differ from the URDF's chain, a
+        link's inertia belongs to no rigid body, or the URDF has no collision geometry.
         """
         path = find(name, beside=beside)
         content = parse(_ArmFile, read_mapping(path), str(path))
@@ -262,7 +266,8 @@ def _check_urdf(arm: Arm, where: str) -> None:
             )
     if not root.findall("link/collision"):
         raise ConfigurationError(
-            f"{where}: no link has collision geometry, so every collision check would pass; add primitive geometry"
+            f"{where}: no link has collision geometry, so every collision check would pass; add primitive "
+            "geometry"
         )
 
 

@@ -1,4 +1,6 @@
-"""What stands around the arm: ground, boxes, and the shape of the payload. Positions are in the frame `base_link`."""
+"""What stands around the arm: ground, boxes, and the shape of the payload. Positions are in the frame
+`base_link`.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Collision of the arm with itself, the ground and the things of the cell, by pinocchio and coal.
 
-Bodies of the arm that are three joints apart or more are watched against each other (nearer ones share a joint
-housing and touch by construction); the moving part from the second link on is watched against ground and boxes.
+Bodies of the arm that are three joints apart or more are watched against each other (nearer ones share a
+joint housing and touch by construction); the moving part from the second link on is watched against ground
+and boxes.
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ class CollisionChecker:
         wanted = len(ElementTree.fromstring(arm.urdf).findall("link/collision"))
         if geometry.ngeoms == 0 or geometry.ngeoms != wanted:
             raise ConfigurationError(
-                f"{arm.urdf_path}: {geometry.ngeoms} of {wanted} collision shapes could be read; a check against the "
-                "rest would pass whatever happens. Use sphere, cylinder or box"
+                f"{arm.urdf_path}: {geometry.ngeoms} of {wanted} collision shapes could be read; a check "
+                "against the rest would pass whatever happens. Use sphere, cylinder or box"
             )
         self._links = [int(shape.parentJoint) for shape in geometry.geometryObjects]
         self._names = [self._model.frames[shape.parentFrame].name for shape in geometry.geometryObjects]
@@ -102,8 +103,9 @@ class CollisionChecker:
     def check_path(self, q: NDArray[np.float64], *, period_s: float = 0.0) -> Clearance:
         """Tightest moment of the path q, (n, 7) [rad], rows `period_s` apart [s].
 
-        Measured at postures with at most half a degree of motion of any joint between them: between two of them no
-        point of the arm comes nearer than their distances by more than a few millimetres, which the margin covers.
+        Measured at postures with at most half a degree of motion of any joint between them: between two of
+        them no point of the arm comes nearer than their distances by more than a few millimetres, which the
+        margin covers.
         """
         path = np.asarray(q, dtype=np.float64)
         if path.ndim != 2 or path.shape[1] != JOINTS or len(path) == 0 or not np.all(np.isfinite(path)):

@@ -1,149 +1,85 @@
-"""The driver: connection to the arm as a lifecycle, on top of a real-time process and a recorder process."""
+"""The driver: the connection to the arm as a lifecycle, on top of a real-time process and a recorder process.
+
+::
+
+    with Driver(Arm.load(), LinkSettings(address="192.168.0.100")) as driver:
+        driver.connect()
+        driver.wait_quality()
+        motion = move_to(arm, driver.state().setpoint, goal, driver.state().period_s)
+        driver.record(Path("session.mcap"), session_metadata(robot="LWR4+"))
+        driver.enter_command()
+        outcome = driver.execute(motion)
+        driver.leave_command()
+        driver.end_record(outcome.status, outcome.reason)
+        outcome.check()
+
+A motion that ended, for whatever reason, is never taken up again.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import LwrError
+from fri.errors import (
+    ConfigurationError,
+    LwrError,
+    NetworkError,
+    OperatorError,
+    RefusedError,
+    RobotError,
+)
+from fri.states import Quality
 from lwr_driver.arm import Arm
-from lwr_driver.motion import Motion
+from lwr_driver.commander import BRAKE, HOLD
+from lwr_driver.control import Control, Job, Mode, Result, Text, Word
+from lwr_driver.link import (
+    LinkSettings,
+    advise_command,
+    advise_connect,
+    advise_leave,
+    advise_quality,
+)
+from lwr_driver.loop import LoopSettings
+from lwr_driver.loop_process import LoopProcess, Scheduling
+from lwr_driver.motion import Motion, check_motion, check_start
+from lwr_driver.motor_torque import KrlMotorTorque
+from lwr_driver.realtime import Rights
+from lwr_driver.recorder import Recorded, Recorder, SessionRequest
+from lwr_driver.ring import Ring
+from lwr_driver.session.writer import ExitStatus
+from lwr_driver.state import LinkState, Measured, Outcome, Progress, Waiting, snapshot
 
 __all__ = ["Driver", "LinkSettings", "LinkState", "Measured", "Outcome", "Progress", "Waiting"]
 
+log = logging.getLogger(__name__)
 
-@dataclass(frozen=True)
-class LinkSettings:
-    """How the arm is reached and how fast the answer must be.
+LOCK_STEP_EPOCH_NS = 1_577_836_800 * 10**9
+"""Log time of packet 0 in lock step: the first of January 2020."""
 
-    address, port : where this computer listens; only this address is bound
-    controller : IP address of the controller; None takes the first that speaks, and then only that
-    lock_step : the other side waits for each answer; nothing runs between commands (the emulator only)
-    handshake : the KRL program that runs on the controller, a name of `fri.krl`
-    realtime : `require` refuses to run without real-time rights, `allow` runs with a warning
-    link_timeout_s : silence after which the link counts as lost [s]; at least ten cycles are always granted
-    """
+ROWS_KEPT = 50
+"""Cycles that an error or an outcome carries."""
 
-    address: str = "192.168.0.100"
-    port: int = 49938
-    controller: str | None = None
-    lock_step: bool = False
-    handshake: str = "fri_control"
-    realtime: Literal["require", "allow"] = "require"
-    priority: int = 80
-    cpu: int | None = None
-    link_timeout_s: float = 0.1
-    tracking_limit_rad: float = 0.2
-    longest_motion_s: float = 900.0
-
-
-@dataclass(frozen=True)
-class Waiting:
-    """What a step of the driver waits for: what is awaited, what is seen, since when, and what to do."""
-
-    awaited: str
-    seen: str
-    since_s: float
-    advice: str
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a motion is: rows sent of rows planned, name of the phase, and the state of the link."""
-
-    row: int
-    rows: int
-    time_s: float
-    phase: str
-    state: LinkState
-
-
-@dataclass(frozen=True)
-class LinkState:
-    """Snapshot of the link. Arrays are (7,) float64 in kinematic order.
-
-    state, quality : names of the FRI states (`MON`, `CMD`; `UNACCEPTABLE` to `PERFECT`), `OFF` before the first packet
-    mode : what the loop answers: `mirror`, `hold`, `motion`, `stop`, `silent`
-    sequence : unwrapped packet count; period_s : sample time of the controller [s]
-    q, tau, q_command : measured position [rad], joint torque sensor [Nm], last position sent [rad]
-    setpoint : the controller's own set point (command plus FRI offset) [rad]
-    tracking_error : worst |q - q_command| of each joint since command mode began [rad]
-    latency_s : reply latency quantiles of the loop {0.5, 0.99, 0.999, 1.0} [s]
-    """
-
-    state: str
-    quality: str
-    mode: str
-    sequence: int
-    period_s: float
-    power: int
-    error: int
-    warning: int
-    control: str
-    safety_limits: float
-    answer_rate: float
-    controller_latency_s: float
-    jitter_s: float
-    miss_rate: float
-    miss_counter: int
-    temperature: NDArray[np.float64]
-    q: NDArray[np.float64]
-    tau: NDArray[np.float64]
-    tau_external: NDArray[np.float64]
-    q_command: NDArray[np.float64]
-    setpoint: NDArray[np.float64]
-    tracking_error: NDArray[np.float64]
-    latency_s: dict[float, float]
-    received: int
-    answered: int
-    lost: int
-    repeated: int
-    reordered: int
-    malformed: int
-    foreign: int
-    late: int
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Means and standard deviations over some cycles at rest; arrays (7,) float64 [rad], [Nm]."""
-
-    cycles: int
-    q: NDArray[np.float64]
-    q_std: NDArray[np.float64]
-    tau: NDArray[np.float64]
-    tau_std: NDArray[np.float64]
-    tau_external: NDArray[np.float64]
-    q_command: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a motion ended.
-
-    status : `success`, `abort` (someone asked to stop), `fail`
-    reason : why, in words; empty on success
-    last_rows : the last rows of the loop, dtype `lwr_driver.ring.ROW`
-    error : what `check()` raises; None unless failed
-    """
-
-    status: Literal["success", "abort", "fail"]
-    reason: str
-    last_rows: NDArray[Any]
-    rows_sent: int
-    error: LwrError | None = None
-
-    def check(self) -> Outcome:
-        """This outcome, or its error raised with the last rows as `.rows`."""
-        if self.error is not None:
-            raise self.error
-        return self
+_POLL_S = 0.002
+_NOTIFY_S = 0.5
+_PROGRESS_S = 0.1
+_SHORTEST_CYCLE_S = 1e-3
+_CLOSE_PATIENCE_S = 2.0
+_ERRORS: Mapping[Result, type[LwrError]] = {
+    Result.REFUSED: RefusedError,
+    Result.ROBOT: RobotError,
+    Result.NETWORK: NetworkError,
+    Result.GUARD: RefusedError,
+}
+_PHASES = {HOLD: "hold", BRAKE: "brake"}
 
 
 class Driver:
@@ -152,12 +88,31 @@ class Driver:
     arm : limits that guard every cycle
     link : how the arm is reached
     notify : called with a Waiting about twice a second while a step waits
+    motor_torque : where the motor torques stand in the KRL variables; None records none
+
+    Steps that wait raise OperatorError if `request_stop` or `drop_link` is called meanwhile, NetworkError if
+    the link or a process is gone, RobotError if the controller does not do what is asked. Errors carry the
+    last cycles as `.rows`.
     """
 
     def __init__(
-        self, arm: Arm, link: LinkSettings, *, notify: Callable[[Waiting], None] | None = None
+        self,
+        arm: Arm,
+        link: LinkSettings,
+        *,
+        notify: Callable[[Waiting], None] | None = None,
+        motor_torque: KrlMotorTorque | None = None,
     ) -> None:
-        raise NotImplementedError
+        self.arm, self.link, self.motor_torque = arm, link, motor_torque
+        self.rights: Rights | None = None
+        self._notify = notify
+        self._control: Control | None = None
+        self._ring: Ring | None = None
+        self._loop: LoopProcess | None = None
+        self._recorder: Recorder | None = None
+        self._recording = False
+        self._stops_seen = 0
+        self._notes_seen = 0
 
     def __enter__(self) -> Driver:
         return self
@@ -167,56 +122,443 @@ class Driver:
     ) -> None:
         self.close()
 
+    # -- lifecycle -------------------------------------------------------------------------------------------
+
     def connect(self, *, timeout_s: float = 60.0) -> LinkState:
-        """Start loop and recorder, wait for the first packet."""
-        raise NotImplementedError
+        """Start loop and recorder and wait for the first packet; everything is ended again if that fails."""
+        if self._loop is not None:
+            return self.state()
+        link = self.link
+        try:
+            self._control = Control.create(round(link.longest_motion_s / _SHORTEST_CYCLE_S))
+            self._ring = Ring.create()
+            self._recorder = Recorder(self._ring, heartbeat_timeout_s=None if link.lock_step else 2.0)
+            settings = LoopSettings(
+                address=link.address,
+                port=link.port,
+                controller=link.controller,
+                lock_step=link.lock_step,
+                handshake=link.handshake,
+                link_timeout_s=link.link_timeout_s,
+                tracking_limit_rad=link.tracking_limit_rad,
+                joint_names=self.arm.joint_names,
+            )
+            scheduling = Scheduling(
+                apply=not link.lock_step,
+                required=not link.lock_step and link.realtime == "require",
+                priority=link.priority,
+                cpu=link.cpu,
+            )
+            self._loop = LoopProcess(settings, self.arm.limits, self._control, self._ring, scheduling)
+            self.rights = self._loop.rights
+            for shortage in (*self.rights.missing, *self.rights.advice):
+                log.warning("%s", shortage)
+            self._wait(
+                Job.CYCLES,
+                a=1,
+                timeout_s=timeout_s,
+                awaited=f"the first packet on UDP {link.address}:{self._loop.port}",
+                advice=advise_connect,
+                failure=NetworkError,
+            )
+        except BaseException:
+            self.close()
+            raise
+        return self.state()
+
+    @property
+    def port(self) -> int:
+        """UDP port on which the loop listens."""
+        return self._need(self._loop).port
+
+    def close(self) -> None:
+        """Stop, leave command mode, end the session and both processes. Safe at any time and repeatedly."""
+        if self._loop is not None:
+            with contextlib.suppress(LwrError):
+                self._come_to_rest()
+            self._loop.stop()
+            self._loop = None
+        if self._recorder is not None:
+            if self._recording:
+                with contextlib.suppress(LwrError):
+                    self._recorder.close("fail", "the driver was closed before the session ended")
+                self._recording = False
+            self._recorder.stop()
+            self._recorder = None
+        if self._ring is not None:
+            self._ring.unlink()
+            self._ring = None
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+
+    def _come_to_rest(self) -> None:
+        words = self._need(self._control).words
+        if words[Word.DROP] or Mode(int(words[Word.MODE])) not in (Mode.HOLD, Mode.MOTION, Mode.STOP):
+            return
+        for job in (Job.HALT, Job.LEAVE):
+            self._wait(
+                job,
+                timeout_s=_CLOSE_PATIENCE_S,
+                patience_s=_CLOSE_PATIENCE_S,
+                awaited="rest",
+                stoppable=False,
+            )
+
+    # -- steps -----------------------------------------------------------------------------------------------
 
     def wait_quality(self, quality: str = "OK", *, cycles: int = 100, timeout_s: float = 60.0) -> LinkState:
         """Wait until the controller has rated the link `quality` or better for `cycles` cycles on end."""
-        raise NotImplementedError
+        try:
+            least = Quality[quality.upper()]
+        except KeyError:
+            known = ", ".join(item.name for item in Quality)
+            raise ConfigurationError(f"quality {quality!r} is unknown; choose one of {known}") from None
+        self._wait(
+            Job.QUALITY,
+            a=cycles,
+            b=int(least),
+            timeout_s=timeout_s,
+            awaited=f"quality {least.name} for {cycles} cycles",
+            advice=advise_quality,
+            failure=NetworkError,
+        )
+        return self.state()
 
     def enter_command(self, *, timeout_s: float = 120.0) -> LinkState:
-        """Ask the KRL program to start commanding, wait for command mode with drives on and no error."""
-        raise NotImplementedError
+        """Ask the KRL program to start commanding; wait for command mode, drives on and no error.
+
+        From then on the arm holds where the controller has it.
+        """
+        try:
+            self._wait(
+                Job.START,
+                timeout_s=timeout_s,
+                awaited="command mode with drives on",
+                advice=advise_command,
+            )
+        except BaseException:
+            # The request must not be granted after nobody waits for it any more.
+            if self._loop is not None:
+                self._post(Job.LEAVE)
+            raise
+        return self.state()
 
     def execute(self, motion: Motion, progress: Callable[[Progress], None] | None = None) -> Outcome:
-        """Command a motion from its first row to its last, then hold the last row."""
-        raise NotImplementedError
+        """Command a motion from its first row to its last, then hold the last row.
+
+        The first row must be the commanded position, `state().q_command`, to the last bit of float32.
+        `progress` is called about ten times a second; an exception from it stops the arm and is passed on.
+
+        Raises RefusedError, before anything moves, if the motion breaks a limit or begins elsewhere, and
+        RobotError if command mode is not on. What happens once it moves is in the outcome, not in an
+        exception.
+        """
+        control, state = self._need(self._control), self.state()
+        if int(control.words[Word.STOP]) != self._stops_seen:
+            self._stops_seen = int(control.words[Word.STOP])
+            return Outcome("abort", "stop requested before the motion began", self._rows(), -1, len(motion))
+        self._check_executable(motion, state)
+        control.put_motion(motion.q, self._number_phases(motion))
+        self._post(Job.MOTION, a=len(motion), b=self._stops_seen)
+        names = dict(zip(control.phase_ids.tolist(), (name for _, name in motion.phases), strict=False))
+        row = -1
+        trouble: LwrError | None = None
+        following = time.monotonic()
+        watch = _Watch(self)
+        try:
+            while not self._done():
+                time.sleep(_POLL_S)
+                watch.check(self.link.lock_step_patience_s)
+                index = int(control.words[Word.INDEX])
+                row = index if index >= 0 else row
+                if time.monotonic() < following:
+                    continue
+                following = time.monotonic() + _PROGRESS_S
+                if trouble is None:
+                    trouble = self._recorder_trouble()
+                if progress is not None:
+                    state = self.state()
+                    phase = self._phase_name(names)
+                    progress(Progress(max(row, 0), len(motion), max(row, 0) * motion.period_s, phase, state))
+        except BaseException as error:
+            self._give_up(error)
+            if isinstance(error, LwrError) and error is watch.error:
+                return Outcome("fail", str(error), self._rows(), row, len(motion), self._with_rows(error))
+            raise
+        return self._outcome(motion, row, trouble)
 
     def monitor(self, cycles: int) -> Measured:
-        """Means over `cycles` cycles, in monitor mode or holding in command mode."""
-        raise NotImplementedError
+        """Means over `cycles` cycles, in monitor mode or while holding in command mode."""
+        if cycles < 1:
+            raise ConfigurationError(f"mean over {cycles} cycles; take one at least")
+        self._wait(
+            Job.CYCLES,
+            a=cycles,
+            timeout_s=max(10.0, 20.0 * cycles * self.state().period_s),
+            awaited=f"{cycles} cycles",
+            advice=advise_connect,
+            failure=NetworkError,
+        )
+        q, q_std, tau, tau_std, external, command = self._need(self._control).measured.copy()
+        return Measured(cycles, q, q_std, tau, tau_std, external, command)
 
     def stop(self) -> LinkState:
-        """Stop within the limits and wait until the commanded position rests; no effect out of command mode."""
-        raise NotImplementedError
+        """Stop within the limits and wait until the commanded position rests."""
+        self._wait(Job.HALT, timeout_s=10.0, awaited="rest", stoppable=False)
+        words = self._need(self._control).words
+        self._stops_seen = int(words[Word.STOP])
+        return self.state()
 
     def request_stop(self) -> None:
-        """Ask for a jerk-limited stop and return at once; may be called from any thread or signal handler."""
-        raise NotImplementedError
+        """Ask for a jerk-limited stop and return at once; from any thread or signal handler.
+
+        It holds until a step notices it: a motion is stopped, a waiting step raises OperatorError, and a
+        motion that has not begun does not begin.
+        """
+        if self._control is not None:
+            self._control.words[Word.STOP] += 1
 
     def drop_link(self) -> None:
-        """Stop answering at once and for good: the controller brakes by itself. From any thread or handler."""
-        raise NotImplementedError
+        """Answer no more, at once and for good: the controller brakes by itself. From any thread or handler."""
+        if self._control is not None:
+            self._control.words[Word.DROP] = 1
 
     def leave_command(self, *, timeout_s: float = 30.0) -> LinkState:
         """Ask the KRL program to stop commanding and wait for monitor mode."""
-        raise NotImplementedError
+        self._wait(
+            Job.LEAVE,
+            timeout_s=timeout_s,
+            awaited="monitor mode",
+            advice=advise_leave,
+            stoppable=False,
+        )
+        return self.state()
 
     def state(self) -> LinkState:
         """Snapshot of the link at this moment; never waits."""
-        raise NotImplementedError
+        control, ring = self._need(self._control), self._need(self._ring)
+        return snapshot(control, time.monotonic_ns(), ring.overruns)
+
+    # -- recording -------------------------------------------------------------------------------------------
 
     def record(
         self, path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes] | None = None
     ) -> None:
-        """Begin a session log at `path` with the next cycle."""
-        raise NotImplementedError
+        """Begin a session log at `path` with the next cycle; `metadata` as from `session_metadata`."""
+        self._need(self._recorder).open(
+            SessionRequest(
+                path=path,
+                joint_names=self.arm.joint_names,
+                metadata=dict(metadata),
+                robot_description=self.arm.urdf,
+                attachments=dict(attachments or {}),
+                phase_names=tuple(_PHASES[number] for number in sorted(_PHASES)),
+                motor_torque=self.motor_torque,
+                virtual_epoch_ns=LOCK_STEP_EPOCH_NS if self.link.lock_step else None,
+            )
+        )
+        self._recording = True
 
-    def end_record(self, status: Literal["success", "abort", "fail"], reason: str = "") -> None:
+    def end_record(self, status: ExitStatus, reason: str = "") -> Recorded:
         """Write everything received so far, then the closing record."""
-        raise NotImplementedError
+        self._recording = False
+        return self._need(self._recorder).close(status, reason)
 
-    def close(self) -> None:
-        """Stop, leave command mode if possible, end both processes. Safe to call at any time and twice."""
-        raise NotImplementedError
+    # -- inside ----------------------------------------------------------------------------------------------
+
+    def _need(self, part: Any) -> Any:
+        if part is None:
+            raise NetworkError("the driver is not connected; call `connect` first")
+        return part
+
+    def _post(self, job: Job, a: int = 0, b: int = 0, limit: int = 0) -> None:
+        words = self._need(self._control).words
+        words[Word.JOB], words[Word.A], words[Word.B], words[Word.LIMIT] = int(job), a, b, limit
+        words[Word.REQUEST] += 1
+
+    def _done(self) -> bool:
+        words = self._need(self._control).words
+        return int(words[Word.DONE]) == int(words[Word.REQUEST])
+
+    def _wait(
+        self,
+        job: Job,
+        *,
+        timeout_s: float,
+        awaited: str,
+        a: int = 0,
+        b: int = 0,
+        advice: Callable[[LinkState], str] | None = None,
+        failure: type[LwrError] = RobotError,
+        stoppable: bool = True,
+        patience_s: float | None = None,
+    ) -> None:
+        """Post a job and wait for its end; the error says what was awaited, what is seen, and what to do.
+
+        The time limit counts cycles where there is a cycle, so that it means the same in lock step.
+        """
+        state = self.state()
+        limit = round(timeout_s / state.period_s) if state.period_s > 0.0 else 0
+        self._post(job, a, b, limit)
+        began = notified = time.monotonic()
+        patience = self.link.lock_step_patience_s if patience_s is None else patience_s
+        watch = _Watch(self)
+        while not self._done():
+            time.sleep(_POLL_S)
+            if state.sequence >= 0:
+                watch.check(patience)
+            elif self._loop is not None:
+                self._loop.check()
+            if stoppable:
+                self._obey(awaited)
+            now = time.monotonic()
+            waiting = Waiting(awaited, "", now - began, "")
+            if now - notified >= _NOTIFY_S:
+                notified = now
+                self._report_notes()
+                if self._notify is not None:
+                    self._notify(self._describe(waiting, advice))
+            wall = timeout_s if state.sequence < 0 or not self.link.lock_step else np.inf
+            if waiting.since_s > wall:
+                raise self._with_rows(failure(str(self._describe(waiting, advice))))
+        result = Result(int(self._need(self._control).words[Word.RESULT]))
+        if result is Result.DONE:
+            return
+        waiting = Waiting(awaited, "", time.monotonic() - began, "")
+        if result is Result.TIMEOUT:
+            waiting = Waiting(awaited, "", timeout_s, "")
+            raise self._with_rows(failure(str(self._describe(waiting, advice))))
+        reason = self._need(self._control).text(Text.REASON)
+        if result is Result.ABORTED:
+            raise self._with_rows(OperatorError(reason))
+        raise self._with_rows(_ERRORS.get(result, failure)(f"{awaited}: {reason}"))
+
+    def _describe(self, waiting: Waiting, advice: Callable[[LinkState], str] | None) -> Waiting:
+        state = self.state()
+        text = advice(state) if advice is not None else ""
+        return Waiting(waiting.awaited, state.summary, waiting.since_s, text)
+
+    def _obey(self, awaited: str) -> None:
+        words = self._need(self._control).words
+        if words[Word.DROP]:
+            raise self._with_rows(
+                OperatorError(f"the link was dropped on request while waiting for {awaited}")
+            )
+        if int(words[Word.STOP]) != self._stops_seen:
+            self._stops_seen = int(words[Word.STOP])
+            raise self._with_rows(OperatorError(f"stop requested while waiting for {awaited}"))
+
+    def _check_executable(self, motion: Motion, state: LinkState) -> None:
+        if state.mode != "hold":
+            left = f" {state.left}" if state.left else ""
+            raise self._with_rows(
+                RobotError(f"not in command mode ({state.summary}).{left} Call `enter_command` first")
+            )
+        if abs(motion.period_s - state.period_s) > 1e-9:
+            raise ConfigurationError(
+                f"motion has a period of {motion.period_s} s, the controller's cycle is {state.period_s} s; "
+                "plan with the controller's"
+            )
+        check_motion(self.arm, motion)
+        check_start(self.arm, motion, state.q_command)
+        if 0.0 < state.safety_limits < 1.0:
+            speed = np.abs(np.diff(motion.q, axis=0)).max(axis=0, initial=0.0) / motion.period_s
+            share = speed / self.arm.v_max
+            joint = int(share.argmax())
+            if share[joint] > state.safety_limits:
+                raise RefusedError(
+                    f"{self.arm.joint_names[joint]} velocity {speed[joint]:.4g} rad/s is {share[joint]:.2f} of "
+                    f"the limit, the controller allows {state.safety_limits:.2f} (friStart); lower `speed_scale`"
+                )
+
+    def _number_phases(self, motion: Motion) -> list[tuple[int, int]]:
+        names = tuple(name for _, name in motion.phases)
+        first = len(_PHASES)
+        if self._recording and names:
+            first = self._need(self._recorder).add_phases(names)
+        return [(row, first + place) for place, (row, _) in enumerate(motion.phases)]
+
+    def _phase_name(self, names: Mapping[int, str]) -> str:
+        rows = self._rows(1)
+        number = int(rows[0]["phase"]) if len(rows) else -1
+        return _PHASES.get(number) or names.get(number, "")
+
+    def _recorder_trouble(self) -> LwrError | None:
+        """What is wrong with the recording; then the motion is stopped, for without data it is in vain."""
+        if not self._recording:
+            return None
+        try:
+            self._need(self._recorder).check()
+        except LwrError as error:
+            self.request_stop()
+            return error
+        return None
+
+    def _give_up(self, error: BaseException) -> None:
+        """Stop what still moves before an exception leaves."""
+        log.info("motion given up: %s", error)
+        with contextlib.suppress(LwrError):
+            self._wait(Job.HALT, timeout_s=_CLOSE_PATIENCE_S, awaited="rest", stoppable=False, patience_s=1.0)
+
+    def _outcome(self, motion: Motion, row: int, trouble: LwrError | None) -> Outcome:
+        control = self._need(self._control)
+        result = Result(int(control.words[Word.RESULT]))
+        reason = control.text(Text.REASON)
+        rows = self._rows()
+        self._report_notes()
+        sent = rows["plan_index"][rows["plan_index"] >= 0]
+        row = max(row, int(sent[-1])) if len(sent) else row
+        if result is Result.DONE:
+            return Outcome("success", "", rows, len(motion) - 1, len(motion))
+        if result is Result.ABORTED and trouble is None:
+            self._stops_seen = int(control.words[Word.STOP])
+            return Outcome("abort", reason, rows, row, len(motion))
+        error = trouble or _ERRORS.get(result, RobotError)(reason)
+        if trouble is not None:
+            self._stops_seen = int(control.words[Word.STOP])
+        return Outcome("fail", str(error), rows, row, len(motion), self._with_rows(error))
+
+    def _rows(self, count: int = ROWS_KEPT) -> NDArray[Any]:
+        rows: NDArray[Any] = self._need(self._control).last_rows(count)
+        return rows
+
+    def _with_rows(self, error: LwrError) -> LwrError:
+        if self._control is not None:
+            error.rows = self._rows()
+        return error
+
+    def _report_notes(self) -> None:
+        control = self._need(self._control)
+        if int(control.words[Word.NOTES]) != self._notes_seen:
+            self._notes_seen = int(control.words[Word.NOTES])
+            log.warning("link: %s", control.text(Text.NOTE))
+
+
+class _Watch:
+    """Notices that the loop process has ended, or in lock step that the other side has gone."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._cycles = -1
+        self._moved = time.monotonic()
+        self.error: LwrError | None = None
+
+    def check(self, patience_s: float) -> None:
+        driver = self._driver
+        try:
+            driver._need(driver._loop).check()
+        except LwrError as error:
+            self.error = error
+            raise
+        if not driver.link.lock_step:
+            return
+        cycles = int(driver._need(driver._control).words[Word.CYCLES])
+        now = time.monotonic()
+        if cycles != self._cycles:
+            self._cycles, self._moved = cycles, now
+        elif now - self._moved > patience_s:
+            self.error = NetworkError(
+                f"no packet for {now - self._moved:.1f} s in lock step; the emulator is gone"
+            )
+            raise self.error

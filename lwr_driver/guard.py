@@ -1,15 +1,17 @@
-"""The guard of every cycle: position, velocity, acceleration and jerk of the float32 value that is about to be sent.
+"""The guard of every cycle: position, velocity, acceleration and jerk of the float32 value that is about to
+be sent.
 
 With the rows x0..x3 sent at the cycles t0 < t1 < t2 < t3, the derivatives are divided differences,
 
     v = (x3 - x2) / h3,   a = 2 (v - v') / (h3 + h2),   j = 3 (a - a') / (h3 + h2 + h1),
 
-which for lost packets (h of several periods) stay within the bounds that hold on the full grid: a divided difference
-over some points of a grid is a weighted mean, with weights above zero, of those over neighbouring points.
+which for lost packets (h of several periods) stay within the bounds that hold on the full grid: a divided
+difference over some points of a grid is a weighted mean, with weights above zero, of those over neighbouring
+points.
 
-A float32 of magnitude 2 to 4 rad is rounded by up to 1.2e-7 rad. At 1 ms that alone makes 2.4e-4 rad/s, 0.48 rad/s²
-and 950 rad/s³ of apparent motion, so each limit is widened by the largest amount that rounding can account for, and
-by nothing else.
+A float32 of magnitude 2 to 4 rad is rounded by up to 1.2e-7 rad. At 1 ms that alone makes 2.4e-4 rad/s, 0.48
+rad/s² and 950 rad/s³ of apparent motion, so each limit is widened by the largest amount that rounding can
+account for, and by nothing else.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lwr_driver.arm import Limits
+from lwr_driver.arm import JOINTS, Limits
 
 __all__ = ["ROUNDING", "Guard", "Violation"]
 
@@ -42,7 +44,8 @@ class Violation:
     def describe(self, joint_names: tuple[str, ...]) -> str:
         """The message with subject, value and limit."""
         unit = _UNITS[self.quantity]
-        return f"{joint_names[self.joint]} {self.quantity} {self.value:.5g} {unit} exceeds {self.limit:.5g} {unit}"
+        name = joint_names[self.joint]
+        return f"{name} {self.quantity} {self.value:.5g} {unit} exceeds {self.limit:.5g} {unit}"
 
 
 class Guard:
@@ -56,13 +59,16 @@ class Guard:
         self._limits = limits
         self._period = period_s
         self._v_max = limits.v_max.copy()
-        self._rest()
-        self._q = np.zeros(7)
+        self._q, self._v, self._a = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS)
+        self._v_error = self._a_error = 0.0
+        self._h1 = self._h2 = period_s
 
     def reset(self, q: NDArray[np.float32]) -> None:
         """Begin at rest at the value q that was sent in this cycle; position limits do not apply to it."""
         self._q = q.astype(np.float64)
-        self._rest()
+        self._v, self._a = np.zeros(JOINTS), np.zeros(JOINTS)
+        self._v_error = self._a_error = 0.0
+        self._h1 = self._h2 = self._period
 
     def scale_velocity(self, factor: float) -> None:
         """Shrink the velocity limit by the controller's `safety_limits`, where that is below 1."""
@@ -72,7 +78,9 @@ class Guard:
             self._v_max[:] = self._limits.v_max
 
     def check(self, q: NDArray[np.float32], cycles: int) -> Violation | None:
-        """Why q must not be sent `cycles` cycles after the last value sent, or None; accepted values are remembered."""
+        """Why q must not be sent `cycles` cycles after the last value sent, or None; accepted values are
+        remembered.
+        """
         limits, h3 = self._limits, cycles * self._period
         x = q.astype(np.float64)
         if not np.all(np.isfinite(x)):
@@ -98,11 +106,6 @@ class Guard:
         self._v_error, self._a_error = v_error, a_error
         self._h1, self._h2 = self._h2, h3
         return None
-
-    def _rest(self) -> None:
-        self._v, self._a = np.zeros(7), np.zeros(7)
-        self._v_error = self._a_error = 0.0
-        self._h1 = self._h2 = self._period
 
     def _violation(
         self,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
 from ruckig import (
     ControlInterface,
     DurationDiscretization,
@@ -90,8 +89,8 @@ class Motion:
 class Extreme:
     """The moment of a motion that comes closest to one kind of limit, or exceeds it most.
 
-    quantity : `position`, `velocity`, `acceleration`, `jerk` of the rows as they are sent, or `stop position`,
-        `stop velocity`: where a stop begun at that row would lead
+    quantity : `position`, `velocity`, `acceleration`, `jerk` of the rows as they are sent, or `stop
+        position`, `stop velocity`: where a stop begun at that row would lead
     joint : name; row, time_s : place in the motion; value, limit : in `unit`; ok : whether the limit is kept
     """
 
@@ -113,16 +112,18 @@ class Extreme:
 
 
 def extremes(arm: Arm, motion: Motion) -> tuple[Extreme, ...]:
-    """For each kind of limit the worst moment of the motion, judged on the float32 values that are really sent.
+    """For each kind of limit the worst moment of the motion, judged on the float32 values that are really
+    sent.
 
-    The arm rests at the first row before the motion and at the last row after it. Derivatives are differences of
-    rows, as in `lwr_driver.guard`; each limit is widened by what rounding to float32 can account for. A motion that
-    passes can be stopped at any row without leaving the limits (`lwr_driver.stop`).
+    The arm rests at the first row before the motion and at the last row after it. Derivatives are differences
+    of rows, as in `lwr_driver.guard`; each limit is widened by what rounding to float32 can account for. A
+    motion that passes can be stopped at any row without leaving the limits (`lwr_driver.stop`).
     """
     limits, period = arm.limits, motion.period_s
     sent = motion.q.astype(np.float32).astype(np.float64)
     planned, rounded = _at_rest_around(motion.q), _at_rest_around(sent)
-    # Rows that were float32 already carry their rounding; of all others the plan itself must keep the limits too.
+    # Rows that were float32 already carry their rounding; of all others the plan itself must keep the limits
+    # too.
     exact = not np.array_equal(sent, motion.q)
     found = [_nearest(arm, motion, "position", sent, sent, ROUNDING)]
     for order, (quantity, unit, bound) in enumerate(
@@ -157,7 +158,9 @@ def check_motion(arm: Arm, motion: Motion) -> None:
 
 
 def check_start(arm: Arm, motion: Motion, q_command: NDArray[np.float64]) -> None:
-    """Raise RefusedError unless row 0, rounded to float32, is the value `q_command` that is being sent, (7,) [rad]."""
+    """Raise RefusedError unless row 0, rounded to float32, is the value `q_command` that is being sent, (7,)
+    [rad].
+    """
     gap = np.abs(motion.q[0].astype(np.float32).astype(np.float64) - q_command)
     joint = int(np.argmax(gap))
     if gap[joint] > 0.0:
@@ -176,11 +179,12 @@ def move_to(
     speed_scale: float = 0.2,
     phase: str = "move_to_start",
 ) -> Motion:
-    """Jerk-limited straight line in joint space, at rest at both ends, in the shortest whole number of periods.
+    """Jerk-limited straight line in joint space, at rest at both ends, in the shortest whole number of
+    periods.
 
-    start, goal : (7,) [rad]. speed_scale : of the velocity limits, above 0 to 1; acceleration is scaled by its
-    square root, jerk not at all. The line is straight (phase synchronisation), so checking it is checking what is
-    executed. Raises RefusedError if start or goal is outside the position limits.
+    start, goal : (7,) [rad]. speed_scale : of the velocity limits, above 0 to 1; acceleration is scaled by
+    its square root, jerk not at all. The line is straight (phase synchronisation), so checking it is checking
+    what is executed. Raises RefusedError if start or goal is outside the position limits.
     """
     if not 0.0 < speed_scale <= 1.0:
         raise ConfigurationError(f"speed_scale {speed_scale} is not above 0 and at most 1")
@@ -203,8 +207,8 @@ def move_to(
     request.synchronization = Synchronization.Phase
     request.duration_discretization = DurationDiscretization.Discrete
     request.current_position, request.target_position = ends[0].tolist(), ends[1].tolist()
-    # A little below the limits: rounding uses them up to the last digit, and a stop begun while accelerating towards
-    # full speed passes it by J T²/8 (`lwr_driver.stop`).
+    # A little below the limits: rounding uses them up to the last digit, and a stop begun while accelerating
+    # towards full speed passes it by J T²/8 (`lwr_driver.stop`).
     keep = 1.0 - 1e-6
     full = keep * limits.v_max - 0.13 * limits.j_max * period_s**2
     request.max_velocity = (speed_scale * np.maximum(full, 0.1 * limits.v_max)).tolist()

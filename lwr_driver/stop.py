@@ -1,17 +1,19 @@
 """The jerk-limited stop, exact in discrete time.
 
 From the last three commanded rows follow the discrete velocity v0 = (q0 - q1)/T and acceleration
-a0 = (q0 - 2 q1 + q2)/T². Ruckig's velocity interface brings (v0, a0) to rest in the shortest time with |a| <= A and
-|j| <= J (Berscheid and Kroeger 2021, each joint by itself), and the rows are q(k) = q(k-1) + T v(kT). Then
+a0 = (q0 - 2 q1 + q2)/T². Ruckig's velocity interface brings (v0, a0) to rest in the shortest time with |a| <=
+A and |j| <= J (Berscheid and Kroeger 2021, each joint by itself), and the rows are q(k) = q(k-1) + T v(kT).
+Then
 
 - first differences are v(kT), and second differences (v(kT) - v(kT - T))/T are means of a, so at most A;
-- third differences are at most J: within the profile as second differences of v, and across the beginning because
-  v(T) - v0 - T a0 is at most J T²/2, which leaves room to let the profile begin at a0 + d with |d| <= J T/2: half a
-  period of jerk gained, without which a stop at the height of an acceleration would overshoot by a0 T/2.
+- third differences are at most J: within the profile as second differences of v, and across the beginning
+  because v(T) - v0 - T a0 is at most J T²/2, which leaves room to let the profile begin at a0 + d with |d| <=
+  J T/2: half a period of jerk gained, without which a stop at the height of an acceleration would overshoot
+  by a0 T/2.
 
-So the stop keeps the limits in the same discrete sense in which the guard and the controller see them. How far a stop
-travels has a closed form, with which a motion is checked beforehand: wherever it is stopped, the arm stays inside its
-position limits.
+So the stop keeps the limits in the same discrete sense in which the guard and the controller see them. How
+far a stop travels has a closed form, with which a motion is checked beforehand: wherever it is stopped, the
+arm stays inside its position limits.
 """
 
 from __future__ import annotations
@@ -90,17 +92,17 @@ class Stop:
 def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, Rows]:
     """Lowest and highest position and highest speed of a stop begun at any row of q.
 
-    q : (n, 7) [rad]; rows before the first are taken equal to it. Returns three (n, 7): lowest position [rad],
-    highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by at most one
-    period at the highest speed.
+    q : (n, 7) [rad]; rows before the first are taken equal to it. Returns three (n, 7): lowest position
+    [rad], highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by at
+    most one period at the highest speed.
     """
     padded = np.vstack([q[:1], q[:1], q])
     v = (padded[2:] - padded[1:-1]) / period_s
     a = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) / period_s**2
     a_max, j_max = limits.a_max, limits.j_max
     a = _let_go(limits, period_s, v, a)
-    # Mirror each case so that the velocity left after letting go of a at full jerk is positive: then jerk comes first
-    # downwards, then acceleration stays at -peak, then jerk leads it back to zero.
+    # Mirror each case so that the velocity left after letting go of a at full jerk is positive: then jerk
+    # comes first downwards, then acceleration stays at -peak, then jerk leads it back to zero.
     sign = np.where(v + a * np.abs(a) / (2.0 * j_max) >= 0.0, 1.0, -1.0)
     v, a = sign * v, sign * a
     peak = np.minimum(np.sqrt(np.maximum(j_max * v + 0.5 * a**2, 0.0)), np.maximum(a_max, -a))
@@ -125,7 +127,9 @@ def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, R
 
 
 def _let_go(limits: Limits, period_s: float, v: Rows, a: Rows) -> Rows:
-    """The acceleration with which the profile begins: a, moved by up to half a period of jerk against the motion."""
+    """The acceleration with which the profile begins: a, moved by up to half a period of jerk against the
+    motion.
+    """
     excess = v + a * np.abs(a) / (2.0 * limits.j_max)
     half = 0.5 * period_s * limits.j_max
     moved = np.clip(a - np.clip(excess / period_s, -half, half), -limits.a_max, limits.a_max)

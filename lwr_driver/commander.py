@@ -1,0 +1,219 @@
+"""What is commanded in a cycle: hold, a row of the motion, or a stop; guarded, and without any socket.
+
+Every value passes the guard. What does not pass is not sent: the arm is stopped instead, and if even the stop
+would break a limit nothing is sent any more, which makes the controller brake by itself.
+
+The rows of a motion are counted by the controller's packets, not by answers: after a lost packet the motion
+is where it would have been. In between the controller extrapolates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lwr_driver.arm import JOINTS, Limits
+from lwr_driver.control import Control, Mode, Result, Text, Word
+from lwr_driver.guard import Guard, Violation
+from lwr_driver.ring import NO_PHASE
+from lwr_driver.stop import Stop
+
+__all__ = ["BRAKE", "HOLD", "Commander"]
+
+HOLD, BRAKE = 0, 1
+"""Numbers of the phases that the loop itself gives to rows: holding, and stopping before the end of a
+motion.
+"""
+
+
+class Commander:
+    """Chooses the position of each cycle in command mode.
+
+    limits : of every value sent. control : shared memory with the motion. joint_names : for reasons.
+    tracking_limit : distance of the arm, or of the controller's set point, from the last value sent at which
+    a motion is stopped [rad].
+
+    mode : what is answered; index : row of the motion, -1 outside one; phase : number of the phase;
+    target : last value sent (7,) float32; ended : result and reason of the motion, (NONE, "") before its end
+    """
+
+    def __init__(
+        self, limits: Limits, control: Control, joint_names: tuple[str, ...], tracking_limit: float
+    ) -> None:
+        self._limits, self._control, self._joint_names = limits, control, joint_names
+        self._plan, self._tracking_limit = control.plan, tracking_limit
+        self.mode = Mode.MIRROR
+        self.index, self.phase = -1, NO_PHASE
+        self.target = np.zeros(JOINTS, dtype=np.float32)
+        self.ended: tuple[Result, str] = (Result.NONE, "")
+        self._period = 0.0
+        self._guard: Guard
+        self._stop: Stop
+        self._since_sent = 0  # cycles since `target` was sent
+        self._past = np.zeros((3, JOINTS))  # rows commanded in that cycle and in the two before it
+        self._hold = np.zeros(JOINTS)
+        self._base, self._rows = 0, 0
+        self._next_phase = 0
+        self._pending: tuple[Result, str] = (Result.NONE, "")  # why the stop under way was begun
+
+    def set_period(self, period_s: float) -> None:
+        """Take the controller's cycle [s]; not in command mode."""
+        self._period = period_s
+        self._guard = Guard(self._limits, period_s)
+        self._stop = Stop(self._limits, period_s)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a motion or a stop is under way."""
+        return self.mode in (Mode.MOTION, Mode.STOP)
+
+    def enter(self, setpoint: NDArray[np.float32], safety_limits: float) -> NDArray[np.float32]:
+        """Begin to command, at rest, with the controller's own set point; returns it."""
+        self.target = setpoint.copy()
+        self._hold = setpoint.astype(np.float64)
+        self._past[:] = self._hold
+        self._guard.reset(setpoint)
+        self._guard.scale_velocity(safety_limits)
+        self._since_sent = 0
+        self.index, self.phase = -1, HOLD
+        self._control.tracking[:] = 0.0
+        self._control.write_text(Text.LEFT, "")
+        self.mode = Mode.HOLD
+        return self.target
+
+    def watch(self, elapsed: int, setpoint: NDArray[np.float32], q: NDArray[np.float32]) -> None:
+        """Count `elapsed` cycles, and stop if arm or set point are not where they were sent."""
+        self._since_sent += elapsed
+        error = np.abs(q - self.target)
+        np.maximum(self._control.tracking, error, out=self._control.tracking)
+        if self.mode is not Mode.MOTION:
+            return
+        limit = self._tracking_limit
+        subject, distance = "measured position", error
+        away = np.abs(setpoint - self.target)
+        if away.max() > limit:
+            subject, distance = "set point of the controller", away
+        joint = int(distance.argmax())
+        if distance[joint] > limit:
+            self.stop(
+                Result.ROBOT,
+                f"{self._joint_names[joint]} {subject} is {distance[joint]:.3f} rad from what was commanded, "
+                f"limit {limit:.3f} rad {self.place()}; something holds the arm, or it does not follow",
+            )
+
+    def begin(self, rows: int, sequence: int) -> None:
+        """Begin the motion of `rows` rows that lies in the shared memory with packet number `sequence`."""
+        self.ended = (Result.NONE, "")
+        if self.mode is not Mode.HOLD:
+            self.ended = (Result.REFUSED, f"a motion cannot begin {self.place()}")
+        elif not np.array_equal(self._plan[0].astype(np.float32), self.target):
+            self.ended = (Result.REFUSED, "the motion does not begin at the commanded position")
+        else:
+            self.mode, self._base, self._rows = Mode.MOTION, sequence, rows
+            self.phase, self._next_phase = NO_PHASE, 0
+
+    def command(self, sequence: int) -> NDArray[np.float32] | None:
+        """The value of packet number `sequence`, (7,); None if nothing may be sent any more."""
+        target = self._next(sequence)
+        violation = self._guard.check(target, self._since_sent)
+        if violation is not None and self.mode is not Mode.STOP:
+            self.stop(Result.GUARD, self._refusal(violation))
+            if self.mode is Mode.STOP:
+                target = self._next(sequence)
+                violation = self._guard.check(target, self._since_sent)
+        if violation is not None:
+            self.fall_silent(Result.GUARD, self._refusal(violation))
+            return None
+        self._commit(target)
+        return target
+
+    def stop(self, result: Result, reason: str) -> None:
+        """Begin a stop within the limits; `ended` tells `result` and `reason` once the arm holds."""
+        if self.mode not in (Mode.MOTION, Mode.HOLD):
+            return
+        self._pending = (result, reason)
+        try:
+            self._stop.begin(*self._past)
+        except ValueError as error:
+            self.fall_silent(result, f"{reason}; {error}")
+            return
+        self.mode = Mode.STOP
+
+    def lose(self, result: Result, reason: str) -> None:
+        """The controller follows no longer: back to the mirror, and the motion, if there is one, ends for
+        good.
+        """
+        if self.mode in (Mode.MIRROR, Mode.SILENT):
+            return
+        reason = f"{reason}, {self.place()}"
+        if self.mode is Mode.MOTION:
+            self.ended = (result, reason)
+        elif self.mode is Mode.STOP:
+            self.ended = (self._pending[0], f"{self._pending[1]}; then {reason}")
+        self._control.write_text(Text.LEFT, reason)
+        self.mode, self.index, self.phase = Mode.MIRROR, -1, NO_PHASE
+
+    def fall_silent(self, result: Result, reason: str) -> None:
+        """Send nothing any more: the controller brakes the arm by itself."""
+        if self.mode is Mode.SILENT:
+            return
+        if self.moving:
+            self.ended = (result, f"{reason}; no more answers are sent")
+        self._control.write_text(Text.LEFT, reason)
+        self.mode, self.index, self.phase = Mode.SILENT, -1, NO_PHASE
+
+    def place(self) -> str:
+        """Where in the motion the loop is, for a reason."""
+        if self.mode is not Mode.MOTION:
+            return f"in mode {self.mode.name.lower()}"
+        row = max(self.index, 0)
+        return f"at row {row} of {self._rows} (t = {row * self._period:.3f} s)"
+
+    def _next(self, sequence: int) -> NDArray[np.float32]:
+        """Row of this cycle, as the mode wants it."""
+        if self.mode is Mode.MOTION:
+            self.index = min(sequence - self._base, self._rows - 1)
+            self._find_phase()
+            return self._plan[self.index].astype(np.float32)
+        self.index = -1
+        if self.mode is Mode.STOP:
+            self.phase = BRAKE
+            return self._stop.advance(self._since_sent).astype(np.float32)
+        self.phase = HOLD
+        return self._hold.astype(np.float32)
+
+    def _commit(self, target: NDArray[np.float32]) -> None:
+        """Remember what is sent, from which a stop would begin, and see whether a motion or a stop is
+        over.
+        """
+        past = self._past
+        if self.mode is Mode.MOTION:
+            for back in range(3):
+                past[back] = self._plan[max(self.index - back, 0)]
+            if self.index == self._rows - 1:
+                self._end(Result.DONE, "")
+        elif self.mode is Mode.STOP:
+            past[:] = self._stop.advance(0)
+            if self._stop.finished:
+                self._end(*self._pending)
+        else:
+            for _ in range(min(self._since_sent, 2)):
+                past[2], past[1], past[0] = past[1], past[0], self._hold
+        self.target = target
+        self._since_sent = 0
+
+    def _end(self, result: Result, reason: str) -> None:
+        """A motion or a stop is over and the arm holds."""
+        self._hold = self._past[0].copy()
+        self.mode = Mode.HOLD
+        self.ended = (result, reason)
+
+    def _find_phase(self) -> None:
+        rows, count = self._control.phase_rows, int(self._control.words[Word.PHASES])
+        while self._next_phase < count and rows[self._next_phase] <= self.index:
+            self.phase = int(self._control.phase_ids[self._next_phase])
+            self._next_phase += 1
+
+    def _refusal(self, violation: Violation) -> str:
+        what = violation.describe(self._joint_names)
+        return f"guard: {what} {self.place()}; the value was not sent. Check the motion with `check_motion`"

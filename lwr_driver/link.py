@@ -1,0 +1,89 @@
+"""How the arm is reached, and what to do when it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from fri.errors import ConfigurationError
+from fri.handshake import find_handshake
+from fri.states import ALL_DRIVES
+from lwr_driver.state import LinkState
+
+__all__ = ["LinkSettings", "advise_command", "advise_connect", "advise_leave", "advise_quality"]
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """How the arm is reached and how fast the answer must be.
+
+    address, port : where this computer listens; only this address is bound. Port 0 takes a free one
+    controller : IP address of the controller; None takes the first that speaks, and then only that
+    lock_step : the other side waits for each answer and nothing runs between commands (the emulator only)
+    handshake : KRL program on the controller: `stanford`, `ros_control`, `rcprg`
+    realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; in lock step
+        they
+        do not matter and are not asked for
+    priority : of SCHED_FIFO; cpu : processor of the loop, None chooses an isolated one or the last
+    link_timeout_s : silence after which the link counts as lost [s]; ten cycles are always granted
+    tracking_limit_rad : distance between command and arm at which a motion is stopped [rad]
+    longest_motion_s : memory for motions, at 1 ms; longer cycles allow for longer motions [s]
+    lock_step_patience_s : real time without a packet after which the other side counts as gone in lock step
+        [s]
+    """
+
+    address: str = "192.168.0.100"
+    port: int = 49938
+    controller: str | None = None
+    lock_step: bool = False
+    handshake: str = "stanford"
+    realtime: Literal["require", "allow"] = "require"
+    priority: int = 80
+    cpu: int | None = None
+    link_timeout_s: float = 0.1
+    tracking_limit_rad: float = 0.2
+    longest_motion_s: float = 900.0
+    lock_step_patience_s: float = 15.0
+
+    def __post_init__(self) -> None:
+        find_handshake(self.handshake)
+        for name in ("link_timeout_s", "tracking_limit_rad", "longest_motion_s", "lock_step_patience_s"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be above zero")
+        if not 1 <= self.priority <= 99:
+            raise ConfigurationError(f"priority {self.priority} is not within 1 to 99")
+
+
+def advise_connect(state: LinkState) -> str:
+    """What to do while no packet comes."""
+    if state.malformed:
+        return "The packets are not FRI 1.0: check which software runs on the controller"
+    if state.foreign:
+        return "Packets come from another address: check `controller`"
+    return (
+        "Start the KRL program; check FRIHOST and FRISOCK on the controller, the cable, the address of this "
+        "computer and its firewall"
+    )
+
+
+def advise_quality(state: LinkState) -> str:
+    """What to do while the controller rates the link as bad."""
+    if state.late > state.received // 100:
+        return "Answers come too late: close other programs, see the real-time rights, or use a longer cycle"
+    return "Check cable and network card, and that only one client answers"
+
+
+def advise_command(state: LinkState) -> str:
+    """What to do while command mode does not come."""
+    if state.state == "CMD" and (state.power != ALL_DRIVES or state.error):
+        return "Switch the drives on and acknowledge messages at the pendant"
+    if state.quality in ("UNACCEPTABLE", "BAD"):
+        return advise_quality(state)
+    if state.control != "POSITION":
+        return "Switch the controller to position control (strategy 10)"
+    return "Start the KRL program, or let it go on; acknowledge messages at the pendant"
+
+
+def advise_leave(state: LinkState) -> str:
+    """What to do while command mode does not end."""
+    return "The KRL program does not react: stop it at the pendant"

@@ -1,0 +1,408 @@
+"""The FRI loop: receive, judge, answer at once, write a row; nothing else.
+
+Outside command mode the answer is the mirror of the controller's own set point, in command mode what
+`lwr_driver.commander` says. Leaving command mode ends a motion for good; what was lost is never taken up
+again.
+
+Requests come through shared memory and are looked at once a cycle. In lock step the loop stands still between
+them, so that no virtual time passes while nobody asks for it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.handshake import find_handshake
+from fri.remote import LinkEvent, RemoteEnd
+from fri.states import ALL_DRIVES, Quality, State
+from fri.states import Control as ControlMode
+from lwr_driver.arm import JOINTS, Limits
+from lwr_driver.commander import Commander
+from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
+from lwr_driver.ring import ROW, Ring
+
+__all__ = ["Loop", "LoopSettings"]
+
+_IDLE_S = 0.0005  # pause of a loop in lock step that has nothing to do
+_SLICE_S = 0.02  # longest wait for a packet before requests and silence are looked at
+_FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated
+_RING_PATIENCE_S = 5.0
+_COUNTERS = (
+    (Word.LOST, "lost"),
+    (Word.REPEATED, "repeated"),
+    (Word.REORDERED, "reordered"),
+    (Word.SUSPECT, "suspect"),
+    (Word.MALFORMED, "malformed"),
+    (Word.FOREIGN, "foreign"),
+    (Word.RESTARTS, "restarts"),
+    (Word.UNREFLECTED, "unreflected"),
+    (Word.ANSWERED, "answered"),
+    (Word.RECEIVED, "received"),
+)
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the loop must know; see `lwr_driver.driver.LinkSettings` for the meaning."""
+
+    address: str
+    port: int
+    controller: str | None
+    lock_step: bool
+    handshake: str
+    link_timeout_s: float
+    tracking_limit_rad: float
+    joint_names: tuple[str, ...]
+
+
+class Loop:
+    """One link to a controller, driven by requests in shared memory.
+
+    Usable in any process: `cycle` handles one packet, `run` goes on until it is told to quit.
+
+    settings, limits : see there. control : the shared memory. ring : rows for the recorder, None keeps none.
+    """
+
+    def __init__(
+        self, settings: LoopSettings, limits: Limits, control: Control, ring: Ring | None = None
+    ) -> None:
+        self._settings, self._control, self._ring = settings, control, ring
+        self._handshake = find_handshake(settings.handshake)
+        self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
+        self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
+        self._words = control.words
+        msr = self.remote.msr
+        self._krl, self._offset = msr["cmd_jnt_pos"], msr["cmd_jnt_pos_fri_offset"]
+        self._q = msr["msr_jnt_pos"]
+        self._sample_time = self._period = 0.0
+        self._silence_s, self._silence_cycles = settings.link_timeout_s, 0
+        self._sequence = -1
+        self._misses = 0
+        self._heard_s = time.monotonic()
+        self._restarts = 0
+        self._last_event: LinkEvent | None = None
+
+        self._request = int(self._words[Word.REQUEST])
+        self._job = Job.NONE
+        self._job_cycles = self._run_length = 0
+        self._begun = False
+        self._rest = _Rest(self.remote)
+        self._row: NDArray[Any] = np.zeros(1, dtype=ROW) if ring is None else ring.row
+        self._row_bytes = _bytes(self._row)
+        self._fields = {name: self._row[name] for name in ROW.names or () if name not in ("msr", "cmd")}
+        self._msr_bytes, self._cmd_bytes = _bytes(msr), _bytes(self.remote.command)
+        self._msr_place, self._cmd_place = _place("msr"), _place("cmd")
+
+    @property
+    def mode(self) -> Mode:
+        """What the loop answers at present."""
+        return self._commander.mode
+
+    def run(self, parent: int | None = None) -> None:
+        """Serve packets and requests until `QUIT` is set or the parent process is gone; stops a motion
+        first.
+        """
+        parent = os.getppid() if parent is None else parent
+        commander = self._commander
+        if self._ring is not None:
+            self._ring.start_writing()
+        try:
+            while True:
+                if self._words[Word.QUIT] or os.getppid() != parent:
+                    if self._settings.lock_step or not commander.moving:
+                        return
+                    if commander.mode is Mode.MOTION:
+                        commander.stop(Result.ABORTED, f"the driver ended {commander.place()}")
+                self._serve()
+        finally:
+            if self._ring is not None:
+                self._ring.stop_writing()
+            self.remote.close()
+
+    def cycle(self, timeout_s: float) -> bool:
+        """Handle the next packet; False if none came within `timeout_s` [s]."""
+        remote = self.remote
+        if remote.receive(timeout_s) is None:
+            self._no_packet()
+            return False
+        elapsed = remote.sequence - self._sequence if self._sequence >= 0 else 1
+        target = self._decide(remote.sequence, elapsed)
+        self._sequence = remote.sequence
+        answered = self._commander.mode is not Mode.SILENT
+        if answered:
+            remote.answer(target)
+        self._write_row(answered)
+        self._advance_job(elapsed)
+        return True
+
+    def _serve(self) -> None:
+        if not self._settings.lock_step:
+            self.cycle(_SLICE_S)
+            return
+        self._take_request()
+        if self._job is not Job.NONE:
+            self._wait_for_ring()
+            self.cycle(_SLICE_S)
+            return
+        time.sleep(_IDLE_S)
+        if self._ring is not None:
+            self._ring.beat(time.monotonic_ns())
+
+    def _wait_for_ring(self) -> None:
+        ring = self._ring
+        if ring is None or ring.free > 0:
+            return
+        deadline = time.monotonic() + _RING_PATIENCE_S
+        while ring.free <= 0 and time.monotonic() < deadline and not self._words[Word.QUIT]:
+            time.sleep(_IDLE_S)
+
+    # -- what to answer --------------------------------------------------------------------------------------
+
+    def _decide(self, sequence: int, elapsed: int) -> NDArray[np.float32] | None:
+        """The position to send, or None for the mirror."""
+        remote, commander = self.remote, self._commander
+        self._heard_s = remote.received_ns * 1e-9
+        if remote.sample_time_s != self._sample_time:
+            self._set_period(remote.sample_time_s)
+        if remote.restarts != self._restarts:
+            self._restarts = remote.restarts
+            self._begun = False
+            self._lose("the controller was started again")
+        elif elapsed > self._silence_cycles:
+            self._lose(f"{elapsed - 1} packets in a row were lost")
+        self._take_request()
+        if commander.mode is Mode.SILENT:
+            return None
+        ready = (
+            remote.state == State.CMD
+            and remote.power == ALL_DRIVES
+            and remote.error == 0
+            and remote.control == ControlMode.POSITION
+        )
+        if not ready:
+            self._leave()
+            return None
+        setpoint = self._krl + self._offset
+        if commander.mode is Mode.MIRROR:
+            return commander.enter(setpoint, float(remote.msr["safety_limits"]))
+        commander.watch(elapsed, setpoint, self._q)
+        if self._job is Job.MOTION and not self._begun:
+            self._begun = True
+            self._misses = int(remote.msr["miss_counter"])
+            commander.begin(int(self._words[Word.A]), sequence)
+        if commander.mode is Mode.MOTION:
+            if int(self._words[Word.STOP]) != int(self._words[Word.B]):
+                commander.stop(Result.ABORTED, f"stop requested {commander.place()}")
+            elif self._job is not Job.MOTION:
+                commander.stop(Result.ABORTED, f"stopped by the driver {commander.place()}")
+        return commander.command(sequence)
+
+    def _set_period(self, sample_time_s: float) -> None:
+        """Take the controller's sample time: float32 on the wire, a whole number of milliseconds in truth."""
+        if self._sample_time:
+            self._lose(f"the controller changed its sample time to {sample_time_s:.4g} s")
+        self._sample_time = sample_time_s
+        self._period = round(sample_time_s * 1e6) * 1e-6
+        self._silence_s = max(self._settings.link_timeout_s, _FEWEST_CYCLES * self._period)
+        self._silence_cycles = round(self._silence_s / self._period)
+        self._commander.set_period(self._period)
+
+    def _leave(self) -> None:
+        """The controller does not follow, or no longer: say why if it did before."""
+        if self._commander.mode is Mode.MIRROR:
+            return
+        remote = self.remote
+        state, quality = State(remote.state).name, Quality(remote.quality).name
+        missed = int(remote.msr["miss_counter"]) - self._misses if self._begun else 0
+        what = "controller left command mode"
+        if remote.power != ALL_DRIVES:
+            what = "drives are off"
+        elif remote.error:
+            what = "drives report an error"
+        elif remote.state == State.CMD:
+            what = "controller left position control"
+        timing = remote.quality <= Quality.BAD or missed > 0
+        self._lose(
+            f"{what}: state {state}, quality {quality}, control {ControlMode(remote.control).name}, "
+            f"power 0x{remote.power:02x}, error 0x{remote.error:02x}, {missed} answers missed",
+            Result.NETWORK if timing and what.startswith("controller left command") else Result.ROBOT,
+        )
+
+    def _lose(self, reason: str, result: Result = Result.NETWORK) -> None:
+        if self._commander.mode in (Mode.MIRROR, Mode.SILENT):
+            return
+        self._commander.lose(result, reason)
+        # The KRL program must not start command mode again before it is asked to.
+        self._handshake.request_stop(self.remote.command, self.remote.msr)
+
+    def _no_packet(self) -> None:
+        now = time.monotonic()
+        if self._ring is not None:
+            self._ring.beat(round(now * 1e9))
+        self._take_request()
+        self._words[Word.MODE] = int(self._commander.mode)
+        if self._commander.mode is Mode.SILENT and self._job in (Job.MOTION, Job.HALT):
+            self._finish(
+                *(self._commander.ended if self._begun else (Result.ABORTED, "the link was dropped"))
+            )
+        silence = now - self._heard_s
+        if self._settings.lock_step or self._sample_time == 0.0 or silence <= self._silence_s:
+            return
+        reason = f"no packet for {silence:.3f} s"
+        self._lose(reason)
+        self._words[Word.MODE] = int(self._commander.mode)
+        if self._job is Job.CYCLES or (self._job is Job.MOTION and not self._begun):
+            self._finish(Result.NETWORK, reason)
+        elif self._job in (Job.MOTION, Job.HALT):
+            self._advance_job(0)
+
+    # -- requests --------------------------------------------------------------------------------------------
+
+    def _take_request(self) -> None:
+        words = self._words
+        if words[Word.DROP] and self._commander.mode is not Mode.SILENT:
+            self._commander.fall_silent(
+                Result.ABORTED, f"the link was dropped on request {self._commander.place()}"
+            )
+        request = int(words[Word.REQUEST])
+        if request != self._request:
+            self._request, self._job = request, Job(int(words[Word.JOB]))
+            self._job_cycles = self._run_length = 0
+            self._begun = False
+
+    def _advance_job(self, elapsed: int) -> None:
+        """See whether what was asked for has come about."""
+        job, words, remote = self._job, self._words, self.remote
+        if job is Job.NONE:
+            return
+        commander, handshake = self._commander, self._handshake
+        self._job_cycles += elapsed
+        done = False
+        if job is Job.CYCLES:
+            done = self._rest.add(first=self._run_length == 0) >= int(words[Word.A])
+            self._run_length += 1
+        elif job is Job.QUALITY:
+            self._run_length = self._run_length + 1 if remote.quality >= int(words[Word.B]) else 0
+            done = self._run_length >= int(words[Word.A])
+        elif job is Job.START:
+            # After a fallback the program wants its stop acknowledged before it takes a start.
+            self._begun = self._begun or handshake.stopped(remote.msr) or remote.state == State.CMD
+            if self._begun:
+                handshake.request_start(remote.command, remote.msr, ControlMode.POSITION)
+            else:
+                handshake.request_stop(remote.command, remote.msr)
+            done = commander.mode is Mode.HOLD and handshake.started(remote.msr)
+        elif job is Job.LEAVE:
+            handshake.request_stop(remote.command, remote.msr)
+            done = remote.state != State.CMD and handshake.stopped(remote.msr)
+        elif job is Job.HALT:
+            done = not commander.moving
+        elif self._begun and commander.ended[0] is not Result.NONE:
+            self._finish(*commander.ended)
+            return
+        elif not self._begun and commander.mode is not Mode.HOLD:
+            self._finish(Result.REFUSED, f"not in command mode. {self._control.text(Text.LEFT)}".strip())
+            return
+        if done:
+            self._finish(Result.DONE, "")
+        elif 0 < int(words[Word.LIMIT]) < self._job_cycles:
+            if job is Job.START:
+                handshake.request_stop(remote.command, remote.msr)
+            self._finish(Result.TIMEOUT, "")
+
+    def _finish(self, result: Result, reason: str) -> None:
+        if self._job is Job.CYCLES and self._run_length > 0:
+            self._rest.write(self._control.measured)
+        self._control.write_text(Text.REASON, reason)
+        self._words[Word.RESULT] = int(result)
+        self._words[Word.DONE] = self._request
+        self._job = Job.NONE
+
+    # -- rows ------------------------------------------------------------------------------------------------
+
+    def _write_row(self, answered: bool) -> None:
+        remote, words, fields, control = self.remote, self._words, self._fields, self._control
+        received_ns, sent_ns = remote.received_ns, time.monotonic_ns()
+        words[Word.HEARD_NS] = received_ns
+        if answered:
+            control.latency[min((sent_ns - received_ns) // BIN_NS, len(control.latency) - 1)] += 1
+        if self._settings.lock_step:
+            # The clock of a log in lock step is the controller's: the same run gives the same log.
+            received_ns = sent_ns = remote.sequence * round(self._period * 1e9)
+        fields["t_recv"][0] = received_ns
+        fields["t_send"][0] = sent_ns if answered else 0
+        fields["sequence"][0] = remote.sequence
+        fields["plan_index"][0] = self._commander.index
+        fields["phase"][0] = self._commander.phase
+        fields["answered"][0] = answered
+        self._row_bytes[self._msr_place] = self._msr_bytes
+        self._row_bytes[self._cmd_place] = self._cmd_bytes
+        if self._ring is not None:
+            self._ring.publish()
+            self._ring.beat(time.monotonic_ns())
+        cycles = int(words[Word.CYCLES])
+        start = cycles % HISTORY * ROW.itemsize
+        control.history_bytes[start : start + ROW.itemsize] = self._row_bytes
+        words[Word.CYCLES] = cycles + 1
+        words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), self._commander.index
+        for word, name in _COUNTERS:
+            words[word] = getattr(remote, name)
+        if remote.events and remote.events[-1] is not self._last_event:
+            self._last_event = remote.events[-1]
+            control.write_text(Text.NOTE, self._last_event.text)
+            words[Word.NOTES] += 1
+
+
+class _Rest:
+    """Means over some cycles; deviations from the first one are summed, so nothing is lost to rounding."""
+
+    def __init__(self, remote: RemoteEnd) -> None:
+        msr = remote.msr
+        self._values = (
+            msr["msr_jnt_pos"],
+            msr["msr_jnt_trq"],
+            msr["est_ext_jnt_trq"],
+            remote.command["jnt_pos"],
+        )
+        self._count = 0
+        self._first = np.zeros((4, JOINTS))
+        self._sum, self._squares = np.zeros((4, JOINTS)), np.zeros((4, JOINTS))
+
+    def add(self, *, first: bool) -> int:
+        """Take the present cycle in, beginning anew with the `first`; returns how many there are."""
+        if first:
+            self._count = 0
+            self._sum[:] = self._squares[:] = 0.0
+            for place, value in enumerate(self._values):
+                self._first[place] = value
+        for place, value in enumerate(self._values):
+            deviation = value - self._first[place]
+            self._sum[place] += deviation
+            self._squares[place] += deviation * deviation
+        self._count += 1
+        return self._count
+
+    def write(self, measured: NDArray[np.float64]) -> None:
+        """Fill (6, 7): mean q, std q, mean tau, std tau, mean external tau, mean command."""
+        mean = self._sum / self._count
+        std = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
+        mean += self._first
+        measured[0], measured[1], measured[2], measured[3] = mean[0], std[0], mean[1], std[1]
+        measured[4], measured[5] = mean[2], mean[3]
+
+
+def _bytes(array: NDArray[Any]) -> memoryview:
+    return array.reshape(1).view(np.uint8).data
+
+
+def _place(name: str) -> slice:
+    fields = ROW.fields
+    assert fields is not None
+    dtype, offset = fields[name][:2]
+    return slice(offset, offset + dtype.itemsize)

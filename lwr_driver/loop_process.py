@@ -1,0 +1,195 @@
+"""The FRI loop in a process of its own: the handle that starts and ends it, and its entry.
+
+The process is a fresh interpreter that imports numpy, ruckig and `fri` only. It inherits the shared memory
+and a pipe for one line, in which it says that it is ready or why not. It ignores Ctrl-C, and ends when its
+parent is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from fri.errors import ConfigurationError, LwrError, NetworkError
+from lwr_driver import realtime
+from lwr_driver.arm import Limits
+from lwr_driver.control import Control, Word
+from lwr_driver.loop import Loop, LoopSettings
+from lwr_driver.realtime import Rights, Shortage
+from lwr_driver.ring import Ring
+
+__all__ = ["LoopProcess", "Scheduling"]
+
+_ROOT = Path(__file__).resolve().parents[1]
+_BOOT = "import sys; from lwr_driver.loop_process import main; main(sys.argv[1:])"
+_START_TIMEOUT_S = 60.0
+_END_TIMEOUT_S = 3.0
+
+
+@dataclass(frozen=True)
+class Scheduling:
+    """How the process runs. required : refuse to start without the rights; apply : ask for them at all."""
+
+    apply: bool
+    required: bool
+    priority: int = 80
+    cpu: int | None = None
+
+
+class LoopProcess:
+    """Starts the loop and waits until it listens.
+
+    Raises NetworkError if the address cannot be bound or required rights are missing, ConfigurationError if
+    the process cannot be started.
+
+    rights : what the process was granted; port : UDP port it listens on; pid : of the process
+    """
+
+    def __init__(
+        self,
+        settings: LoopSettings,
+        limits: Limits,
+        control: Control,
+        ring: Ring,
+        scheduling: Scheduling,
+    ) -> None:
+        self._control = control
+        order = {
+            "settings": asdict(settings),
+            "limits": {name: np.asarray(value).tolist() for name, value in asdict(limits).items()},
+            "scheduling": asdict(scheduling),
+            "control": [control.descriptor, control.plan_rows],
+            "ring": ring.name,
+            "parent": os.getpid(),
+        }
+        places = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _BOOT, json.dumps(order)],
+                pass_fds=(control.descriptor,),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(places), "OPENBLAS_NUM_THREADS": "1"},
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._errors.close()
+            raise ConfigurationError(f"the loop process cannot be started: {error}") from error
+        try:
+            answer = self._ready()
+        except BaseException:
+            self._process.kill()
+            self._process.wait()
+            self._errors.close()
+            raise
+        self.port = int(answer["port"])
+        self.rights = Rights(
+            tuple(Shortage(*shortage) for shortage in answer["missing"]),
+            tuple(Shortage(*shortage) for shortage in answer["advice"]),
+            answer["processor"],
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process id of the loop."""
+        return self._process.pid
+
+    def check(self) -> None:
+        """Raise NetworkError if the process has ended by itself."""
+        code = self._process.poll()
+        if code is not None:
+            raise NetworkError(
+                f"the loop process {self.pid} ended with code {code}. {self._complaint()}".strip()
+            )
+
+    def stop(self) -> None:
+        """Tell the process to end, which it does after stopping a motion; kill it if it does not."""
+        if self._process.poll() is None:
+            self._control.words[Word.QUIT] = 1
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_END_TIMEOUT_S)
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+
+    def _ready(self) -> dict[str, Any]:
+        output = self._process.stdout
+        assert output is not None
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while (remaining := deadline - time.monotonic()) > 0.0:
+            if not select.select([output], [], [], remaining)[0]:
+                break
+            line = output.readline()
+            if not line:
+                self._process.wait()
+                self.check()
+            answer: dict[str, Any] = json.loads(line)
+            if "error" in answer:
+                kinds = {kind.__name__: kind for kind in (NetworkError, ConfigurationError)}
+                raise kinds.get(answer["kind"], LwrError)(answer["error"])
+            return answer
+        raise NetworkError(f"the loop process did not get ready within {_START_TIMEOUT_S:g} s")
+
+    def _complaint(self) -> str:
+        with contextlib.suppress(OSError, ValueError):
+            self._errors.seek(0)
+            lines = self._errors.read().decode(errors="replace").strip().splitlines()
+            return lines[-1] if lines else ""
+        return ""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Entry of the loop process: one argument, the order as JSON."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    order = json.loads(arguments[0])
+    try:
+        scheduling = Scheduling(**order["scheduling"])
+        settings = dict(order["settings"])
+        settings["joint_names"] = tuple(settings["joint_names"])
+        limits = Limits(**{name: np.array(value) for name, value in order["limits"].items()})
+        control = Control(*order["control"])
+        loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]))
+        rights = realtime.set_up(scheduling.priority, scheduling.cpu) if scheduling.apply else Rights()
+        if scheduling.required:
+            rights.enforce()
+    except LwrError as error:
+        _say({"error": str(error), "kind": type(error).__name__})
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        control.words[Word.QUIT] = 1
+
+    signal.signal(signal.SIGTERM, end)
+    _say(
+        {
+            "port": loop.remote.address[1],
+            "missing": [[shortage.what, shortage.remedy] for shortage in rights.missing],
+            "advice": [[shortage.what, shortage.remedy] for shortage in rights.advice],
+            "processor": rights.processor,
+        }
+    )
+    loop.run(order["parent"])
+
+
+def _say(answer: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()

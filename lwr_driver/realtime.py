@@ -1,0 +1,192 @@
+"""Real-time set-up of a process on Linux: what is needed, what is missing, and how to get it.
+
+Measured on a busy computer, it is the scheduler and not the language that decides whether an answer leaves
+within a millisecond: SCHED_FIFO, a processor of its own and locked memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import platform
+import resource
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from fri.errors import NetworkError
+
+__all__ = ["Rights", "Shortage", "assess", "set_up"]
+
+_CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_PREFAULT_BYTES = 16 * 2**20
+_LIMITS_FILE = "/etc/security/limits.d/realtime.conf"
+_LOCK_BYTES = 512 * 2**20
+
+# Held open for the life of the process: closing it lets the processor sleep deeply again.
+_awake: list[int] = []
+
+
+@dataclass(frozen=True)
+class Shortage:
+    """A right that is missing: what it is, why it counts, and how to get it."""
+
+    what: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.remedy}"
+
+
+@dataclass(frozen=True)
+class Rights:
+    """What the process has and lacks.
+
+    missing : without these no cycle is safe; advice : would make the timing better
+    processor : that the loop is bound to, None for any
+    """
+
+    missing: tuple[Shortage, ...] = ()
+    advice: tuple[Shortage, ...] = ()
+    processor: int | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is missing."""
+        return not self.missing
+
+    def enforce(self) -> None:
+        """Raise NetworkError, with every remedy, if something is missing."""
+        if self.missing:
+            lines = "; ".join(str(shortage) for shortage in self.missing)
+            raise NetworkError(
+                f"this computer grants no real-time operation. {lines}. Then log in again, or allow operation "
+                "without real time where a missed answer does no harm (the emulator)"
+            )
+
+
+def assess(priority: int = 80) -> Rights:
+    """What a real-time process started by this user would have and lack; changes nothing."""
+    missing, advice = [], []
+    capabilities = _capabilities()
+    ceiling = resource.getrlimit(resource.RLIMIT_RTPRIO)[1]
+    if not capabilities >> _CAP_SYS_NICE & 1 and 0 <= ceiling < priority:
+        missing.append(_no_priority(priority, ceiling))
+    lockable = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    if not capabilities >> _CAP_IPC_LOCK & 1 and 0 <= lockable < _LOCK_BYTES:
+        missing.append(_no_memory(lockable))
+    kernel = _kernel_advice()
+    if kernel is not None:
+        advice.append(kernel)
+    if _processors() < 2:
+        advice.append(
+            Shortage("a single processor", "the loop shares it with everything else; use two or more")
+        )
+    return Rights(tuple(missing), tuple(advice))
+
+
+def set_up(priority: int = 80, processor: int | None = None) -> Rights:
+    """Make this process a real-time one as far as it may; returns what was not granted.
+
+    priority : of SCHED_FIFO, 1 to 99. processor : to be bound to; None takes an isolated one, else the last.
+    """
+    missing, advice = [], []
+    kernel = _kernel_advice()
+    if kernel is not None:
+        advice.append(kernel)
+    chosen = _choose(processor)
+    if chosen is not None:
+        try:
+            os.sched_setaffinity(0, {chosen})
+        except OSError as error:
+            remedy = f"choose one of {sorted(os.sched_getaffinity(0))} ({error.strerror})"
+            missing.append(Shortage(f"no operation on processor {chosen}", remedy))
+            chosen = None
+    _prefault()
+    library = ctypes.CDLL(None, use_errno=True)
+    if library.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        missing.append(_no_memory(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]))
+    with contextlib.suppress(OSError):
+        descriptor = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
+        os.write(descriptor, b"\0\0\0\0")
+        _awake.append(descriptor)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError:
+        missing.append(_no_priority(priority, resource.getrlimit(resource.RLIMIT_RTPRIO)[0]))
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return Rights(tuple(missing), tuple(advice), chosen)
+
+
+def _no_priority(priority: int, ceiling: int) -> Shortage:
+    interpreter = os.path.realpath(sys.executable)
+    return Shortage(
+        f"SCHED_FIFO priority {priority} is not granted (limit {max(ceiling, 0)})",
+        f"put `@realtime - rtprio {max(priority, 95)}` into {_LIMITS_FILE} and add the user with "
+        "`sudo groupadd -f realtime && sudo usermod -aG realtime $USER`, or run "
+        f"`sudo setcap cap_sys_nice,cap_ipc_lock+ep {interpreter}`",
+    )
+
+
+def _no_memory(limit: int) -> Shortage:
+    return Shortage(
+        f"memory cannot be locked (limit {limit // 1024} KiB)",
+        f"put `@realtime - memlock unlimited` into {_LIMITS_FILE}",
+    )
+
+
+def _kernel_advice() -> Shortage | None:
+    with contextlib.suppress(OSError):
+        if Path("/sys/kernel/realtime").read_text().strip() == "1":
+            return None
+    version = platform.version()
+    if "PREEMPT_RT" in version:
+        return None
+    return Shortage(
+        f"kernel {platform.release()} is not PREEMPT_RT",
+        "stalls of some ms are possible at 1 kHz; install the distribution's real-time kernel "
+        "(Debian: linux-image-rt-amd64, Ubuntu: `sudo pro enable realtime-kernel`) or use a cycle of 5 ms "
+        "or more",
+    )
+
+
+def _capabilities() -> int:
+    """Effective capabilities as a bit mask."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("CapEff:"):
+                return int(line.split()[1], 16)
+    return 0
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _choose(processor: int | None) -> int | None:
+    """The processor to bind to: as asked, an isolated one, or the last (interrupts prefer the first)."""
+    if processor is not None:
+        return processor
+    with contextlib.suppress(OSError, ValueError):
+        isolated = Path("/sys/devices/system/cpu/isolated").read_text().strip()
+        if isolated:
+            return int(isolated.replace("-", ",").split(",")[0])
+    allowed = sorted(os.sched_getaffinity(0))
+    return allowed[-1] if len(allowed) > 1 else None
+
+
+def _prefault() -> None:
+    """Have the heap grown and its pages present, and keep it so: no page faults later."""
+    library = ctypes.CDLL(None, use_errno=True)
+    with contextlib.suppress(AttributeError):
+        library.mallopt(_M_TRIM_THRESHOLD, -1)
+        library.mallopt(_M_MMAP_MAX, 0)
+    block = bytearray(_PREFAULT_BYTES)
+    block[:: resource.getpagesize()] = b"\1" * len(block[:: resource.getpagesize()])
+    del block
