@@ -15,11 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from lwr_driver.session.columns import JointColumns
 
-__all__ = ["FreshTorques", "KrlMotorTorque", "KrlTorqueDecoder"]
+__all__ = ["FreshTorques", "KrlMotorTorque", "KrlTorqueDecoder", "TorqueMatch", "match_torques"]
 
 _SLOTS = 16
 _LONGEST_STEP = 1000
+_FOLLOWS, _FOLLOWS_NOT = 0.95, 0.6
+_GAIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -146,3 +149,66 @@ class KrlTorqueDecoder:
             np.array(numbers, dtype=np.int64),
             values[rows].astype(np.float64) * self._factor,
         )
+
+
+@dataclass(frozen=True)
+class TorqueMatch:
+    """How the motor torque of a joint compares with the joint torque sensors.
+
+    correlation : with the sensor of the same joint; gain : slope of the motor torque over that sensor
+    follows, follows_correlation : the joint whose sensor it follows best
+    """
+
+    joint: str
+    correlation: float
+    gain: float
+    follows: str
+    follows_correlation: float
+
+    @property
+    def swapped(self) -> bool:
+        """Whether it clearly follows another joint's sensor and not its own."""
+        return (
+            self.follows != self.joint
+            and self.follows_correlation >= _FOLLOWS
+            and abs(self.correlation) < _FOLLOWS_NOT
+        )
+
+    @property
+    def suspect(self) -> bool:
+        """Whether order, sign or scale look wrong; friction and inertia leave the gain near one."""
+        clear = abs(self.correlation) >= _FOLLOWS
+        return self.swapped or (clear and not 1.0 / _GAIN < self.gain < _GAIN)
+
+    def __str__(self) -> str:
+        if self.swapped:
+            return (
+                f"motor torque of {self.joint} follows the torque sensor of {self.follows} (correlation "
+                f"{self.follows_correlation:.3f}) and not its own ({self.correlation:.3f})"
+            )
+        return (
+            f"motor torque of {self.joint} is {self.gain:.3g} times its torque sensor "
+            f"(correlation {self.correlation:.3f})"
+        )
+
+
+def match_torques(joint: JointColumns, motor: JointColumns) -> tuple[TorqueMatch, ...]:
+    """Compare motor torques with the joint torque sensors, interpolated at the times of the motor torques.
+
+    Motor torque is sensor torque plus friction and drive inertia, so a joint that carries a load correlates
+    with itself.
+    """
+    sensor = np.stack(
+        [np.interp(motor.log_time, joint.log_time, column) for column in joint.effort.T], axis=1
+    )
+    a, b = sensor - sensor.mean(axis=0), motor.effort - motor.effort.mean(axis=0)
+    norm_a, norm_b = np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0)
+    pairs = (b.T @ a) / np.maximum(norm_b[:, None] * norm_a[None, :], 1e-300)
+    matches = []
+    for row, name in enumerate(motor.names):
+        best = int(np.argmax(np.abs(pairs[row])))
+        gain = float(b[:, row] @ a[:, row] / max(float(norm_a[row] ** 2), 1e-300))
+        matches.append(
+            TorqueMatch(name, float(pairs[row, row]), gain, joint.names[best], float(pairs[row, best]))
+        )
+    return tuple(matches)

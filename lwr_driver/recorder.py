@@ -309,6 +309,7 @@ class _Server:
     def _close(self, request: _Close) -> Recorded:
         if self._recording is not None:
             self._drain(request.upto)
+            self._watch_writer()
         if self._recording is not None:
             recorded = self._recording.close(request.exit_status, request.reason, self._lost_rows())
             self._recording = None

@@ -40,6 +40,24 @@ class Messages:
     channel: NDArray[np.int64]
     log_time: NDArray[np.int64]
 
+    def split(self, log_time: int) -> tuple[Messages, Messages]:
+        """The messages up to `log_time`, and those after it."""
+        at = int(np.searchsorted(self.log_time, log_time, side="right"))
+        return (
+            Messages(self.records[:at], self.channel[:at], self.log_time[:at]),
+            Messages(self.records[at:], self.channel[at:], self.log_time[at:]),
+        )
+
+    def merged(self, other: Messages) -> Messages:
+        """These messages and `other`, in order of log time."""
+        if not len(other.records):
+            return self
+        times = np.concatenate([self.log_time, other.log_time])
+        order = np.argsort(times, kind="stable")
+        records = [*self.records, *other.records]
+        channel = np.concatenate([self.channel, other.channel])
+        return Messages([records[row] for row in order.tolist()], channel[order], times[order])
+
 
 @dataclass
 class _Channel:

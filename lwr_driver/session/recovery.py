@@ -82,11 +82,18 @@ def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
 
 
 def copy_messages(
-    scan: Scan, container: Container, *, metadata: Mapping[str, str] | None = None
+    scan: Scan,
+    container: Container,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    added: Messages | None = None,
 ) -> dict[str, int]:
     """Copy attachments, metadata and messages of `scan` chunk by chunk, by log time within each.
 
-    metadata : replaces the record `session`. Returns the number of messages of each topic.
+    metadata : replaces the record `session`
+    added : further messages, put into the chunks to which their log times belong
+
+    Returns the number of messages copied of each topic.
     """
     counts: dict[str, int] = {}
     described = False
@@ -95,13 +102,19 @@ def copy_messages(
             described = True
             _copy_head(scan, container, metadata)
         channels = {number: scan.channels.get(number) for number in np.unique(block.channel).tolist()}
-        container.write_chunk(_messages(block, channels, container))
+        messages = _messages(block, channels, container)
+        if added is not None and len(block.log_time):
+            now, added = added.split(int(block.log_time.max()))
+            messages = messages.merged(now)
+        container.write_chunk(messages)
         for number, channel in channels.items():
             if channel is not None:
                 count = int((block.channel == number).sum())
                 counts[channel.topic] = counts.get(channel.topic, 0) + count
     if not described:
         _copy_head(scan, container, metadata)
+    if added is not None:
+        container.write_chunk(added)
     for name, values in scan.metadata:
         if name != "session":
             container.describe(name, values)
