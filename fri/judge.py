@@ -102,18 +102,9 @@ class CommandJudge:
             )
         return None
 
-    def step(
-        self, command: CmdBuffer, target: np.ndarray, previous: np.ndarray, missed: int
-    ) -> Objection | None:
-        """Position, speed and, where the policy asks for it, acceleration of the way from `target` to the
-        command.
-
-        `previous` is the setpoint before `target`, `missed` the cycles bridged since the last command.
-        """
+    def velocity(self, command: CmdBuffer, target: np.ndarray) -> Objection | None:
+        """The step from `target`, the present setpoint, to the commanded position within the speed limits."""
         q = command.jnt_pos.tolist()
-        objection = self.position(q, "commanded")
-        if objection is not None:
-            return objection
         steps = self._steps
         for joint, now in enumerate(target.tolist()):
             step = q[joint] - now
@@ -123,22 +114,25 @@ class CommandJudge:
                     f"excessive commanded joint speed: {JOINT_NAMES[joint]} {abs(step) / self._period:.4f} "
                     f"rad/s exceeds {steps[joint] / self._period:.4f} rad/s ({self._reason})",
                 )
-        if self._policy.acceleration_factor is None:
-            return None
-        return self._acceleration(command.jnt_pos, target, previous, missed, self._policy.acceleration_factor)
+        return None
 
-    def _acceleration(
-        self, q: np.ndarray, target: np.ndarray, previous: np.ndarray, missed: int, factor: float
-    ) -> Objection | None:
-        # After n bridged cycles a constant acceleration shows as (n + 1)(n + 2) / 2 times its change of step.
-        widening = (missed + 1) * (missed + 2) / 2
-        allowed = self._limits.a_max * factor * self._period**2 * widening + 2 * self._policy.limit_tolerance
-        change = np.abs((q - target) - (target - previous))
-        joint = int((change / allowed).argmax())
-        if change[joint] <= allowed[joint]:
+    def acceleration(self, change: np.ndarray, cycles: float) -> Objection | None:
+        """The `change` (7,) [rad] of the step between two commands `cycles` apart within the limits.
+
+        Where the policy does not ask for it, there is nothing to object to.
+        """
+        factor = self._policy.acceleration_factor
+        if factor is None:
             return None
+        tolerance = 2.0 * self._policy.limit_tolerance
+        allowed = self._limits.a_max * factor * self._period**2 * cycles + tolerance
+        excess = np.abs(change) / allowed
+        joint = int(excess.argmax())
+        if excess[joint] <= 1.0:
+            return None
+        scale = 1.0 / (self._period**2 * cycles)
         return (
             EventKind.ACCELERATION,
-            f"{JOINT_NAMES[joint]} commanded acceleration {change[joint] / self._period**2:.2f} rad/s^2 "
-            f"exceeds {allowed[joint] / self._period**2:.2f} rad/s^2",
+            f"{JOINT_NAMES[joint]} commanded acceleration {abs(change[joint]) * scale:.2f} rad/s^2 exceeds "
+            f"{allowed[joint] * scale:.2f} rad/s^2",
         )

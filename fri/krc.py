@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fri.event import Event, EventKind
-from fri.judge import CommandJudge
+from fri.judge import CommandJudge, Objection
 from fri.packets import CMD, JOINT_NAMES, JOINTS, CmdBuffer, Fault, new_msr
 from fri.policy import KrcLimits, KrcPolicy
-from fri.ramp import StopRamp
 from fri.sample import IDENTITY_POSE, Sample
 from fri.states import (
     ALL_DRIVES,
@@ -41,6 +40,7 @@ from fri.states import (
     Trigger,
 )
 from fri.timing import AnswerStatistics, classify
+from fri.track import SetpointTrack
 
 __all__ = ["Event", "EventKind", "KrcLimits", "KrcPolicy", "KrcSession", "Sample", "Setpoint"]
 
@@ -148,12 +148,7 @@ class KrcSession:
         # KRL's setpoint is kept as the float32 that is sent, so that setpoint plus offset is exact for
         # clients.
         self._krl = _as_sent(q)
-        self._target = self._krl.copy()
-        self._previous = self._target
-        self._goal = self._target
-        self._ramp: StopRamp | None = None
-        self._ramp_ms = 0
-        self._fractions = np.ones((1, 1))
+        self._track = SetpointTrack(limits, policy, self._krl)
         self._safety_limits = 1.0
         self._t1 = False
         self._judge = CommandJudge(limits, policy)
@@ -173,7 +168,6 @@ class KrcSession:
         self._command = CmdBuffer()
         self._monitor_flags: int | None = None
         self._first_command = True
-        self._missed = 0
         self._drop: Event | None = None
         self._counts = dict.fromkeys(("answered", "late", "duplicated", "malformed", "starts", "drops"), 0)
 
@@ -210,12 +204,12 @@ class KrcSession:
     @property
     def ramping(self) -> bool:
         """Whether the arm is still braking after command mode."""
-        return self._ramp is not None
+        return self._track.ramping
 
     @property
     def setpoint(self) -> np.ndarray:
         """Total setpoint, KRL plus FRI, (7,) [rad]; a copy."""
-        return self._target.copy()
+        return self._track.target.copy()
 
     @property
     def krl_setpoint(self) -> np.ndarray:
@@ -258,7 +252,7 @@ class KrcSession:
         if not self._transition(Trigger.FRI_OPEN):
             return self.state
         self.sample_time_ms = int(sample_time_ms)
-        self._fractions = np.arange(1, self.sample_time_ms + 1)[:, np.newaxis] / self.sample_time_ms
+        self._track.set_period(self.sample_time_ms)
         self._tell_judge()
         self._statistics = AnswerStatistics(self.policy.window)
         self.quality = Quality.UNACCEPTABLE
@@ -294,7 +288,7 @@ class KrcSession:
         """``friStop()``: back to monitor mode; an arm in motion is braked."""
         self._start_pending = False
         if self._transition(Trigger.FRI_STOP):
-            self._begin_ramp()
+            self._track.brake()
             self._note(EventKind.STOPPED, "stopped")
         return self.state
 
@@ -335,7 +329,7 @@ class KrcSession:
         elif switched_off and self.policy.drop_on_drives_off:
             self.drop(EventKind.DRIVES_OFF, "drives switched off in command mode")
         elif switched_off:
-            self._previous = self._target
+            self._track.rest()
 
     def drop(self, kind: EventKind, text: str) -> None:
         """End command mode as the controller does: monitor mode, the arm braked, KRL out of step.
@@ -347,7 +341,7 @@ class KrcSession:
         self._start_pending = False
         self.needs_resync = True
         self._counts["drops"] += 1
-        self._begin_ramp()
+        self._track.brake()
         self._drop = self._note(kind, text)
 
     def move_krl(self, q: ArrayLike) -> None:
@@ -356,8 +350,8 @@ class KrcSession:
         In command mode the arm goes on following FRI and the offset takes up the difference.
         """
         krl = _as_sent(q)
-        if self.state is not State.CMD and self._ramp is None:
-            self._goal = self._goal + (krl - self._krl)
+        if self.state is not State.CMD:
+            self._track.shift(krl - self._krl)
         self._krl = krl
 
     def resync(self, q: ArrayLike | None = None) -> None:
@@ -365,10 +359,10 @@ class KrcSession:
 
         Not in command mode and not while the arm is braking. A given `q` becomes the setpoint at once.
         """
-        if self.state is State.CMD or self._ramp is not None:
+        if self.state is State.CMD or self._track.ramping:
             raise RuntimeError("KRL's setpoint cannot be set anew while FRI moves the arm; stop it first")
-        self._krl = _as_sent(self._target if q is None else q)
-        self._target = self._goal = self._previous = self._krl.copy()
+        self._krl = _as_sent(self._track.target if q is None else q)
+        self._track.place(self._krl)
         self.needs_resync = False
 
     def packet(self, sample: Sample) -> bytes:
@@ -413,7 +407,7 @@ class KrcSession:
         for name, view in self._views.items():
             view[...] = getattr(sample, name)
         self._cmd_jnt_pos[:] = self._krl
-        np.subtract(self._target, self._krl, out=self._offset, casting="same_kind")
+        np.subtract(self._track.target, self._krl, out=self._offset, casting="same_kind")
         return bytes(buffer)
 
     def receive(self, datagram: bytes | bytearray | memoryview, delay_s: float = 0.0) -> bool:
@@ -453,7 +447,7 @@ class KrcSession:
         """
         if self.state is State.OFF:
             self._uptime_ms += self.sample_time_ms
-            positions = self._coast()
+            positions = self._track.coast()
         elif not self._open:
             raise RuntimeError("no cycle to close: call packet() first")
         else:
@@ -489,120 +483,73 @@ class KrcSession:
         self._dwell = self._dwell + 1 if self.quality >= self.policy.start_quality else 0
 
     def _try_start(self) -> None:
-        if self._dwell < self.policy.start_dwell or self._ramp is not None:
+        if self._dwell < self.policy.start_dwell or self._track.ramping:
             return
         if self.quality < self.policy.start_quality or not self._transition(Trigger.FRI_START):
             return
         self._start_pending = False
         self._first_command = True
-        self._missed = 0
-        self._previous = self._goal = self._target
+        self._track.rest()
         self._counts["starts"] += 1
         self._note(EventKind.STARTED, f"command mode with limits x {self._safety_limits:.2f}")
 
     def _monitor(self) -> np.ndarray:
         if self.answered:
             self._monitor_flags = self._command.cmd_flags
-        return self._coast()
-
-    def _begin_ramp(self) -> None:
-        velocity = (self._target - self._previous) / self.sample_time_s
-        self._previous = self._goal = self._target
-        self._missed = 0
-        if not velocity.any():
-            return
-        deceleration = self.limits.a_max * self.policy.stop_acceleration_factor
-        self._ramp = StopRamp(
-            self._target,
-            velocity,
-            deceleration,
-            deceleration / self.policy.stop_jerk_time_s,
-            self.limits.q_min,
-            self.limits.q_max,
-        )
-        self._ramp_ms = 0
-
-    def _coast(self) -> np.ndarray:
-        """Setpoints of a period without commands: brake, or follow KRL."""
-        if self._ramp is None:
-            start, self._target = self._target, self._goal
-            return self._line(start, self._target)
-        times = (self._ramp_ms + np.arange(1, self.sample_time_ms + 1)) * 1e-3
-        positions = self._ramp.position(times)
-        self._ramp_ms += self.sample_time_ms
-        self._target = self._previous = self._goal = positions[-1].copy()
-        if self._ramp_ms * 1e-3 >= self._ramp.duration_s:
-            self._ramp = None
-        return positions
-
-    def _line(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Linear interpolation to 1 ms, (n, 7), ending exactly at `end`."""
-        if self.sample_time_ms == 1:
-            return end.reshape(1, JOINTS).copy()
-        positions = start + self._fractions * (end - start)
-        positions[-1] = end
-        return positions
+        return self._track.coast()
 
     def _follow(self) -> np.ndarray:
-        """Judge a cycle of command mode."""
+        """Judge a cycle of command mode; the setpoints of the next period."""
+        track = self._track
         target: np.ndarray | None = None
+        objection: Objection | None
         if self._fault is not None and self.policy.drop_on_malformed:
-            self.drop(EventKind.MALFORMED, f"malformed datagram in command mode: {self._fault.value}")
+            objection = EventKind.MALFORMED, f"malformed datagram in command mode: {self._fault.value}"
         elif self.answered:
-            target = self._commanded()
+            target, objection = self._commanded()
         else:
-            target = self._bridged()
-        if self.state is State.CMD and self.quality < self.policy.hold_quality:
-            self.drop(
+            objection = self._missing()
+        if objection is None and self.quality < self.policy.hold_quality:
+            statistics = self._statistics
+            objection = (
                 EventKind.QUALITY,
                 f"quality {self.quality.name} in command mode is below {self.policy.hold_quality.name}: "
-                f"answer rate {self._statistics.answer_rate:.2f}, "
-                f"latency {self._statistics.latency * 1e3:.2f} ms",
+                f"answer rate {statistics.answer_rate:.2f}, latency {statistics.latency * 1e3:.2f} ms",
             )
-        if self.state is not State.CMD or target is None:
-            return self._coast()
-        self._previous, self._target = self._target, target
-        self._goal = target
-        return self._line(self._previous, target)
+        if objection is not None:
+            self.drop(*objection)
+            return track.coast()
+        return track.bridge() if target is None else track.command(target)
 
-    def _bridged(self) -> np.ndarray | None:
-        """The next setpoint without an answer: the last step once more."""
-        self._missed += 1
-        if self._missed > self.policy.bridged_cycles:
-            self.drop(
+    def _missing(self) -> Objection | None:
+        """Whether one more missing answer can be bridged."""
+        missed = self._track.missed + 1
+        if missed > self.policy.bridged_cycles:
+            return (
                 EventKind.MISSES,
-                f"{self._missed} answers in a row are missing, "
-                f"at most {self.policy.bridged_cycles} are bridged",
+                f"{missed} answers in a row are missing, at most {self.policy.bridged_cycles} are bridged",
             )
-            return None
-        target = self._target + (self._target - self._previous)
-        objection = self._judge.position(target.tolist(), "extrapolated")
-        if objection is not None:
-            self.drop(*objection)
-            return None
-        return target
+        return self._judge.position(self._track.extrapolated().tolist(), "extrapolated")
 
-    def _commanded(self) -> np.ndarray | None:
-        """The setpoint of the answer, or None after it ended command mode."""
-        command = self._command
-        objection = self._judge.flags(command, self._monitor_flags, self.control)
-        target = self._target
-        if objection is None and command.cmd_flags & CommandFlag.JNTPOS:
-            if self.power == 0:
-                objection = self._judge.mirror(command, target, "the command with the drives off")
-            else:
-                if self._first_command:
-                    objection = self._judge.mirror(command, target, "the first command")
-                if objection is None:
-                    objection = self._judge.step(command, target, self._previous, self._missed)
-                if objection is None:
-                    target = command.jnt_pos.astype(float)
-                    self._first_command = False
-        if objection is not None:
-            self.drop(*objection)
-            return None
-        self._missed = 0
-        return target
+    def _commanded(self) -> tuple[np.ndarray, Objection | None]:
+        """The setpoint of the answer, and what is to be said against it."""
+        command, judge, held = self._command, self._judge, self._track.target
+        objection = judge.flags(command, self._monitor_flags, self.control)
+        if objection is not None or not command.cmd_flags & CommandFlag.JNTPOS:
+            return held, objection
+        if self.power == 0:
+            return held, judge.mirror(command, held, "the command with the drives off")
+        target = command.jnt_pos.astype(float)
+        if self._first_command:
+            objection = judge.mirror(command, held, "the first command")
+        objection = (
+            objection
+            or judge.position(command.jnt_pos.tolist(), "commanded")
+            or judge.velocity(command, held)
+            or judge.acceleration(*self._track.change_of_step(target))
+        )
+        self._first_command = False
+        return target, objection
 
 
 def _as_sent(q: ArrayLike) -> np.ndarray:

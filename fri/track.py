@@ -1,0 +1,136 @@
+"""The total setpoint of the arm and how it goes on: commanded, extrapolated, braking, or moved by KRL.
+
+Periods are cut into milliseconds: a setpoint is approached linearly over the period and reached at its end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fri.packets import JOINTS
+from fri.policy import KrcLimits, KrcPolicy
+from fri.ramp import StopRamp
+
+__all__ = ["SetpointTrack"]
+
+
+class SetpointTrack:
+    """Setpoint of seven joints over time.
+
+    Parameters
+    ----------
+    limits, policy : KrcLimits, KrcPolicy
+        Bounds of the braking.
+    q : np.ndarray
+        (7,) setpoint at the beginning [rad].
+
+    Attributes
+    ----------
+    target : np.ndarray
+        (7,) setpoint at the end of the present period [rad]; never written in place.
+    missed : int
+        Commands missing since the last one.
+    """
+
+    def __init__(self, limits: KrcLimits, policy: KrcPolicy, q: np.ndarray) -> None:
+        self._limits = limits
+        self._deceleration = limits.a_max * policy.stop_acceleration_factor
+        self._jerk = self._deceleration / policy.stop_jerk_time_s
+        self._ramp: StopRamp | None = None
+        self._ramp_ms = 0
+        self._goal = q
+        self.target = q
+        self.missed = 0
+        self.set_period(1)
+        self.place(q)
+
+    @property
+    def ramping(self) -> bool:
+        """Whether the setpoint is braking."""
+        return self._ramp is not None
+
+    def set_period(self, period_ms: int) -> None:
+        """Set the period [ms]."""
+        self._period_ms = period_ms
+        self._fractions = np.arange(1, period_ms + 1)[:, np.newaxis] / period_ms
+
+    def place(self, q: np.ndarray) -> None:
+        """Set the setpoint to `q` at once, at rest."""
+        self.target = q.copy()
+        self.rest()
+
+    def shift(self, change: np.ndarray) -> None:
+        """Move by `change` (7,) [rad] in the next period without commands; not while braking."""
+        if self._ramp is None:
+            self._goal = self._goal + change
+
+    def rest(self) -> None:
+        """Forget the velocity of the commands."""
+        # The last command, its mean step per cycle, and the cycles over which that is the mean.
+        self._previous = self._goal = self._accepted = self.target
+        self._step = np.zeros(JOINTS)
+        self._span = 1
+        self.missed = 0
+
+    def change_of_step(self, q: np.ndarray) -> tuple[np.ndarray, float]:
+        """Change of the step per cycle, (7,) [rad], if `q` were the next command, and its cycles."""
+        span = self.missed + 1
+        return (q - self._accepted) / span - self._step, (span + self._span) / 2
+
+    def command(self, q: np.ndarray) -> np.ndarray:
+        """Go on to the command `q`; the setpoints of the period, (n, 7)."""
+        self._span = self.missed + 1
+        self._step = (q - self._accepted) / self._span
+        self._accepted = q
+        self.missed = 0
+        return self._go(q)
+
+    def extrapolated(self) -> np.ndarray:
+        """The setpoint one step further on, (7,)."""
+        return self.target + self._step
+
+    def bridge(self) -> np.ndarray:
+        """Go on to the extrapolated setpoint; the setpoints of the period, (n, 7)."""
+        self.missed += 1
+        return self._go(self.extrapolated())
+
+    def brake(self) -> None:
+        """Come to rest from the present velocity; ``coast`` gives the setpoints."""
+        velocity = (self.target - self._previous) / (self._period_ms * 1e-3)
+        self.rest()
+        if not velocity.any():
+            return
+        limits = self._limits
+        self._ramp = StopRamp(
+            self.target, velocity, self._deceleration, self._jerk, limits.q_min, limits.q_max
+        )
+        self._ramp_ms = 0
+
+    def coast(self) -> np.ndarray:
+        """The setpoints of a period without commands, (n, 7): braking, or as ``shift`` said."""
+        if self._ramp is None:
+            positions = self._line(self.target, self._goal)
+            self.target = self._goal
+            self.rest()
+            return positions
+        times = (self._ramp_ms + np.arange(1, self._period_ms + 1)) * 1e-3
+        positions = self._ramp.position(times)
+        self._ramp_ms += self._period_ms
+        if self._ramp_ms * 1e-3 >= self._ramp.duration_s:
+            self._ramp = None
+        self.target = positions[-1].copy()
+        self.rest()
+        return positions
+
+    def _go(self, q: np.ndarray) -> np.ndarray:
+        positions = self._line(self.target, q)
+        self._previous, self.target = self.target, q
+        self._goal = q
+        return positions
+
+    def _line(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        if self._period_ms == 1:
+            return end.reshape(1, JOINTS).copy()
+        positions = start + self._fractions * (end - start)
+        positions[-1] = end
+        return positions
