@@ -1,14 +1,15 @@
 """Serial chains of revolute and prismatic joints in modified Denavit-Hartenberg frames.
 
-Frame j stands on the axis of joint j (z_j along it) and is reached from frame j-1 by (Khalil and Kleinfinger, 1986)::
+Frame j stands on the axis of joint j (z_j along it) and is reached from frame j-1 by (Khalil and Kleinfinger,
+1986)::
 
     T(j-1, j) = Rx(alpha_j) Tx(d_j) Rz(theta_j) Tz(r_j)
 
-with theta_j = theta0_j + q_j for a revolute joint and r_j = r0_j + q_j for a prismatic one. The names of the dynamic
-parameters refer to these frames. A chain comes from a table of those numbers or from a URDF. When the link frames of
-the URDF already obey the convention they are used as they are; otherwise such frames are built on the joint axes, and
-`link_placements` keeps where each URDF link frame stands in its modified-DH frame, so that inertial parameters can
-be carried both ways.
+with theta_j = theta0_j + q_j for a revolute joint and r_j = r0_j + q_j for a prismatic one. The names of the
+dynamic parameters refer to these frames. A chain comes from a table of those numbers or from a URDF. When the
+link frames of the URDF already obey the convention they are used as they are; otherwise such frames are built
+on the joint axes, and `link_placements` keeps where each URDF link frame stands in its modified-DH frame, so
+that inertial parameters can be carried both ways.
 """
 
 from __future__ import annotations
@@ -25,15 +26,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
 from ident import parameters
-from ident.urdf import Joint, read_urdf
+from ident.mdh import build_frames, exact_cos_sin, mdh_transform, table_as_is
+from ident.urdf import read_urdf
 
 __all__ = ["STANDARD_GRAVITY", "Chain"]
 
 logger = logging.getLogger(__name__)
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
-_LENGTH_SNAP_M = 1e-9
-_PARALLEL = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class Chain:
                 object.__setattr__(self, name, value)
             if value.shape != shape or not np.all(np.isfinite(value)):
                 raise ConfigurationError(
-                    f"chain: `{name}` has shape {value.shape} or is not finite; expected finite values of shape {shape}"
+                    f"chain: `{name}` of shape {value.shape}: expected finite values of shape {shape}"
                 )
             value.setflags(write=False)
         if not self.link_names:
@@ -113,7 +113,8 @@ class Chain:
         gravity: ArrayLike = STANDARD_GRAVITY,
         base_placement: ArrayLike | None = None,
     ) -> Chain:
-        """Chain from a modified-DH table: one mapping a joint with `alpha`, `d`, `theta`, `r` (0 where left out).
+        """Chain from a modified-DH table: one mapping a joint with `alpha`, `d`, `theta`, `r` (0 where left
+        out).
 
         `name` (default `q1`, `q2`, ...) and `kind` ("revolute" or "prismatic") are optional. Raises
         ConfigurationError on unknown keys or kinds.
@@ -137,7 +138,10 @@ class Chain:
         return cls(
             tuple(names),
             np.array(prismatic, dtype=bool),
-            *constants,
+            constants[0],
+            constants[1],
+            constants[2],
+            constants[3],
             gravity=np.asarray(gravity, dtype=np.float64),
             base_placement=np.eye(4)
             if base_placement is None
@@ -156,13 +160,15 @@ class Chain:
     ) -> Chain:
         """Chain from a URDF: a path, or the text itself (it begins with `<`).
 
-        root, tip : link names; by default the root of the tree and the end of its only chain of movable joints.
+        root, tip : link names; by default the root of the tree and the end of its only chain of movable
+            joints.
         gravity : (3,) in the axes of the root link [m/s^2].
-        snap_rad : angles alpha and theta this near to a multiple of pi/2 are taken as that multiple, because files
+        snap_rad : angles alpha and theta this near to a multiple of pi/2 are taken as that multiple, because
+            files
             write 1.5708; 0 takes every digit as it stands.
 
-        Fixed joints are merged. Raises ConfigurationError for an unreadable file, a tree without a unique chain
-        or joints other than revolute, continuous, prismatic and fixed.
+        Fixed joints are merged. Raises ConfigurationError for an unreadable file, a tree without a unique
+        chain or joints other than revolute, continuous, prismatic and fixed.
         """
         urdf = read_urdf(source)
         joints = urdf.chain(root, tip)
@@ -177,16 +183,19 @@ class Chain:
             if joint.movable:
                 local.append(pending)
                 pending = np.eye(4)
-        table = _table_as_is(local, movable, snap_rad)
+        table = table_as_is(local, movable, snap_rad)
         if table is not None:
             base, placements = np.eye(4), np.tile(np.eye(4), (len(movable), 1, 1))
         else:
             logger.info("robot %s: link frames are not modified-DH frames; building them", urdf.name)
-            base, table, placements = _build_frames(local, movable, snap_rad)
+            base, table, placements = build_frames(local, movable, snap_rad)
         return cls(
             tuple(joint.name for joint in movable),
             np.array([joint.kind == "prismatic" for joint in movable]),
-            *table.T,
+            table[:, 0],
+            table[:, 1],
+            table[:, 2],
+            table[:, 3],
             gravity=base[:3, :3].T @ np.asarray(gravity, dtype=np.float64),
             base_placement=base,
             link_names=tuple(joint.child for joint in movable),
@@ -197,13 +206,13 @@ class Chain:
     @cached_property
     def cos_sin_alpha(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """cos and sin of alpha, exactly 0 and 1 at right angles."""
-        return _exact_cos_sin(self.alpha)
+        return exact_cos_sin(self.alpha)
 
     def placement(self, joint: int, position: float = 0.0) -> NDArray[np.float64]:
-        """(4, 4) pose of frame `joint` (counted from 0) in the frame before it at the joint position given."""
+        """(4, 4) pose of frame `joint` (counted from 0) in the frame before it at a joint position."""
         theta = self.theta[joint] + (0.0 if self.prismatic[joint] else position)
         r = self.r[joint] + (position if self.prismatic[joint] else 0.0)
-        return _mdh(self.alpha[joint], self.d[joint], theta, r)
+        return mdh_transform(self.alpha[joint], self.d[joint], theta, r)
 
     def forward(self, q: ArrayLike) -> NDArray[np.float64]:
         """Poses (n, 4, 4) of frames 1..n in the root link of the URDF (frame 0 of a table) for one q (n,)."""
@@ -234,8 +243,8 @@ class Chain:
     def urdf_inertials(self) -> NDArray[np.float64]:
         """(n, 10) inertial parameters that the URDF gives, in modified-DH frames.
 
-        Bodies fixed to a moving link, side branches included, are added to it (their own movable joints are taken
-        at 0). Raises ConfigurationError when the chain was not read from a URDF.
+        Bodies fixed to a moving link, side branches included, are added to it (their own movable joints are
+        taken at 0). Raises ConfigurationError when the chain was not read from a URDF.
         """
         if self.urdf is None:
             raise ConfigurationError(
@@ -262,16 +271,15 @@ class Chain:
             joint = pin.JointModelPZ() if self.prismatic[k] else pin.JointModelRZ()
             pose = pose @ self.placement(k)
             parent = model.addJoint(parent, joint, pin.SE3(pose), name)
-            mass, com, _ = parameters.to_com(bodies[k])
             body = pin.Inertia.Zero()
-            if mass != 0.0:
+            if np.any(bodies[k] != 0.0):
                 body = pin.Inertia.FromDynamicParameters(parameters.to_pinocchio(bodies[k]))
             model.appendBodyToJoint(parent, body, pin.SE3.Identity())
             pose = np.eye(4)
         return model
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain content for YAML or JSON, from which `from_dict` restores the chain (without the URDF text)."""
+        """Plain content for YAML or JSON from which `from_dict` restores the chain (not the URDF text)."""
         assert self.link_placements is not None
         rows = [
             {
@@ -314,148 +322,3 @@ class Chain:
             link_placements=content.get("link_placements"),
             urdf=urdf,
         )
-
-
-def _exact_cos_sin(angle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    for values in (cosine, sine):
-        values[np.abs(values) < 1e-15] = 0.0
-    return cosine, sine
-
-
-def _mdh(alpha: float, d: float, theta: float, r: float) -> NDArray[np.float64]:
-    (ca, ct), (sa, st) = _exact_cos_sin(np.array([alpha, theta]))
-    return np.array(
-        [
-            [ct, -st, 0.0, d],
-            [ca * st, ca * ct, -sa, -sa * r],
-            [sa * st, sa * ct, ca, ca * r],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-
-
-def _read_mdh(pose: NDArray[np.float64], snap_rad: float) -> NDArray[np.float64] | None:
-    """alpha, d, theta, r of a pose that has the modified-DH form, else None."""
-    rotation, shift = pose[:3, :3], pose[:3, 3]
-    alpha = np.arctan2(-rotation[1, 2], rotation[2, 2])
-    theta = np.arctan2(-rotation[0, 1], rotation[0, 0])
-    angles = np.array([_snap(alpha, snap_rad), _snap(theta, snap_rad)])
-    (ca,), (sa,) = _exact_cos_sin(angles[:1])
-    d, r = shift[0], ca * shift[2] - sa * shift[1]
-    found = np.array([angles[0], _zero(d), angles[1], _zero(r)])
-    error = np.abs(_mdh(*found) - pose).max()
-    return found if error < 2.0 * max(snap_rad, 1e-9) else None
-
-
-def _snap(angle: float, tolerance: float) -> float:
-    nearest = round(angle / (np.pi / 2)) * (np.pi / 2)
-    snapped = nearest if abs(angle - nearest) <= tolerance else angle
-    return float(np.pi if snapped == -np.pi else snapped)
-
-
-def _zero(length: float) -> float:
-    return 0.0 if abs(length) < _LENGTH_SNAP_M else float(length)
-
-
-def _table_as_is(
-    local: Sequence[NDArray[np.float64]], joints: Sequence[Joint], snap_rad: float
-) -> NDArray[np.float64] | None:
-    """The (n, 4) table when the URDF's own frames obey the convention, else None."""
-    rows = []
-    for pose, joint in zip(local, joints, strict=True):
-        row = _read_mdh(pose, snap_rad) if np.allclose(joint.axis, (0.0, 0.0, 1.0), atol=1e-9) else None
-        if row is None:
-            return None
-        rows.append(row)
-    return np.array(rows)
-
-
-def _build_frames(
-    local: Sequence[NDArray[np.float64]], joints: Sequence[Joint], snap_rad: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Modified-DH frames on the joint axes at q = 0.
-
-    x_j lies along the common normal of axes j and j+1 (towards j+1; for crossing axes, the direction nearest to the
-    link frame's x). Frame 0 is frame 1 at q = 0. The last frame keeps the origin and, as far as the axis allows, the x
-    axis of the URDF's link frame, so that a payload's frame is the one users know. Returns base placement, (n, 4)
-    table, (n, 4, 4) link placements.
-    """
-    links, pose = [], np.eye(4)
-    for step in local:
-        pose = pose @ step
-        links.append(pose)
-    origins = [pose[:3, 3] for pose in links]
-    axes = [pose[:3, :3] @ joint.axis for pose, joint in zip(links, joints, strict=True)]
-    frames: list[NDArray[np.float64]] = []
-    for j in range(len(links)):
-        entry = origins[j] if j == 0 else _foot(frames[-1], origins[j], axes[j])
-        if j + 1 == len(links):
-            x, origin = _perpendicular(links[j], axes[j]), origins[j]
-        else:
-            x, origin = _common_normal(links[j], entry, axes[j], origins[j + 1], axes[j + 1])
-        frame = np.eye(4)
-        frame[:3, :3] = np.column_stack([x, np.cross(axes[j], x), axes[j]])
-        frame[:3, 3] = origin
-        frames.append(frame)
-    table, before = [], frames[0]
-    for frame in frames:
-        row = _read_mdh(np.linalg.inv(before) @ frame, snap_rad)
-        if row is None:
-            raise ConfigurationError(
-                "the joint axes of the URDF do not yield modified-DH frames; check its joint origins"
-            )
-        table.append(row)
-        before = frame
-    placements = np.array([np.linalg.inv(frame) @ link for frame, link in zip(frames, links, strict=True)])
-    placements[np.abs(placements) < 1e-12] = 0.0
-    return frames[0], np.array(table), placements
-
-
-def _foot(
-    frame: NDArray[np.float64], point: NDArray[np.float64], axis: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Where axis j meets the x axis of the frame before it (the foot of the incoming common normal)."""
-    x, z, start = frame[:3, 0], frame[:3, 2], frame[:3, 3]
-    # start + s x + t z = point + u axis, where for parallel axes t = 0 is taken by least squares.
-    solution = np.linalg.lstsq(np.column_stack([x, z, -axis]), point - start, rcond=1e-9)[0]
-    if np.linalg.norm(np.cross(z, axis)) < _PARALLEL:
-        return point + axis * float(axis @ (start - point))
-    return point + solution[2] * axis
-
-
-def _common_normal(
-    link: NDArray[np.float64],
-    entry: NDArray[np.float64],
-    axis: NDArray[np.float64],
-    next_point: NDArray[np.float64],
-    next_axis: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Direction of x_j and origin of frame j."""
-    cross = np.cross(axis, next_axis)
-    between = next_point - entry
-    if np.linalg.norm(cross) < _PARALLEL:
-        # Parallel axes: every common normal serves; take the one that makes r_j zero.
-        normal = between - axis * float(axis @ between)
-        if np.linalg.norm(normal) < _LENGTH_SNAP_M:
-            return _perpendicular(link, axis), entry
-        return normal / np.linalg.norm(normal), entry
-    x = cross / np.linalg.norm(cross)
-    system = np.column_stack([axis, x, -next_axis])
-    along, distance, _ = np.linalg.solve(system, between)
-    if abs(distance) > _LENGTH_SNAP_M:
-        x = x * np.sign(distance)
-    else:
-        preferences = [float(x @ link[:3, k]) for k in range(3)]
-        decisive = next(value for value in preferences if abs(value) > 1e-6)
-        x = x * np.sign(decisive)
-    return x, entry + along * axis
-
-
-def _perpendicular(link: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The link frame's x axis (or y, z) made perpendicular to the joint axis."""
-    for k in range(3):
-        x = link[:3, k] - axis * float(axis @ link[:3, k])
-        if np.linalg.norm(x) > 1e-3:
-            return x / np.linalg.norm(x)
-    raise ConfigurationError("a link frame of the URDF is not a rotation; check its joint origins")

@@ -4,15 +4,16 @@ Every link has 17 standard parameters in this order::
 
     XX XY XZ YY YZ ZZ  MX MY MZ  M  Ia  Fvl Fcl offl  Fvm Fcm offm
 
-The first ten are the *inertial* ones: the inertia tensor about the origin of the link frame (tensor entries, so
-`XY` = -int x y dm), the first moments and the mass. The other seven are the *drive* ones: drive inertia, viscous
-and Coulomb friction and offset on the joint side (`l`, after the gear, seen by a joint torque sensor) and on the
-motor side (`m`). A payload is a body of its own, number n + 1, in the frame of the last link.
+The first ten are the *inertial* ones: the inertia tensor about the origin of the link frame (tensor entries,
+so `XY` = -int x y dm), the first moments and the mass. The other seven are the *drive* ones: drive inertia,
+viscous and Coulomb friction and offset on the joint side (`l`, after the gear, seen by a joint torque sensor)
+and on the motor side (`m`). A payload is a body of its own, number n + 1, in the frame of the last link.
 
 Functions on inertial parameters take arrays whose last axis has length 10 and keep the leading axes.
 
-Reference: Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, chapter 9; Traversaro et al.,
-Identification of fully physical consistent inertial parameters, 2016; Wensing, Kim and Slotine, 2018 (pseudo-inertia).
+Reference: Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, chapter 9; Traversaro et
+al., Identification of fully physical consistent inertial parameters, 2016; Wensing, Kim and Slotine, 2018
+(pseudo-inertia).
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def _inertial(parameters: ArrayLike) -> NDArray[np.float64]:
     array = np.asarray(parameters, dtype=np.float64)
     if array.shape[-1:] != (10,):
         raise ConfigurationError(
-            f"inertial parameters have shape {array.shape}; the last axis must hold the ten {' '.join(INERTIAL)}"
+            f"inertial parameters have shape {array.shape}; the last axis must hold {' '.join(INERTIAL)}"
         )
     return array
 
@@ -129,7 +130,8 @@ def _steiner(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float
 def to_com(
     parameters: ArrayLike,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mass [kg] (...,), centre of mass [m] (..., 3) and inertia about it [kg m^2] (..., 3, 3), axes of the link.
+    """Mass [kg] (...,), centre of mass [m] (..., 3) and inertia about it [kg m^2] (..., 3, 3), axes of the
+    link.
 
     A body of zero mass must have zero first moments; its centre of mass is put at the origin. Raises
     ConfigurationError when first moments stand beside a zero mass.
@@ -144,7 +146,7 @@ def to_com(
 
 
 def from_com(mass: ArrayLike, com: ArrayLike, inertia: ArrayLike) -> NDArray[np.float64]:
-    """Ten inertial parameters (..., 10) from mass, centre of mass and inertia about it (the inverse of `to_com`)."""
+    """Ten inertial parameters (..., 10) from mass, centre of mass and inertia about it: undoes `to_com`."""
     m = np.asarray(mass, dtype=np.float64)
     c = np.asarray(com, dtype=np.float64)
     tensor = np.asarray(inertia, dtype=np.float64) + m[..., None, None] * _steiner(c, c)
@@ -173,9 +175,11 @@ def frame_change(placement: ArrayLike) -> NDArray[np.float64]:
 
 
 def pseudo_inertia(parameters: ArrayLike) -> NDArray[np.float64]:
-    """Pseudo-inertia matrix (..., 4, 4): [[tr(J)/2 1 - J, h], [h', m]] with J about the origin, h first moments.
+    """Pseudo-inertia matrix (..., 4, 4): [[tr(J)/2 1 - J, h], [h', m]] with J about the origin, h first
+    moments.
 
-    It is positive definite exactly when the ten parameters can belong to a rigid body of positive mass density.
+    It is positive definite exactly when the ten parameters can belong to a rigid body of positive mass
+    density.
     """
     inertial = _inertial(parameters)
     tensor = _tensor(inertial)
@@ -196,7 +200,7 @@ def from_pseudo_inertia(matrix: ArrayLike) -> NDArray[np.float64]:
 
 
 def to_pinocchio(parameters: ArrayLike) -> NDArray[np.float64]:
-    """The ten parameters in pinocchio's order m, mc, Ixx, Ixy, Iyy, Ixz, Iyz, Izz (`Inertia.FromDynamicParameters`)."""
+    """The ten in pinocchio's order m mc Ixx Ixy Iyy Ixz Iyz Izz (for `Inertia.FromDynamicParameters`)."""
     inertial = _inertial(parameters)
     reordered = np.empty_like(inertial)
     reordered[..., _IN_PINOCCHIO] = inertial
@@ -214,7 +218,8 @@ class Consistency:
 
     link : the name used in messages. mass : [kg].
     smallest_eigenvalue : of the pseudo-inertia matrix; positive for a real body.
-    principal : (3,) principal moments of inertia about the centre of mass [kg m^2], ascending (NaN without mass).
+    principal : (3,) principal moments of inertia about the centre of mass [kg m^2], ascending (NaN without
+        mass).
     consistent : mass positive and pseudo-inertia positive semi-definite to the tolerance.
     reason : why not, in words; empty when consistent.
     """

@@ -1,4 +1,5 @@
-"""The linear structure of the torque models 1, 2 and 3: which columns, which rows, and the stacked observation matrix.
+"""The linear structure of the torque models 1, 2 and 3: which columns, which rows, and the stacked
+observation matrix.
 
 **Models.** With tau_l the joint torque and tau the motor torque (both after the gear)::
 
@@ -6,20 +7,21 @@
     tau   = Ia qdd + tau_l + Fvm qd + Fcm sign(qd) + offm               motor rows
     tau - tau_l = Ia qdd + Fvm qd + Fcm sign(qd) + offm                 difference rows
 
-Model 1 has joint rows, Model 2 motor and joint rows, Model 3 difference rows. A structure may be told to have other
-sides, for an arm without one of the channels.
+Model 1 has joint rows, Model 2 motor and joint rows, Model 3 difference rows. A structure may be told to have
+other sides, for an arm without one of the channels.
 
-**Columns.** The 17 standard parameters of each link in the order of `parameters.PER_LINK`, link after link; then 17 for
-each payload, which is a body of its own (link n + 1, n + 2, ...) in the frame of the last link, so its columns equal
-those of link n where it is mounted and are zero where it is not; then three for each coupling of joints.
+**Columns.** The 17 standard parameters of each link in the order of `parameters.PER_LINK`, link after link;
+then 17 for each payload, which is a body of its own (link n + 1, n + 2, ...) in the frame of the last link,
+so its columns equal those of link n where it is mounted and are zero where it is not; then three for each
+coupling of joints.
 
-**Rows.** Session after session in the order given; in a session side after side (motor before joint); in a side joint
-after joint; in a joint sample after sample. So `W.reshape` never mixes, and the rows of one joint and side, which share
-one error variance, are one contiguous slice (`row_blocks`).
+**Rows.** Session after session in the order given; in a session side after side (motor before joint); in a
+side joint after joint; in a joint sample after sample. So `W.reshape` never mixes, and the rows of one joint
+and side, which share one error variance, are one contiguous slice (`row_blocks`).
 
-Reference: equations (1) to (8) of Kolyubin, Paramonov and Shiriaev, Refining dynamics identification for co-bots, 2017;
-Jubien, Gautier and Janot, Dynamic identification of the Kuka LWR robot using motor torques and joint torque sensors
-data, 2014.
+Reference: equations (1) to (8) of Kolyubin, Paramonov and Shiriaev, Refining dynamics identification for
+co-bots, 2017; Jubien, Gautier and Janot, Dynamic identification of the Kuka LWR robot using motor torques and
+joint torque sensors data, 2014.
 """
 
 from __future__ import annotations
@@ -89,7 +91,7 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Condition:
-    """What a session's rows stand for: the payload that is mounted (None: the bare arm) and the sides measured.
+    """What a session's rows stand for: the payload mounted (None: the bare arm) and the sides measured.
 
     `sides` None means all sides of the structure.
     """
@@ -100,7 +102,7 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """One session as the regression sees it: q, qd, qdd (N, n), torques (N, n) where measured, payload mounted."""
+    """One session for the regression: q, qd, qdd (N, n), torques (N, n) where measured, the payload."""
 
     q: Floats
     qd: Floats
@@ -125,8 +127,8 @@ class ModelStructure:
     """Columns and rows of a linear torque model for a chain.
 
     chain : the arm. model : 1, 2 or 3.
-    payloads : names of the payloads that are identified (link n + 1 is the first). A session is recorded with one of
-        them or with none.
+    payloads : names of the payloads that are identified (link n + 1 is the first). A session is recorded with
+        one of them or with none.
     without : parameters left out of the model: a symbol for all links ("Fvl") or a name for one ("offm3").
     couplings : coupled joints. coulomb : the function that stands for sign(qd).
     sides : other sides than the model's, for an arm without a channel, e.g. ("motor",).
@@ -229,7 +231,7 @@ class ModelStructure:
         return (Condition(), *(Condition(payload) for payload in self.payloads))
 
     def condition_sides(self, condition: Condition) -> tuple[Side, ...]:
-        """Sides of a condition in row order. Raises ConfigurationError for one that the structure does not have."""
+        """Sides of a condition in row order. Raises ConfigurationError for one the structure lacks."""
         if condition.sides is None:
             return self.sides
         foreign = [side for side in condition.sides if side not in self.sides]
@@ -257,7 +259,7 @@ class ModelStructure:
             out[first + 2, a] = out[first + 2, b] = self.coulomb(both)
 
     def signal_of(self, column: int, side: Side, joint: int) -> int | None:
-        """Which of the non-rigid atoms stands in `column` in the rows of `side` and `joint`; None where zero."""
+        """The non-rigid atom that stands in `column` in the rows of `side` and `joint`; None where zero."""
         if not self.active[column]:
             return None
         link, position = divmod(column, len(PER_LINK))
@@ -276,7 +278,7 @@ class ModelStructure:
         return _SIGNAL_OF[symbol] if present[side] else None
 
     def rigid_of(self, column: int, payload: str | None) -> tuple[int, int] | None:
-        """(link, inertial position) of the arm's regressor column that stands in `column`; None where zero."""
+        """(link, inertial position) of the arm's rigid column that stands in `column`; None where zero."""
         link, position = divmod(column, len(PER_LINK))
         if not self.active[column] or link >= self.n_links or position >= len(INERTIAL):
             return None
@@ -334,7 +336,7 @@ class ModelStructure:
         return out.reshape(len(wanted), -1).T
 
     def stack(self, sessions: Sequence[Samples], *, columns: ArrayLike | None = None) -> Floats:
-        """Stacked observation matrix of sessions: sides are those of the structure whose torque a session has."""
+        """Stacked observation matrix of sessions, each with the sides whose torque it has."""
         parts = [
             self.regressor(s.q, s.qd, s.qdd, payload=s.payload, sides=self.measured(s), columns=columns)
             for s in sessions
@@ -346,7 +348,7 @@ class ModelStructure:
         )
 
     def measured(self, samples: Samples) -> tuple[Side, ...]:
-        """Sides of the structure for which the session has the torque. Raises DataError when there is none."""
+        """Sides of the structure that the session has the torque for. Raises DataError for none."""
         have: dict[str, bool] = {"motor": samples.motor is not None, "joint": samples.joint is not None}
         have["difference"] = have["motor"] and have["joint"]
         sides = tuple(side for side in self.sides if have[side])
@@ -367,7 +369,7 @@ class ModelStructure:
 
     def _columns(self, columns: ArrayLike | None) -> NDArray[np.int64]:
         wanted = np.arange(self.n_columns) if columns is None else np.asarray(columns, dtype=np.int64)
-        if wanted.ndim != 1 or wanted.size and not 0 <= wanted.min() <= wanted.max() < self.n_columns:
+        if wanted.ndim != 1 or np.any((wanted < 0) | (wanted >= self.n_columns)):
             raise ConfigurationError(f"columns must be a list of indices below {self.n_columns}")
         return wanted
 

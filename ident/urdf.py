@@ -1,7 +1,7 @@
 """The part of a URDF that dynamics needs: links' inertials and the tree of joints, read with plain XML.
 
-Positions, axes and inertia are taken as written (roll-pitch-yaw as in the URDF specification); meshes, visuals and
-extensions are ignored, so a file reads without its packages.
+Positions, axes and inertia are taken as written (roll-pitch-yaw as in the URDF specification); meshes,
+visuals and extensions are ignored, so a file reads without its packages.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prisma
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """One joint: kind ("revolute", "prismatic", "fixed"), parent and child link, origin (4, 4), unit axis (3,)."""
+    """One joint: kind ("revolute", "prismatic", "fixed"), parent and child, origin (4, 4), unit axis (3,)."""
 
     name: str
     kind: str
@@ -41,7 +41,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A URDF: robot name, text, joints in the order of the file, inertials (10,) by link about the link frame."""
+    """A URDF: robot name, text, joints in the file's order, inertials (10,) by link about its frame."""
 
     name: str
     text: str
@@ -58,7 +58,7 @@ class Urdf:
         return roots[0]
 
     def chain(self, root: str | None = None, tip: str | None = None) -> list[Joint]:
-        """Joints from `root` to `tip`; without a tip, the one chain through all movable joints below the root."""
+        """Joints from `root` to `tip`; without a tip, the one chain through all movable joints."""
         start = root if root is not None else self.root
         for link in (start, tip):
             if link is not None and link not in self.inertials:
@@ -85,7 +85,7 @@ class Urdf:
             if len(branches) > 1:
                 named = ", ".join(joint.name for joint in branches)
                 raise ConfigurationError(
-                    f"robot {self.name!r} branches at link {here!r} (joints {named}); give the `tip` link of the arm"
+                    f"robot {self.name!r} branches at link {here!r} (joints {named}); give the arm's `tip`"
                 )
             if branches:
                 link = branches[0].child
@@ -105,7 +105,7 @@ class Urdf:
         return found
 
     def lumped_inertial(self, link: str, stop: Collection[str]) -> NDArray[np.float64]:
-        """(10,) inertial parameters about the frame of `link` with all that hangs on it, short of the joints `stop`."""
+        """(10,) inertial parameters about the frame of `link`, all on it up to joints `stop` included."""
         total = self.inertials[link].copy()
         for joint in self.joints:
             if joint.parent == link and joint.name not in stop:

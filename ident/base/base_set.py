@@ -109,7 +109,8 @@ class BaseSet:
         return x[self.columns] + self.regrouping @ x[self.dependent]
 
     def expand(self, base: ArrayLike, prior: ArrayLike | None = None) -> Floats:
-        """Standard parameters (n_columns,) with these base parameters (b,): those nearest to `prior` (default 0).
+        """Standard parameters (n_columns,) with these base parameters (b,): those nearest to `prior` (default
+        0).
 
         All of them give the same torque; the difference is which representative of the set one likes to see.
         Parameters without effect keep the prior's value.
@@ -164,12 +165,13 @@ class BaseSet:
 def columns_by_preference(structure: ModelStructure) -> NDArray[np.int64]:
     """All columns, those that the literature keeps as base parameters first.
 
-    Khalil's choice: of a revolute joint's link YY, MZ and M are regrouped into the link before it; of a prismatic
-    joint's link the six entries of the inertia tensor (and MZ where a rule needs it); lower links are kept before
-    higher ones, and inertial parameters before drive inertias.
+    Khalil's choice: of a revolute joint's link YY, MZ and M are regrouped into the link before it; of a
+    prismatic joint's link the six entries of the inertia tensor (and MZ where a rule needs it); lower links
+    are kept before higher ones, and inertial parameters before drive inertias.
     """
     size, n = len(PER_LINK), structure.chain.n
-    first, last = [], []
+    first: list[int] = []
+    last: list[int] = []
     for column in range(structure.n_columns):
         link, position = divmod(column, size)
         symbol = PER_LINK[position] if link < structure.n_links else ""

@@ -1,29 +1,32 @@
 """Base parameters from the modified-DH constants alone, by the rules of Khalil, Bennis and Gautier.
 
-The rigid part works on the links' energies. Going from the last link to the first, what a joint's motion cannot tell
-apart is moved to the link before it:
+The rigid part works on the links' energies. Going from the last link to the first, what a joint's motion
+cannot tell apart is moved to the link before it:
 
-* revolute joint j: a body that is symmetric about z_j and has no inertia about it (YY_j = XX_j, MZ_j, M_j) moves no
-  differently when it is fixed to link j-1, so YY_j, MZ_j and M_j are regrouped into link j-1 (and XX_j - YY_j stays);
+* revolute joint j: a body that is symmetric about z_j and has no inertia about it (YY_j = XX_j, MZ_j, M_j)
+  moves no differently when it is fixed to link j-1, so YY_j, MZ_j and M_j are regrouped into link j-1 (and
+  XX_j - YY_j stays);
 * prismatic joint j: link j turns with link j-1, so its six inertia entries are regrouped there.
 
-Near the base, with r1 the first revolute joint and r2 the first revolute joint whose axis is not parallel to it:
+Near the base, with r1 the first revolute joint and r2 the first revolute joint not parallel to it:
 
 * prismatic, j < r1: the link does not turn, so its first moments have no effect;
-* revolute, r1 <= j < r2: of the tensor only ZZ_j acts; MX_j and MY_j act unless their axis stands still and lies along
-  gravity;
-* prismatic, r1 < j < r2: the first moment along z_r1 has no effect (one of MX_j, MY_j, MZ_j is regrouped into the
-  others); when z_j is parallel to z_r1, MX_j and MY_j are regrouped into link j-1.
+* revolute, r1 <= j < r2: of the tensor only ZZ_j acts; MX_j and MY_j act unless their axis stands still and
+  lies along gravity;
+* prismatic, r1 < j < r2: the first moment along z_r1 has no effect (one of MX_j, MY_j, MZ_j is regrouped into
+  the others); when z_j is parallel to z_r1, MX_j and MY_j are regrouped into link j-1.
 
-What is left are functions of the motion, one for each rigid base parameter. Some of them are quadratic forms of the
-joint speeds with constant coefficients plus a constant force (ZZ_r1 is qd_r1^2 / 2), as are the functions of the drive
-inertias and offsets; written out as such, they show which of those are regrouped (Ia_r1 into ZZ_r1, Ia_r2 into ZZ_r2
-when z_r2 is perpendicular to z_r1, the prismatic ones). The stack of sessions, sides and payloads is then a small matrix
-of constants whose independent columns are the base parameters. A payload is body n + 1, welded to link n while mounted.
+What is left are functions of the motion, one for each rigid base parameter. Some of them are quadratic forms
+of the joint speeds with constant coefficients plus a constant force (ZZ_r1 is qd_r1^2 / 2), as are the
+functions of the drive inertias and offsets; written out as such, they show which of those are regrouped
+(Ia_r1 into ZZ_r1, Ia_r2 into ZZ_r2 when z_r2 is perpendicular to z_r1, the prismatic ones). The stack of
+sessions, sides and payloads is then a small matrix of constants whose independent columns are the base
+parameters. A payload is body n + 1, welded to link n while mounted.
 
-Reference: Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE Trans.
-Robotics and Automation 6(3), 1990; Khalil, Bennis and Gautier, The use of the generalized links to determine the minimum
-inertial parameters of robots, J. Robotic Systems 7(2), 1990; Khalil and Dombre 2002, section 9.4.2.
+Reference: Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE
+Trans. Robotics and Automation 6(3), 1990; Khalil, Bennis and Gautier, The use of the generalized links to
+determine the minimum inertial parameters of robots, J. Robotic Systems 7(2), 1990; Khalil and Dombre 2002,
+section 9.4.2.
 """
 
 from __future__ import annotations
@@ -74,7 +77,8 @@ class _Axes:
 
     r1 : first revolute joint (n if none). r2 : first revolute joint not parallel to it (n if none).
     r3 : first revolute joint after r2 not parallel to r2 (n if none).
-    along : (n,) cosine between z_j and z_r1, for j <= r2. second : (n,) the same with z_r2, for r2 <= j < r3. axis : (n, 3) z_r1 in frame j, for r1 <= j < r2.
+    along : (n,) cosine between z_j and z_r1, for j <= r2. second : (n,) the same with z_r2, for r2 <= j < r3.
+        axis : (n, 3) z_r1 in frame j, for r1 <= j < r2.
     """
 
     r1: int
@@ -112,7 +116,7 @@ class _Rigid:
     def __init__(self, chain: Chain) -> None:
         if np.linalg.norm(chain.gravity) < _SAME:
             raise ConfigurationError(
-                "the closed-form rules assume gravity, and the chain has none; use the numeric base parameters"
+                "the closed-form rules assume gravity, and the chain has none; use `numeric_base` instead"
             )
         self.chain = chain
         self.axes = _Axes.of(chain)
@@ -191,7 +195,7 @@ class _Rigid:
         return True
 
     def constant_forms(self) -> list[tuple[int, Floats, Floats]]:
-        """Relations (pivot, coefficients (f,) on the functions, constant form (n, n + 1)) that hold identically.
+        """Identities (pivot, coefficients (f,) on the functions, constant form (n, n + 1)).
 
         A constant form stands for the energy qd' A qd / 2 and the constant forces b: [A, b]. The pivot is the
         function of the highest link in the relation.
@@ -265,8 +269,8 @@ class _Rigid:
 def _coordinates(structure: ModelStructure, rigid: _Rigid, payload: str | None, side: Side) -> Floats:
     """(g, n_columns): every column of the rows of one condition and side on functions that are independent.
 
-    Functions: the rigid base functions, constant quadratic forms (n, n), constant forces (n), and for each joint
-    qd and sign(qd); then two for each coupling.
+    Functions: the rigid base functions, constant quadratic forms (n, n), constant forces (n), and for each
+    joint qd and sign(qd); then two for each coupling.
     """
     chain = structure.chain
     n, f, size = chain.n, len(rigid.kept), len(PER_LINK)
@@ -308,8 +312,8 @@ def _signal_row(base: int, n: int, joint: int, signal: int) -> int:
 def _rewrite(functions: Floats, constants: Floats, forms: list[tuple[int, Floats, Floats]]) -> None:
     """Express the functions that have a constant form by it (in place).
 
-    A relation says coefficients . functions = form; the function of its highest link is replaced by the form and the
-    functions of lower links, so the relations are taken from the last link to the first.
+    A relation says coefficients . functions = form; the function of its highest link is replaced by the form
+    and the functions of lower links, so the relations are taken from the last link to the first.
     """
     for pivot, coefficients, form in reversed(forms):
         amount = functions[pivot] / coefficients[pivot]

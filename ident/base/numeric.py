@@ -1,9 +1,9 @@
 """Base parameters from the rank of observation matrices at random states (Gautier 1991).
 
-Random states excite every combination that any motion can excite, so dependence among the columns of the sampled
-matrix is dependence of the model. Rounding leaves dependent columns at 1e-15 of the independent ones, and real
-dependence on the geometry (link lengths of a centimetre) leaves singular values above 1e-6: the gap between the two is
-nine orders of magnitude wide, and the rank is read off at its widest place.
+Random states excite every combination that any motion can excite, so dependence among the columns of the
+sampled matrix is dependence of the model. Rounding leaves dependent columns at 1e-15 of the independent ones,
+and real dependence on the geometry (link lengths of a centimetre) leaves singular values above 1e-6: the gap
+between the two is nine orders of magnitude wide, and the rank is read off at its widest place.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def numeric_base(
     samples : random states for each condition; the default gives three rows for each column.
 
     Columns are scaled to norm 1; the rank is where consecutive singular values, the smaller below 1e-8 of the
-    largest, fall the most. Raises DataError when there is no clear gap (a factor of 1e3): the geometry is then nearly
-    degenerate, and the message says by how much.
+    largest, fall the most. Raises DataError when there is no clear gap (a factor of 1e3): the geometry is
+    then nearly degenerate, and the message says by how much.
     """
     stack = tuple(conditions) if conditions is not None else structure.conditions()
     if not stack:
@@ -104,7 +104,7 @@ def _rank(singular: Floats) -> tuple[int, float, float]:
     gap = float(ratios[rank - 1])
     if gap < _SMALLEST_GAP:
         raise DataError(
-            f"the singular values of the observation matrix fall by no more than {gap:.1e} anywhere, so its rank is "
-            "not clear; the geometry is nearly degenerate: check the modified-DH constants"
+            f"the singular values of the observation matrix fall by no more than {gap:.1e} anywhere, so its "
+            "rank is not clear; the geometry is nearly degenerate: check the modified-DH constants"
         )
     return rank, gap, float(np.sqrt(padded[rank - 1] * padded[rank]))
