@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -62,7 +62,8 @@ class Estimate:
 
     values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed, by
     name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y - A chi [Nm]
-    of each row group.
+    of each row group. standard : standard parameters, where the estimator finds them; prior_scale : factor s on the
+    prior's covariance, where there is a prior.
     """
 
     method: str
@@ -77,7 +78,8 @@ class Estimate:
     converged: bool = True
     notes: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    standard: FloatArray | None = field(default=None)
+    standard: FloatArray | None = None
+    prior_scale: float | None = None
 
     @property
     def std(self) -> FloatArray:

@@ -40,8 +40,9 @@ class InstrumentalVariables:
         values, weights, factor, _, _ = weighted_solution(problem)
         root = factor.inverse_root()
         consumed = consumed_parameters(problem, weights, root)
-        converged = False
+        converged, done = False, 0
         for iteration in range(1, self.iterations + 1):
+            done = iteration
             matrices = self._checked(problem, values)
             cross, moment = _moments(problem, matrices, weights)
             scale = np.sqrt(np.diag(factor.normal))
@@ -79,7 +80,7 @@ class InstrumentalVariables:
             settings=self.covariance,
             matrices=matrices,
             plain=textbook(bread @ square @ bread.T),
-            iterations=iteration,
+            iterations=done,
             converged=converged,
         )
 

@@ -6,6 +6,7 @@ trust it. Rows count with their effective number, so that thousands of correlate
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -99,6 +100,7 @@ class MaximumAPosteriori:
             )
         values, weights = _start(problem, self.prior)
         scale, converged = 1.0, False
+        iteration = 0
         for iteration in range(1, self.iterations + 1):
             tempered = weights * _shares(problem, values)
             scale_new = self._scale(problem, tempered)
@@ -136,7 +138,10 @@ class MaximumAPosteriori:
         )
         posterior = Covariance(bread, "posterior with the effective number of rows: holds if the prior does")
         return replace(
-            estimate, covariance=posterior, covariances={**estimate.covariances, "posterior": posterior}
+            estimate,
+            covariance=posterior,
+            prior_scale=scale,
+            covariances={**estimate.covariances, "posterior": posterior},
         )
 
     def _how(self) -> str:
@@ -199,7 +204,7 @@ def _posterior(
     return root @ factor[:p, p], root
 
 
-def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray):  # type: ignore[no-untyped-def]  # noqa: ANN202
+def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray) -> Callable[[float], float]:
     """Minus the log marginal likelihood as a function of log s."""
     r = problem.weighted(weights).r
     p = len(prior.mean)
@@ -217,7 +222,9 @@ def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray):  # type
     return cost
 
 
-def _cross_validation_cost(problem: Problem, prior: Prior, weights: FloatArray, blocks: int):  # type: ignore[no-untyped-def]  # noqa: ANN202
+def _cross_validation_cost(
+    problem: Problem, prior: Prior, weights: FloatArray, blocks: int
+) -> Callable[[float], float]:
     """Weighted squared error on blocks of time left out, as a function of log s."""
     p = len(prior.mean)
     grams = np.zeros((blocks, p + 1, p + 1))

@@ -77,6 +77,8 @@ def estimate_from(
     coefficients: Sequence[FloatArray] | None = None,
     matrices: Sequence[FloatArray] | None = None,
     plain: Covariance | None = None,
+    scores: Scores | None = None,
+    offset: FloatArray | None = None,
     iterations: int = 1,
     converged: bool = True,
     notes: tuple[str, ...] = (),
@@ -86,6 +88,7 @@ def estimate_from(
     bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each row
     (default: class weight times residual). matrices : what multiplies them (default: the regressors; the
     instruments of an instrumental-variable estimate). plain : the estimator's own textbook covariance.
+    scores : in place of coefficients and matrices. offset : (p, p), added to the robust covariances.
     """
     residuals = problem.residuals(values)
     n_eff = effective_rows(problem, residuals)
@@ -110,8 +113,10 @@ def estimate_from(
             coefficient * np.sqrt(fits[number].rows / max(fits[number].rows - consumed[number], 1.0))
             for coefficient, number in zip(coefficients, problem.class_of_group, strict=True)
         ]
-        scores = Scores.of(problem, corrected, matrices)
-        robust, bandwidth = hac(scores, bread, problem.sample_time_s, settings.bandwidth_s)
+        summed = scores if scores is not None else Scores.of(problem, corrected, matrices)
+        robust, bandwidth = hac(summed, bread, problem.sample_time_s, settings.bandwidth_s)
+        if offset is not None:
+            robust = replace(robust, matrix=robust.matrix + offset)
         covariances["hac"] = robust
         if settings.kind == "bootstrap":
             block = settings.block_s if settings.block_s is not None else 2.0 * bandwidth

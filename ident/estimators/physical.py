@@ -1,0 +1,333 @@
+"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives that only dissipate.
+
+Standard parameters are fitted through their base parameters under linear matrix inequalities (Sousa and Cortesao
+2014; Wensing, Kim and Slotine 2018) with a distance to a prior model that settles what the data cannot say (Lee,
+Wensing and Park 2020). The convex program goes to clarabel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import clarabel
+import numpy as np
+from scipy import sparse
+
+from fri.errors import ConfigurationError, DataError
+from ident.estimators.covariance import CovarianceSettings, effective_rows
+from ident.estimators.estimate import Estimate
+from ident.estimators.prior import MaximumAPosteriori, Prior
+from ident.estimators.problem import FloatArray, Problem
+from ident.parameters import pseudo_inertia
+
+__all__ = ["BodyPrior", "PhysicallyConsistent", "nearest_consistent"]
+
+Metric = Literal["pullback", "entropic", "euclidean"]
+
+_BODY = 10
+_ROOT2 = np.sqrt(2.0)
+
+
+@dataclass(frozen=True)
+class BodyPrior:
+    """The standard parameters and what is known of them beforehand.
+
+    projection : K (p, n), base parameters = K standard parameters.
+    bodies : (k, 10) int, positions of the ten inertial parameters of each rigid body, in the order of
+        `parameters.INERTIAL`.
+    nonnegative : positions of parameters that cannot be negative (drive inertia, friction).
+    inertial : (k, 10) prior of the bodies; each must be consistent (`nearest_consistent` makes it so).
+    absent : positions of parameters that the model leaves out; they stay zero.
+    """
+
+    projection: FloatArray
+    bodies: np.ndarray
+    nonnegative: np.ndarray
+    inertial: FloatArray
+    absent: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if self.bodies.shape != self.inertial.shape or self.bodies.shape[1:] != (_BODY,):
+            raise ConfigurationError(
+                f"bodies {self.bodies.shape} and their prior {self.inertial.shape} must both be (k, 10)"
+            )
+        for number, body in enumerate(self.inertial):
+            if np.linalg.eigvalsh(pseudo_inertia(body))[0] <= 0:
+                raise ConfigurationError(
+                    f"prior of body {number + 1} belongs to no rigid body; pass it through `nearest_consistent`"
+                )
+
+    def hessian(self, metric: Metric) -> FloatArray:
+        """(n, n) quadratic form of the distance to the prior at the prior; zero for the drive parameters.
+
+        "pullback" (and "entropic", which agrees with it to second order): tr(J0^-1 dJ J0^-1 dJ) / 2, invariant
+        to the choice of frames and units. "euclidean": each parameter relative to its body's size.
+        """
+        n = self.projection.shape[1]
+        total = np.zeros((n, n))
+        basis = pseudo_inertia(np.eye(_BODY))
+        for places, body in zip(self.bodies, self.inertial, strict=True):
+            if metric == "euclidean":
+                block = np.diag(1.0 / _sizes(body) ** 2)
+            else:
+                inverse = np.linalg.inv(pseudo_inertia(body))
+                moved = np.einsum("ab,kbc->kac", inverse, basis)
+                block = 0.5 * np.einsum("kab,lba->kl", moved, moved)
+            total[np.ix_(places, places)] += block
+        return total
+
+    def prior(self, metric: Metric) -> Prior:
+        """The same as a normal prior of the base parameters; those with a drive parameter in them stay free."""
+        n = self.projection.shape[1]
+        inertial = np.zeros(n, dtype=bool)
+        inertial[self.bodies.ravel()] = True
+        inertial[self.absent] = False
+        covariance = np.zeros((n, n))
+        places = np.flatnonzero(inertial)
+        block = self.hessian(metric)[np.ix_(places, places)]
+        covariance[np.ix_(places, places)] = np.linalg.inv(block)
+        known = np.array([not np.any(row[~inertial]) and bool(np.any(row)) for row in self.projection])
+        mean = np.zeros(n)
+        mean[self.bodies.ravel()] = self.inertial.ravel()
+        return Prior.projected(mean, covariance, self.projection, known)
+
+
+@dataclass(frozen=True)
+class PhysicallyConsistent:
+    """Minimises sum of (n_eff / n) ||e_c||^2 / sigma_c^2 + distance(x, x_0) / s over consistent x.
+
+    metric : distance of a body from its prior: "pullback" (quadratic, invariant), "entropic" (log-determinant
+        divergence, keeps away from the boundary), "euclidean".
+    strength : how s is chosen, see `MaximumAPosteriori`.
+    margin : smallest eigenvalue of a pseudo-inertia relative to the prior's smallest.
+    The result's `standard` holds the standard parameters (n,).
+    """
+
+    prior: BodyPrior
+    metric: Metric = "pullback"
+    strength: Literal["evidence", "cross_validation"] | float = "evidence"
+    margin: float = 1e-3
+    covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
+
+    def fit(self, problem: Problem) -> Estimate:
+        """Estimate (p,) and `standard` (n,). Standard deviations are those without the inequalities."""
+        linear = MaximumAPosteriori(self.prior.prior(self.metric), self.strength, self.covariance).fit(
+            problem
+        )
+        assert linear.prior_scale is not None
+        shares = effective_rows(problem, linear.residuals) / [max(c.rows, 1) for c in linear.classes]
+        factor = problem.weighted(linear.weights * np.minimum(shares, 1.0))
+        p = len(problem.names)
+        projection = self.prior.projection
+        quadratic = factor.r[:p, :p] @ projection
+        target = factor.r[:p, p]
+        standard = _Program(self.prior, self.metric, 1.0 / linear.prior_scale, self.margin).solve(
+            quadratic, target
+        )
+        values = projection @ standard
+        touching = _touching(self.prior, standard, self.margin)
+        notes = (
+            *linear.notes,
+            f"{touching} of {len(self.prior.bodies)} bodies at the boundary of consistency",
+        )
+        return replace(
+            linear,
+            method=f"physically consistent ({self.metric})",
+            values=values,
+            residuals=problem.residuals(values),
+            classes=_refit(linear, problem, values),
+            notes=notes,
+            standard=standard,
+        )
+
+
+def nearest_consistent(inertial: FloatArray, *, margin: float = 1e-2) -> FloatArray:
+    """Consistent (k, 10) nearest to `inertial` in size-relative Euclidean distance.
+
+    margin : smallest eigenvalue of each pseudo-inertia relative to a compact body of that mass.
+    """
+    result = []
+    for body in np.atleast_2d(np.asarray(inertial, dtype=np.float64)):
+        mass = max(float(body[9]), 1e-3)
+        floor = margin * _compact(mass)
+        weights = 1.0 / _sizes(body) ** 2
+        rows, offset, cones = _psd_rows(np.arange(_BODY), _BODY, floor)
+        solution = _run(sparse.diags(2.0 * weights).tocsc(), -2.0 * weights * body, rows, offset, cones)
+        result.append(solution)
+    return np.array(result)
+
+
+@dataclass(frozen=True)
+class _Program:
+    """The convex program in clarabel's form."""
+
+    prior: BodyPrior
+    metric: Metric
+    strength: float
+    margin: float
+
+    def solve(self, quadratic: FloatArray, target: FloatArray) -> FloatArray:
+        """Standard parameters (n,) for ||quadratic x - target||^2 plus the regularisation."""
+        prior, n = self.prior, quadratic.shape[1]
+        start = np.zeros(n)
+        start[prior.bodies.ravel()] = prior.inertial.ravel()
+        hessian = 2.0 * quadratic.T @ quadratic
+        gradient = -2.0 * quadratic.T @ target
+        entropic = self.metric == "entropic"
+        extra = len(prior.bodies) * (_BODY + 4) if entropic else 0
+        if not entropic:
+            form = 2.0 * self.strength * prior.hessian(self.metric)
+            hessian += form
+            gradient -= form @ start
+        parts, offsets, cones = [], [], []
+        sign = np.zeros((len(prior.nonnegative), n))
+        sign[np.arange(len(prior.nonnegative)), prior.nonnegative] = -1.0
+        zero = np.zeros((len(prior.absent), n))
+        zero[np.arange(len(prior.absent)), prior.absent] = 1.0
+        for rows, cone in (
+            (zero, clarabel.ZeroConeT(len(zero))),
+            (sign, clarabel.NonnegativeConeT(len(sign))),
+        ):
+            if len(rows):
+                parts.append(np.hstack([rows, np.zeros((len(rows), extra))]))
+                offsets.append(np.zeros(len(rows)))
+                cones.append(cone)
+        linear = np.concatenate([gradient, np.zeros(extra)])
+        for number, (places, body) in enumerate(zip(prior.bodies, prior.inertial, strict=True)):
+            matrix = pseudo_inertia(body)
+            if entropic:
+                first = n + number * (_BODY + 4)
+                rows, offset, kinds = _entropic_rows(places, n + extra, first)
+                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4, whose second-order form is the pullback metric.
+                slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
+                linear[places] += self.strength * slope
+                linear[first + _BODY : first + _BODY + 4] -= self.strength
+            else:
+                floor = self.margin * _smallest(matrix)
+                rows, offset, kinds = _psd_rows(places, n + extra, floor)
+            parts.append(rows)
+            offsets.append(offset)
+            cones += kinds
+        full = np.zeros((n + extra, n + extra))
+        full[:n, :n] = hessian
+        # Parameters without effect and without prior get a trace of curvature, so that the solution is unique.
+        full[np.arange(n), np.arange(n)] += 1e-12 * max(float(np.diag(hessian).max()), 1e-12)
+        solution = _run(
+            sparse.csc_matrix(np.triu(full)), linear, np.vstack(parts), np.concatenate(offsets), cones
+        )
+        return solution[:n]
+
+
+def _run(
+    quadratic: sparse.csc_matrix, linear: FloatArray, rows: FloatArray, offset: FloatArray, cones: list
+) -> FloatArray:
+    # Columns scaled to the size of the curvature: masses and inertias differ by orders of magnitude.
+    diagonal = np.sqrt(np.maximum(np.asarray(quadratic.diagonal()).ravel(), 0.0))
+    typical = float(np.median(diagonal[diagonal > 0])) if np.any(diagonal > 0) else 1.0
+    scale = 1.0 / np.where(diagonal > 1e-6 * typical, diagonal, typical)
+    objective = float(np.max(np.abs(linear * scale), initial=1e-300))
+    spread = sparse.diags(scale)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = 1e-10
+    settings.tol_feas = 1e-10
+    solver = clarabel.DefaultSolver(
+        sparse.csc_matrix(spread @ quadratic @ spread / objective),
+        linear * scale / objective,
+        sparse.csc_matrix(rows * scale),
+        offset,
+        cones,
+        settings,
+    )
+    result = solver.solve()
+    status = str(result.status)
+    if status not in ("Solved", "AlmostSolved"):
+        raise DataError(
+            f"the physically consistent program ended with {status}; check the prior's masses and the parameters' "
+            "units, or raise `strength`"
+        )
+    return scale * np.array(result.x)
+
+
+def _svec(matrix: FloatArray) -> FloatArray:
+    """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD cone."""
+    size = matrix.shape[-1]
+    entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]
+    return np.stack(entries, axis=-1)
+
+
+def _psd_rows(places: np.ndarray, width: int, floor: FloatArray) -> tuple[FloatArray, FloatArray, list]:
+    """Rows of A x + s = b for J(x) - floor in the PSD cone."""
+    rows = np.zeros((_BODY, width))
+    rows[:, places] = -_svec(pseudo_inertia(np.eye(_BODY))).T
+    return rows, -_svec(floor), [clarabel.PSDTriangleConeT(4)]
+
+
+def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArray, FloatArray, list]:
+    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at column `first`."""
+    lower = [(i, j) for j in range(4) for i in range(j, 4)]
+    psd = np.zeros((36, width))
+    big = np.zeros((_BODY, 8, 8))
+    big[:, :4, :4] = pseudo_inertia(np.eye(_BODY))
+    psd[:, places] = -_svec(big).T
+    exponential = np.zeros((12, width))
+    offset = np.zeros(12)
+    for k, (i, j) in enumerate(lower):
+        block = np.zeros((8, 8))
+        block[i, 4 + j] = block[4 + j, i] = 1.0
+        if i == j:
+            block[4 + i, 4 + i] = 1.0
+            # Exponential cone (u, 1, L_ii): exp(u) <= L_ii.
+            exponential[3 * i, first + _BODY + i] = -1.0
+            exponential[3 * i + 2, first + k] = -1.0
+            offset[3 * i + 1] = 1.0
+        psd[:, first + k] = -_svec(block)
+    cones = [clarabel.PSDTriangleConeT(8)] + [clarabel.ExponentialConeT()] * 4
+    return np.vstack([psd, exponential]), np.concatenate([np.zeros(36), offset]), cones
+
+
+def _compact(mass: float) -> FloatArray:
+    """Pseudo-inertia of a ball of that mass and the density of aluminium: the scale of a real body."""
+    radius = (3.0 * mass / (4.0 * np.pi * 2700.0)) ** (1.0 / 3.0)
+    return np.diag([mass * radius**2 / 5.0] * 3 + [mass])
+
+
+def _smallest(matrix: FloatArray) -> FloatArray:
+    """Diagonal floor from a prior's own size, length and mass apart."""
+    second = float(
+        np.linalg.eigvalsh(matrix[:3, :3] - np.outer(matrix[:3, 3], matrix[:3, 3]) / matrix[3, 3])[0]
+    )
+    return np.diag([second] * 3 + [matrix[3, 3]])
+
+
+def _sizes(body: FloatArray) -> FloatArray:
+    """Natural size (10,) of each parameter of a body: its radius of gyration makes lengths."""
+    mass = max(abs(float(body[9])), 1e-3)
+    inertia = max(float(np.mean(np.abs(body[[0, 3, 5]]))), float(_compact(mass)[0, 0]) * 2.0)
+    length = np.sqrt(inertia / mass)
+    return np.array([inertia] * 6 + [mass * length] * 3 + [mass])
+
+
+def _touching(prior: BodyPrior, standard: FloatArray, margin: float) -> int:
+    count = 0
+    for places, body in zip(prior.bodies, prior.inertial, strict=True):
+        floor = margin * _smallest(pseudo_inertia(body))
+        excess = np.linalg.eigvalsh(pseudo_inertia(standard[places]) - floor)[0]
+        count += bool(excess < 1e-3 * np.linalg.eigvalsh(pseudo_inertia(body))[0])
+    return count
+
+
+def _refit(estimate: Estimate, problem: Problem, values: FloatArray) -> tuple:
+    """Class table with the residuals of the constrained values."""
+    fits = []
+    for fit, row_class in zip(estimate.classes, problem.classes, strict=True):
+        square = row_class.factor.sum_of_squares(values)
+        fits.append(
+            replace(
+                fit,
+                rms=float(np.sqrt(square / max(fit.rows, 1))),
+                sigma=float(np.sqrt(square / max(fit.rows - fit.parameters, 1.0))),
+            )
+        )
+    return tuple(fits)
