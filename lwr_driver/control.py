@@ -99,7 +99,7 @@ class Word(IntEnum):
     RECEIVED = 30
     NOTES = 31  # count of notes; the last is in the text NOTE
     SUSPECT = 32
-    OVERRUNS = 33
+    ROW = 33  # last row of a motion that was sent, -1 if none since the motion was asked for
 
 
 class Text(IntEnum):
@@ -147,7 +147,7 @@ class Control:
         except OSError as error:
             raise ConfigurationError(f"no shared memory for motions of {plan_rows} rows: {error}") from error
         control = cls(descriptor, plan_rows)
-        control.words[Word.INDEX] = -1
+        control.words[Word.INDEX] = control.words[Word.ROW] = -1
         return control
 
     def write_text(self, place: Text, text: str) -> None:

@@ -240,7 +240,8 @@ class Driver:
         except BaseException:
             # The request must not be granted after nobody waits for it any more.
             if self._loop is not None:
-                self._post(Job.LEAVE)
+                with contextlib.suppress(LwrError):
+                    self._wait(Job.LEAVE, timeout_s=_CLOSE_PATIENCE_S, awaited="rest", stoppable=False)
             raise
         return self.state()
 
@@ -262,7 +263,6 @@ class Driver:
         control.put_motion(motion.q, self._number_phases(motion))
         self._post(Job.MOTION, a=len(motion), b=self._stops_seen)
         names = dict(zip(control.phase_ids.tolist(), (name for _, name in motion.phases), strict=False))
-        row = -1
         trouble: LwrError | None = None
         following = time.monotonic()
         watch = _Watch(self)
@@ -270,23 +270,21 @@ class Driver:
             while not self._done():
                 time.sleep(_POLL_S)
                 watch.check(self.link.lock_step_patience_s)
-                index = int(control.words[Word.INDEX])
-                row = index if index >= 0 else row
                 if time.monotonic() < following:
                     continue
                 following = time.monotonic() + _PROGRESS_S
                 if trouble is None:
                     trouble = self._recorder_trouble()
                 if progress is not None:
-                    state = self.state()
+                    row = max(int(control.words[Word.ROW]), 0)
                     phase = self._phase_name(names)
-                    progress(Progress(max(row, 0), len(motion), max(row, 0) * motion.period_s, phase, state))
+                    progress(Progress(row, len(motion), row * motion.period_s, phase, self.state()))
         except BaseException as error:
             self._give_up(error)
             if isinstance(error, LwrError) and error is watch.error:
-                return Outcome("fail", str(error), self._rows(), row, len(motion), self._with_rows(error))
+                return self._failed(motion, error)
             raise
-        return self._outcome(motion, row, trouble)
+        return self._outcome(motion, trouble)
 
     def monitor(self, cycles: int) -> Measured:
         """Means over `cycles` cycles, in monitor mode or while holding in command mode."""
@@ -320,12 +318,14 @@ class Driver:
             self._control.words[Word.STOP] += 1
 
     def drop_link(self) -> None:
-        """Answer no more, at once and for good: the controller brakes by itself. From any thread or handler."""
+        """Answer no more, for good: the controller brakes by itself. From any thread or signal handler."""
         if self._control is not None:
             self._control.words[Word.DROP] = 1
 
     def leave_command(self, *, timeout_s: float = 30.0) -> LinkState:
-        """Ask the KRL program to stop commanding and wait for monitor mode."""
+        """Ask the KRL program to stop commanding and wait for monitor mode; no effect after `drop_link`."""
+        if Mode(int(self._need(self._control).words[Word.MODE])) is Mode.SILENT:
+            return self.state()
         self._wait(
             Job.LEAVE,
             timeout_s=timeout_s,
@@ -410,6 +410,8 @@ class Driver:
                 watch.check(patience)
             elif self._loop is not None:
                 self._loop.check()
+            if self._need(self._control).words[Word.DROP]:
+                raise self._with_rows(OperatorError(f"link dropped on request, waiting for {awaited}"))
             if stoppable:
                 self._obey(awaited)
             now = time.monotonic()
@@ -468,8 +470,8 @@ class Driver:
             joint = int(share.argmax())
             if share[joint] > state.safety_limits:
                 raise RefusedError(
-                    f"{self.arm.joint_names[joint]} velocity {speed[joint]:.4g} rad/s is {share[joint]:.2f} of "
-                    f"the limit, the controller allows {state.safety_limits:.2f} (friStart); lower `speed_scale`"
+                    f"{self.arm.joint_names[joint]} velocity {speed[joint]:.4g} rad/s is {share[joint]:.2f} "
+                    f"of the limit, the controller allows {state.safety_limits:.2f} (friStart); slow down"
                 )
 
     def _number_phases(self, motion: Motion) -> list[tuple[int, int]]:
@@ -501,23 +503,25 @@ class Driver:
         with contextlib.suppress(LwrError):
             self._wait(Job.HALT, timeout_s=_CLOSE_PATIENCE_S, awaited="rest", stoppable=False, patience_s=1.0)
 
-    def _outcome(self, motion: Motion, row: int, trouble: LwrError | None) -> Outcome:
+    def _failed(self, motion: Motion, error: LwrError) -> Outcome:
+        row = int(self._need(self._control).words[Word.ROW])
+        return Outcome("fail", str(error), self._rows(), row, len(motion), self._with_rows(error))
+
+    def _outcome(self, motion: Motion, trouble: LwrError | None) -> Outcome:
         control = self._need(self._control)
         result = Result(int(control.words[Word.RESULT]))
         reason = control.text(Text.REASON)
-        rows = self._rows()
+        rows, row = self._rows(), int(control.words[Word.ROW])
         self._report_notes()
-        sent = rows["plan_index"][rows["plan_index"] >= 0]
-        row = max(row, int(sent[-1])) if len(sent) else row
-        if result is Result.DONE:
-            return Outcome("success", "", rows, len(motion) - 1, len(motion))
-        if result is Result.ABORTED and trouble is None:
+        if result is Result.ABORTED:
             self._stops_seen = int(control.words[Word.STOP])
-            return Outcome("abort", reason, rows, row, len(motion))
-        error = trouble or _ERRORS.get(result, RobotError)(reason)
         if trouble is not None:
-            self._stops_seen = int(control.words[Word.STOP])
-        return Outcome("fail", str(error), rows, row, len(motion), self._with_rows(error))
+            return self._failed(motion, trouble)
+        if result is Result.DONE:
+            return Outcome("success", "", rows, row, len(motion))
+        if result is Result.ABORTED:
+            return Outcome("abort", reason, rows, row, len(motion))
+        return self._failed(motion, _ERRORS.get(result, RobotError)(reason))
 
     def _rows(self, count: int = ROWS_KEPT) -> NDArray[Any]:
         rows: NDArray[Any] = self._need(self._control).last_rows(count)
@@ -532,7 +536,8 @@ class Driver:
         control = self._need(self._control)
         if int(control.words[Word.NOTES]) != self._notes_seen:
             self._notes_seen = int(control.words[Word.NOTES])
-            log.warning("link: %s", control.text(Text.NOTE))
+            note = control.text(Text.NOTE)
+            log.log(logging.INFO if note.startswith("locked") else logging.WARNING, "link %s", note)
 
 
 class _Watch:

@@ -83,7 +83,7 @@ class Loop:
         self._sample_time = self._period = 0.0
         self._silence_s, self._silence_cycles = settings.link_timeout_s, 0
         self._sequence = -1
-        self._misses = 0
+        self._misses, self._misses_before, self._missed_at = 0, 0, -_FEWEST_CYCLES
         self._heard_s = time.monotonic()
         self._restarts = 0
         self._last_event: LinkEvent | None = None
@@ -172,11 +172,15 @@ class Loop:
             self._set_period(remote.sample_time_s)
         if remote.restarts != self._restarts:
             self._restarts = remote.restarts
-            self._begun = False
+            # The request to start was made to the program before and is cleared; it is made anew.
+            self._begun = self._begun and self._job is not Job.START
             self._lose("the controller was started again")
         elif elapsed > self._silence_cycles:
             self._lose(f"{elapsed - 1} packets in a row were lost")
         self._take_request()
+        misses = int(remote.msr["miss_counter"])
+        if misses != self._misses:
+            self._misses, self._missed_at = misses, sequence
         if commander.mode is Mode.SILENT:
             return None
         ready = (
@@ -190,11 +194,11 @@ class Loop:
             return None
         setpoint = self._krl + self._offset
         if commander.mode is Mode.MIRROR:
+            self._misses_before = misses
             return commander.enter(setpoint, float(remote.msr["safety_limits"]))
         commander.watch(elapsed, setpoint, self._q)
         if self._job is Job.MOTION and not self._begun:
             self._begun = True
-            self._misses = int(remote.msr["miss_counter"])
             commander.begin(int(self._words[Word.A]), sequence)
         if commander.mode is Mode.MOTION:
             if int(self._words[Word.STOP]) != int(self._words[Word.B]):
@@ -219,7 +223,7 @@ class Loop:
             return
         remote = self.remote
         state, quality = State(remote.state).name, Quality(remote.quality).name
-        missed = int(remote.msr["miss_counter"]) - self._misses if self._begun else 0
+        missed = self._misses - self._misses_before
         what = "controller left command mode"
         if remote.power != ALL_DRIVES:
             what = "drives are off"
@@ -227,10 +231,10 @@ class Loop:
             what = "drives report an error"
         elif remote.state == State.CMD:
             what = "controller left position control"
-        timing = remote.quality <= Quality.BAD or missed > 0
+        timing = remote.quality <= Quality.BAD or remote.sequence - self._missed_at < _FEWEST_CYCLES
         self._lose(
             f"{what}: state {state}, quality {quality}, control {ControlMode(remote.control).name}, "
-            f"power 0x{remote.power:02x}, error 0x{remote.error:02x}, {missed} answers missed",
+            f"power 0x{remote.power:02x}, error 0x{remote.error:02x}, {missed} answers missed in command mode",
             Result.NETWORK if timing and what.startswith("controller left command") else Result.ROBOT,
         )
 
@@ -275,6 +279,8 @@ class Loop:
             self._request, self._job = request, Job(int(words[Word.JOB]))
             self._job_cycles = self._run_length = 0
             self._begun = False
+            if self._job is Job.MOTION:
+                words[Word.ROW] = -1
 
     def _advance_job(self, elapsed: int) -> None:
         """See whether what was asked for has come about."""
@@ -350,12 +356,15 @@ class Loop:
         start = cycles % HISTORY * ROW.itemsize
         control.history_bytes[start : start + ROW.itemsize] = self._row_bytes
         words[Word.CYCLES] = cycles + 1
-        words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), self._commander.index
+        index = self._commander.index
+        words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), index
+        if index >= 0:
+            words[Word.ROW] = index
         for word, name in _COUNTERS:
             words[word] = getattr(remote, name)
         if remote.events and remote.events[-1] is not self._last_event:
             self._last_event = remote.events[-1]
-            control.write_text(Text.NOTE, self._last_event.text)
+            control.write_text(Text.NOTE, f"{self._last_event.kind.value}: {self._last_event.text}")
             words[Word.NOTES] += 1
 
 

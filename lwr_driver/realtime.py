@@ -64,8 +64,8 @@ class Rights:
         if self.missing:
             lines = "; ".join(str(shortage) for shortage in self.missing)
             raise NetworkError(
-                f"this computer grants no real-time operation. {lines}. Then log in again, or allow operation "
-                "without real time where a missed answer does no harm (the emulator)"
+                f"this computer grants no real-time operation. {lines}. Then log in again, or allow "
+                "operation without real time where a missed answer does no harm (the emulator)"
             )
 
 
