@@ -2,9 +2,9 @@
 
 A jump of the counter is either a gap (packets were lost), a late packet (the network changed the order), a
 damaged packet, or a controller that was started again. The controller's timestamp tells them apart: over a
-gap, counter and clock advance together. A jump that fits nothing, or spans more than half the counter's
-range, is held back until the next packet confirms it, so that a single damaged packet is not taken for a
-restart or a long silence.
+gap, counter and clock advance together; a clock that went back by more than a second is a restart. A jump
+that fits nothing, or spans more than half the counter's range, is held back until the next packet confirms
+it, so that a single damaged packet is not taken for a restart or a long silence.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ __all__ = ["Arrival", "SequenceTracker"]
 _WRAP = 0x10000
 # Disagreement of counter and clock over a jump that still counts as agreement [packets], plus 2 % of it.
 _SLACK = 16
-# A packet older than so many is not late, it is another count.
-_LATEST = 1000
+# A packet older than this [s] is not late: the controller's clock began anew.
+_LATEST_S = 1.0
+# A clock that is wrong at a jump of the counter by no more than this is damage, not a restart.
+_SHORT_JUMP = 64
 # So many old packets in a row, in order, are a controller that counts from an earlier number.
 _OLD_RUN = 8
 _FLOAT32_EPS = 1.2e-7
@@ -117,9 +119,11 @@ class SequenceTracker:
         if agrees and step == 0:
             self.repeated += 1
             return Arrival.REPEATED
-        if agrees and -_LATEST <= step < 0:
+        if agrees and step < 0 and elapsed >= -_LATEST_S:
             self.reordered += 1
             return self._old_packet(send_seq, timestamp)
+        if elapsed < -_LATEST_S and not 0 < delta <= _SHORT_JUMP:
+            return self._restart(send_seq, timestamp)
         return self._doubt(step if agrees and step > 0 else 0, send_seq, timestamp, sample_time)
 
     def _slack(self, cycles: float, timestamp: float, sample_time: float) -> float:

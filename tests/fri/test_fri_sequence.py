@@ -87,22 +87,40 @@ def test_a_shuffled_stream_is_never_a_restart(delays):
     assert new + tracker.reordered == len(delays) or tracker.restarts
 
 
-def test_restart_is_believed_when_the_next_packet_confirms_it():
+@pytest.mark.parametrize("first", [0, 12_345, 29_000, 40_000])
+def test_a_clock_that_begins_anew_is_a_restart(first):
     tracker = SequenceTracker()
     for number in range(30_000, 30_100):
         tracker.feed(number, stamp(number, 500.0), T)
     before = tracker.sequence
-    assert tracker.feed(0, stamp(0), T) is Arrival.SUSPECT
-    assert tracker.feed(1, stamp(1), T) is Arrival.RESTARTED
-    assert tracker.feed(2, stamp(2), T) is Arrival.NEW
+    assert tracker.feed(first, stamp(0), T) is Arrival.RESTARTED
+    assert tracker.feed(first + 1, stamp(1), T) is Arrival.NEW
     assert (tracker.sequence, tracker.restarts, tracker.lost) == (before + 2, 1, 0)
 
 
-def test_restart_is_believed_when_its_first_packet_comes_again():
+def test_restart_with_a_later_clock_is_believed_when_the_next_packet_confirms_it():
+    tracker = SequenceTracker()
+    for number in range(30_000, 30_100):
+        tracker.feed(number, stamp(number), T)
+    before = tracker.sequence
+    assert tracker.feed(0, stamp(0, 900.0), T) is Arrival.SUSPECT
+    assert tracker.feed(1, stamp(1, 900.0), T) is Arrival.RESTARTED
+    assert (tracker.sequence, tracker.restarts, tracker.lost) == (before + 1, 1, 0)
+
+
+def test_restart_with_a_later_clock_is_believed_when_its_first_packet_comes_again():
     tracker = SequenceTracker()
     tracker.feed(30_000, stamp(30_000), T)
-    assert tracker.feed(5, stamp(0), T) is Arrival.SUSPECT
-    assert tracker.feed(5, stamp(0), T) is Arrival.RESTARTED
+    assert tracker.feed(5, stamp(0, 900.0), T) is Arrival.SUSPECT
+    assert tracker.feed(5, stamp(0, 900.0), T) is Arrival.RESTARTED
+
+
+def test_late_packets_stay_late_up_to_a_second():
+    tracker = SequenceTracker()
+    for number in range(3000):
+        tracker.feed(number, stamp(number), T)
+    assert tracker.feed(2100, stamp(2100), T) is Arrival.REORDERED
+    assert tracker.feed(1900, stamp(1900), T) is Arrival.RESTARTED
 
 
 def test_one_damaged_counter_is_not_a_restart():
