@@ -95,7 +95,7 @@ class FaultyWire:
         self._numbers = itertools.count(1)
         self._order = itertools.count()
         self._to_pc: list[tuple[int, int, bytes]] = []
-        self._to_krc: list[tuple[int, int, bytes, float]] = []
+        self._to_krc: list[tuple[int, bool, int, bytes, float]] = []
         self._beside: list[Parcel] = []
         self._highest = -1
         self.struck = 0
@@ -178,15 +178,16 @@ class FaultyWire:
 
     def _store(self, datagram: bytes, cycle: int, age_s: float) -> None:
         whole = int(age_s // self.period_s)
-        heapq.heappush(
-            self._to_krc, (cycle + whole, next(self._order), datagram, age_s - whole * self.period_s)
-        )
+        rest_s = age_s - whole * self.period_s
+        # A late one comes after the punctual one of its cycle, so that it is overtaken.
+        entry = (cycle + whole, whole > 0, next(self._order), datagram, rest_s)
+        heapq.heappush(self._to_krc, entry)
 
     def due(self, cycle: int) -> list[Incoming]:
         """Commands that reach the session in `cycle`, in order."""
         arrived = []
         while self._to_krc and self._to_krc[0][0] <= cycle:
-            _, _, datagram, age_s = heapq.heappop(self._to_krc)
+            _, _, _, datagram, age_s = heapq.heappop(self._to_krc)
             arrived.append(Incoming(datagram, age_s))
         return arrived
 

@@ -26,6 +26,7 @@ __all__ = ["Pendant", "PendantServer"]
 
 MAX_DATAGRAM = 65_000
 _REMEMBERED = 64
+_TRACE_S = 120.0
 
 
 class Pendant:
@@ -198,8 +199,16 @@ class Pendant:
         self.request("start_trace")
 
     def save_trace(self, path: Path | str) -> int:
-        """End the controller trace and write it to `path`; returns its number of samples."""
-        return int(self.request("save_trace", path=str(Path(path).resolve())))
+        """End the controller trace and write it to `path`; returns its number of samples when it is
+        written.
+        """
+        samples = int(self.request("save_trace", path=str(Path(path).resolve())))
+        deadline = time.monotonic() + _TRACE_S
+        while self.status()["saving_trace"]:
+            if time.monotonic() > deadline:
+                raise NetworkError(f"emulator did not finish writing {path} within {_TRACE_S:g} s")
+            time.sleep(0.02)
+        return samples
 
     def reset_monitor(self) -> None:
         """Forget the extremes that the command monitor has seen."""
