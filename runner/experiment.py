@@ -5,18 +5,21 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from fri.errors import RefusedError
+from fri.errors import LwrError, RefusedError
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
-from lwr_driver.driver import Driver, LinkState, Outcome
+from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, Outcome
 from lwr_driver.driver import Progress as MotionProgress
 from lwr_driver.motion import Motion
+from lwr_driver.session import session_metadata
+from lwr_driver.trace import import_trace
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.interrupt import Interrupts
 from runner.operator import Operator
@@ -44,6 +47,7 @@ class Record:
     status: Status
     reason: str
     link: LinkState | None = None
+    error: LwrError | None = None
 
 
 @dataclass(frozen=True)
@@ -114,14 +118,21 @@ class Run:
         preflight.enforce()
         attempt = self._progress.begin(plan.name, path)
         self._rest = None
+        traced = self.experiment.motor_torque.source == "trace_file"
+        if traced:
+            bench.operator.start_trace()
         bench.driver.record(path, self._metadata(plan, attempt), self._attachments(motion, preflight))
         outcome = self._drive(plan, motion)
-        bench.driver.end_record(outcome.status, outcome.reason)
+        recorded = bench.driver.end_record(outcome.status, outcome.reason)
         link = bench.driver.state()
+        if recorded.error:
+            return Record(plan.name, path, "fail", f"the log could not be written: {recorded.error}", link)
+        if traced:
+            self._import_trace(path)
         if outcome.status == "success":
             self._rest = self._at_rest(plan.payload)
             self._progress.finish(plan.name, self._rest)
-        return Record(plan.name, path, outcome.status, outcome.reason, link)
+        return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error)
 
     def _swap(self, plan: SessionPlan) -> None:
         """Have the payload of the session on the flange, and make sure that it is the announced one."""
@@ -164,6 +175,17 @@ class Run:
                 driver.leave_command()
         return outcome
 
+    def _import_trace(self, path: Path) -> None:
+        """Give the log the motor torques of the controller's trace, where there is one."""
+        trace = path.with_suffix(".trace.csv")
+        if self.bench.operator.save_trace(trace):
+            self.bench.status.say(str(import_trace(path, trace)))
+        else:
+            self.bench.status.say(
+                f"{trace.name} is not there: {path.name} has no motor torques and serves Model 1; "
+                f"`lwr-run attach {path} TRACE` adds them later"
+            )
+
     def _cycles(self, seconds: float) -> int:
         return max(10, round(seconds / self.bench.driver.state().period_s))
 
@@ -171,20 +193,20 @@ class Run:
         experiment = self.experiment
         payload = plan.payload
         uid = f"{experiment.uid}-{plan.name}"
-        metadata = {
-            "robot": self.bench.arm.name,
-            "serial": experiment.serial,
-            "payload": "none" if payload is None else payload.name,
-            "experiment": experiment.name,
-            "uid": f"{uid}-{attempt}",
-            "parent_uid": f"{uid}-{attempt - 1}" if attempt > 1 else "",
-            "motor_torque_source": experiment.motor_torque.source,
-            "software": software(),
-            "git_commit": git_commit(),
-        }
-        if payload is not None:
-            metadata["payload_mass"] = repr(payload.mass)
-        return metadata
+        source = experiment.motor_torque.source
+        return session_metadata(
+            robot=self.bench.arm.name,
+            serial=experiment.serial,
+            payload="none" if payload is None else payload.name,
+            payload_mass=None if payload is None else payload.mass,
+            experiment=experiment.name,
+            uid=f"{uid}-{attempt}",
+            parent_uid=f"{uid}-{attempt - 1}" if attempt > 1 else "",
+            motor_torque_source="krl_reals" if source == "krl_reals" else "none",
+            software=software(),
+            git_commit=git_commit(),
+            utc_start=_utc(LOCK_STEP_EPOCH_NS) if experiment.lock_step else None,
+        )
 
     def _attachments(self, motion: Motion, preflight: Preflight) -> dict[str, bytes]:
         time = np.arange(len(motion)) * motion.period_s
@@ -197,6 +219,10 @@ class Run:
             "plan.npz": buffer.getvalue(),
             "preflight.json": preflight.to_json(),
         }
+
+
+def _utc(nanoseconds: int) -> str:
+    return datetime.fromtimestamp(nanoseconds * 1e-9, UTC).isoformat()
 
 
 def _payload_name(payload: Payload | None) -> str:

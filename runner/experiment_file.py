@@ -12,8 +12,10 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from fri.errors import ConfigurationError
+from fri.handshake import find_handshake
 from lwr_driver.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
+from lwr_driver.motor_torque import KrlMotorTorque
 
 __all__ = [
     "Excitation",
@@ -126,10 +128,11 @@ class Link:
     address: str = "127.0.0.1"
     port: int = 49938
     controller: str | None = None
-    handshake: Literal["stanford", "centro_piaggio"] = "stanford"
+    handshake: str = "stanford"
     quality_s: float = 1.0
 
     def __post_init__(self) -> None:
+        find_handshake(self.handshake)
         if not 0 <= self.port <= 65535:
             raise ConfigurationError(f"port {self.port} is outside 0 to 65535")
 
@@ -138,15 +141,13 @@ class Link:
 class MotorTorque:
     """Where motor torques come from; the FRI packet has none.
 
-    krl_reals : the KRL program publishes them in `$FRI_TO_REA` with a counter in `$FRI_TO_INT`.
+    krl_reals : the KRL program publishes them in `$FRI_TO_REA` with a counter in `$FRI_TO_INT`, see `krl`.
     trace_file : the controller's own recording, imported after each motion and aligned by the data.
     none : a valid session for Model 1.
     """
 
     source: Literal["krl_reals", "trace_file", "none"] = "krl_reals"
-    reals: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
-    counter_int: int = 1
-    scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    krl: KrlMotorTorque = field(default_factory=KrlMotorTorque)
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,7 @@ class Experiment:
     identification: Identification = field(default_factory=Identification)
     sessions: tuple[SessionPlan, ...] = (SessionPlan("unloaded"),)
     source: Path = field(default=Path(), init=False)
+    folder: Path = field(default=Path(), init=False)
     text: str = field(default="", init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -194,18 +196,22 @@ class Experiment:
             raise ConfigurationError("lock_step is for the emulator; set `lock_step: false` with backend fri")
 
     @classmethod
-    def load(cls, name: str | Path = DEFAULT) -> Experiment:
-        """Read and check an experiment file; raises ConfigurationError with file, key, value and advice."""
+    def load(cls, name: str | Path = DEFAULT, *, beside: Path | None = None) -> Experiment:
+        """Read and check an experiment file; raises ConfigurationError with file, key, value and advice.
+
+        Files that it names are looked for in the folder `beside`, by default the file's own.
+        """
         path = find(name)
         experiment = parse(cls, read_mapping(path), str(path))
         object.__setattr__(experiment, "source", path)
+        object.__setattr__(experiment, "folder", path.parent if beside is None else beside)
         object.__setattr__(experiment, "text", path.read_text(encoding="utf-8"))
         return experiment
 
     @property
     def emulator_path(self) -> Path:
         """Path of the emulator's configuration."""
-        return find(self.emulator, beside=self.source.parent)
+        return find(self.emulator, beside=self.folder)
 
     @property
     def uid(self) -> str:

@@ -10,6 +10,7 @@ from types import TracebackType
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.driver import Driver, LinkSettings, Waiting
+from lwr_driver.motor_torque import KrlMotorTorque
 from runner.experiment import Bench
 from runner.experiment_file import Experiment
 from runner.operator import EmulatedOperator, Operator, Person
@@ -59,7 +60,7 @@ class Laboratory:
 
     def _set_up(self, stack: ExitStack) -> Bench:
         experiment = self.experiment
-        beside = experiment.source.parent
+        beside = experiment.folder
         arm = Arm.load(experiment.arm, beside=beside)
         cell = Cell.load(experiment.cell, beside=beside)
         port = experiment.link.port
@@ -76,7 +77,9 @@ class Laboratory:
             self.emulator = stack.enter_context(emulator)
             known = robot_file(load_configuration(experiment.emulator_path)).payloads
             operator = EmulatedOperator(emulator.pendant, frozenset(known))
-        driver = stack.enter_context(Driver(arm, self._link(port), notify=self._notify))
+        driver = stack.enter_context(
+            Driver(arm, self._link(port), notify=self._notify, motor_torque=self._krl())
+        )
         driver.connect()
         return Bench(arm, cell, driver, operator, self.status)
 
@@ -91,6 +94,10 @@ class Laboratory:
             handshake=link.handshake,
             realtime="allow" if emulated or self._allow_non_realtime else "require",
         )
+
+    def _krl(self) -> KrlMotorTorque | None:
+        settings = self.experiment.motor_torque
+        return settings.krl if settings.source == "krl_reals" else None
 
     def _notify(self, waiting: Waiting) -> None:
         self.status.show(

@@ -29,7 +29,7 @@ def plan_excitation(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationP
     """
     settings = experiment.excitation
     if settings.plan is not None:
-        plan = ExcitationPlan.load(find(settings.plan, beside=experiment.source.parent))
+        plan = ExcitationPlan.load(find(settings.plan, beside=experiment.folder))
         if plan.joint_names != arm.joint_names:
             raise ConfigurationError(
                 f"{settings.plan}: joints {', '.join(plan.joint_names)} are not those of {arm.name}, "

@@ -24,6 +24,7 @@ class Progress:
     """Finished sessions with the arm's state at rest after each, and the attempts at every session."""
 
     path: Path
+    origin: Path | None = None
     finished: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     attempts: dict[str, int] = field(default_factory=dict)
 
@@ -35,11 +36,19 @@ class Progress:
             return cls(path)
         try:
             content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            return cls(path, dict(content["finished"]), dict(content["attempts"]))
+            origin = Path(content["origin"]) if content["origin"] else None
+            return cls(path, origin, dict(content["finished"]), dict(content["attempts"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(
                 f"{path}: cannot be read: {error}; delete it to start the experiment anew"
             ) from error
+
+    @classmethod
+    def create(cls, folder: Path, origin: Path) -> Progress:
+        """Begin the progress of an experiment whose file lies in `origin`, with the files that it names."""
+        progress = cls(folder / NAME, origin)
+        progress._save()
+        return progress
 
     def rest(self, session: str, payload: Payload | None) -> Rest:
         """The arm at rest after a finished session."""
@@ -69,7 +78,7 @@ class Progress:
         self._save()
 
     def _save(self) -> None:
-        content = {"finished": self.finished, "attempts": self.attempts}
+        content = {"origin": str(self.origin or ""), "finished": self.finished, "attempts": self.attempts}
         draft = self.path.with_suffix(".json.new")
         with draft.open("w", encoding="utf-8") as stream:
             json.dump(content, stream, indent=1)

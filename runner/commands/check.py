@@ -29,8 +29,8 @@ def command(file: str, period_ms: float, as_json: bool) -> None:
     lwr-run check my_lab.yaml --period-ms 2 --json
     """
     experiment = Experiment.load(file)
-    arm = Arm.load(experiment.arm, beside=experiment.source.parent)
-    cell = Cell.load(experiment.cell, beside=experiment.source.parent)
+    arm = Arm.load(experiment.arm, beside=experiment.folder)
+    cell = Cell.load(experiment.cell, beside=experiment.folder)
     excite = excitation_rows(plan_excitation(experiment, arm, cell), experiment.excitation.periods)
     home = experiment.home(len(arm.joint_names))
     found: dict[str, Preflight] = {}

@@ -1,0 +1,121 @@
+"""`lwr-run experiment`: plan, drive, log, swap the payload, estimate."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import datetime
+from pathlib import Path
+
+import click
+
+from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
+from ident.excitation import ExcitationPlan
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Cell
+from runner.experiment import Record, Run
+from runner.experiment_file import DEFAULT, Experiment
+from runner.laboratory import Laboratory
+from runner.planning import excitation_rows, plan_excitation
+from runner.progress import Progress
+from runner.results import estimate, summarise, write_results
+from runner.status import StatusLine
+
+COPY = "experiment.yaml"
+PLAN = "plan.yaml"
+
+
+@click.command("experiment")
+@click.argument("file", required=False)
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Folder of the results; default experiments/NAME-STAMP."
+)
+@click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
+@click.option(
+    "--resume",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Go on with the aborted experiment in FOLDER at its first unfinished motion.",
+)
+@click.option(
+    "--allow-non-realtime", is_flag=True, help="Command the real arm without real-time rights; may stutter."
+)
+def command(
+    file: str | None, out: Path | None, yes: bool, resume: Path | None, allow_non_realtime: bool
+) -> None:
+    """Run the experiment FILE; without one the default, against the built-in emulator.
+
+    Plans an exciting motion, checks it, drives the arm through it, logs it, has the payload swapped and
+    checked, drives again, and estimates the model. The last line printed is the folder of the results.
+
+    Ctrl-C once stops the arm within its limits, twice drops the link.
+
+    \b
+    lwr-run experiment                                   the default, on the emulator
+    lwr-run experiment my_lab.yaml --out results/monday
+    lwr-run experiment --resume results/monday           go on after an abort
+    """
+    experiment, folder = _begin(file, out, resume)
+    arm = Arm.load(experiment.arm, beside=experiment.folder)
+    cell = Cell.load(experiment.cell, beside=experiment.folder)
+    status = StatusLine()
+    plan = _plan(experiment, arm, cell, folder, status)
+    laboratory = Laboratory(experiment, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
+    with laboratory as bench:
+        records = Run(
+            experiment, folder, bench, excitation_rows(plan, experiment.excitation.periods)
+        ).sessions()
+    done = all(record.status == "success" for record in records)
+    found = estimate(experiment, arm, records) if done else None
+    summary = summarise(experiment, records, found)
+    click.echo(write_results(folder, experiment, arm, summary, found))
+    click.echo(str(folder))
+    if not done:
+        raise _failure(records[-1], folder)
+
+
+def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Experiment, Path]:
+    """The experiment and the folder of its results, which holds a copy of the experiment file."""
+    if resume is not None:
+        if file is not None or out is not None:
+            raise ConfigurationError(
+                "--resume takes its experiment file and folder from FOLDER; leave FILE and --out"
+            )
+        if not (resume / COPY).is_file():
+            raise ConfigurationError(
+                f"{resume} holds no {COPY}; name the folder of an experiment that was begun"
+            )
+        return Experiment.load((resume / COPY).resolve(), beside=Progress.load(resume).origin), resume
+    experiment = Experiment.load(file if file is not None else DEFAULT)
+    stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    folder = out if out is not None else Path("experiments") / f"{experiment.name}-{stamp}"
+    if folder.exists() and any(folder.iterdir()):
+        raise ConfigurationError(f"{folder} is not empty; choose another --out, or go on there with --resume")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(experiment.source, folder / COPY)
+        Progress.create(folder, experiment.folder)
+    except OSError as error:
+        raise ConfigurationError(
+            f"{folder} cannot be written: {error.strerror}; choose another --out"
+        ) from error
+    return experiment, folder
+
+
+def _plan(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status: StatusLine) -> ExcitationPlan:
+    """The exciting motion: the one already in the folder, or planned now and stored there."""
+    path = folder / PLAN
+    if path.is_file():
+        return ExcitationPlan.load(path)
+    status.show("planning the excitation", 0.0, "")
+    plan = plan_excitation(experiment, arm, cell)
+    status.clear()
+    plan.save(path)
+    return plan
+
+
+def _failure(record: Record, folder: Path) -> LwrError:
+    """The error for the exit code of an experiment that did not finish."""
+    text = f"session {record.name}: {record.reason}. `lwr-run experiment --resume {folder}` goes on from here"
+    if record.status == "abort":
+        return OperatorError(text)
+    return type(record.error)(text) if record.error is not None else RobotError(text)

@@ -1,0 +1,154 @@
+"""What an experiment leaves behind: model.yaml, summary.json and a short text report."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident.identify import Identification, IdentificationSettings, identify
+from ident.kinematics import Chain
+from ident.model import DynamicModel
+from ident.model_file import write_model
+from ident.signals.settings import SignalSettings
+from lwr_driver.arm import Arm
+from lwr_driver.driver import LinkState
+from lwr_driver.session import read_session
+from runner.experiment import Record
+from runner.experiment_file import Experiment
+from runner.versions import software, versions
+from sim_backend.truth import truth
+
+__all__ = ["agreement", "estimate", "summarise", "true_base", "write_results"]
+
+
+def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
+    """Identify the arm from the finished sessions of an experiment."""
+    wanted = experiment.identification
+    settings = IdentificationSettings(
+        model=wanted.model,
+        signals=SignalSettings(cutoff_hz=wanted.cutoff_hz, decimate_hz=wanted.decimate_hz),
+        resonance_hz=arm.resonance_hz,
+    )
+    sessions = [read_session(record.path) for record in records if record.status == "success"]
+    return identify(sessions, Chain.from_urdf(arm.urdf), settings)
+
+
+def true_base(experiment: Experiment, found: Identification) -> dict[str, float]:
+    """The emulated arm's true base parameters by name; empty where the arm is real."""
+    if experiment.backend != "emulator":
+        return {}
+    structure = found.structure
+    values = truth(experiment.emulator_path, payload=structure.payloads[0] if structure.payloads else None)
+    standard = np.array([values.get(name, 0.0) for name in structure.names])
+    return dict(zip(found.base.names, found.base.reduce(standard).tolist(), strict=True))
+
+
+def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> float:
+    """Share of the parameters whose estimate lies within `sigmas` standard deviations of the truth."""
+    known = [entry for entry in parameters if "truth" in entry]
+    if not known:
+        return math.nan
+    inside = [abs(entry["estimate"] - entry["truth"]) <= sigmas * entry["std"] for entry in known]
+    return sum(inside) / len(inside)
+
+
+def summarise(
+    experiment: Experiment, records: Sequence[Record], found: Identification | None
+) -> dict[str, Any]:
+    """Content of summary.json: how the experiment ended, what was estimated, how the link was."""
+    last = records[-1]
+    summary: dict[str, Any] = {
+        "schema_version": 1,
+        "experiment": experiment.name,
+        "exit_status": last.status,
+        "reason": last.reason if last.status != "success" else "",
+        "sessions": [
+            {
+                "name": record.name,
+                "file": record.path.name,
+                "exit_status": record.status,
+                "reason": record.reason,
+            }
+            for record in records
+        ],
+        "link": {record.name: _link(record.link) for record in records if record.link is not None},
+        "versions": versions(),
+    }
+    if found is None:
+        return summary
+    summary.update(found.to_dict())
+    known = true_base(experiment, found)
+    for entry in summary["parameters"]:
+        if entry["name"] in known:
+            entry["truth"] = known[entry["name"]]
+    if known:
+        summary["within_3_sigma"] = agreement(summary["parameters"])
+    return summary
+
+
+def write_results(
+    folder: Path, experiment: Experiment, arm: Arm, summary: dict[str, Any], found: Identification | None
+) -> str:
+    """Write model.yaml, report.txt and summary.json into `folder`; returns the report."""
+    report = _report(experiment, summary, found)
+    if found is not None:
+        provenance = {
+            "experiment": experiment.name,
+            "sessions": [entry["file"] for entry in summary["sessions"]],
+            "estimator": found.estimate.method,
+            "covariance": found.estimate.covariance.kind,
+            "software": software(),
+        }
+        model = DynamicModel(
+            robot=arm.name,
+            structure=found.structure,
+            names=found.base.names,
+            values=found.estimate.values,
+            covariance=found.estimate.covariance.matrix,
+            base=found.base,
+            provenance=provenance,
+        )
+        write_model(model, folder / "model.yaml")
+    (folder / "report.txt").write_text(report, encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    return report
+
+
+def _link(state: LinkState) -> dict[str, Any]:
+    return {
+        "cycles": state.received,
+        "missed": state.miss_counter,
+        "lost": state.lost,
+        "late": state.late,
+        "period_s": state.period_s,
+        "latency_s": {f"p{100 * quantile:g}": value for quantile, value in state.latency_s.items()},
+        "worst_tracking_error_rad": state.tracking_error.tolist(),
+    }
+
+
+def _report(experiment: Experiment, summary: dict[str, Any], found: Identification | None) -> str:
+    lines = [f"Experiment {experiment.name}: {summary['exit_status']}"]
+    if summary["reason"]:
+        lines.append(f"  reason: {summary['reason']}")
+    for entry in summary["sessions"]:
+        lines.append(f"  {entry['file']:<20} {entry['exit_status']}  {entry['reason']}".rstrip())
+    for name, link in summary["link"].items():
+        tracking = 1000 * max(link["worst_tracking_error_rad"])
+        latency = ", ".join(f"{key} {1e6 * value:.0f} µs" for key, value in link["latency_s"].items())
+        lines.append(
+            f"  link of {name}: {link['cycles']} cycles, {link['missed']} missed, reply {latency}, "
+            f"tracking error at most {tracking:.1f} mrad"
+        )
+    if found is None:
+        return "\n".join(lines) + "\n"
+    if "within_3_sigma" in summary:
+        lines.append(
+            f"  {100 * summary['within_3_sigma']:.1f} % of the estimates lie within 3 standard deviations "
+            "of the emulated arm's true parameters"
+        )
+    return "\n".join([*lines, "", found.summary()]) + "\n"
