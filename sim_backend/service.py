@@ -57,7 +57,6 @@ class Service:
         self._follow = follow
         self._parent = os.getppid()
         self._ended = False
-        self._heard = False
         self._impatient = False
         self._unanswerable = 0
         self._poller = select.poll()
@@ -181,7 +180,6 @@ class Service:
         datagram = self.end.receive(0.0)
         if datagram is None:
             return None
-        self._heard = True
         cabinet = self.cabinet
         cabinet.arrived(datagram)
         if self.wire.quiet:
@@ -224,8 +222,11 @@ class Service:
             deadline = time.monotonic() + _PERHAPS_S
 
     def _serve_until_heard(self, sent: bytes) -> bool:
-        """Repeat the very first packet until anything comes back; True if the wait is over for good."""
-        while self.running and not self._heard:
+        """Repeat a session's packet until it had its first answer; True if the wait is over for good.
+
+        After a restart the PC believes the new count only when the packet comes again.
+        """
+        while self.running and not self.cabinet.session.counters()["answered"]:
             if self._serve(_RESEND_S):
                 return False
             if self.cabinet.session.state is State.OFF or self.operator.silent:
