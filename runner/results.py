@@ -81,7 +81,9 @@ def summarise(
     }
     if found is None:
         return summary
-    summary.update(found.to_dict())
+    details = found.to_dict()
+    details["signals"] = details.pop("sessions")
+    summary.update(details)
     known = true_base(experiment, found)
     for entry in summary["parameters"]:
         if entry["name"] in known:

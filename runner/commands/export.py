@@ -1,0 +1,64 @@
+"""`lwr-run export`: a model as URDF, MJCF, or stand-alone inverse dynamics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fri.errors import ConfigurationError
+
+__all__ = ["command"]
+
+_FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
+
+
+@click.command("export")
+@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("outputs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--payload", help="Mount this payload of the model (default: the bare arm).")
+@click.option("--name", default="arm", show_default=True, help="Name in the file; begins the C functions.")
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+def command(model: Path, outputs: tuple[Path, ...], payload: str | None, name: str, force: bool) -> None:
+    """Write a model in the formats that the OUTPUTS' endings say.
+
+    \b
+    .urdf  URDF: consistent inertials, damping and friction
+    .xml   MJCF (MuJoCo): the same with drive inertia as armature
+    .c     C99 inverse dynamics without dependencies
+    .py    numpy inverse dynamics
+
+    URDF and MJCF need bodies that can exist: what the identification leaves open follows the arm's own URDF,
+    and where the estimate itself is of no real body the nearest one is taken and the change is stated.
+
+    \b
+    lwr-run export results/model.yaml lwr.urdf lwr.xml lwr.c lwr.py
+    """
+    from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
+    from ident.model_file import read_model
+
+    for output in outputs:
+        if output.suffix not in _FORMATS:
+            known = ", ".join(f"{ending} ({kind})" for ending, kind in _FORMATS.items())
+            raise ConfigurationError(f"output {output}: the ending says the format; known: {known}")
+        if output.exists() and not force:
+            raise ConfigurationError(f"output {output} exists; choose another name or give --force")
+    source = read_model(model)
+    plain = standard_model(source, payload=payload)
+    wants_bodies = any(output.suffix in (".urdf", ".xml") for output in outputs)
+    bodies = standard_model(source, payload=payload, consistent=True) if wants_bodies else plain
+    writers = {
+        ".urdf": lambda: to_urdf(bodies),
+        ".xml": lambda: to_mjcf(bodies, name=name),
+        ".c": lambda: to_c(plain, name),
+        ".py": lambda: to_numpy(plain),
+    }
+    for output in outputs:
+        text = writers[output.suffix]()
+        try:
+            output.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"output {output} cannot be written: {error.strerror}") from error
+        click.echo(f"{output}: {_FORMATS[output.suffix]}, {plain.title}")
+    for note in bodies.notes:
+        click.echo(f"  {note}")
