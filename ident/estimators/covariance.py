@@ -6,8 +6,12 @@ deviation can be several times too small. Here the scores of all rows of one ins
 correlation between joints and sides is covered too, and then
 
 * `hac`: Bartlett-weighted autocovariances of the scores (Newey and West 1987), bandwidth after Andrews (1991) or
-  stated, residuals corrected for the parameters fitted, critical values after Kiefer and Vogelsang (2005);
-* `bootstrap`: whole blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
+  stated, critical values after Kiefer and Vogelsang (2005). With a hundred parameters on a minute of motion it is
+  still 10 to 20 % too small, since the residuals at the very frequencies that matter were fitted away;
+* `jackknife` (the default): blocks of time, twice the bandwidth long, are left out one after the other. It undoes
+  that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard deviations are
+  the jackknife's, correlations the HAC's, which have full rank;
+* `bootstrap`: blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
 """
 
 from __future__ import annotations
@@ -17,12 +21,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import FloatArray, Problem
+import itertools
 
-__all__ = ["CovarianceSettings", "Scores", "bootstrap", "effective_rows", "hac", "textbook"]
+__all__ = [
+    "CovarianceSettings",
+    "Scores",
+    "bootstrap",
+    "effective_rows",
+    "hac",
+    "jackknife",
+    "textbook",
+]
 
 _LONGEST = 4000
 _CHUNK = 8192
@@ -32,12 +46,13 @@ _CHUNK = 8192
 class CovarianceSettings:
     """Which covariance an estimate states.
 
-    kind : "hac" (serial-correlation robust, default), "bootstrap" (block bootstrap) or "textbook" (equation 14).
+    kind : "jackknife" (blocks of time left out, default), "hac" (Newey-West) and "bootstrap" (blocks drawn) are robust
+        to serial correlation; "textbook" is equation (14).
     bandwidth_s : largest lag [s] of the HAC weights, None chooses it from the scores.
-    block_s : length of a bootstrap block [s], None takes twice the HAC bandwidth.
+    block_s : length of a block of the jackknife and the bootstrap [s], None takes twice the HAC bandwidth.
     """
 
-    kind: Literal["hac", "bootstrap", "textbook"] = "hac"
+    kind: Literal["jackknife", "hac", "bootstrap", "textbook"] = "jackknife"
     bandwidth_s: float | None = None
     block_s: float | None = None
     draws: int = 400
@@ -151,20 +166,84 @@ def hac(
     return Covariance(matrix, kind, inflation=inflation), length * step
 
 
+def jackknife(
+    problem: Problem,
+    bread: FloatArray,
+    coefficients: Sequence[FloatArray],
+    row_weights: Sequence[FloatArray],
+    block_s: float,
+    *,
+    matrices: Sequence[FloatArray] | None = None,
+    correlation: FloatArray | None = None,
+) -> Covariance:
+    """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
+
+    coefficients : weight times residual of each row; row_weights : what multiplies a row's a a^T in the inverse of
+    `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p, p) covariance whose
+    correlations are taken over.
+    """
+    p = len(problem.names)
+    information = np.linalg.inv(bread)
+    normals: dict[tuple[int, int], FloatArray] = {}
+    sums: dict[tuple[int, int], FloatArray] = {}
+    length = _block_length(problem, block_s)
+    for number, group in enumerate(problem.groups):
+        left = group.matrix if matrices is None else matrices[number]
+        for block, rows in _blocks(group.time_index, length):
+            key = (group.record, block)
+            weighted = left[rows] * row_weights[number][rows, None]
+            normals[key] = normals.get(key, np.zeros((p, p))) + weighted.T @ group.matrix[rows]
+            sums[key] = sums.get(key, np.zeros(p)) + left[rows].T @ coefficients[number][rows]
+    shifts = []
+    for key, normal in normals.items():
+        rest = information - normal
+        scale = np.sqrt(np.maximum(np.diag(rest), 1e-12 * np.diag(information)))
+        scaled = rest / np.outer(scale, scale)
+        shifts.append(np.linalg.lstsq(scaled, sums[key] / scale, rcond=1e-10)[0] / scale)
+    count = len(shifts)
+    stacked = np.array(shifts)
+    matrix = (count - 1) / count * (stacked.T @ stacked)
+    if correlation is not None:
+        own, other = np.sqrt(np.diag(matrix)), np.sqrt(np.diag(correlation))
+        ratio = own / np.where(other > 0, other, 1.0)
+        matrix = correlation * np.outer(ratio, ratio)
+    kind = (
+        f"block jackknife ({count} blocks of {length * problem.sample_time_s:.2f} s left out): robust to serial "
+        "correlation"
+    )
+    return Covariance(matrix, kind, degrees_of_freedom=max(1.0, count - 1.0))
+
+
+def _block_length(problem: Problem, block_s: float) -> int:
+    """Length of a block in samples; at least eight blocks in all, at most eighty."""
+    samples = sum(_span(problem, record) for record in {group.record for group in problem.groups})
+    length = max(1, round(block_s / problem.sample_time_s))
+    return int(np.clip(length, -(-samples // 80), max(1, samples // 8)))
+
+
+def _span(problem: Problem, record: int) -> int:
+    indices = [g.time_index for g in problem.groups if g.record == record and len(g.time_index)]
+    return max(int(i[-1]) for i in indices) - min(int(i[0]) for i in indices) + 1 if indices else 0
+
+
+def _blocks(time_index: NDArray[np.int64], length: int) -> list[tuple[int, slice]]:
+    """Number and rows of each block of `length` samples; the index increases."""
+    block = time_index // length
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(block)) + 1, [len(block)]])
+    return [(int(block[a]), slice(int(a), int(b))) for a, b in itertools.pairwise(edges) if b > a]
+
+
 def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int) -> Covariance:
     """Covariance of `draws` weighted least-squares solutions over blocks of time drawn with replacement."""
-    length = max(1, round(block_s / problem.sample_time_s))
+    length = _block_length(problem, block_s)
     p = len(problem.names)
     grams: dict[tuple[int, int], FloatArray] = {}
     for group, number in zip(problem.groups, problem.class_of_group, strict=True):
-        block = group.time_index // length
-        edges = np.flatnonzero(np.diff(block)) + 1
-        for rows in np.split(np.arange(len(block)), edges):
-            if len(rows):
-                augmented = np.column_stack([group.matrix[rows], group.target[rows]])
-                key = (group.record, int(block[rows[0]]))
-                gram = grams.setdefault(key, np.zeros((p + 1, p + 1)))
-                gram += weights[number] * (augmented.T @ augmented)
+        for block, rows in _blocks(group.time_index, length):
+            augmented = np.column_stack([group.matrix[rows], group.target[rows]])
+            key = (group.record, block)
+            product = weights[number] * (augmented.T @ augmented)
+            grams[key] = grams.get(key, np.zeros((p + 1, p + 1))) + product
     stack = np.array(list(grams.values()))
     random = np.random.default_rng(seed)
     flat = stack.reshape(len(stack), -1)

@@ -128,10 +128,12 @@ class MaximumAPosteriori:
             weights=weights,
             bread=bread,
             consumed=consumed_parameters(problem, tempered, root),
-            settings=replace(
-                self.covariance, kind="hac" if self.covariance.kind == "bootstrap" else self.covariance.kind
-            ),
+            settings=self.covariance,
             coefficients=coefficients,
+            row_weights=[
+                np.full(len(group.target), tempered[number])
+                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
+            ],
             iterations=iteration,
             converged=converged,
             notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({self._how()})",),

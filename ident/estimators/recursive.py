@@ -135,12 +135,13 @@ class RecursiveLeastSquares:
         if self.memory_s is not None:
             forgetting = float(np.exp(-problem.sample_time_s / self.memory_s))
         values, root, weights = recursion.values, recursion.root, 1.0 / sigma**2
-        coefficients = []
+        coefficients, row_weights = [], []
         for group, residual, number in zip(
             problem.groups, problem.residuals(values), problem.class_of_group, strict=True
         ):
             age = count - 1 - np.array([ages[group.record][int(t)] for t in group.time_index])
-            coefficients.append(weights[number] * forgetting**age * residual)
+            row_weights.append(weights[number] * forgetting**age)
+            coefficients.append(row_weights[-1] * residual)
         consumed = consumed_parameters(problem, weights, root)
         return estimate_from(
             problem,
@@ -151,6 +152,7 @@ class RecursiveLeastSquares:
             consumed=np.minimum(consumed, [0.5 * c.factor.rows for c in problem.classes]),
             settings=self.covariance,
             coefficients=coefficients,
+            row_weights=row_weights,
             notes=() if self.memory_s is None else (f"forgets with a time constant of {self.memory_s:g} s",),
         )
 

@@ -62,6 +62,7 @@ class RobustLeastSquares:
             consumed=consumed,
             settings=self.covariance,
             coefficients=coefficients,
+            row_weights=slopes,
             plain=textbook(spread * bread),
             iterations=done,
             converged=converged,

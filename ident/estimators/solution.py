@@ -14,6 +14,7 @@ from ident.estimators.covariance import (
     bootstrap,
     effective_rows,
     hac,
+    jackknife,
     textbook,
 )
 from ident.estimators.estimate import ClassFit, Covariance, Estimate
@@ -76,6 +77,7 @@ def estimate_from(
     settings: CovarianceSettings,
     coefficients: Sequence[FloatArray] | None = None,
     matrices: Sequence[FloatArray] | None = None,
+    row_weights: Sequence[FloatArray] | None = None,
     plain: Covariance | None = None,
     scores: Scores | None = None,
     offset: FloatArray | None = None,
@@ -87,7 +89,8 @@ def estimate_from(
 
     bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each row
     (default: class weight times residual). matrices : what multiplies them (default: the regressors; the
-    instruments of an instrumental-variable estimate). plain : the estimator's own textbook covariance.
+    instruments of an instrumental-variable estimate). row_weights : what multiplies a a^T of each row in the inverse
+    of `bread` (default: class weight). plain : the estimator's own textbook covariance.
     scores : in place of coefficients and matrices. offset : (p, p), added to the robust covariances.
     """
     residuals = problem.residuals(values)
@@ -109,18 +112,19 @@ def estimate_from(
                 weights[number] * residual
                 for residual, number in zip(residuals, problem.class_of_group, strict=True)
             ]
-        corrected = [
-            coefficient * np.sqrt(fits[number].rows / max(fits[number].rows - consumed[number], 1.0))
-            for coefficient, number in zip(coefficients, problem.class_of_group, strict=True)
-        ]
-        summed = scores if scores is not None else Scores.of(problem, corrected, matrices)
-        robust, bandwidth = hac(summed, bread, problem.sample_time_s, settings.bandwidth_s)
+        if row_weights is None:
+            row_weights = [
+                np.full(len(group.target), weights[number])
+                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
+            ]
+        covariances |= _robust(
+            problem, bread, consumed, settings, weights, coefficients, row_weights, matrices, scores
+        )
         if offset is not None:
-            robust = replace(robust, matrix=robust.matrix + offset)
-        covariances["hac"] = robust
-        if settings.kind == "bootstrap":
-            block = settings.block_s if settings.block_s is not None else 2.0 * bandwidth
-            covariances["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
+            covariances = {
+                name: replace(c, matrix=c.matrix + offset) if name != "textbook" else c
+                for name, c in covariances.items()
+            }
     shared = _nuisance_covariance(problem, bread, weights, matrices)
     if shared is not None:
         covariances = {
@@ -131,7 +135,7 @@ def estimate_from(
         method=method,
         names=problem.names,
         values=values,
-        covariance=covariances[settings.kind],
+        covariance=covariances.get(settings.kind, covariances.get("hac", covariances["textbook"])),
         covariances=covariances,
         classes=tuple(fits),
         weights=weights,
@@ -141,6 +145,43 @@ def estimate_from(
         notes=notes,
         units=problem.units,
     )
+
+
+def _robust(
+    problem: Problem,
+    bread: FloatArray,
+    consumed: FloatArray,
+    settings: CovarianceSettings,
+    weights: FloatArray,
+    coefficients: Sequence[FloatArray],
+    row_weights: Sequence[FloatArray],
+    matrices: Sequence[FloatArray] | None,
+    scores: Scores | None,
+) -> dict[str, Covariance]:
+    """The serial-correlation-robust covariances; without rows of its own (`scores` given) HAC only."""
+    rows = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
+    inflation = np.sqrt(rows / np.maximum(rows - consumed, 1.0))
+    if scores is None:
+        corrected = [c * inflation[n] for c, n in zip(coefficients, problem.class_of_group, strict=True)]
+        summed = Scores.of(problem, corrected, matrices)
+    else:
+        summed = scores
+    robust, bandwidth = hac(summed, bread, problem.sample_time_s, settings.bandwidth_s)
+    found = {"hac": robust}
+    block = settings.block_s if settings.block_s is not None else 2.0 * bandwidth
+    if settings.kind == "bootstrap":
+        found["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
+    elif settings.kind == "jackknife" and scores is None:
+        found["jackknife"] = jackknife(
+            problem,
+            bread,
+            coefficients,
+            row_weights,
+            block,
+            matrices=matrices,
+            correlation=robust.matrix,
+        )
+    return found
 
 
 def _nuisance_covariance(

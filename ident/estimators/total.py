@@ -86,6 +86,10 @@ class TotalLeastSquares:
             settings=self.covariance,
             coefficients=coefficients,
             matrices=matrices,
+            row_weights=[
+                np.full(len(group.target), weights[number])
+                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
+            ],
             iterations=done,
             converged=converged,
             notes=(f"{len(noisy)} columns with errors, {len(clean)} exact",),
