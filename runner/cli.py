@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import sys
 from typing import Any
 
 import click
 
 from fri.errors import LwrError
+
+# Before numpy is imported: the matrices are small, a second BLAS thread costs more than it gives on a busy PC.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __all__ = ["main"]
 

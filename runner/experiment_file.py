@@ -155,6 +155,7 @@ class Identification:
     """Which model is estimated from the sessions, and how the signals are prepared."""
 
     model: Literal[1, 2, 3] = 2
+    estimator: str = "wls"
     cutoff_hz: float = 10.0
     decimate_hz: float = 2.0
 

@@ -23,7 +23,7 @@ from runner.experiment_file import Experiment
 from runner.versions import software, versions
 from sim_backend.truth import truth
 
-__all__ = ["agreement", "estimate", "summarise", "true_base", "write_results"]
+__all__ = ["agreement", "estimate", "identified_model", "summarise", "true_base", "write_results"]
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
@@ -32,6 +32,7 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     settings = IdentificationSettings(
         model=wanted.model,
         signals=SignalSettings(cutoff_hz=wanted.cutoff_hz, decimate_hz=wanted.decimate_hz),
+        estimator=wanted.estimator,
         resonance_hz=arm.resonance_hz,
     )
     sessions = [read_session(record.path) for record in records if record.status == "success"]
@@ -99,26 +100,29 @@ def write_results(
     """Write model.yaml, report.txt and summary.json into `folder`; returns the report."""
     report = _report(experiment, summary, found)
     if found is not None:
-        provenance = {
-            "experiment": experiment.name,
-            "sessions": [entry["file"] for entry in summary["sessions"]],
-            "estimator": found.estimate.method,
-            "covariance": found.estimate.covariance.kind,
-            "software": software(),
-        }
-        model = DynamicModel(
-            robot=arm.name,
-            structure=found.structure,
-            names=found.base.names,
-            values=found.estimate.values,
-            covariance=found.estimate.covariance.matrix,
-            base=found.base,
-            provenance=provenance,
-        )
+        model = identified_model(found, arm.name, [entry["file"] for entry in summary["sessions"]])
         write_model(model, folder / "model.yaml")
     (folder / "report.txt").write_text(report, encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     return report
+
+
+def identified_model(found: Identification, robot: str, sessions: Sequence[str]) -> DynamicModel:
+    """The identified model with its covariance and where it comes from."""
+    return DynamicModel(
+        robot=robot,
+        structure=found.structure,
+        names=found.base.names,
+        values=found.estimate.values,
+        covariance=found.estimate.covariance.matrix,
+        base=found.base,
+        provenance={
+            "sessions": list(sessions),
+            "estimator": found.estimate.method,
+            "covariance": found.estimate.covariance.kind,
+            "software": software(),
+        },
+    )
 
 
 def _link(state: LinkState) -> dict[str, Any]:

@@ -1,0 +1,85 @@
+"""`lwr-run identify`: a model from session logs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from fri.errors import ConfigurationError
+from ident.identify import IdentificationSettings, identify
+from ident.kinematics import Chain
+from ident.model_file import write_model
+from ident.signals.settings import SignalSettings
+from lwr_driver.session import read_session
+from runner.results import identified_model
+
+ESTIMATORS = ("wls", "ols", "huber", "tukey", "tls")
+
+
+@click.command("identify")
+@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--model",
+    type=click.IntRange(1, 3),
+    default=2,
+    show_default=True,
+    help="1: joint torques; 2: motor and joint torques; 3: their difference.",
+)
+@click.option("--estimator", type=click.Choice(ESTIMATORS), default="wls", show_default=True)
+@click.option(
+    "--without", multiple=True, metavar="NAME", help="Leave out a parameter (offm3) or a kind (Fvl)."
+)
+@click.option("--cutoff-hz", default=10.0, show_default=True, help="Low-pass on the positions.")
+@click.option("--decimate-hz", default=2.0, show_default=True, help="Low-pass of the parallel decimation.")
+@click.option("--choose-cutoff", is_flag=True, help="Take the cut-off from the spectrum of the positions.")
+@click.option("--average-periods", is_flag=True, help="Average the periods of a periodic motion first.")
+@click.option(
+    "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Write the model to this file, e.g. model.yaml.")
+@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+def command(
+    sessions: tuple[Path, ...],
+    model: int,
+    estimator: str,
+    without: tuple[str, ...],
+    cutoff_hz: float,
+    decimate_hz: float,
+    choose_cutoff: bool,
+    average_periods: bool,
+    urdf: Path | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Estimate the base parameters of an arm from its SESSIONS, stacked.
+
+    Each session's payload is the one that its metadata names; sessions without and with a payload together
+    identify the payload apart from the last link.
+
+    \b
+    lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
+    lwr-run identify unloaded.mcap --model 1 --estimator huber
+    """
+    logs = [read_session(path) for path in sessions]
+    if urdf is None and logs[0].robot_description is None:
+        raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
+    chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
+    settings = IdentificationSettings(
+        model=model,
+        signals=SignalSettings(
+            cutoff_hz=cutoff_hz,
+            decimate_hz=decimate_hz,
+            choose_cutoff=choose_cutoff,
+            average_periods=average_periods,
+        ),
+        estimator=estimator,
+        without=without,
+    )
+    found = identify(logs, chain, settings)
+    click.echo(json.dumps(found.to_dict(), indent=1) if as_json else found.summary())
+    if out is not None:
+        names = [path.name for path in sessions]
+        write_model(identified_model(found, logs[0].metadata.get("robot", "arm"), names), out)
+        click.echo(str(out), err=as_json)
