@@ -144,6 +144,11 @@ class Container:
             self._channels[topic] = _Channel(number, schema, content, schema_record)
         return self._channels[topic].number
 
+    def count(self, topic: str) -> int:
+        """Messages of `topic` in the file."""
+        channel = self._channels.get(topic)
+        return 0 if channel is None else self._counts.get(channel.number, 0)
+
     def write_chunk(self, messages: Messages) -> None:
         """Write a chunk with its message indexes."""
         if not len(messages.records):

@@ -233,7 +233,9 @@ class _JointTopic:
         count = len(rows)
         values = {name: np.empty((count, len(self.names))) for name in self.fields}
         stamps = np.empty(count, dtype=np.int64)
-        for size in np.unique(sizes).tolist():
+        alike = (sizes == sizes[0]).all()
+        # The sizes in the order of the file, so that an error names the first message that breaks a rule.
+        for size in sizes[:1].tolist() if alike else dict.fromkeys(sizes.tolist()):
             left = np.flatnonzero(sizes == size)
             layouts = self.layouts.setdefault(size, [])
             tried = 0

@@ -7,6 +7,7 @@ bytes of a log depend on the samples alone and not on how they arrived.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import struct
 import uuid
@@ -134,9 +135,9 @@ class SessionWriter:
             raise ConfigurationError(
                 f"session log {path}: joint names {self.joint_names} must be different, one at least"
             )
-        self.samples = 0
         self.missed = 0
         self.closed = False
+        self._failure: DataError | None = None
         self._last_sequence: int | None = None
         self._period_ns = round(chunk_period_s * 1e9)
         self._frames = None if robot_description is None else LinkFrames(robot_description)
@@ -177,7 +178,6 @@ class SessionWriter:
             before = numbers[0] - 1 if self._last_sequence is None else self._last_sequence
             self.missed += int(np.maximum(np.diff(numbers, prepend=before) - 1, 0).sum())
             self._last_sequence = int(numbers[-1])
-            self.samples += len(numbers)
 
     def write_motor_states(
         self,
@@ -297,17 +297,17 @@ class SessionWriter:
     ) -> None:
         """Write what is left, the record `session_end` and the summary. Does nothing if it is closed already.
 
-        After a failed write this still tries to end the file with what was written before; the error is
-        raised then too.
+        After a failed write (disk full) the file ends behind its last whole chunk, with exit status `fail`.
+        DataError if what is left, or even the end, cannot be written.
         """
         if self.closed:
             return
         self.closed = True
-        failure: DataError | None = None
-        try:
+        known = self._failure
+        with contextlib.suppress(DataError):
             self._emit(None)
-        except DataError as error:
-            failure, exit_status, reason = error, "fail", reason or str(error)
+        if self._failure is not None:
+            exit_status, reason = "fail", reason or str(self._failure)
         end = {
             "exit_status": exit_status,
             "reason": reason,
@@ -321,13 +321,18 @@ class SessionWriter:
         except DataError:
             self._container.abandon()
             raise
-        if failure is not None:
-            raise failure
+        if self._failure is not known and self._failure is not None:
+            raise self._failure
 
     def abandon(self) -> None:
         """Close the file without an end, as a crash would."""
         self.closed = True
         self._container.abandon()
+
+    @property
+    def samples(self) -> int:
+        """Joint states in the file, after `close`; before it, those in whole chunks."""
+        return self._container.count("/joint_states")
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -386,6 +391,8 @@ class SessionWriter:
         publish_time: ArrayLike | None,
         sequence: ArrayLike | None,
     ) -> NDArray[np.int64]:
+        if self._failure is not None:
+            raise self._failure
         times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
         count = len(times)
         done = self._counts.get(topic, 0)
@@ -450,7 +457,14 @@ class SessionWriter:
             if self._description is not None:
                 description, self._description = self._description, None
                 self._write_text("/robot_description", min(heads), description, None)
-            self._container.write_chunk(self._take(stop))
+            messages = self._take(stop)
+            try:
+                self._container.write_chunk(messages)
+            except DataError as error:
+                # What follows would stand behind a hole.
+                self._failure = error
+                self._queues.clear()
+                raise
 
     def _take(self, stop: int) -> Messages:
         """Take all messages before `stop` off the queues, in order of log time."""
