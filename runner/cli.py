@@ -12,7 +12,7 @@ import click
 
 from fri.errors import LwrError
 
-# Before numpy is imported: the matrices are small, a second BLAS thread costs more than it gives on a busy PC.
+# Before numpy is imported: the matrices are small, and a second BLAS thread costs more than it gives.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __all__ = ["main"]

@@ -212,7 +212,8 @@ class Run:
         time = np.arange(len(motion)) * motion.period_s
         qd = np.gradient(motion.q, motion.period_s, axis=0)
         buffer = io.BytesIO()
-        np.savez(buffer, time=time, q=motion.q, qd=qd, qdd=np.gradient(qd, motion.period_s, axis=0))
+        qdd = np.gradient(qd, motion.period_s, axis=0)
+        np.savez_compressed(buffer, time=time, q=motion.q, qd=qd, qdd=qdd)
         return {
             "experiment.yaml": self.experiment.text.encode(),
             "robot.urdf": self.bench.arm.urdf.encode(),
