@@ -66,7 +66,7 @@ def project(
     *,
     covariance: ArrayLike | None = None,
     margin: float = 1e-3,
-    firmness: float = 1e-6,
+    firmness: float = 1e-3,
 ) -> Projection:
     """Consistent bodies for base parameters, see the head of the module.
 
@@ -90,7 +90,13 @@ def project(
     slope, missing = k_matrix @ step, chi - k_matrix @ bodies.ravel()
     scale = _scale(slope, covariance)
     used = scale > 0.0
-    found = _solve_exact(slope[used] / scale[used, None], missing[used] / scale[used], len(bodies), margin)
+    found = None
+    for closeness in (margin, 1e-3 * margin):
+        found = _solve_exact(
+            slope[used] / scale[used, None], missing[used] / scale[used], len(bodies), closeness
+        )
+        if found is not None:
+            break
     exact = found is not None
     if found is None:
         logger.info(

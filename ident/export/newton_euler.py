@@ -1,8 +1,8 @@
 """Recursive Newton-Euler of a chain with given parameters, written as expressions of q, qd and qdd.
 
 The customised algorithm of Khalil and Kleinfinger (1987): modified Denavit-Hartenberg frames, inertia about
-the frame origins, and U = [alpha]x + [omega]x[omega]x formed once a link. With base parameters most of the ten
-numbers of a link are zero; their terms never come into being.
+the frame origins, and U = [alpha]x + [omega]x[omega]x formed once a link. With base parameters most of the
+ten numbers of a link are zero; their terms never come into being.
 """
 
 from __future__ import annotations

@@ -1,0 +1,264 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from fri.errors import ConfigurationError, DataError
+from ident.import_log import LogMapping, import_log
+from lwr_driver.configuration import CONFIGS, parse
+from lwr_driver.session import read_session
+from runner.commands.import_log import command
+
+JOINTS = ["a", "b"]
+PLAIN: dict[str, Any] = {
+    "robot": "bench arm",
+    "joints": JOINTS,
+    "time": {"column": "t", "file": "arm.csv"},
+    "position": {"file": "arm.csv", "columns": ["qa", "qb"], "unit": "rad"},
+    "joint_torque": {"file": "arm.csv", "columns": ["ta", "tb"], "unit": "Nm"},
+}
+
+
+def mapping(**changes: Any) -> LogMapping:
+    return parse(LogMapping, PLAIN | changes, "mapping.yaml")
+
+
+def write_csv(folder: Path, rows: int = 4, name: str = "arm.csv", **columns: Any) -> Path:
+    table = {
+        "t": np.arange(rows) * 0.01,
+        "qa": np.linspace(0, 1, rows),
+        "qb": np.linspace(1, 2, rows),
+        "ta": np.linspace(-1, 1, rows),
+        "tb": np.linspace(3, 4, rows),
+    } | columns
+    lines = [",".join(table)]
+    for row in zip(*table.values(), strict=True):
+        lines.append(",".join(value if isinstance(value, str) else repr(float(value)) for value in row))
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_plain_columns_arrive_bit_for_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    values = {name: rng.normal(size=50) for name in ("qa", "qb", "ta", "tb")}
+    report = import_log(mapping(), write_csv(tmp_path, 50, **values), tmp_path / "x.mcap")
+    session = read_session(report.path)
+    np.testing.assert_array_equal(session.joint.position, np.column_stack([values["qa"], values["qb"]]))
+    np.testing.assert_array_equal(session.joint.effort, np.column_stack([values["ta"], values["tb"]]))
+    assert session.joint_names == ("a", "b")
+    assert session.motor is None
+    assert report.rows == {"/joint_states": 50}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    hnp.arrays(np.float64, (6, 2), elements=st.floats(-1e6, 1e6)),
+    st.lists(st.floats(1e-4, 0.1), min_size=6, max_size=6),
+)
+def test_no_sample_and_no_time_is_lost_or_changed(
+    tmp_path_factory: pytest.TempPathFactory, torque: np.ndarray, steps: list[float]
+) -> None:
+    folder = tmp_path_factory.mktemp("arm")
+    times = np.cumsum(steps)
+    write_csv(folder, 6, t=times, ta=torque[:, 0], tb=torque[:, 1])
+    import_log(mapping(), folder, folder / "x.mcap")
+    session = read_session(folder / "x.mcap")
+    np.testing.assert_array_equal(session.joint.effort, torque)
+    np.testing.assert_allclose(session.joint.log_time * 1e-9, times, rtol=0, atol=0.51e-9)
+
+
+def test_degrees_signs_scales_and_offsets(tmp_path: Path) -> None:
+    changed = mapping(
+        position=PLAIN["position"] | {"unit": "deg", "sign": [1, -1]},
+        joint_torque=PLAIN["joint_torque"] | {"unit": "mNm", "sign": -1, "scale": [2.0, 1.0]},
+        offset_rad=[0.5, -0.25],
+    )
+    import_log(changed, write_csv(tmp_path, qa=[10.0] * 4, qb=[20.0] * 4, ta=[5e3] * 4), tmp_path / "x.mcap")
+    session = read_session(tmp_path / "x.mcap")
+    np.testing.assert_allclose(
+        session.joint.position[0], [np.radians(10) + 0.5, np.radians(-20) - 0.25], rtol=1e-15
+    )
+    np.testing.assert_allclose(session.joint.effort[0], [-10.0, -3e-3], rtol=1e-15)
+
+
+def test_motor_side_keeps_position_and_power_through_coupled_gears(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    motor_torque, motor_position = rng.normal(size=(2, 30, 2))
+    changed = mapping(
+        position=PLAIN["position"] | {"side": "motor"},
+        velocity=PLAIN["position"] | {"side": "motor", "unit": "rad/s"},
+        motor_torque=PLAIN["joint_torque"] | {"side": "motor"},
+        transmission={"reduction": [45, -32], "coupling": [{"motor": "b", "joint": "a", "ratio": 32}]},
+        joint_torque=None,
+    )
+    write_csv(
+        tmp_path,
+        30,
+        qa=motor_position[:, 0],
+        qb=motor_position[:, 1],
+        ta=motor_torque[:, 0],
+        tb=motor_torque[:, 1],
+    )
+    import_log(changed, tmp_path, tmp_path / "x.mcap")
+    session = read_session(tmp_path / "x.mcap")
+    assert session.motor is not None
+    q, tau = session.joint.position, session.motor.effort
+    np.testing.assert_allclose(45 * q[:, 0], motor_position[:, 0], atol=1e-14)
+    np.testing.assert_allclose(32 * q[:, 0] - 32 * q[:, 1], motor_position[:, 1], atol=1e-14)
+    power = np.sum(tau * session.joint.velocity, axis=1)
+    np.testing.assert_allclose(power, np.sum(motor_torque * motor_position, axis=1), rtol=1e-12, atol=1e-13)
+    assert session.joint.effort.shape[1] == 0
+    assert session.metadata["motor_torque_source"].startswith("import")
+
+
+def test_npz_arrays_and_unix_times(tmp_path: Path) -> None:
+    times = 1460034860.0 + np.cumsum([0.0, 0.0034, 0.0065, 0.005])
+    q = np.arange(8.0).reshape(4, 2)
+    np.savez(tmp_path / "run.npz", times=times, q=q, tau=q[:, ::-1])
+    changed = mapping(
+        time={"column": "times", "zero": "unix"},
+        position={"array": "q", "unit": "rad"},
+        joint_torque={"array": "tau", "columns": [2, 1], "unit": "Nm"},
+    )
+    report = import_log(changed, tmp_path / "run.npz", tmp_path / "x.mcap")
+    session = read_session(tmp_path / "x.mcap")
+    np.testing.assert_array_equal(session.joint.effort, q)
+    assert session.metadata["utc_start"].startswith("2016-04-07T13:14:20")
+    np.testing.assert_allclose(np.diff(session.joint.log_time) * 1e-9, np.diff(times), atol=2e-9)
+    assert report.shortest_s < report.longest_s
+
+
+def test_motor_channel_may_have_its_own_clock(tmp_path: Path) -> None:
+    write_csv(tmp_path, 10)
+    (tmp_path / "drive.txt").write_text("\n".join(f"{0.02 * k + 0.003} {k} {2 * k}" for k in range(5)))
+    changed = mapping(
+        motor_torque={
+            "file": "drive.txt",
+            "columns": [2, 3],
+            "unit": "A",
+            "scale": 0.5,
+            "time": {"column": 1},
+        },
+        header=False,
+        time={"column": 1, "file": "arm.csv"},
+        position={"file": "arm.csv", "columns": [2, 3], "unit": "rad"},
+        joint_torque={"file": "arm.csv", "columns": [4, 5], "unit": "Nm"},
+    )
+    text = (tmp_path / "arm.csv").read_text().split("\n", 1)[1]
+    (tmp_path / "arm.csv").write_text(text)
+    import_log(changed, tmp_path, tmp_path / "x.mcap")
+    session = read_session(tmp_path / "x.mcap")
+    assert session.motor is not None
+    np.testing.assert_array_equal(session.motor.effort, [[0.5 * k, k] for k in range(5)])
+    np.testing.assert_array_equal(session.motor.log_time, [20_000_000 * k + 3_000_000 for k in range(5)])
+
+
+def test_the_same_recording_has_the_same_uid_and_other_rows_another(tmp_path: Path) -> None:
+    write_csv(tmp_path, 20)
+    whole = import_log(mapping(), tmp_path, tmp_path / "a.mcap")
+    again = import_log(mapping(), tmp_path, tmp_path / "b.mcap")
+    part = import_log(mapping(), tmp_path, tmp_path / "c.mcap", rows=(0, 10))
+    assert whole.uid == again.uid != part.uid
+    session = read_session(part.path)
+    assert len(session.joint) == 10
+    assert session.metadata["imported_rows"] == "0:10 of 20"
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"ta": ["1", "nan", "1", "1"]}, r"`joint_torque` of 'a' is nan in row 1 \(1 such values\)"),
+        ({"qb": ["1", "inf", "1", "1"]}, "`position` of 'b' is inf in row 1"),
+        ({"qa": ["1", "", "1", "1"]}, "line 3, column 'qa' is empty"),
+        ({"qa": ["1", "x", "1", "1"]}, "line 3, column 'qa' holds 'x'"),
+        ({"t": [0.0, 0.2, 0.1, 0.3]}, "time 0.1 s in row 2 follows 0.2 s"),
+        ({"t": [0.0, 0.1, 0.1, 0.3]}, "times must increase"),
+        ({"t": ["0", "nan", "1", "2"]}, "time in row 1 is nan"),
+        ({"t": [-1.0, 0.0, 1.0, 2.0]}, "give `start_utc`"),
+    ],
+)
+def test_bad_rows_are_named(tmp_path: Path, columns: dict[str, Any], message: str) -> None:
+    write_csv(tmp_path, 4, **columns)
+    with pytest.raises(DataError, match=message):
+        import_log(mapping(), tmp_path, tmp_path / "x.mcap")
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_a_short_row_is_an_error(tmp_path: Path) -> None:
+    write_csv(tmp_path)
+    (tmp_path / "arm.csv").write_text((tmp_path / "arm.csv").read_text() + "0.5,1,2\n")
+    with pytest.raises(DataError, match="line 6 has 3 columns, the first has 5"):
+        import_log(mapping(), tmp_path, tmp_path / "x.mcap")
+
+
+def test_channels_of_unequal_length_are_an_error(tmp_path: Path) -> None:
+    write_csv(tmp_path, 5)
+    write_csv(tmp_path, 4, name="torque.csv")
+    changed = mapping(joint_torque=PLAIN["joint_torque"] | {"file": "torque.csv"})
+    with pytest.raises(DataError, match="4 rows, its time column 't' has 5"):
+        import_log(changed, tmp_path, tmp_path / "x.mcap")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joint_torque": None}, "no torque"),
+        ({"offset_rad": [1.0]}, "1 entries for 2 joints"),
+        ({"position": PLAIN["position"] | {"unit": "Nm"}}, "does not measure that"),
+        ({"position": PLAIN["position"] | {"side": "motor"}}, "give `transmission`"),
+        ({"position": PLAIN["position"] | {"sign": [1, 2]}}, "must be 1 or -1"),
+        ({"position": PLAIN["position"] | {"unit": "counts"}}, "needs? `scale`|give `scale`"),
+        ({"position": PLAIN["position"] | {"columns": ["qa"]}}, "1 `columns` for 2 joints"),
+        ({"time": {"column": "t", "rate_hz": 10}}, "and not both"),
+        ({"transmission": {"reduction": [0, 1]}}, "no inverse"),
+        ({"transmission": {"reduction": [1]}}, "1 entries for 2 joints"),
+        (
+            {
+                "transmission": {
+                    "reduction": [1, 1],
+                    "coupling": [{"motor": "x", "joint": "a", "ratio": 1}],
+                }
+            },
+            "names joint 'x'",
+        ),
+        ({"positon": 1}, "did you mean `position`"),
+    ],
+)
+def test_a_mapping_that_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        mapping(**changes)
+
+
+def test_missing_column_and_missing_file_name_what_there_is(tmp_path: Path) -> None:
+    write_csv(tmp_path)
+    with pytest.raises(DataError, match="no column 'qz'; it has t, qa, qb, ta, tb"):
+        import_log(
+            mapping(position=PLAIN["position"] | {"columns": ["qa", "qz"]}), tmp_path, tmp_path / "x.mcap"
+        )
+    with pytest.raises(DataError, match="no such file; the mapping needs it"):
+        import_log(mapping(position=PLAIN["position"] | {"file": "no.csv"}), tmp_path, tmp_path / "x.mcap")
+
+
+def test_command_imports_and_reports(tmp_path: Path) -> None:
+    write_csv(tmp_path, 20)
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(PLAIN))
+    arguments = [str(tmp_path / "map.yaml"), str(tmp_path), str(tmp_path / "x.mcap")]
+    result = CliRunner().invoke(command, [*arguments, "--payload", "flange", "--payload-mass", "1.5"])
+    assert result.exit_code == 0, result.output
+    assert "/joint_states 20 (recording: 20)" in result.output
+    session = read_session(tmp_path / "x.mcap")
+    assert (session.metadata["payload"], session.metadata["payload_mass"]) == ("flange", "1.5")
+    assert "mapping.yaml" in session.attachments
+
+
+@pytest.mark.parametrize("path", sorted((CONFIGS / "imports").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_mappings_parse(path: Path) -> None:
+    assert LogMapping.load(path.stem).robot

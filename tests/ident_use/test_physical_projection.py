@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fri.errors import ConfigurationError
+from ident import parameters
+from ident.physical import project, reference_bodies
+
+
+def bodies(count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(count, 4, 6))
+    return parameters.from_pseudo_inertia(root @ root.transpose(0, 2, 1) * 0.1)
+
+
+def test_base_parameters_of_real_bodies_are_kept_exactly() -> None:
+    rng = np.random.default_rng(1)
+    truth, guess = bodies(3), bodies(3, 7)
+    matrix = rng.normal(size=(18, 30))
+    base = matrix @ truth.ravel()
+    found = project(matrix, base, guess)
+    assert found.exact
+    assert found.worst == 0.0
+    np.testing.assert_allclose(matrix @ found.bodies.ravel(), base, rtol=0, atol=1e-11)
+    assert all(verdict.consistent for verdict in parameters.consistency(found.bodies))
+
+
+def test_of_all_bodies_that_fit_the_one_near_the_reference_is_taken() -> None:
+    reference = bodies(2)
+    matrix = np.random.default_rng(2).normal(size=(12, 20))
+    found = project(matrix, matrix @ reference.ravel(), reference)
+    np.testing.assert_allclose(found.bodies, reference, atol=1e-9)
+
+
+def test_impossible_base_parameters_give_way_by_their_own_uncertainty() -> None:
+    reference = bodies(1)
+    base = reference.ravel().copy()
+    base[5] = -0.02
+    std = np.full(10, 1e-6)
+    std[5] = 0.1
+    found = project(np.eye(10), base, reference, covariance=np.diag(std**2))
+    assert not found.exact
+    assert parameters.consistency(found.bodies)[0].consistent
+    assert abs(found.shift[5]) < 10
+    np.testing.assert_allclose(np.delete(found.base, 5), np.delete(base, 5), atol=1e-4)
+
+
+def test_the_margin_is_kept() -> None:
+    reference = bodies(1)
+    base = reference.ravel().copy()
+    base[9] = 0.0
+    found = project(np.eye(10), base, reference, covariance=np.eye(10), margin=0.05)
+    root = np.linalg.inv(np.linalg.cholesky(parameters.pseudo_inertia(reference[0])))
+    relative = root @ parameters.pseudo_inertia(found.bodies[0]) @ root.T
+    assert np.linalg.eigvalsh(relative)[0] > 0.05 - 1e-6
+
+
+def test_reference_bodies_repairs_what_cannot_exist_and_leaves_the_rest() -> None:
+    good = bodies(1)[0]
+    flat = parameters.from_com(2.0, [0.1, 0.0, 0.2], np.diag([0.01, 0.01, 0.5]))
+    repaired = reference_bodies([good, flat, np.zeros(10)])
+    np.testing.assert_allclose(repaired[0], good, atol=1e-12)
+    assert all(verdict.consistent for verdict in parameters.consistency(repaired))
+    np.testing.assert_allclose(repaired[1, 6:], flat[6:], atol=1e-12)
+
+
+def test_a_reference_that_cannot_exist_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="cannot exist"):
+        project(np.eye(10), np.zeros(10), np.zeros((1, 10)))
