@@ -146,12 +146,12 @@ def model_text(model: DynamicModel) -> str:
 
 
 def _parameter_entries(model: DynamicModel) -> list[dict[str, Any]]:
-    std = model.std
     entries = []
     for k, (name, unit, value) in enumerate(zip(model.names, model.units, model.values, strict=True)):
         entry: dict[str, Any] = {"name": name, "unit": unit, "value": float(value)}
-        if std is not None:
-            entry["std"] = float(f"{std[k]:.10g}")
+        if model.covariance is not None:
+            # The root of the variance as written, so that a file read and written again stays the same.
+            entry["std"] = float(f"{np.sqrt(float(f'{model.covariance[k, k]:.10g}')):.10g}")
         entry["kind"] = model.kind
         entries.append(entry)
     return entries

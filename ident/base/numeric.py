@@ -17,11 +17,12 @@ from fri.errors import DataError
 from ident.base.base_set import BaseSet, base_set
 from ident.structure import Condition, ModelStructure
 
-__all__ = ["numeric_base", "random_states"]
+__all__ = ["numeric_base", "random_states", "rank_at_gap"]
 
 _FLOOR = 1e-8
 _SMALLEST_GAP = 1e3
-_ZERO = 1e-12
+# Columns this small beside the largest are rounding, or an angle a billionth off the right one.
+_ZERO = 1e-8
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def numeric_base(
     scaled = matrix[:, used] / norms[used]
     triangle = np.linalg.qr(scaled, mode="r")
     singular = np.linalg.svd(triangle, compute_uv=False)
-    rank, gap, threshold = _rank(singular)
+    rank, gap, threshold = rank_at_gap(singular)
     reduced = np.zeros((len(triangle), structure.n_columns))
     reduced[:, used] = triangle * norms[used]
     found = base_set(
@@ -86,14 +87,17 @@ def numeric_base(
     )
     if len(found) != rank:
         raise DataError(
-            f"the singular values say rank {rank}, the choice of columns {len(found)}; the geometry is nearly "
+            f"the singular values say rank {rank}, the columns {len(found)}; the geometry is nearly "
             "degenerate (an angle or a length that should be exact is not): check the modified-DH constants"
         )
     return found
 
 
-def _rank(singular: Floats) -> tuple[int, float, float]:
-    """Rank, gap and the geometric middle of the gap, relative to the largest singular value."""
+def rank_at_gap(singular: Floats) -> tuple[int, float, float]:
+    """Rank, gap and the geometric middle of the gap, relative to the first of descending singular values.
+
+    Raises DataError when no gap below 1e-8 of the largest is a factor of 1e3 wide.
+    """
     relative = singular / singular[0]
     # One more value at rounding level stands for full rank.
     floor = np.finfo(float).eps * len(singular) * 0.1
