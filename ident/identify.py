@@ -5,21 +5,27 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
+from ident.assumptions import Assumptions, check_assumptions
 from ident.base import BaseSet, numeric_base
+from ident.essential import Essential, EssentialSettings, find_essential
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate, Estimator
+from ident.estimators.instrumental import InstrumentalVariables
 from ident.estimators.ordinary import OrdinaryLeastSquares
 from ident.estimators.problem import Problem
 from ident.estimators.robust import RobustLeastSquares
 from ident.estimators.total import TotalLeastSquares
 from ident.estimators.weighted import WeightedLeastSquares
+from ident.instruments import commanded
 from ident.kinematics import Chain
+from ident.model import DynamicModel
 from ident.observation import observe
 from ident.signals.prepare import PreparedSession, prepare
 from ident.signals.settings import SignalSettings
@@ -50,10 +56,12 @@ class IdentificationSettings:
     """What to estimate and how.
 
     model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
-    estimator : "wls" (default), "ols", "huber", "tukey", "tls", or a factory that gets the base set, the problem and
-        the covariance settings and returns an estimator.
+    estimator : "wls" (default), "ols", "huber", "tukey", "tls", or a factory that gets the base set, the
+        problem and the covariance settings and returns an estimator.
     without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
     resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
+    essential : how essential parameters are found; None leaves that out.
+    robot : name of the arm in the model; the sessions' metadata otherwise.
     """
 
     model: int = 2
@@ -64,6 +72,8 @@ class IdentificationSettings:
     couplings: tuple[Coupling, ...] = ()
     coulomb: Coulomb = field(default_factory=Coulomb)
     resonance_hz: float | None = None
+    essential: EssentialSettings | None = field(default_factory=EssentialSettings)
+    robot: str = ""
 
     def __post_init__(self) -> None:
         if isinstance(self.estimator, str) and self.estimator not in _ESTIMATORS:
@@ -76,7 +86,8 @@ class Identification:
     """Result of `identify`.
 
     base : the base parameters and their regrouping; estimate : values, covariance and residuals.
-    prepared : the sessions as filtered; problem : the stacked regression. warnings : sentences for the report.
+    prepared : the sessions as filtered; problem : the stacked regression. warnings : sentences for the
+    report.
     """
 
     settings: IdentificationSettings
@@ -88,7 +99,51 @@ class Identification:
     payloads: tuple[str | None, ...]
     condition: float
     condition_normalised: float
+    assumptions: Assumptions
+    essential: Essential | None
+    robot: str
     warnings: tuple[str, ...]
+
+    @cached_property
+    def model(self) -> DynamicModel:
+        """The identified model with all base parameters."""
+        return DynamicModel(
+            self.robot,
+            self.structure,
+            self.base.names,
+            self.estimate.values,
+            self.estimate.covariance.matrix,
+            self.base,
+            self._provenance,
+        )
+
+    @cached_property
+    def essential_model(self) -> DynamicModel:
+        """The identified model with the essential parameters only. Raises ConfigurationError if none were
+        sought.
+        """
+        if self.essential is None:
+            raise ConfigurationError("essential parameters were not sought; set `essential` in the settings")
+        found = self.essential.estimate
+        return DynamicModel(
+            self.robot,
+            self.structure,
+            found.names,
+            found.values,
+            found.covariance.matrix,
+            self.base,
+            self._provenance,
+        )
+
+    @property
+    def _provenance(self) -> dict[str, Any]:
+        return {
+            "estimator": self.estimate.method,
+            "covariance": self.estimate.covariance.kind,
+            "sessions": [session.name for session in self.prepared],
+            "cutoff_hz": self.settings.signals.cutoff_hz,
+            "decimate_hz": self.settings.signals.decimate_hz,
+        }
 
     @property
     def counts(self) -> dict[str, int]:
@@ -147,6 +202,8 @@ class Identification:
             "condition_normalised": self.condition_normalised,
             "parameters": self.parameters,
             "torque_rms": self.torque_rms,
+            "assumptions": self.assumptions.to_dict(),
+            "essential": None if self.essential is None else self.essential.to_dict(),
             "warnings": list(self.warnings),
         }
 
@@ -166,7 +223,9 @@ class Identification:
         lines.append(
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
         )
-        lines += ["", self.estimate.summary()]
+        lines += ["", self.estimate.summary(), "", self.assumptions.summary()]
+        if self.essential is not None:
+            lines += ["", self.essential.summary()]
         if self.warnings:
             lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
         return "\n".join(lines)
@@ -191,7 +250,8 @@ def identify(
         names = ", ".join(session.path.name for session in chosen)
         raise DataError(
             f"Model {settings.model} needs motor torques, and {names} "
-            f"ha{'s' if len(chosen) == 1 else 've'} no /motor_states; choose Model 1 (`--model 1`), or record with a "
+            f"ha{'s' if len(chosen) == 1 else 've'} no /motor_states; choose Model 1 (`--model 1`), or "
+            "record with a "
             "motor torque source"
         )
     if settings.model == 3:
@@ -212,6 +272,15 @@ def identify(
     problem = observe(prepared, mounted, structure, columns=base.columns, names=base.names, units=base.units)
     normalised = problem.require_rank()
     estimate = _estimator(settings, base, problem).fit(problem)
+    assumptions = check_assumptions(
+        problem,
+        estimate,
+        instrumental=_instrumental(chosen, prepared, mounted, structure, base, problem, settings),
+        period_rows=_common_period(prepared),
+    )
+    essential = None
+    if settings.essential is not None:
+        essential = find_essential(problem, estimate, settings.essential, settings.covariance)
     warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
     warnings += _condition_warnings(normalised, estimate)
     return Identification(
@@ -224,6 +293,9 @@ def identify(
         payloads=tuple(payloads),
         condition=problem.condition,
         condition_normalised=normalised,
+        assumptions=assumptions,
+        essential=essential,
+        robot=settings.robot or chosen[0].metadata.get("robot", "") or "arm",
         warnings=tuple(warnings),
     )
 
@@ -231,6 +303,34 @@ def identify(
 def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
     factory = _ESTIMATORS[settings.estimator] if isinstance(settings.estimator, str) else settings.estimator
     return factory(base, problem, settings.covariance)
+
+
+def _instrumental(
+    sessions: Sequence[Session],
+    prepared: Sequence[PreparedSession],
+    payloads: Sequence[str | None],
+    structure: ModelStructure,
+    base: BaseSet,
+    problem: Problem,
+    settings: IdentificationSettings,
+) -> Estimate | None:
+    """Instrumental-variable estimate on the commanded motion, None where the sessions do not have it."""
+    if settings.signals.average_periods:
+        return None
+    motions = [commanded(session, one) for session, one in zip(sessions, prepared, strict=True)]
+    whole = [motion for motion in motions if motion is not None]
+    if len(whole) < len(motions):
+        return None
+    matrices = [g.matrix for g in observe(whole, payloads, structure, columns=base.columns).groups]
+    return InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
+
+
+def _common_period(prepared: Sequence[PreparedSession]) -> int | None:
+    """Rows of a period, if all sessions have the same and at least one has two of them."""
+    lengths = {session.period_rows for session in prepared}
+    length = lengths.pop() if len(lengths) == 1 else None
+    averaged = any(session.settings.average_periods for session in prepared)
+    return None if averaged or not any(session.periods > 1 for session in prepared) else length
 
 
 def _payload(session: Session) -> str | None:
@@ -244,7 +344,8 @@ def _same_robot(sessions: Sequence[Session]) -> None:
         if len(found) > 1:
             listed = ", ".join(f"{s.path.name}: {s.metadata.get(key) or 'unnamed'}" for s in sessions)
             raise DataError(
-                f"the sessions are of different robots by their `{key}` ({listed}); identify each robot by itself"
+                f"the sessions are of different robots by their `{key}` ({listed}); identify each robot by "
+                "itself"
             )
 
 
@@ -252,8 +353,10 @@ def _every_joint_moves(prepared: Sequence[PreparedSession], chain: Chain) -> Non
     still = [name for name in chain.joint_names if not any(name in session.moving for session in prepared)]
     if still:
         raise DataError(
-            f"joint{'s' if len(still) > 1 else ''} {', '.join(still)} never move{'s' if len(still) == 1 else ''}; "
-            "plan an excitation that moves every joint, or identify with a chain in which these joints are fixed"
+            f"joint{'s' if len(still) > 1 else ''} {', '.join(still)} never "
+            f"move{'s' if len(still) == 1 else ''}; "
+            "plan an excitation that moves every joint, or identify with a chain in which these joints are "
+            "fixed"
         )
 
 
@@ -280,7 +383,8 @@ def _payload_warnings(
     found = []
     if structure.payloads and None not in payloads:
         found.append(
-            "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into the arm's; "
+            "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into "
+            "the arm's; "
             "add an unloaded session of the same arm"
         )
     for payload in structure.payloads:
@@ -299,12 +403,15 @@ def _payload_warnings(
         stated = [float(m) for m in masses if m]
         if mass < 3.0 * std:
             found.append(
-                f"payload {payload!r}: the estimated mass {mass:.3f} ± {std:.3f} kg is not above zero; it was announced "
-                "but not mounted, or mounted in the unloaded session too: correct the metadata or repeat the session"
+                f"payload {payload!r}: the estimated mass {mass:.3f} ± {std:.3f} kg is not above zero; it "
+                "was announced "
+                "but not mounted, or mounted in the unloaded session too: correct the metadata or repeat "
+                "the session"
             )
         elif stated and abs(mass - stated[0]) > max(0.1 * stated[0], 3.0 * std):
             found.append(
-                f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg against {stated[0]:.3f} kg stated; check "
+                f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg against {stated[0]:.3f} kg "
+                "stated; check "
                 "what was mounted, and the torque sensors' gain"
             )
     return found
@@ -317,6 +424,7 @@ def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
     worst = np.argsort(-np.diag(inverse))[:8]
     names = ", ".join(estimate.names[k] for k in worst)
     return [
-        f"condition number of the normalised columns {normalised:.0f} exceeds {_WIDE_CONDITION:.0f}; the motion hardly "
+        f"condition number of the normalised columns {normalised:.0f} exceeds {_WIDE_CONDITION:.0f}; the "
+        "motion hardly "
         f"separates {names}: excite them, or judge them by their RSD"
     ]

@@ -1,8 +1,8 @@
 """From prepared sessions to the stacked regression: one filter for the torque and for every regressor column.
 
-The regressor is evaluated at the sample times of the torque it explains, and both pass the same parallel low-pass
-down to the row rate, Coulomb columns included (parallel decimation). The full-rate matrix exists only for a
-stretch of rows at a time, so the memory does not grow with the sampling rate.
+The regressor is evaluated at the sample times of the torque it explains, and both pass the same parallel
+low-pass down to the row rate, Coulomb columns included (parallel decimation). The full-rate matrix exists
+only for a stretch of rows at a time, so the memory does not grow with the sampling rate.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def observe(
     """Stacked problem of the sessions, each with the payload mounted in it.
 
     columns : indices of the structure's columns (default all active ones); names : their names in the result.
-    Sessions without a motor channel contribute their joint rows only. Rows of a joint that stood still or whose
-    samples are missing are left out. Raises DataError when no row is left.
+    Sessions without a motor channel contribute their joint rows only. Rows of a joint that stood still or
+    whose samples are missing are left out. Raises DataError when no row is left.
     """
     chosen = np.flatnonzero(structure.active) if columns is None else np.asarray(columns, dtype=np.int64)
     titles = [structure.names[c] for c in chosen] if names is None else list(names)
@@ -61,8 +61,10 @@ def observe(
             nuisances.append(Nuisance(f"motor delay of {session.name}", session.delay.std, slopes))
     if not groups:
         raise DataError(
-            f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a joint stood "
-            "still, samples were missing or the channel was absent; check the phases and channels of the sessions"
+            f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a "
+            "joint stood "
+            "still, samples were missing or the channel was absent; check the phases and channels of the "
+            "sessions"
         )
     return Problem(
         tuple(titles),

@@ -5,17 +5,19 @@ not: unmodelled physics repeats with the motion, so neighbouring rows err alike 
 deviation can be several times too small. Here the scores of all rows of one instant are summed first, so
 correlation between joints and sides is covered too, and then
 
-* `hac`: Bartlett-weighted autocovariances of the scores (Newey and West 1987), bandwidth after Andrews (1991) or
-  stated, critical values after Kiefer and Vogelsang (2005). With a hundred parameters on a minute of motion it is
-  still 10 to 20 % too small, since the residuals at the very frequencies that matter were fitted away;
-* `jackknife` (the default): blocks of time, twice the bandwidth long, are left out one after the other. It undoes
-  that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard deviations are
-  the jackknife's, correlations the HAC's, which have full rank;
+* `hac`: Bartlett-weighted autocovariances of the scores (Newey and West 1987), bandwidth after Andrews (1991)
+  or stated, critical values after Kiefer and Vogelsang (2005). With a hundred parameters on a minute of
+  motion it is still 10 to 20 % too small, since the residuals at the very frequencies that matter were fitted
+  away;
+* `jackknife` (the default): blocks of time, twice the bandwidth long, are left out one after the other. It
+  undoes that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard
+  deviations are the jackknife's, correlations the HAC's, which have full rank;
 * `bootstrap`: blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -26,7 +28,6 @@ from scipy.signal import fftconvolve
 
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import FloatArray, Problem
-import itertools
 
 __all__ = [
     "CovarianceSettings",
@@ -46,8 +47,8 @@ _CHUNK = 8192
 class CovarianceSettings:
     """Which covariance an estimate states.
 
-    kind : "jackknife" (blocks of time left out, default), "hac" (Newey-West) and "bootstrap" (blocks drawn) are robust
-        to serial correlation; "textbook" is equation (14).
+    kind : "jackknife" (blocks of time left out, default), "hac" (Newey-West) and "bootstrap" (blocks drawn)
+        are robust to serial correlation; "textbook" is equation (14).
     bandwidth_s : largest lag [s] of the HAC weights, None chooses it from the scores.
     block_s : length of a block of the jackknife and the bootstrap [s], None takes twice the HAC bandwidth.
     """
@@ -72,7 +73,9 @@ class Scores:
         coefficients: Sequence[FloatArray],
         matrices: Sequence[FloatArray] | None = None,
     ) -> Scores:
-        """Scores with a coefficient for each row (weight times residual); `matrices` replace the regressors."""
+        """Scores with a coefficient for each row (weight times residual); `matrices` replace the
+        regressors.
+        """
         spans: dict[int, tuple[int, int]] = {}
         for group in problem.groups:
             if len(group.time_index):
@@ -104,7 +107,9 @@ class Scores:
         return sum(len(record) for record in self.records)
 
     def bartlett(self, length: int) -> FloatArray:
-        """Sum over lags |l| < length of (1 - |l| / length) S_l: the sum of squares of all windows of `length`."""
+        """Sum over lags |l| < length of (1 - |l| / length) S_l: the sum of squares of all windows of
+        `length`.
+        """
         p = self.records[0].shape[1]
         total = np.zeros((p, p))
         for record in self.records:
@@ -119,7 +124,9 @@ class Scores:
         return Scores(tuple(_block_sums(record, factor) for record in self.records))
 
     def bandwidth(self, bread: FloatArray) -> float:
-        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own scores."""
+        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own
+        scores.
+        """
         numerator = denominator = 0.0
         directions = bread.T / np.maximum(np.sqrt(np.abs(np.diag(bread))), 1e-300)
         for record in self.records:
@@ -178,9 +185,9 @@ def jackknife(
 ) -> Covariance:
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
-    coefficients : weight times residual of each row; row_weights : what multiplies a row's a a^T in the inverse of
-    `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p, p) covariance whose
-    correlations are taken over.
+    coefficients : weight times residual of each row; row_weights : what multiplies a row's a a^T in the
+    inverse of `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p, p)
+    covariance whose correlations are taken over.
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
@@ -208,7 +215,8 @@ def jackknife(
         ratio = own / np.where(other > 0, other, 1.0)
         matrix = correlation * np.outer(ratio, ratio)
     kind = (
-        f"block jackknife ({count} blocks of {length * problem.sample_time_s:.2f} s left out): robust to serial "
+        f"block jackknife ({count} blocks of {length * problem.sample_time_s:.2f} s left out): robust to "
+        "serial "
         "correlation"
     )
     return Covariance(matrix, kind, degrees_of_freedom=max(1.0, count - 1.0))
@@ -267,7 +275,9 @@ def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int,
 
 
 def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatArray:
-    """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's initial sequence."""
+    """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's initial
+    sequence.
+    """
     result = []
     for row_class in problem.classes:
         total: FloatArray = np.zeros(1)

@@ -16,10 +16,11 @@ __all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance (p, p) of the estimate, what it assumes (`kind`), and the degrees of freedom of its intervals.
+    """Covariance (p, p) of the estimate, what it assumes (`kind`), and the degrees of freedom of its
+    intervals.
 
-    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed those of the
-    normal law because a serial-correlation-robust variance is itself uncertain.
+    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed those of
+    the normal law because a serial-correlation-robust variance is itself uncertain.
     """
 
     matrix: FloatArray
@@ -38,7 +39,8 @@ class ClassFit:
     """Residual of one joint and side.
 
     sigma : std of the rows with the correct degrees of freedom [Nm]; rms : plain root mean square [Nm];
-    parameters : share of the p parameters that these rows consumed (the trace of their part of the hat matrix);
+    parameters : share of the p parameters that these rows consumed (the trace of their part of the hat
+    matrix);
     n_eff : number of independent rows that the serial correlation leaves.
     """
 
@@ -60,10 +62,10 @@ class ClassFit:
 class Estimate:
     """Result of an estimator.
 
-    values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed, by
-    name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y - A chi [Nm]
-    of each row group. standard : standard parameters, where the estimator finds them; prior_scale : factor s on the
-    prior's covariance, where there is a prior.
+    values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed,
+    by name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y - A
+    chi [Nm] of each row group. standard : standard parameters, where the estimator finds them; prior_scale :
+    factor s on the prior's covariance, where there is a prior.
     """
 
     method: str
@@ -120,7 +122,8 @@ class Estimate:
         rsd = self.rsd_percent
         for index, name in enumerate(self.names):
             lines.append(
-                f"{name:<10} {self.values[index]:>12.5g} {self.std[index]:>10.3g} {rsd[index]:>8.2f}  {units[index]}"
+                f"{name:<10} {self.values[index]:>12.5g} {self.std[index]:>10.3g} {rsd[index]:>8.2f}  "
+                f"{units[index]}"
             )
         lines += ["", f"{'rows':<14} {'count':>7} {'n_eff':>7} {'consumed':>9} {'sigma Nm':>9} {'rms Nm':>9}"]
         lines += [

@@ -1,7 +1,9 @@
-"""Instrumental variables (IDIM-IV, Janot, Vandanjon and Gautier 2014): consistent when the regressor is noisy.
+"""Instrumental variables (IDIM-IV, Janot, Vandanjon and Gautier 2014): consistent when the regressor is
+noisy.
 
-The instruments are the regressor evaluated on motions that the measurement noise has not touched: the states of a
-simulation with the present estimate under the same controller and reference, or the commanded motion itself.
+The instruments are the regressor evaluated on motions that the measurement noise has not touched: the states
+of a simulation with the present estimate under the same controller and reference, or the commanded motion
+itself.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class InstrumentalVariables:
             condition = float(np.linalg.cond(scaled))
             if not condition < 1e12:
                 raise DataError(
-                    f"the instruments do not span the parameters (condition {condition:.1e}); simulate the same "
+                    f"the instruments do not span the parameters (condition {condition:.1e}); simulate the "
+                    "same "
                     "motion that was recorded, all joints moving"
                 )
             bread = np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale), dtype=np.float64)
@@ -93,7 +96,8 @@ class InstrumentalVariables:
         for matrix, group in zip(matrices, problem.groups, strict=True):
             if matrix.shape != group.matrix.shape or not np.all(np.isfinite(matrix)):
                 raise DataError(
-                    f"{group.label}: instruments of shape {matrix.shape} are not finite or do not match the rows "
+                    f"{group.label}: instruments of shape {matrix.shape} are not finite or do not match "
+                    "the rows "
                     f"{group.matrix.shape}; evaluate them at the same times"
                 )
         return matrices

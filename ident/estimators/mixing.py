@@ -4,11 +4,12 @@ Extension: the regression y = a^T chi is accumulated with a fading memory (Kreis
 
     Phi <- lambda Phi + sum w a a^T,    Y <- lambda Y + sum w a y,    so that Y = Phi chi at any time.
 
-Mixing: multiplied by a row of the adjugate it falls apart into p scalar regressions, z_i = d_i chi_i. Any scale of
-a row may be chosen; here d_i^2 = 1 / (Phi^-1)_ii, the information on parameter i that the others leave, which is
-zero as long as the motion cannot tell i from them and does not suffer when other directions are not excited (the
-determinant would). Each parameter is then a scalar weighted mean over the whole motion: it moves only when it is
-excited and keeps its initial value otherwise, and its error never grows because of another parameter's.
+Mixing: multiplied by a row of the adjugate it falls apart into p scalar regressions, z_i = d_i chi_i. Any
+scale of a row may be chosen; here d_i^2 = 1 / (Phi^-1)_ii, the information on parameter i that the others
+leave, which is zero as long as the motion cannot tell i from them and does not suffer when other directions
+are not excited (the determinant would). Each parameter is then a scalar weighted mean over the whole motion:
+it moves only when it is excited and keeps its initial value otherwise, and its error never grows because of
+another parameter's.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ __all__ = ["RegressorExtensionMixing"]
 class RegressorExtensionMixing:
     """Element-wise estimates that need no persistent excitation.
 
-    memory_s : time constant of the extension [s]; it runs on from one session to the next. every : instants between two mixings.
-    initial, initial_std : values (p,) to begin with and their standard deviation (a number or (p,)); what is never
-        excited stays there. sigma : standard deviation of the rows by class, None takes the root mean square of the
-        torque by class as a scale, which needs no solution of the whole problem.
+    memory_s : time constant of the extension [s]; it runs on from one session to the next. every : instants
+    between two mixings.
+    initial, initial_std : values (p,) to begin with and their standard deviation (a number or (p,)); what is
+        never excited stays there. sigma : standard deviation of the rows by class, None takes the root mean
+        square of the torque by class as a scale, which needs no solution of the whole problem.
     null : share of a parameter in the unexcited directions above which it counts as not excited.
     """
 

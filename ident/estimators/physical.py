@@ -1,8 +1,9 @@
-"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives that only dissipate.
+"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives that only
+dissipate.
 
-Standard parameters are fitted through their base parameters under linear matrix inequalities (Sousa and Cortesao
-2014; Wensing, Kim and Slotine 2018) with a distance to a prior model that settles what the data cannot say (Lee,
-Wensing and Park 2020). The convex program goes to clarabel.
+Standard parameters are fitted through their base parameters under linear matrix inequalities (Sousa and
+Cortesao 2014; Wensing, Kim and Slotine 2018) with a distance to a prior model that settles what the data
+cannot say (Lee, Wensing and Park 2020). The convex program goes to clarabel.
 """
 
 from __future__ import annotations
@@ -55,14 +56,15 @@ class BodyPrior:
         for number, body in enumerate(self.inertial):
             if np.linalg.eigvalsh(pseudo_inertia(body))[0] <= 0:
                 raise ConfigurationError(
-                    f"prior of body {number + 1} belongs to no rigid body; pass it through `nearest_consistent`"
+                    f"prior of body {number + 1} belongs to no rigid body; pass it through "
+                    "`nearest_consistent`"
                 )
 
     def hessian(self, metric: Metric) -> FloatArray:
         """(n, n) quadratic form of the distance to the prior at the prior; zero for the drive parameters.
 
-        "pullback" (and "entropic", which agrees with it to second order): tr(J0^-1 dJ J0^-1 dJ) / 2, invariant
-        to the choice of frames and units. "euclidean": each parameter relative to its body's size.
+        "pullback" (and "entropic", which agrees with it to second order): tr(J0^-1 dJ J0^-1 dJ) / 2,
+        invariant to the choice of frames and units. "euclidean": each parameter relative to its body's size.
         """
         n = self.projection.shape[1]
         total = np.zeros((n, n))
@@ -78,7 +80,9 @@ class BodyPrior:
         return total
 
     def prior(self, metric: Metric) -> Prior:
-        """The same as a normal prior of the base parameters; those with a drive parameter in them stay free."""
+        """The same as a normal prior of the base parameters; those with a drive parameter in them stay
+        free.
+        """
         n = self.projection.shape[1]
         inertial = np.zeros(n, dtype=bool)
         inertial[self.bodies.ravel()] = True
@@ -199,7 +203,8 @@ class _Program:
             if entropic:
                 first = n + number * (_BODY + 4)
                 rows, offset, kinds = _entropic_rows(places, n + extra, first)
-                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4, whose second-order form is the pullback metric.
+                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4, whose second-order form is
+                # the pullback metric.
                 slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
                 linear[places] += self.strength * slope
                 linear[first + _BODY : first + _BODY + 4] -= self.strength
@@ -211,7 +216,8 @@ class _Program:
             cones += kinds
         full = np.zeros((n + extra, n + extra))
         full[:n, :n] = hessian
-        # Parameters without effect and without prior get a trace of curvature, so that the solution is unique.
+        # Parameters without effect and without prior get a trace of curvature, so that the solution
+        # is unique.
         full[np.arange(n), np.arange(n)] += 1e-12 * max(float(np.diag(hessian).max()), 1e-12)
         solution = _run(
             sparse.csc_matrix(np.triu(full)), linear, np.vstack(parts), np.concatenate(offsets), cones
@@ -244,14 +250,17 @@ def _run(
     status = str(result.status)
     if status not in ("Solved", "AlmostSolved"):
         raise DataError(
-            f"the physically consistent program ended with {status}; check the prior's masses and the parameters' "
+            f"the physically consistent program ended with {status}; check the prior's masses and the "
+            "parameters' "
             "units, or raise `strength`"
         )
     return scale * np.array(result.x)
 
 
 def _svec(matrix: FloatArray) -> FloatArray:
-    """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD cone."""
+    """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD
+    cone.
+    """
     size = matrix.shape[-1]
     entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]
     return np.stack(entries, axis=-1)

@@ -1,7 +1,8 @@
 """Maximum a posteriori: least squares with a prior model (CAD, or another arm of the series).
 
-The prior says where the parameters are expected and how far from there they may lie; the data decide how much to
-trust it. Rows count with their effective number, so that thousands of correlated rows do not drown the prior.
+The prior says where the parameters are expected and how far from there they may lie; the data decide how much
+to trust it. Rows count with their effective number, so that thousands of correlated rows do not drown the
+prior.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class Prior:
     ) -> Prior:
         """Prior of base parameters chi_B = P chi from one of standard parameters.
 
-        mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool, base
-        parameters that the prior speaks of, the others stay free.
+        mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool,
+        base parameters that the prior speaks of, the others stay free.
         """
         chosen = np.flatnonzero(known)
         part = projection[chosen]
@@ -80,9 +81,9 @@ class Prior:
 class MaximumAPosteriori:
     """Minimises sum of (n_eff / n) ||e_c||^2 / sigma_c^2 + (chi - chi_0)^T Lambda (chi - chi_0) / s.
 
-    strength : how the prior's scale s is chosen: "evidence" maximises the marginal likelihood of the data (MacKay
-        1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the prior's own
-        standard deviations, smaller is firmer).
+    strength : how the prior's scale s is chosen: "evidence" maximises the marginal likelihood of the data
+        (MacKay 1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the
+        prior's own standard deviations, smaller is firmer).
     blocks : number of blocks of the cross-validation.
     """
 

@@ -75,7 +75,9 @@ class TriangularFactor:
 
     @classmethod
     def of(cls, matrix: FloatArray, target: FloatArray) -> TriangularFactor:
-        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky where that is safe, blocked QR otherwise."""
+        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky where that is safe, blocked QR
+        otherwise.
+        """
         if not len(target):
             return cls(np.zeros((matrix.shape[1] + 1,) * 2), 0)
         if len(target) > _QR_ROWS:
@@ -233,14 +235,17 @@ class Problem:
         )
 
     def require_rank(self) -> float:
-        """Condition number of the column-normalised stack; DataError that names the parameters if rank is lost."""
+        """Condition number of the column-normalised stack; DataError that names the parameters if rank is
+        lost.
+        """
         factor = self.weighted(np.ones(len(self.classes)))
         p = factor.parameters
         norms = np.linalg.norm(factor.r[:, :p], axis=0)
         empty = [self.names[i] for i in np.flatnonzero(norms == 0.0)]
         if empty:
             raise DataError(
-                f"no row says anything about {_listed(empty)}; move these joints, add the session that excites "
+                f"no row says anything about {_listed(empty)}; move these joints, add the session that "
+                "excites "
                 "them, or leave the parameters out of the model"
             )
         if self.rows < p:
@@ -250,13 +255,16 @@ class Problem:
             suspects = [self.names[i] for i in np.flatnonzero(np.abs(right[-1]) > 0.1)]
             raise DataError(
                 f"the motion cannot tell {_listed(suspects)} apart (singular value ratio "
-                f"{singular[-1] / singular[0]:.1e}); excite them, add a session (unloaded and loaded), or regroup"
+                f"{singular[-1] / singular[0]:.1e}); excite them, add a session (unloaded and loaded), or "
+                "regroup"
             )
         return float(singular[0] / singular[-1])
 
     @property
     def condition(self) -> float:
-        """Condition number of the unscaled, unweighted observation matrix: the figure of the paper's Table 1."""
+        """Condition number of the unscaled, unweighted observation matrix: the figure of the paper's Table
+        1.
+        """
         singular = np.linalg.svd(self.weighted(np.ones(len(self.classes))).r[:, :-1], compute_uv=False)
         return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
 

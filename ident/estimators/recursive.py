@@ -1,8 +1,8 @@
 """Recursive least squares in square-root form: the estimate while the arm moves.
 
-The information is kept as a triangular factor, updated by orthogonal transformations (Bierman 1977), so it stays
-positive definite. Forgetting acts on what was learned, never on the initial information, which prevents wind-up
-when the motion excites nothing.
+The information is kept as a triangular factor, updated by orthogonal transformations (Bierman 1977), so it
+stays positive definite. Forgetting acts on what was learned, never on the initial information, which prevents
+wind-up when the motion excites nothing.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ __all__ = ["RecursiveFilter", "RecursiveLeastSquares", "Track"]
 class RecursiveFilter:
     """Square-root information filter for p constant or slowly drifting parameters.
 
-    initial : (p + 1, p + 1) triangular factor of the initial information [A y]. forgetting : factor per update on
-    the information gathered so far, 1 keeps all.
+    initial : (p + 1, p + 1) triangular factor of the initial information [A y]. forgetting : factor per
+    update on the information gathered so far, 1 keeps all.
     """
 
     def __init__(self, initial: FloatArray, forgetting: float = 1.0) -> None:
@@ -87,7 +87,8 @@ class RecursiveLeastSquares:
 
     memory_s : time constant of the forgetting [s], None keeps all; then the result is that of WLS.
     prior : where to begin; None begins without information (a standard deviation of `initial_std`).
-    sigma : standard deviation of the rows by class label ("A1 motor"); None takes those of a WLS over the problem.
+    sigma : standard deviation of the rows by class label ("A1 motor"); None takes those of a WLS over the
+    problem.
     """
 
     memory_s: float | None = None

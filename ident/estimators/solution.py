@@ -53,7 +53,8 @@ def class_variances(problem: Problem, values: FloatArray, consumed: FloatArray) 
         freedom = row_class.factor.rows - share
         if freedom < 1.0:
             raise DataError(
-                f"{row_class.label}: {row_class.factor.rows} rows for {share:.1f} parameters leave no residual; "
+                f"{row_class.label}: {row_class.factor.rows} rows for {share:.1f} parameters leave no "
+                "residual; "
                 "record a longer motion or raise the output rate of the signals"
             )
         result.append(row_class.factor.sum_of_squares(values) / freedom)
@@ -89,8 +90,8 @@ def estimate_from(
 
     bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each row
     (default: class weight times residual). matrices : what multiplies them (default: the regressors; the
-    instruments of an instrumental-variable estimate). row_weights : what multiplies a a^T of each row in the inverse
-    of `bread` (default: class weight). plain : the estimator's own textbook covariance.
+    instruments of an instrumental-variable estimate). row_weights : what multiplies a a^T of each row in the
+    inverse of `bread` (default: class weight). plain : the estimator's own textbook covariance.
     scores : in place of coefficients and matrices. offset : (p, p), added to the robust covariances.
     """
     residuals = problem.residuals(values)

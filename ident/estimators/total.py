@@ -1,7 +1,7 @@
 """Total least squares: errors in the regressor's columns as well as in the torque.
 
-Mixed and scaled (Golub and Van Loan 1980; Van Huffel and Vandewalle 1991): columns named exact (offsets) have no
-error, the others an error of known size relative to their own root mean square.
+Mixed and scaled (Golub and Van Loan 1980; Van Huffel and Vandewalle 1991): columns named exact (offsets) have
+no error, the others an error of known size relative to their own root mean square.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ __all__ = ["TotalLeastSquares"]
 class TotalLeastSquares:
     """Minimises ||Y - Omega chi||^2 / (1 + chi^T D chi) over rows weighted as in WLS.
 
-    relative_noise : standard deviation of a column's error as a share of the column's root mean square, one for
-        all or by parameter name. With a 10 Hz position filter and a 2 Hz parallel filter encoder noise leaves 1e-4
-        to 1e-3, which is why TLS and WLS agree on such data.
+    relative_noise : standard deviation of a column's error as a share of the column's root mean square, one
+        for all or by parameter name. With a 10 Hz position filter and a 2 Hz parallel filter encoder noise
+        leaves 1e-4 to 1e-3, which is why TLS and WLS agree on such data.
     exact : pattern of the names of columns without error (default: the offsets, columns of ones).
     """
 
@@ -66,7 +66,8 @@ class TotalLeastSquares:
             ) from error
         inverse = np.linalg.inv(lower)
         bread = inverse.T @ inverse
-        # The criterion's gradient is a row's a w e + D chi w e^2 / scale; the second part, summed, cancels the bias.
+        # The criterion's gradient is a row's a w e + D chi w e^2 / scale; the second part, summed,
+        # cancels the bias.
         correction = spread * values / scale
         coefficients = [
             weights[number] * residual

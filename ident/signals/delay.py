@@ -4,10 +4,10 @@ Of each joint the difference of the two torques obeys Model 3,
 
     tau_m(t + d) - tau_l(t) = Ia qdd + Fvm qd + Fcm sign(qd) + offm,
 
-with one delay d for the channel. All terms pass the same low-pass; d enters through the filtered motor torque and
-its time derivative, so it is the solution of a small nonlinear least-squares problem, started from a grid. Its
-standard deviation is robust to serial correlation. A delay acts like a change of Ia by -Fvm d, so it must be known
-before Ia can be believed.
+with one delay d for the channel. All terms pass the same low-pass; d enters through the filtered motor torque
+and its time derivative, so it is the solution of a small nonlinear least-squares problem, started from a
+grid. Its standard deviation is robust to serial correlation. A delay acts like a change of Ia by -Fvm d, so
+it must be known before Ia can be believed.
 """
 
 from __future__ import annotations
@@ -90,7 +90,8 @@ def estimate_delay(
     best = int(np.argmin(cost))
     if best in (0, len(grid) - 1):
         raise DataError(
-            f"the motor channel fits the joint channel best at the edge of the searched delays, {1e3 * grid[best]:.0f} "
+            "the motor channel fits the joint channel best at the edge of the searched delays, "
+            f"{1e3 * grid[best]:.0f} "
             "ms; check the motor channel's clock and sign, raise `delay_search_s`, or state `motor_delay_s`"
         )
     delay = float(grid[best])
@@ -180,7 +181,9 @@ def _cost(parts: Sequence[_Filtered], delay: float) -> float:
 
 
 def _sampling_error(parts: Sequence[_Filtered]) -> float:
-    """Standard error [s] that a slow channel leaves: each reversal is seen to one sample, evenly distributed."""
+    """Standard error [s] that a slow channel leaves: each reversal is seen to one sample, evenly
+    distributed.
+    """
     reversals, period = 0, 0.0
     for part in parts:
         period = float(np.median(np.diff(part.data.motor_times)))

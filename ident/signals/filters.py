@@ -16,7 +16,8 @@ __all__ = ["ParallelFilter", "differentiate", "interpolate_uniform", "low_pass"]
 
 FloatArray = NDArray[np.float64]
 
-# Central differences of sixth order: error (w dt)^6 / 140 of the velocity, (w dt)^6 / 560 of the acceleration.
+# Central differences of sixth order: error (w dt)^6 / 140 of the velocity, (w dt)^6 / 560 of the
+# acceleration.
 _FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 _SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
 _OUTPUTS = 8
@@ -25,7 +26,8 @@ _OUTPUTS = 8
 def low_pass(values: FloatArray, dt: float, cutoff_hz: float, order: int = 4) -> FloatArray:
     """Butterworth low-pass of `order` run forward and back over (n, k) values sampled every `dt` seconds.
 
-    Zero phase. The gain is the square of the single pass: -6 dB at the cut-off, roll-off of order 2 x `order`.
+    Zero phase. The gain is the square of the single pass: -6 dB at the cut-off, roll-off of order 2 x
+    `order`.
     """
     nyquist = 0.5 / dt
     if cutoff_hz >= nyquist:
@@ -45,7 +47,9 @@ def differentiate(values: FloatArray, dt: float) -> tuple[FloatArray, FloatArray
 
 
 def interpolate_uniform(values: FloatArray, start: float, dt: float, times: FloatArray) -> FloatArray:
-    """Values (n, k) sampled at start + i dt, at other times (m,): six-point Lagrange, for band-limited signals."""
+    """Values (n, k) sampled at start + i dt, at other times (m,): six-point Lagrange, for band-limited
+    signals.
+    """
     position = (times - start) / dt
     base = np.clip(np.floor(position).astype(np.int64) - 2, 0, max(len(values) - 6, 0))
     offset = position - base
@@ -60,11 +64,12 @@ def interpolate_uniform(values: FloatArray, start: float, dt: float, times: Floa
 
 @dataclass(frozen=True)
 class ParallelFilter:
-    """Weighted mean around output times: a Kaiser-windowed sinc, applied alike to torque and regressor columns.
+    """Weighted mean around output times: a Kaiser-windowed sinc, applied alike to torque and regressor
+    columns.
 
-    times : (m,) sample times [s], need not be equidistant; outputs : (K,) times of the rows [s].
-    A row is sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time that sample i stands for. Any
-    such mean of Y = Omega chi holds for the same chi, so irregular or slow sampling does not bias the estimate.
+    times : (m,) sample times [s], need not be equidistant; outputs : (K,) times of the rows [s]. A row is
+    sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time that sample i stands for. Any such
+    mean of Y = Omega chi holds for the same chi, so irregular or slow sampling does not bias the estimate.
     """
 
     times: FloatArray
@@ -104,7 +109,9 @@ class ParallelFilter:
         return result.reshape(len(self.outputs), *flagged.shape[1:])
 
     def coverage(self) -> FloatArray:
-        """Share (K,) of the kernel's absolute area that the samples cover; a gap or an end leaves less than 1."""
+        """Share (K,) of the kernel's absolute area that the samples cover; a gap or an end leaves less than
+        1.
+        """
         whole = np.linspace(-self.half_width, self.half_width, 2001)
         area = float(np.mean(np.abs(self._kernel(np.abs(whole))))) * 2.0 * self.half_width
         result = np.empty(len(self.outputs))

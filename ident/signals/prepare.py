@@ -1,14 +1,15 @@
 """From the raw channels of a session to filtered motion and torque at their own sample times.
 
-The positions pass the zero-phase Butterworth and are differentiated; the torques are left as measured, since the
-parallel filter that makes the rows acts on torque and regressor alike. The motion is evaluated at the sample times
-of the motor channel, less its delay, so a slow or irregular torque is never resampled.
+The positions pass the zero-phase Butterworth and are differentiated; the torques are left as measured, since
+the parallel filter that makes the rows acts on torque and regressor alike. The motion is evaluated at the
+sample times of the motor channel, less its delay, so a slow or irregular torque is never resampled.
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,8 @@ logger = logging.getLogger(__name__)
 class TorqueChannel:
     """Torque of one side as measured, and the filtered motion at its sample times.
 
-    times : (m,) [s], delay removed; q, qd, qdd, torque : (m, J); flagged : (m, J), bridged or outlying samples.
+    times : (m,) [s], delay removed; q, qd, qdd, torque : (m, J); flagged : (m, J), bridged or outlying
+    samples.
     """
 
     side: str
@@ -68,8 +70,10 @@ class Passage:
 class PreparedSession:
     """A session ready for any regressor.
 
-    row_time_s : time between rows; period_rows : rows in one period of the excitation, None if it has no periods.
-    delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped rows.
+    row_time_s : time between rows; period_rows : rows in one period of the excitation, None if it has no
+    periods.
+    delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
+    rows.
     moving : joints that move. warnings : sentences for the report.
     """
 
@@ -102,8 +106,8 @@ def prepare(
 ) -> PreparedSession:
     """Filter and align one session. `motor` False leaves the motor channel aside.
 
-    Raises DataError when nothing usable is left: too few samples, times that do not increase, non-finite values,
-    no torque, no motion.
+    Raises DataError when nothing usable is left: too few samples, times that do not increase, non-finite
+    values, no torque, no motion.
     """
     settings = settings or SignalSettings()
     name = session.path.name
@@ -123,7 +127,8 @@ def prepare(
     for columns, what in ((crowded, "position"), (also, "joint torque")):
         for column in columns:
             warnings.append(
-                f"{name}: {session.joint_names[column]} {what} jumps too often for outliers, nothing was removed; "
+                f"{name}: {session.joint_names[column]} {what} jumps too often for outliers, nothing was "
+                "removed; "
                 "look at the channel"
             )
     bad: BoolArray = np.asarray(position_flags.any(axis=1))
@@ -136,7 +141,8 @@ def prepare(
     names = moving(position, session.joint_names)
     if not names:
         raise DataError(
-            f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone says nothing "
+            f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone says "
+            "nothing "
             "about inertia and friction"
         )
     windows, periods = _windows(session, times)
@@ -156,7 +162,8 @@ def prepare(
     if not passages:
         need = 2.0 * (half_width(settings.decimate_hz, settings.attenuation_db) + settings.edge)
         raise DataError(
-            f"{name}: no stretch is longer than the filters' ends, {need:.1f} s; record a longer motion or raise "
+            f"{name}: no stretch is longer than the filters' ends, {need:.1f} s; record a longer motion or "
+            "raise "
             "`decimate_hz`"
         )
     warnings += advice(
@@ -303,7 +310,9 @@ def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -
 def _motor(
     session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
+    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor
+    channel.
+    """
     assert session.motor is not None
     _check_finite(session.motor, name)
     if not session.motor.effort.shape[1]:
@@ -316,7 +325,8 @@ def _motor(
         shift = np.median(session.motor.log_time - clock) - np.median(session.joint.log_time - reference)
         times = times + shift * 1e-9
         warnings.append(
-            f"{name}: the motor channel's clock differs from the joint channel's by {shift * 1e-9:.3f} s; aligned by "
+            f"{name}: the motor channel's clock differs from the joint channel's by {shift * 1e-9:.3f} s; "
+            "aligned by "
             "the host's times first, the rest is the estimated delay"
         )
     sample_period(times, None, f"{name}: /motor_states")
@@ -324,7 +334,8 @@ def _motor(
     flags, crowded = flag_outliers(effort, settings.outlier_scale)
     for column in crowded:
         warnings.append(
-            f"{name}: {session.joint_names[column]} motor torque jumps too often for outliers, nothing was removed; "
+            f"{name}: {session.joint_names[column]} motor torque jumps too often for outliers, nothing was "
+            "removed; "
             "look at the channel"
         )
     effort = effort.copy()
@@ -366,7 +377,8 @@ def _check_finite(columns: JointColumns, name: str) -> None:
         if values.size and not np.all(np.isfinite(values)):
             row, joint = np.argwhere(~np.isfinite(values))[0]
             raise DataError(
-                f"{name}: {columns.topic} {what} of {columns.names[joint]} is {values[row, joint]} at sample {row}; "
+                f"{name}: {columns.topic} {what} of {columns.names[joint]} is {values[row, joint]} at "
+                f"sample {row}; "
                 "remove or repair the sample"
             )
 
@@ -394,7 +406,7 @@ def _row_grid(
     if periods and len(windows) > 1:
         lengths = np.array([high - low for low, high in windows])
         length = float(np.mean(lengths[:-1]))
-        joined = all(abs(a[1] - b[0]) < 0.5 * step for a, b in zip(windows, windows[1:], strict=False))
+        joined = all(abs(a[1] - b[0]) < 0.5 * step for a, b in pairwise(windows))
         if joined and np.ptp(lengths) < 0.1 * step:
             count = max(1, round(length / step))
             total = count * len(windows)

@@ -18,7 +18,8 @@ FloatArray = NDArray[np.float64]
 def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) -> float:
     """Frequency [Hz] below which lies `share` of the power of the fastest-changing joint velocity.
 
-    velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest harmonic.
+    velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest
+    harmonic.
     """
     highest = 0.0
     power_of_joint = np.var(velocity, axis=0)
@@ -33,10 +34,10 @@ def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) 
 def optimal_cutoff(position: FloatArray, dt: float, order: int = 4) -> float:
     """Cut-off [Hz] that minimises the expected square error of the accelerations, from the data.
 
-    position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; what stands above
-    it is signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward pass, the error
-    is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by their signal's power. The
-    answer is bounded to 0.02 to 0.4 of the sampling rate.
+    position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; what stands
+    above it is signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward pass,
+    the error is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by their
+    signal's power. The answer is bounded to 0.02 to 0.4 of the sampling rate.
     """
     rate = 1.0 / dt
     grid = np.geomspace(0.002 * rate, 0.4 * rate, 240)
@@ -60,11 +61,14 @@ def advice(
     motor_rate_hz: float | None = None,
     resonance_hz: float | None = None,
 ) -> tuple[str, ...]:
-    """Warnings about the cut-offs against the excitation n_f w0, the sampling rates and the lowest resonance."""
+    """Warnings about the cut-offs against the excitation n_f w0, the sampling rates and the lowest
+    resonance.
+    """
     found: list[str] = []
     if settings.decimate_hz < 2.0 * excitation_hz:
         found.append(
-            f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest excitation "
+            f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest "
+            "excitation "
             f"frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms reach there, raise `decimate_hz`"
         )
     if settings.cutoff_hz < 5.0 * excitation_hz:
@@ -76,22 +80,26 @@ def advice(
     for name, rate in rates:
         if settings.row_rate_hz > rate:
             found.append(
-                f"rows at {settings.row_rate_hz:g} Hz exceed the {name} channel's {rate:.1f} Hz; lower `decimate_hz`"
+                f"rows at {settings.row_rate_hz:g} Hz exceed the {name} channel's {rate:.1f} Hz; lower "
+                "`decimate_hz`"
             )
     if settings.cutoff_hz > 0.2 * joint_rate_hz:
         found.append(
-            f"the position cut-off {settings.cutoff_hz:g} Hz is above a fifth of the sampling rate {joint_rate_hz:.0f} "
+            f"the position cut-off {settings.cutoff_hz:g} Hz is above a fifth of the sampling rate "
+            f"{joint_rate_hz:.0f} "
             "Hz; differences lose accuracy there, lower `cutoff_hz`"
         )
     if resonance_hz is not None:
         if excitation_hz > 0.5 * resonance_hz:
             found.append(
-                f"the motion reaches {excitation_hz:.2f} Hz, over half the lowest resonance {resonance_hz:g} Hz; the "
+                f"the motion reaches {excitation_hz:.2f} Hz, over half the lowest resonance "
+                f"{resonance_hz:g} Hz; the "
                 "joints' elasticity is excited and the rigid model is biased, plan a slower motion"
             )
         if settings.decimate_hz > 0.5 * resonance_hz:
             found.append(
-                f"the parallel filter's cut-off {settings.decimate_hz:g} Hz lets the lowest resonance {resonance_hz:g} "
+                f"the parallel filter's cut-off {settings.decimate_hz:g} Hz lets the lowest resonance "
+                f"{resonance_hz:g} "
                 "Hz through; lower `decimate_hz`"
             )
     return tuple(found)

@@ -112,10 +112,10 @@ def _fitted_step(times: FloatArray, steps: NDArray[np.int64], dt: float) -> floa
 def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int]]:
     """Flags (n, k) of samples far from the median of five, and the columns with too many for outliers.
 
-    Far is more than `scale` robust standard deviations and more than 1 % of the range, the deviation taken from
-    the cubic through the four neighbours, which follows any slope. The median keeps steps, so the reversal of
-    Coulomb friction is no outlier. Where over 1 % of a column is far, nothing of it is flagged: that is not an
-    outlier but a property of the signal.
+    Far is more than `scale` robust standard deviations and more than 1 % of the range, the deviation taken
+    from the cubic through the four neighbours, which follows any slope. The median keeps steps, so the
+    reversal of Coulomb friction is no outlier. Where over 1 % of a column is far, nothing of it is flagged:
+    that is not an outlier but a property of the signal.
     """
     padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
     far_left, left, middle, right, far_right = (padded[i : i + len(values)] for i in range(5))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -106,19 +106,19 @@ def session(
     period_s: float = 10.0,
     periods: int = 2,
     run_in_s: float = 3.0,
-    sensors: Sensors = field(default_factory=Sensors),  # type: ignore[assignment]
+    sensors: Sensors | None = None,
     motor: bool = True,
     motion_seed: int = 5,
     phases: bool = True,
 ) -> Session:
     """A session that runs through the periods with a run-in and a run-out."""
-    sensors = sensors if isinstance(sensors, Sensors) else Sensors()
+    sensors = sensors or Sensors()
     random = np.random.default_rng(seed)
     dt = 1.0 / rate_hz
     count = round((periods * period_s + 2 * run_in_s) * rate_hz) + 1
     time = np.arange(count) * dt
     q, qd, qdd = fourier(time - run_in_s, period_s, motion_seed)
-    joint_torque, motor_torque = torques(q, qd, qdd, loaded)
+    joint_torque, _ = torques(q, qd, qdd, loaded)
     position = q + sensors.position * random.normal(size=q.shape)
     joint_torque = joint_torque + sensors.joint * correlated(random, q.shape, dt, sensors.correlation_s)
     for row, column, value in sensors.joint_outliers:
