@@ -233,6 +233,11 @@ class Ring:
             self._owner = False
             self._memory.unlink()
 
+    def __del__(self) -> None:
+        # Else the shared memory complains at exit that views of it are still around.
+        if hasattr(self, "_bytes"):
+            self.close()
+
     def __enter__(self) -> Ring:
         return self
 

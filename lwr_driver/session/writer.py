@@ -149,6 +149,9 @@ class SessionWriter:
         self._slow_bucket: dict[str, int] = {}
         self._container = Container(self.path, library=LIBRARY, fsync=fsync)
         try:
+            # All numbers are given out beforehand: they must not depend on what happens to come first.
+            for topic, schema in TOPICS.items():
+                self._container.channel(topic, schema)
             self._container.describe("session", metadata)
             files = dict(attachments or {})
             if robot_description is not None:
@@ -471,7 +474,7 @@ class SessionWriter:
         records: list[bytes] = []
         channels: list[NDArray[np.int64]] = []
         times: list[NDArray[np.int64]] = []
-        for number, queue in self._queues.items():
+        for number, queue in sorted(self._queues.items()):
             while queue and queue[0][0][0] < stop:
                 log_time, rows = queue.popleft()
                 count = int(np.searchsorted(log_time, stop, side="left"))
