@@ -48,7 +48,10 @@ def _load(plugin: Plugin, *arguments: Any, **named: Any) -> Any:
 
 
 class Cabinet:
-    """See the module. `milliseconds` and `cycle` count since the start and never go back."""
+    """See the module. `milliseconds` and `cycle` count since the start and never go back.
+
+    under_way : whether the packet of this cycle is made, so that what is done now shows in the next one
+    """
 
     def __init__(self, config: EmulatorConfig) -> None:
         self.config = config
@@ -81,6 +84,7 @@ class Cabinet:
         self.error_bits = 0
         self.warning_bits = 0
         self.moving = False
+        self.under_way = False
         self._idle_cycles = 0
         self._last_setpoint = np.zeros(self.joints)
         self._model_age = 0
@@ -209,6 +213,7 @@ class Cabinet:
             self.monitor.period_s = session.sample_time_s
             self.monitor.rest(self._last_setpoint, self.cycle - 1)
         self._commanding = commanding
+        self.under_way = True
         self.packets += 1
         datagram = session.packet(sample)
         self._sequence = datagram[:2]
@@ -226,6 +231,7 @@ class Cabinet:
 
     def close(self) -> None:
         """End the cycle: judge the answers, simulate its milliseconds, let the KRL program run."""
+        self.under_way = False
         setpoint = self.session.close_cycle()
         positions = setpoint.positions
         for row in positions:

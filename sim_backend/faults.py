@@ -228,7 +228,7 @@ class FaultyWire:
                 case "duplicate":
                     copies = 2
                 case "truncate":
-                    datagram, clean = datagram[: int(random.integers(0, len(datagram)))], False
+                    datagram, clean = datagram[: int(random.random() * len(datagram))], False
                 case "corrupt":
                     datagram, clean = _flip(datagram, fault.bits, random), False
                 case "foreign":

@@ -103,7 +103,7 @@ class Operator:
     @property
     def silent(self) -> bool:
         """Whether the controller sends nothing although a session is open."""
-        return self._silent_since is not None
+        return self._silent_since is not None and self.cabinet.cycle >= self._silent_since
 
     @property
     def busy(self) -> bool:
@@ -311,7 +311,7 @@ class Operator:
 
     def silence(self, cycles: int | None = None) -> None:
         """Send nothing for `cycles` cycles, None for ever (0 ends it)."""
-        self._silent_since = self.cabinet.cycle
+        self._silent_since = self.cabinet.cycle + self.cabinet.under_way
         self._silent_until = None if cycles is None else self._silent_since + int(cycles)
 
     def degrade_quality(self, cycles: int) -> None:

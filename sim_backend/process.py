@@ -167,17 +167,6 @@ class EmulatorProcess:
             raise RobotError("emulator is not running; call `start` or use it in a `with` block")
         return self._process.wait()
 
-    def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait until the process ends by itself; its exit status, None if `timeout_s` passed or it never
-        ran.
-        """
-        if self._process is None:
-            return None
-        try:
-            return self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            return None
-
     def stop(self) -> int | None:
         """End the process; returns its exit status, None if it never ran. Safe to call twice."""
         if self._pendant is not None:

@@ -93,23 +93,25 @@ class Service:
             cycle()
 
     def _serve(self, timeout_s: float) -> bool:
-        """Wait for something at most `timeout_s`, serve pendant and parent; True if an FRI datagram is
-        there.
+        """Wait for something at most `timeout_s`, serve pendant and parent; True if an FRI datagram is there.
+
+        FRI goes first: what was sent before a request to the pendant has then been acted on before it.
         """
         ready = self._poller.poll(timeout_s * 1000.0)
-        fri = False
+        if not ready:
+            # A parent that died may have left its end of the pipe to a forked child.
+            if self._follow is not None and os.getppid() != self._parent:
+                self._ended = True
+            return False
         for descriptor, _ in ready:
             if descriptor == self._fri:
-                fri = True
-            elif descriptor == self._follow:
-                if not os.read(descriptor, 4096):
-                    self._ended = True
-            else:
+                return True
+        for descriptor, _ in ready:
+            if descriptor != self._follow:
                 self.pendant.serve()
-        # A parent that died may have left its end of the pipe to a forked child.
-        if not ready and self._follow is not None and os.getppid() != self._parent:
-            self._ended = True
-        return fri
+            elif not os.read(descriptor, 4096):
+                self._ended = True
+        return False
 
     def _lock_step(self) -> None:
         cabinet, operator = self.cabinet, self.operator
@@ -133,15 +135,21 @@ class Service:
         """A cycle in which nothing is sent: time goes on only where something waits for it."""
         cabinet, operator = self.cabinet, self.operator
         if not operator.busy:
-            self._serve(_IDLE_S)
+            self._serve_silently(_IDLE_S)
             return
         if cabinet.cycle % _PENDANT_EVERY == 0:
-            self._serve(0.0)
+            self._serve_silently(0.0)
         if cabinet.session.state is not State.OFF:
             # Made as ever, but it does not leave: the PC will find the gap in the counter.
             cabinet.packet()
         cabinet.close()
         operator.step()
+
+    def _serve_silently(self, timeout_s: float) -> None:
+        """Serve while no answer is expected; what comes from the PC nevertheless is late."""
+        while self._serve(timeout_s):
+            self._take(self.config.fri.answer_delay_s)
+            timeout_s = 0.0
 
     def _send_faulty(self, datagram: bytes, age_s: float) -> None:
         cabinet = self.cabinet
@@ -160,7 +168,7 @@ class Service:
             # Nothing to wait for; a link that is dead for good must not race through its time.
             paced = self._unanswerable > _PACED_AFTER
             if paced or cabinet.cycle % _PENDANT_EVERY == 0:
-                self._serve(CYCLE_S if paced else 0.0)
+                self._serve_silently(CYCLE_S if paced else 0.0)
 
     def _send_parcel(self, parcel: Parcel) -> None:
         if parcel.host is None:

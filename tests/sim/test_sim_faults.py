@@ -9,6 +9,7 @@ from fri.errors import ConfigurationError
 from sim_backend.faults import FaultyWire, WireFault
 
 PERIOD = 1e-3
+KINDS = ["loss", "burst", "delay", "jitter", "duplicate", "reorder", "truncate", "corrupt"]
 
 
 def wire(*faults, seed=5):
@@ -53,9 +54,8 @@ def test_loss_has_the_stated_probability_in_one_direction():
 
 
 def test_burst_loses_neighbours():
-    lost = sorted(
-        set(range(3000)) - {n for _, n, _ in leave(wire(WireFault("burst", "to_pc", 0.01, length=4)), 3000)}
-    )
+    left = leave(wire(WireFault("burst", "to_pc", 0.01, length=4)), 3000)
+    lost = sorted(set(range(3000)) - {n for _, n, _ in left})
     runs = np.split(lost, np.flatnonzero(np.diff(lost) != 1) + 1)
     assert min(len(run) for run in runs[:-1]) >= 4
 
