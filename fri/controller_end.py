@@ -55,7 +55,6 @@ class ControllerEnd:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.foreign = 0
         self.send_errors = 0
-        self.heard = False
 
     def fileno(self) -> int:
         """File descriptor, so that the socket can be waited for together with others."""
@@ -81,7 +80,6 @@ class ControllerEnd:
                 select.select((self._socket,), (), (), remaining)
                 continue
             if source == self.remote:
-                self.heard = True
                 return datagram
             self.foreign += 1
             if monotonic() >= deadline:
@@ -98,15 +96,16 @@ class ControllerEnd:
         """One cycle in which virtual time stands still until the PC has answered.
 
         In monitor mode it waits for ever, in command mode `patience_s` [s] of real time, then the answer is
-        missing. A malformed answer ends the wait too. Until the PC was heard for the first time the packet is
-        sent again every 0.2 s. `idle` is called every 50 ms of waiting; if it returns True the cycle is given
-        up: the result is None and the session must be closed.
+        missing. A malformed answer ends the wait too. Until the session has had its first answer the packet
+        is sent again every 0.2 s. `idle` is called every 50 ms of waiting; if it returns True the cycle is
+        given up: the result is None and the session must be closed.
         """
         if session.state is State.OFF:
             return session.close_cycle()
         packet = session.packet(sample)
         self.send(packet)
         commanding = session.state is State.CMD
+        unheard = session.counters()["answered"] == 0
         started = sent = monotonic()
         while not (session.answered or session.malformed_now):
             datagram = self.receive(_SLICE_S)
@@ -118,7 +117,7 @@ class ControllerEnd:
             now = monotonic()
             if commanding and now - started >= patience_s:
                 break
-            if not self.heard and now - sent >= _RESEND_S:
+            if unheard and now - sent >= _RESEND_S:
                 self.send(packet)
                 sent = now
         return session.close_cycle()

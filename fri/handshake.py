@@ -1,8 +1,8 @@
-"""The PC's side of the published KRL programs: how to ask for command mode, and how to see that it was
-granted.
+"""The PC's side of the published KRL programs: asking for command mode and seeing that it was granted.
 
 The objects have no state. They write requests into the command that goes out next (``RemoteEnd.command``) and
-read the last measurement (``RemoteEnd.msr``). A request stays in the command until another one replaces it.
+read the last measurement (``RemoteEnd.msr``). A request is made in every cycle until its effect is seen
+(``started``, ``stopped``); the variables stay in the command after that.
 """
 
 from __future__ import annotations
@@ -43,9 +43,6 @@ class Handshake(Protocol):
     def stopped(self, msr: np.ndarray) -> bool:
         """Whether a stop was granted and monitor mode is on."""
 
-    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """Take back an acknowledged request, where the program needs that; once a cycle while waiting."""
-
 
 class StanfordHandshake:
     """Stanford's FRIControl: ``$FRI_FRM_INT[15..16]``, ``$FRI_TO_INT[15..16]``."""
@@ -78,9 +75,6 @@ class StanfordHandshake:
         """10 in [16], state MON."""
         return bool(msr["krl_int"][15] == 10 and msr["state"] == State.MON)
 
-    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """Nothing: requests are states."""
-
 
 class RosHandshake:
     """CentroEPiaggio's ros_control: ``$FRI_FRM_INT[1..2]``, ``$FRI_TO_INT[2]``."""
@@ -103,7 +97,7 @@ class RosHandshake:
 
     def opened(self, msr: np.ndarray) -> bool:
         """The program marks nothing but its state: 10, 1 or 0 in [2]."""
-        return bool(msr["krl_int"][1] in (0, 1, 10))
+        return bool(msr["state"] != State.OFF and msr["krl_int"][1] in (0, 1, 10))
 
     def started(self, msr: np.ndarray) -> bool:
         """1 in [2], state CMD."""
@@ -113,27 +107,24 @@ class RosHandshake:
         """0 or 10 in [2], state MON."""
         return bool(msr["krl_int"][1] in (0, 10) and msr["state"] == State.MON)
 
-    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """Nothing: requests are states."""
-
 
 class RcprgHandshake:
     """RCPRG's fri_start: ``$FRI_FRM_BOOL[1]`` with ``$FRI_FRM_INT[1]``, ``$FRI_TO_BOOL[1]``.
 
     The published program carries a request out again and again while the bit is set, even after a fallback,
-    so the bit must be taken back with ``settle``. The control mode is the program's own.
+    so the bit is taken back as soon as the program acknowledges. The control mode is the program's own.
     """
 
     name = "rcprg"
     can_close = False
 
     def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
-        """1 in [1], request bit set."""
-        self._request(cmd, 1)
+        """1 in [1], request bit set until acknowledged."""
+        self._request(cmd, msr, 1, State.CMD)
 
     def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """2 in [1], request bit set."""
-        self._request(cmd, 2)
+        """2 in [1], request bit set until acknowledged."""
+        self._request(cmd, msr, 2, State.MON)
 
     def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
         """The program has no close: as ``request_stop``."""
@@ -144,20 +135,19 @@ class RcprgHandshake:
         return bool(msr["state"] != State.OFF)
 
     def started(self, msr: np.ndarray) -> bool:
-        """State CMD."""
-        return bool(msr["state"] == State.CMD)
+        """State CMD, and the program is through with the request."""
+        return bool(msr["state"] == State.CMD and not msr["krl_bool"] & 1)
 
     def stopped(self, msr: np.ndarray) -> bool:
-        """State MON."""
-        return bool(msr["state"] == State.MON)
-
-    def settle(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """Clear the request bit when the program acknowledges."""
-        if msr["krl_bool"] & 1:
-            cmd["krl_bool"] &= 0xFFFE
+        """State MON, and the program is through with the request."""
+        return bool(msr["state"] == State.MON and not msr["krl_bool"] & 1)
 
     @staticmethod
-    def _request(cmd: np.ndarray, request: int) -> None:
+    def _request(cmd: np.ndarray, msr: np.ndarray, request: int, wanted: State) -> None:
+        busy = bool(msr["krl_bool"] & 1)
+        if busy or msr["state"] == wanted:
+            cmd["krl_bool"] &= 0xFFFE
+            return
         cmd["krl_int"][0] = request
         cmd["krl_bool"] |= 1
 
