@@ -120,7 +120,9 @@ def _influence(
     forgetting: float,
     values: FloatArray,
 ) -> tuple[Scores, FloatArray]:
-    """Influence of every instant on the estimate, as scores, and the covariance for uncorrelated residuals."""
+    """Influence of every instant on the estimate, as scores, and the covariance for uncorrelated
+    residuals.
+    """
     p = len(values)
     records: dict[int, list[tuple[int, FloatArray]]] = {}
     white = np.zeros((p, p))

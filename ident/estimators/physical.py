@@ -274,7 +274,9 @@ def _psd_rows(places: np.ndarray, width: int, floor: FloatArray) -> tuple[FloatA
 
 
 def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArray, FloatArray, list]:
-    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at column `first`."""
+    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at
+    column `first`.
+    """
     lower = [(i, j) for j in range(4) for i in range(j, 4)]
     psd = np.zeros((36, width))
     big = np.zeros((_BODY, 8, 8))

@@ -73,7 +73,9 @@ class RecursiveFilter:
 
 @dataclass(frozen=True)
 class Track:
-    """Course of a recursive estimate: records and time indices (K,), values and standard deviations (K, p)."""
+    """Course of a recursive estimate: records and time indices (K,), values and standard
+    deviations (K, p).
+    """
 
     record: np.ndarray
     time_index: np.ndarray

@@ -1,4 +1,6 @@
-"""Iteratively reweighted least squares: rows that fit badly count less (Huber 1964; Beaton and Tukey 1974)."""
+"""Iteratively reweighted least squares: rows that fit badly count less (Huber 1964; Beaton and
+Tukey 1974).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""From a solution to a results object: residuals, variances with the right degrees of freedom, covariances."""
+"""From a solution to a results object: residuals, variances with the right degrees of freedom,
+covariances.
+"""
 
 from __future__ import annotations
 

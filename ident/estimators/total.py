@@ -39,7 +39,9 @@ class TotalLeastSquares:
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,) from the smallest singular vector; the covariance from the scores of the criterion."""
+        """Estimate (p,) from the smallest singular vector; the covariance from the scores of the
+        criterion.
+        """
         values, weights, factor, done, converged = weighted_solution(problem)
         p = factor.parameters
         level = self._noise(problem, factor.r[:, :p], factor.rows)

@@ -109,7 +109,9 @@ def estimate_delay(
 
 @dataclass(frozen=True)
 class _Filtered:
-    """Filtered columns of one stretch at its output times, and the filtered motor torque as a smooth curve."""
+    """Filtered columns of one stretch at its output times, and the filtered motor torque as a
+    smooth curve.
+    """
 
     data: DelayData
     cutoff_hz: float

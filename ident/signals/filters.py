@@ -1,4 +1,6 @@
-"""Zero-phase filters: Butterworth forward and back, derivatives, and the parallel low-pass that makes rows."""
+"""Zero-phase filters: Butterworth forward and back, derivatives, and the parallel low-pass that
+makes rows.
+"""
 
 from __future__ import annotations
 
