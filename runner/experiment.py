@@ -116,12 +116,12 @@ class Run:
             self.folder,
         )
         preflight.enforce()
-        attempt = self._progress.begin(plan.name, path)
+        uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
         self._rest = None
         traced = self.experiment.motor_torque.source == "trace_file"
         if traced:
             bench.operator.start_trace()
-        bench.driver.record(path, self._metadata(plan, attempt), self._attachments(motion, preflight))
+        bench.driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
         outcome = self._drive(plan, motion)
         recorded = bench.driver.end_record(outcome.status, outcome.reason)
         link = bench.driver.state()
@@ -189,10 +189,9 @@ class Run:
     def _cycles(self, seconds: float) -> int:
         return max(10, round(seconds / self.bench.driver.state().period_s))
 
-    def _metadata(self, plan: SessionPlan, attempt: int) -> dict[str, str]:
+    def _metadata(self, plan: SessionPlan, uid: str, parent_uid: str) -> dict[str, str]:
         experiment = self.experiment
         payload = plan.payload
-        uid = f"{experiment.uid}-{plan.name}"
         source = experiment.motor_torque.source
         return session_metadata(
             robot=self.bench.arm.name,
@@ -200,8 +199,8 @@ class Run:
             payload="none" if payload is None else payload.name,
             payload_mass=None if payload is None else payload.mass,
             experiment=experiment.name,
-            uid=f"{uid}-{attempt}",
-            parent_uid=f"{uid}-{attempt - 1}" if attempt > 1 else "",
+            uid=uid,
+            parent_uid=parent_uid,
             motor_torque_source="krl_reals" if source == "krl_reals" else "none",
             software=software(),
             git_commit=git_commit(),

@@ -152,5 +152,5 @@ def check_disk(folder: Path, cycles: int) -> Item:
         "enough" if free >= needed else f"{free / 1e6:.0f} MB",
         f"{needed / 1e6:.0f} MB",
         free >= needed,
-        f"make room on the disk of {place}, or choose another --out",
+        "make room on the disk of the results, or choose another --out",
     )

@@ -21,12 +21,12 @@ NAME = "progress.json"
 
 @dataclass
 class Progress:
-    """Finished sessions with the arm's state at rest after each, and the attempts at every session."""
+    """Finished sessions with the arm's state at rest after each, and the uids of all attempts at each."""
 
     path: Path
     origin: Path | None = None
     finished: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-    attempts: dict[str, int] = field(default_factory=dict)
+    attempts: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
     def load(cls, folder: Path) -> Progress:
@@ -55,22 +55,21 @@ class Progress:
         entry = self.finished[session]
         return Rest(np.asarray(entry["q"]), np.asarray(entry["tau"]), payload)
 
-    def begin(self, session: str, log: Path) -> int:
+    def begin(self, session: str, log: Path, uid: str) -> tuple[str, str]:
         """Count an attempt at a session; an earlier unfinished log is kept under a name of its own.
 
-        Returns the number of this attempt, from 1.
+        Returns the uid of this attempt, which begins with `uid`, and that of the attempt before it or "".
         """
-        attempt = self.attempts.get(session, 0)
+        earlier = self.attempts.setdefault(session, [])
         if log.exists():
-            attempt = max(attempt, 1)
-            kept = log.with_name(f"{log.stem}.attempt-{attempt}{log.suffix}")
-            while kept.exists():
-                attempt += 1
-                kept = log.with_name(f"{log.stem}.attempt-{attempt}{log.suffix}")
+            number = max(len(earlier), 1)
+            while (kept := log.with_name(f"{log.stem}.attempt-{number}{log.suffix}")).exists():
+                number += 1
             log.rename(kept)
-        self.attempts[session] = attempt + 1
+        parent = earlier[-1] if earlier else ""
+        earlier.append(f"{uid}-{len(earlier) + 1}")
         self._save()
-        return attempt + 1
+        return earlier[-1], parent
 
     def finish(self, session: str, rest: Rest) -> None:
         """Mark a session as finished."""
