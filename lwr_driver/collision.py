@@ -174,6 +174,10 @@ def _subsample(path: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     if travelled[-1] == 0.0:
         return path[:1], np.zeros(1)
     marks = np.linspace(0.0, travelled[-1], max(2, math.ceil(travelled[-1] / _STEP) + 1))
+    # Where a joint turns round the arm is nearest to something more often than elsewhere.
+    direction = np.sign(np.diff(path, axis=0))
+    turns = np.flatnonzero(np.any(direction[1:] * direction[:-1] < 0.0, axis=1)) + 1
+    marks = np.union1d(marks, travelled[turns])
     # Rows at rest share one mark; the first of them stands for all.
     distinct = np.concatenate([[True], np.diff(travelled) > 0.0])
     rows = np.arange(len(path))[distinct]

@@ -12,6 +12,8 @@ from lwr_driver.state import LinkState
 
 __all__ = ["LinkSettings", "advise_command", "advise_connect", "advise_leave", "advise_quality"]
 
+_POSITION_PROGRAMS = ("stanford", "ros_control")
+
 
 @dataclass(frozen=True)
 class LinkSettings:
@@ -20,7 +22,7 @@ class LinkSettings:
     address, port : where this computer listens; only this address is bound. Port 0 takes a free one
     controller : IP address of the controller; None takes the first that speaks, and then only that
     lock_step : the other side waits for each answer and nothing runs between commands (the emulator only)
-    handshake : KRL program on the controller: `stanford`, `ros_control`, `rcprg`
+    handshake : KRL program on the controller: `stanford`, `ros_control`
     realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; in lock step
         they
         do not matter and are not asked for
@@ -46,7 +48,11 @@ class LinkSettings:
     lock_step_patience_s: float = 15.0
 
     def __post_init__(self) -> None:
-        find_handshake(self.handshake)
+        if find_handshake(self.handshake).name not in _POSITION_PROGRAMS:
+            raise ConfigurationError(
+                f"KRL program {self.handshake!r} runs the arm in impedance control; the driver commands positions. "
+                f"Use one of {', '.join(_POSITION_PROGRAMS)}"
+            )
         for name in ("link_timeout_s", "tracking_limit_rad", "longest_motion_s", "lock_step_patience_s"):
             if not getattr(self, name) > 0.0:
                 raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be above zero")

@@ -93,8 +93,8 @@ def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, R
     """Lowest and highest position and highest speed of a stop begun at any row of q.
 
     q : (n, 7) [rad]; rows before the first are taken equal to it. Returns three (n, 7): lowest position
-    [rad], highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by at
-    most one period at the highest speed.
+    [rad], highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by less
+    than a period at the highest speed.
     """
     padded = np.vstack([q[:1], q[:1], q])
     v = (padded[2:] - padded[1:-1]) / period_s
@@ -117,13 +117,13 @@ def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, R
     root = (a - np.sqrt(np.maximum(a**2 + 2.0 * j_max * v, 0.0))) / j_max
     turn = np.where(v < 0.0, np.clip(root, 0.0, t1), 0.0)
     back = v * turn + 0.5 * a * turn**2 - j_max * turn**3 / 6.0
-    speed = np.maximum(np.abs(v), np.where(a > 0.0, v + a**2 / (2.0 * j_max), 0.0))
-    reach = period_s * speed
-    above = np.maximum(np.maximum(end, back), 0.0) + reach
-    below = np.minimum(np.minimum(end, back), 0.0) - reach
+    peak_speed = np.where(a > 0.0, v + a**2 / (2.0 * j_max), v)
+    # T times the sum of v(kT) passes the integral only where v rises, by the height of the rise at most.
+    above = np.maximum(np.maximum(end, back), 0.0) + period_s * (peak_speed - v)
+    below = np.minimum(np.minimum(end, back), 0.0)
     lowest = q + np.where(sign > 0.0, below, -above)
     highest = q + np.where(sign > 0.0, above, -below)
-    return lowest, highest, speed
+    return lowest, highest, np.maximum(np.abs(v), peak_speed)
 
 
 def _let_go(limits: Limits, period_s: float, v: Rows, a: Rows) -> Rows:
