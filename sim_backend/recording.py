@@ -33,8 +33,10 @@ class _Delay:
         self._next = 0
 
     def put(self, values: np.ndarray) -> np.ndarray:
-        """Take `values` (size,) in, give those of `milliseconds` ago; the array is reused."""
+        """Take `values` (size,) in, give those of `milliseconds` ago; do not keep them."""
         rows = self._rows
+        if len(rows) == 1:
+            return values
         rows[self._next] = values
         self._next = (self._next + 1) % len(rows)
         # The row to be overwritten next is the oldest.
@@ -96,6 +98,8 @@ class ControllerTrace:
 
     def millisecond(self, time_s: float, motor_torque: np.ndarray, position: np.ndarray) -> None:
         """One sample, if recording."""
+        if not self.recording and not self.config.delay_ms:
+            return
         late = self._delay.put(motor_torque)
         if not self.recording:
             return
