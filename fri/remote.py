@@ -105,6 +105,8 @@ class RemoteEnd:
         Whether its answer moves the arm: state CMD and drives on.
     events : deque of LinkEvent
         The last 64 rare events.
+    malformed_by : dict of Fault to int
+        Malformed datagrams by reason.
     received, answered, lost, repeated, reordered, suspect, malformed, foreign, restarts, port_changes,
     unreflected, send_errors : int
         Counters. `lost` includes what came too late (`reordered`); `unreflected` counts answers of ours that
@@ -379,6 +381,10 @@ class RemoteEnd:
             self.malformed_by[fault] += 1
             return False
         if new_source:
+            # A session that was opened again begins in monitor mode; command mode never moves to another port.
+            if self.controller is not None and msr.state == _CMD:
+                self._count_foreign(source)
+                return False
             new_source = self._lock(source)
         now_ns = monotonic_ns()
         self._heard_s = now_ns * 1e-9

@@ -8,6 +8,7 @@ from fri.errors import ConfigurationError
 from fri.handshake import HANDSHAKES, find_handshake
 from fri.krc import EventKind
 from fri.krl import PROGRAMS, Interpreter, StanfordProgram
+from fri.packets import new_cmd, new_msr
 from fri.states import ALL_DRIVES, Control, State
 
 NAMES = sorted(PROGRAMS)
@@ -181,6 +182,19 @@ def test_rcprg_values_on_the_wire():
     assert acknowledged
     assert int(cell.krl["krl_bool"]) == 0
     assert cell.handshake.started(cell.rig.msr)
+
+
+def test_rcprg_request_is_taken_back_when_acknowledged():
+    handshake, cmd, msr = find_handshake("rcprg"), new_cmd(), new_msr()
+    msr["state"] = State.MON
+    handshake.request_start(cmd, msr, Control.JNT_IMP)
+    assert (int(cmd["krl_bool"]), int(cmd["krl_int"][0])) == (1, 1)
+    msr["krl_bool"] = 1
+    handshake.request_start(cmd, msr, Control.JNT_IMP)
+    assert int(cmd["krl_bool"]) == 0
+    msr["krl_bool"] = 0
+    handshake.request_start(cmd, msr, Control.JNT_IMP)
+    assert int(cmd["krl_bool"]) == 1
 
 
 def test_rcprg_opens_again_with_another_period():

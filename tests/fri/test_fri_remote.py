@@ -310,6 +310,19 @@ def test_controller_that_was_opened_again_from_another_port_is_accepted(end, con
     again.close()
 
 
+def test_command_mode_does_not_move_to_another_port(end, controller, monkeypatch):
+    monkeypatch.setattr(fri.remote, "_PORT_GRACE_S", 0.0)
+    exchange(end, controller, state=State.CMD)
+    second = Controller(end)
+    second.number = controller.number
+    second.send(state=State.CMD)
+    assert end.receive(0.0) is None
+    assert (end.foreign, end.port_changes) == (1, 0)
+    assert second.silent()
+    exchange(end, controller)
+    second.close()
+
+
 def test_restart_clears_requests_and_goes_on_counting(end, controller):
     end.krl_int[15] = 10
     end.set_krl_bool(3, True)
