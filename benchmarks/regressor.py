@@ -63,7 +63,8 @@ def figaroh_loop(model: Any, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> 
     from figaroh.tools.regressor import RegressorBuilder, RegressorConfig
 
     builder = RegressorBuilder(SimpleNamespace(model=model, data=model.createData()), RegressorConfig())
-    return lambda: builder.build_basic_regressor(q, qd, qdd)
+    settings = {"act_idxv": list(range(model.nv))}
+    return lambda: builder.build_basic_regressor(q, qd, qdd, settings)
 
 
 def main() -> None:
