@@ -14,12 +14,17 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.assumptions import Assumptions, check_assumptions
 from ident.base import BaseSet, numeric_base
+from ident.cad_prior import cad_prior
 from ident.essential import Essential, EssentialSettings, find_essential
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate, Estimator
 from ident.estimators.instrumental import InstrumentalVariables
+from ident.estimators.mixing import RegressorExtensionMixing
 from ident.estimators.ordinary import OrdinaryLeastSquares
+from ident.estimators.physical import PhysicallyConsistent
+from ident.estimators.prior import MaximumAPosteriori
 from ident.estimators.problem import Problem
+from ident.estimators.recursive import RecursiveLeastSquares
 from ident.estimators.robust import RobustLeastSquares
 from ident.estimators.total import TotalLeastSquares
 from ident.estimators.weighted import WeightedLeastSquares
@@ -47,6 +52,14 @@ _ESTIMATORS: dict[str, EstimatorFactory] = {
     "huber": lambda base, problem, covariance: RobustLeastSquares("huber", covariance=covariance),
     "tukey": lambda base, problem, covariance: RobustLeastSquares("tukey", covariance=covariance),
     "tls": lambda base, problem, covariance: TotalLeastSquares(covariance=covariance),
+    "recursive": lambda base, problem, covariance: RecursiveLeastSquares(covariance=covariance),
+    "mixing": lambda base, problem, covariance: RegressorExtensionMixing(covariance=covariance),
+    "map": lambda base, problem, covariance: MaximumAPosteriori(
+        cad_prior(base).prior("pullback"), 1.0, covariance
+    ),
+    "physical": lambda base, problem, covariance: PhysicallyConsistent(
+        cad_prior(base), covariance=covariance
+    ),
 }
 _WIDE_CONDITION = 100.0
 
