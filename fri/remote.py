@@ -381,7 +381,8 @@ class RemoteEnd:
             self.malformed_by[fault] += 1
             return False
         if new_source:
-            # A session that was opened again begins in monitor mode; command mode never moves to another port.
+            # A session that was opened again begins in monitor mode; command mode never moves to another
+            # port.
             if self.controller is not None and msr.state == _CMD:
                 self._count_foreign(source)
                 return False

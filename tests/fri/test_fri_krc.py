@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
-from fri_rig import LIMITS, Q_MAX, Q_START, V_MAX, Rig
+from fri_rig import LIMITS, Q_MAX, Q_START, QUICK, V_MAX, Rig
 
-from fri.krc import EventKind, KrcSession
+from fri.krc import EventKind, KrcPolicy, KrcSession
 from fri.packets import MSR
 from fri.sample import Sample
 from fri.states import ALL_DRIVES, Control, Quality, State
@@ -648,3 +650,35 @@ def test_sample_is_sent_as_it_is():
     msr = rig.begin()
     for name in names:
         assert msr[name].tolist() == np.asarray(getattr(rig.sample, name), MSR[name].base).tolist(), name
+
+
+@pytest.mark.parametrize(("first", "style"), [(1, "absolute"), (2, "superposed"), (54_323, "superposed")])
+@pytest.mark.parametrize("sample_time_ms", [1, 10, 100])
+def test_clients_that_know_only_the_bytes(first, style, sample_time_ms):
+    """A client written with `struct` alone: absolute from its own start, or on top of the KRL setpoint."""
+    session = KrcSession(LIMITS, Q_START, KrcPolicy(**QUICK))
+    session.fri_open(sample_time_ms)
+    session.fri_start()
+    start, moved = None, -1
+    for k in range(80):
+        packet = session.packet(Sample())
+        sequence, _, size, identifier = struct.unpack_from("<4H", packet)
+        assert (size, identifier, len(packet)) == (916, 0x2006, 916)
+        state, quality = struct.unpack_from("<2H", packet, 144)
+        (power,) = struct.unpack_from("<H", packet, 180)
+        krl = struct.unpack_from("<7f", packet, 292)
+        fri_offset = struct.unpack_from("<7f", packet, 320)
+        q = [a + b for a, b in zip(krl, fri_offset, strict=True)]
+        if state == 2 and power:
+            start = start or q
+            moved += 1
+            base = krl if style == "superposed" else start
+            q = [value + 1e-4 * sample_time_ms * moved for value in base]
+        zeros = [0.0] * 51
+        head = ((first + k) & 0xFFFF, sequence, 376, 0x1005)
+        session.receive(struct.pack("<4H16f16i2HI58f", *head, *[0.0] * 16, *[0] * 16, 0, 0, 1, *q, *zeros))
+        setpoint = session.close_cycle()
+    assert quality == Quality.PERFECT
+    assert moved > 50
+    assert setpoint.state is State.CMD
+    assert np.allclose(setpoint.position, Q_START + 1e-4 * sample_time_ms * moved, atol=1e-6)
