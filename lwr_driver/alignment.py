@@ -14,10 +14,12 @@ this.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.optimize import linear_sum_assignment
 
 from fri.errors import DataError
@@ -35,6 +37,7 @@ _CLEAR = 2.0
 _LARGEST_RATE = 1e-3
 _BLOCKS = 20
 _MOST_POINTS = 60_000
+_SMOOTH_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -309,10 +312,16 @@ def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     middle = 0.5 * (begin + end)
     time, target = coarse.time[rows], coarse.position[rows]
+    # Slopes of noisy samples would be noise; those of a smoothed copy serve as instruments instead.
+    width = max(1, round(_SMOOTH_S / fine.period))
+    smooth = dataclasses.replace(
+        fine, position=uniform_filter1d(fine.position, width, axis=0, mode="nearest")
+    )
     for _ in range(30):
         wanted = time + shift + rate * (time - middle)
         inside = (wanted >= fine.time[1]) & (wanted <= fine.time[-2])
-        value, slope = _interpolated(fine, wanted[inside])
+        value, _ = _interpolated(fine, wanted[inside])
+        _, slope = _interpolated(smooth, wanted[inside])
         normal, right, residual = _normal_equations(value - target[inside], slope, time[inside] - middle)
         update = np.linalg.solve(normal.sum(axis=0), right.sum(axis=0))
         shift, rate = shift - float(update[0]), rate - float(update[1])

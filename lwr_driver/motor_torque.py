@@ -21,8 +21,10 @@ __all__ = ["FreshTorques", "KrlMotorTorque", "KrlTorqueDecoder", "TorqueMatch", 
 
 _SLOTS = 16
 _LONGEST_STEP = 1000
-_FOLLOWS, _FOLLOWS_NOT = 0.95, 0.6
-_GAIN = 2.0
+_FOLLOWS = 0.9
+_CLEARLY = 4.0
+_LOADED = 0.8
+_GAIN = 3.0
 
 
 @dataclass(frozen=True)
@@ -167,17 +169,18 @@ class TorqueMatch:
 
     @property
     def swapped(self) -> bool:
-        """Whether it clearly follows another joint's sensor and not its own."""
+        """Whether another sensor explains it far better than its own: leaves a quarter of the variance."""
+        own, other = 1.0 - self.correlation**2, 1.0 - self.follows_correlation**2
         return (
             self.follows != self.joint
-            and self.follows_correlation >= _FOLLOWS
-            and abs(self.correlation) < _FOLLOWS_NOT
+            and abs(self.follows_correlation) >= _FOLLOWS
+            and own > _CLEARLY * other
         )
 
     @property
     def suspect(self) -> bool:
-        """Whether order, sign or scale look wrong; friction and inertia leave the gain near one."""
-        clear = abs(self.correlation) >= _FOLLOWS
+        """Whether order, sign or scale look wrong; friction and inertia leave the gain of a load near one."""
+        clear = abs(self.correlation) >= _LOADED
         return self.swapped or (clear and not 1.0 / _GAIN < self.gain < _GAIN)
 
     def __str__(self) -> str:
