@@ -119,7 +119,7 @@ def test_terms_are_left_out_by_symbol_and_by_name():
 
 
 def test_the_wrist_of_the_tx40_is_coupled():
-    """Reduction of the coupled wrist: data/README of the TX40 recordings, Iam6, fvm6, fcm6."""
+    """Terms of FIGAROH's TX40 example: Iam6, fvm6, fcm6."""
     structure = ModelStructure(tx40(), 2, sides=("motor",), couplings=(Coupling(("q5", "q6")),))
     assert structure.names[-3:] == ("Iam6", "fvm6", "fcm6")
     q, qd, qdd = states(structure.chain, 30)
