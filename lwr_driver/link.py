@@ -50,8 +50,8 @@ class LinkSettings:
     def __post_init__(self) -> None:
         if find_handshake(self.handshake).name not in _POSITION_PROGRAMS:
             raise ConfigurationError(
-                f"KRL program {self.handshake!r} runs the arm in impedance control; the driver commands positions. "
-                f"Use one of {', '.join(_POSITION_PROGRAMS)}"
+                f"KRL program {self.handshake!r} runs the arm in impedance control; the driver commands "
+                f"positions. Use one of {', '.join(_POSITION_PROGRAMS)}"
             )
         for name in ("link_timeout_s", "tracking_limit_rad", "longest_motion_s", "lock_step_patience_s"):
             if not getattr(self, name) > 0.0:

@@ -234,7 +234,7 @@ class Loop:
         timing = remote.quality <= Quality.BAD or remote.sequence - self._missed_at < _FEWEST_CYCLES
         self._lose(
             f"{what}: state {state}, quality {quality}, control {ControlMode(remote.control).name}, "
-            f"power 0x{remote.power:02x}, error 0x{remote.error:02x}, {missed} answers missed in command mode",
+            f"power 0x{remote.power:02x}, error 0x{remote.error:02x}, {missed} answers missed meanwhile",
             Result.NETWORK if timing and what.startswith("controller left command") else Result.ROBOT,
         )
 

@@ -93,8 +93,8 @@ def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, R
     """Lowest and highest position and highest speed of a stop begun at any row of q.
 
     q : (n, 7) [rad]; rows before the first are taken equal to it. Returns three (n, 7): lowest position
-    [rad], highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by less
-    than a period at the highest speed.
+    [rad], highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by
+    about a period at the highest speed at most.
     """
     padded = np.vstack([q[:1], q[:1], q])
     v = (padded[2:] - padded[1:-1]) / period_s

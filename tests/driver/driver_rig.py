@@ -1,4 +1,4 @@
-"""A loop and a controller's session in one thread: one call is one FRI cycle, over real sockets, without a clock."""
+"""A loop and a controller's session in one thread: one call is one FRI cycle, over real sockets, no clock."""
 
 from __future__ import annotations
 

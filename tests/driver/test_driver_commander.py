@@ -1,4 +1,4 @@
-"""The commander alone, against the worst that a link can do: whatever happens, what is sent keeps every limit."""
+"""The commander alone against the worst that a link can do: what is sent keeps every limit."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from lwr_driver.control import Control, Mode, Result
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE
 
+HOP = np.array([0.9, -0.6, 0.5, 0.7, -0.8, 0.4, 1.1])
 HELD = START.astype(np.float32)
 
 
@@ -58,9 +59,7 @@ class Link:
 
 
 def motion(period_s: float = 0.001, speed_scale: float = 1.0) -> Motion:
-    there = move_to(
-        arm(), START, START + [0.9, -0.6, 0.5, 0.7, -0.8, 0.4, 1.1], period_s, speed_scale=speed_scale
-    )
+    there = move_to(arm(), START, START + HOP, period_s, speed_scale=speed_scale)
     return there.join(move_to(arm(), there.q[-1], START, period_s, speed_scale=speed_scale, phase="return"))
 
 
