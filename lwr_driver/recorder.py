@@ -293,7 +293,7 @@ class _Server:
                 self._drain(None)
                 self._end_by_failure("the recorder was stopped before the session was closed")
                 return False
-        except (LwrError, OSError, ValueError, TypeError, KeyError) as error:
+        except Exception as error:  # whatever a request brings about, the recorder goes on
             self._connection.send(_Failure.of(error))
         return True
 
@@ -327,7 +327,7 @@ class _Server:
         if len(rows) and self._recording is not None:
             try:
                 self._recording.write(rows)
-            except (LwrError, OSError, ValueError) as error:
+            except Exception as error:  # the session ends in order, whatever the rows hold
                 self._ring.release(len(rows))
                 self._end_by_failure(str(error), _Failure.of(error))
                 return len(rows)

@@ -23,7 +23,7 @@ from lwr_driver.session.mcap_format import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opc
 
 __all__ = ["Block", "ChannelRecord", "Scan", "SchemaRecord"]
 
-_LARGEST_CHUNK = 1 << 30
+_LARGEST_CHUNK = 1 << 28
 _LOOSE_BYTES = 4 << 20
 _HEAD = np.dtype(
     [
@@ -103,7 +103,7 @@ class Scan:
 
     closed : the file ends with a footer; bytes_unread : bytes behind the last whole record
     lost_from, lost_to : log times of the chunk that was cut, if its head can be read
-    skipped : damaged chunks that were left out, in words (only with `skip_damage`)
+    skipped : damaged chunks and records that were left out, in words (only with `skip_damage`)
     """
 
     def __init__(self, path: str | Path, *, skip_damage: bool = False) -> None:
@@ -310,7 +310,7 @@ class Scan:
         if not parts:
             return None
         places = np.sort(np.concatenate(parts))
-        if not len(places) or places[-1] + _HEAD.itemsize > len(data):
+        if not len(places) or int(places[-1]) + _HEAD.itemsize > len(data):
             return None
         starts = places.astype(np.int64)
         heads = _heads(plain, starts)
@@ -357,6 +357,14 @@ class Scan:
             raise DataError(f"{self.path}: messages near byte {at}: {error}") from error
 
     def _record(self, opcode: int, content: bytes, at: int) -> None:
+        try:
+            self._take_record(opcode, content, at)
+        except DataError as error:
+            if not self._skip_damage:
+                raise
+            self.skipped.append(str(error).removeprefix(f"{self.path}: "))
+
+    def _take_record(self, opcode: int, content: bytes, at: int) -> None:
         try:
             reader = _Fields(content)
             if opcode == Opcode.HEADER:

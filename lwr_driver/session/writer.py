@@ -135,6 +135,11 @@ class SessionWriter:
             raise ConfigurationError(
                 f"session log {path}: joint names {self.joint_names} must be different, one at least"
             )
+        for key, value in metadata.items():
+            if not isinstance(key, str) or not isinstance(value, str):
+                raise ConfigurationError(
+                    f"session log {path}: metadata {key!r} is {value!r}; it must be a text"
+                )
         self.missed = 0
         self.closed = False
         self._failure: DataError | None = None

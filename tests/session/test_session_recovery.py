@@ -130,6 +130,18 @@ def test_damaged_chunk_is_left_out_and_named(tmp_path, content):
     assert session.end["exit_status"] == "success"
 
 
+def test_damaged_attachment_is_left_out_and_named(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_session(path, 600, attachments={"plan.npz": b"0123456789", "experiment.yaml": b"a: 1"})
+    path.write_bytes(path.read_bytes().replace(b"0123456789", b"0123456780"))
+    with pytest.raises(DataError, match=r"attachment 'plan\.npz' at byte \d+ is damaged"):
+        read_session(path)
+    result = recover(path)
+    assert len(result.lost) == 1
+    assert result.lost[0].startswith("attachment 'plan.npz'")
+    assert read_session(result.out).attachments == {"experiment.yaml": b"a: 1"}
+
+
 def test_whole_file_needs_nothing(tmp_path, content):
     path = tmp_path / "a.mcap"
     path.write_bytes(content)

@@ -226,6 +226,12 @@ def test_folder_that_cannot_be_written(tmp_path):
         SessionWriter(tmp_path / "nowhere" / "a.mcap", JOINTS, METADATA)
 
 
+def test_metadata_are_texts(tmp_path):
+    with pytest.raises(ConfigurationError, match=r"metadata 'payload_mass' is 4\.5; it must be a text"):
+        SessionWriter(tmp_path / "a.mcap", JOINTS, {**METADATA, "payload_mass": 4.5})
+    assert not (tmp_path / "a.mcap").exists()
+
+
 def test_log_time_must_rise_within_and_across_batches(tmp_path):
     position, _ = signals(3)
     with SessionWriter(tmp_path / "a.mcap", JOINTS, METADATA) as writer:
