@@ -189,8 +189,8 @@ def validate(
     if any(seen) and not allow_seen:
         named = ", ".join(s.path.name for s, flag in zip(sessions, seen, strict=True) if flag)
         raise DataError(
-            f"{named}: the estimate was made from this session, so predicting it proves nothing; give a session "
-            "of another motion, or --allow-seen to see the fit anyway"
+            f"{named}: the estimate was made from this session, so predicting it proves nothing; give a "
+            "session of another motion, or --allow-seen to see the fit anyway"
         )
     scores = []
     for session, flag in zip(sessions, seen, strict=True):

@@ -115,8 +115,8 @@ def consistent_parameters(model: DynamicModel, reference: Floats | None = None) 
     structure, n = model.structure, model.structure.chain.n
     if structure.sides == ("difference",):
         raise ConfigurationError(
-            f"the model of {model.robot} describes the difference of motor and joint torque and has no bodies; "
-            "export code, or identify Model 1 or 2"
+            f"the model of {model.robot} describes the difference of motor and joint torque and has no "
+            "bodies; export code, or identify Model 1 or 2"
         )
     bodies = structure.n_links
     inertial = np.array([_LINK * link + k for link in range(bodies) for k in range(_BODY)])

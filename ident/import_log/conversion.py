@@ -260,7 +260,8 @@ def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, 
         row, column = np.argwhere(bad)[0]
         raise DataError(
             f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} "
-            f"({int(bad.sum())} such values); leave these rows out with `--rows`, a session holds measured values only"
+            f"({int(bad.sum())} such values); leave these rows out with "
+            "`--rows`, a session holds measured values only"
         )
 
 

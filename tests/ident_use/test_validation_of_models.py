@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fri.errors import ConfigurationError, DataError
+from ident.competitors import competitor_scores
+from ident.forward_simulation import simulate, simulate_session
+from ident.model import DynamicModel
+from ident.signals.settings import SignalSettings
+from ident.validation import Validation, validate
+
+PLAIN = SignalSettings(motor_delay_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def unloaded(bench: Any) -> Any:
+    return bench.session("unloaded", seed=1, periods=2, controller_model=True)
+
+
+@pytest.fixture(scope="module")
+def loaded(bench: Any) -> Any:
+    return bench.session("loaded", seed=2, payload="load")
+
+
+def scores(result: Validation, side: str) -> np.ndarray:
+    return np.array([s.rms for s in result.scores[0].scores if s.side == side])
+
+
+def test_the_true_model_leaves_the_noise_and_reaches_the_floor(truth_model: Any, unloaded: Any) -> None:
+    result = validate(truth_model, [unloaded], settings=PLAIN)
+    np.testing.assert_allclose(scores(result, "joint"), 0.05, rtol=0.06)
+    np.testing.assert_allclose(scores(result, "motor"), 0.2, rtol=0.06)
+    for score in result.scores[0].scores:
+        assert abs(score.bias) < 0.02
+        assert score.floor_rms == pytest.approx(score.band_rms, rel=0.35)
+        assert score.band_rms < 0.3 * score.rms
+    assert result.scores[0].relative["joint"] < 0.01
+
+
+def test_the_loaded_session_is_predicted_with_its_payload(truth_model: Any, loaded: Any) -> None:
+    np.testing.assert_allclose(
+        scores(validate(truth_model, [loaded], settings=PLAIN), "joint"), 0.05, rtol=0.06
+    )
+
+
+def test_errors_of_the_model_are_found_where_they_are(truth_model: Any, bench: Any, unloaded: Any) -> None:
+    values = truth_model.values.copy()
+    values[truth_model.names.index("offl3")] += 0.5
+    values[truth_model.names.index("Fvm5")] *= 1.5
+    wrong = DynamicModel(
+        truth_model.robot, truth_model.structure, truth_model.names, values, None, truth_model.base
+    )
+    result = validate(wrong, [unloaded], settings=PLAIN)
+    table = {(s.joint, s.side): s for s in result.scores[0].scores}
+    assert table["E1", "joint"].bias == pytest.approx(-0.5, abs=0.02)
+    assert table["E1", "motor"].bias == pytest.approx(-0.5, abs=0.02)
+    assert table["A4", "motor"].rms > 0.5
+    assert table["A4", "joint"].rms == pytest.approx(0.05, rel=0.06)
+    worst = table["A4", "motor"]
+    t, _, qd, _ = bench.motion(1, 26.0, 250.0, 12.0)
+    speed = np.interp(worst.worst_time_s, t, qd[:, 4])
+    assert abs(worst.worst) == pytest.approx(
+        abs(speed) * values[truth_model.names.index("Fvm5")] / 3, abs=0.8
+    )
+
+
+def test_a_session_that_the_estimate_has_seen_is_refused_or_labelled(
+    estimated: Callable[..., DynamicModel], unloaded: Any, loaded: Any
+) -> None:
+    for provenance in (
+        {"sessions": [{"uid": "uid-unloaded", "file": "x.mcap"}]},
+        {"sessions": ["uid-unloaded"]},
+        {"sessions": ["unloaded.mcap"], "experiment": ""},
+    ):
+        model = estimated(provenance=provenance)
+        with pytest.raises(DataError, match=r"unloaded\.mcap: the estimate was made from this session"):
+            validate(model, [unloaded, loaded], settings=PLAIN)
+        result = validate(model, [unloaded, loaded], settings=PLAIN, allow_seen=True)
+        assert [score.seen for score in result.scores] == [True, False]
+        assert [score.session for score in result.unseen] == ["loaded.mcap"]
+        assert "SEEN BY THE ESTIMATE" in str(result)
+    other = estimated(provenance={"sessions": ["unloaded.mcap"], "experiment": "another one"})
+    assert not validate(other, [unloaded], settings=PLAIN).scores[0].seen
+
+
+def test_an_unknown_payload_is_refused(truth_model: Any, bench: Any) -> None:
+    session = bench.session("strange", seed=3)
+    strange = replace(session, metadata={**session.metadata, "payload": "gripper"})
+    with pytest.raises(DataError, match=r"payload 'gripper' is not in the model \(payloads: load\)"):
+        validate(truth_model, [strange], settings=PLAIN)
+
+
+def test_a_session_without_the_sides_of_the_model_says_so(truth_model: Any, bench: Any) -> None:
+    session = bench.session("jointonly", seed=4, motor=False)
+    result = validate(truth_model, [session], settings=PLAIN)
+    assert {score.side for score in result.scores[0].scores} == {"joint"}
+    structure = replace(truth_model.structure, model=3, sides=("difference",), payloads=())
+    difference = DynamicModel("LWR4+", structure, ("Fvm1",), np.array([16.0]))
+    with pytest.raises(DataError, match="no usable difference torque"):
+        validate(difference, [session], settings=PLAIN)
+
+
+def test_results_print_and_serialise(truth_model: Any, unloaded: Any) -> None:
+    result = validate(truth_model, [unloaded], settings=PLAIN)
+    result = replace(result, competitors=competitor_scores(truth_model, [unloaded], settings=PLAIN))
+    text = str(result)
+    assert "floor" in text
+    assert "controller's M(q), g(q)" in text
+    content = json.loads(json.dumps(result.to_dict()))
+    assert content["sessions"][0]["scores"][0]["joint"] == "A1"
+    assert {c["predictor"] for c in content["competitors"]} == {
+        "controller's M(q), g(q)",
+        "CAD (URDF), no friction",
+    }
+
+
+def test_competitors_leave_what_they_do_not_describe(truth_model: Any, unloaded: Any) -> None:
+    found = competitor_scores(truth_model, [unloaded], settings=PLAIN, others=[truth_model])
+    by_name = {score.predictor: score for score in found}
+    other = [s.rms for s in by_name["model of LWR4+"].scores]
+    np.testing.assert_allclose(other, 0.05, rtol=0.06)
+    # The controller's matrices are the true ones here: friction and centrifugal terms remain.
+    rms = {s.joint: s.rms for s in by_name["controller's M(q), g(q)"].scores}
+    friction = truth_model.drive()
+    assert rms["A1"] > 0.9 * friction["Fcl"][0]
+    assert rms["A5"] == pytest.approx(0.05, abs=0.03)
+    assert by_name["CAD (URDF), no friction"].relative["joint"] > 0.02
+
+
+def test_a_competitor_without_joint_torque_is_refused(truth_model: Any, unloaded: Any) -> None:
+    structure = replace(truth_model.structure, sides=("motor",))
+    motor_only = DynamicModel("motors", structure, ("Fvm1",), np.array([1.0]))
+    with pytest.raises(ConfigurationError, match="cannot compete"):
+        competitor_scores(truth_model, [unloaded], settings=PLAIN, others=[motor_only])
+
+
+def test_forward_simulation_reproduces_the_measured_torque(truth_model: Any, loaded: Any) -> None:
+    result = simulate_session(truth_model, loaded, settings=PLAIN, step_s=2e-3)
+    assert result.reference == "commanded"
+    assert result.side == "motor"
+    assert result.relative < 0.05
+    assert result.position_rms.max() < 0.02
+    assert "Forward simulation of loaded.mcap, motor torque" in str(result)
+
+
+def test_forward_simulation_feels_a_wrong_payload(truth_model: Any, loaded: Any) -> None:
+    blind = replace(loaded, metadata={**loaded.metadata, "payload": "none"})
+    good = simulate_session(truth_model, loaded, settings=PLAIN, step_s=4e-3)
+    bad = simulate_session(truth_model, blind, settings=PLAIN, step_s=4e-3)
+    assert bad.torque_rms[1] > good.torque_rms[1] + 2.0
+
+
+def test_simulated_pendulum_keeps_its_energy_balance(truth_model: Any) -> None:
+    """The work of the controller is what the energy gains and friction takes."""
+    times = np.arange(0, 2.0, 5e-4)
+    target = 0.3 * np.sin(2 * np.pi * 0.5 * times)[:, None] * np.ones(7)
+    q, qd, torque = simulate(truth_model, times, target, side="joint")
+    kinetic = 0.5 * np.einsum("ni,nij,nj->n", qd, truth_model.mass_matrix(q), qd)
+    drive = truth_model.drive()
+    resisting = drive["Fvl"] * qd + drive["Fcl"] * np.tanh(qd / 5e-3) + drive["offl"]
+    power = np.sum(qd * (torque - resisting - truth_model.gravity(q)), axis=1)
+    work = np.concatenate([[0.0], np.cumsum(0.5 * (power[1:] + power[:-1]) * 5e-4)])
+    np.testing.assert_allclose(kinetic - kinetic[0], work, atol=0.02 * kinetic.max() + 1e-3)
+
+
+def test_a_model_of_no_real_arm_is_not_simulated(truth_model: Any) -> None:
+    values = truth_model.values.copy()
+    for name in ("ZZ7", "Ia7"):
+        values[truth_model.names.index(name)] = -5.0
+    wrong = DynamicModel(
+        truth_model.robot, truth_model.structure, truth_model.names, values, None, truth_model.base
+    )
+    times = np.arange(0, 0.1, 1e-3)
+    with pytest.raises(DataError, match="not positive definite"):
+        simulate(wrong, times, np.zeros((len(times), 7)))
