@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.estimators.problem import Nuisance, Problem, RowGroup
-from ident.signals.filters import ParallelFilter
+from ident.signals.filters import ParallelFilter, interpolate_uniform
 from ident.signals.prepare import Passage, PreparedSession, TorqueChannel
 from ident.structure import ModelStructure, Side
 
@@ -107,11 +107,13 @@ def _side(
     valid = passage.motor_valid
     slope = _slope(passage.motor, passage.rows, session)
     if side == "difference":
-        settings = session.settings
-        parallel = ParallelFilter(
-            passage.joint.times, passage.rows, settings.decimate_hz, settings.attenuation_db
-        )
-        target = target - parallel.apply(passage.joint.torque)
+        # The joint torque is taken at the motor channel's own times: both then see the same reversals.
+        joint, settings = passage.joint, session.settings
+        start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
+        inside = (passage.motor.times >= start) & (passage.motor.times <= joint.times[-1])
+        times = passage.motor.times[inside]
+        parallel = ParallelFilter(times, passage.rows, settings.decimate_hz, settings.attenuation_db)
+        target = target - parallel.apply(interpolate_uniform(joint.torque, start, dt, times))
         valid = valid & passage.joint_valid
     return _Part(matrix, target, slope, valid, passage.index)
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.signal import lfilter
 
 from ident.kinematics import Chain
 from ident.parameters import DRIVE, INERTIAL
 from ident.regressor import torque
 from lwr_driver.session import JointColumns, Phase, Session
+
+Array = np.ndarray
+States = tuple[Array, Array, Array]
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -48,7 +53,7 @@ def drive(symbol: str) -> np.ndarray:
     return np.array([truth()[f"{symbol}{link}"] for link in range(1, 8)])
 
 
-def fourier(time: np.ndarray, period_s: float, seed: int, harmonics: int = 5, scale: float = 1.0):
+def fourier(time: np.ndarray, period_s: float, seed: int, harmonics: int = 5, scale: float = 1.0) -> States:
     """Position, velocity and acceleration (n, 7) of a random Fourier motion."""
     random = np.random.default_rng(seed)
     q = np.tile(random.uniform(-0.5, 0.5, 7), (len(time), 1))
@@ -80,8 +85,6 @@ class Sensors:
 
 def correlated(random: np.random.Generator, shape: tuple[int, int], dt: float, tau: float) -> np.ndarray:
     """Unit-variance noise: white, or an AR(1) process of correlation time tau [s]."""
-    from scipy.signal import lfilter
-
     white = random.normal(size=shape)
     if tau <= 0:
         return white
@@ -90,7 +93,7 @@ def correlated(random: np.random.Generator, shape: tuple[int, int], dt: float, t
     return lfilter([np.sqrt(1 - rho**2)], [1, -rho], white, axis=0, zi=rho * start)[0]
 
 
-def torques(q, qd, qdd, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
+def torques(q: Array, qd: Array, qdd: Array, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
     """Joint and motor torques (n, 7) of equations (1) to (4)."""
     joint = torque(chain(), q, qd, qdd, inertial(loaded))
     joint = joint + drive("Fvl") * qd + drive("Fcl") * np.sign(qd) + drive("offl")
@@ -110,6 +113,9 @@ def session(
     motor: bool = True,
     motion_seed: int = 5,
     phases: bool = True,
+    still: tuple[int, ...] = (),
+    command: bool = False,
+    metadata: dict[str, str] | None = None,
 ) -> Session:
     """A session that runs through the periods with a run-in and a run-out."""
     sensors = sensors or Sensors()
@@ -117,7 +123,14 @@ def session(
     dt = 1.0 / rate_hz
     count = round((periods * period_s + 2 * run_in_s) * rate_hz) + 1
     time = np.arange(count) * dt
-    q, qd, qdd = fourier(time - run_in_s, period_s, motion_seed)
+
+    def motion(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        states = fourier(at - run_in_s, period_s, motion_seed)
+        for joint in still:
+            states[0][:, joint], states[1][:, joint], states[2][:, joint] = 0.1, 0.0, 0.0
+        return states
+
+    q, qd, qdd = motion(time)
     joint_torque, _ = torques(q, qd, qdd, loaded)
     position = q + sensors.position * random.normal(size=q.shape)
     joint_torque = joint_torque + sensors.joint * correlated(random, q.shape, dt, sensors.correlation_s)
@@ -132,8 +145,7 @@ def session(
     if motor:
         step = sensors.motor_step_s or dt
         when = np.arange(0.0, time[-1], step)
-        states = fourier(when - run_in_s, period_s, motion_seed)
-        effort = torques(*states, loaded)[1]
+        effort = torques(*motion(when), loaded)[1]
         effort = effort + sensors.motor * correlated(random, effort.shape, step, sensors.correlation_s)
         stamps = when + sensors.motor_delay_s
         motor_columns = _columns("/motor_states", names, stamps, np.arange(len(when)), effort[:, :0], effort)
@@ -143,10 +155,13 @@ def session(
         begin += [(run_in_s + k * period_s, f"period {k + 1}") for k in range(periods)]
         begin += [(run_in_s + periods * period_s, "brake")]
         marks = tuple(Phase(_ns(at), name) for at, name in begin)
-    metadata = {"payload": "payload" if loaded else "none", "robot": "test arm"}
+    content = {"payload": "payload" if loaded else "none", "robot": "test arm"} | (metadata or {})
+    sent = None
+    if command:
+        sent = _columns("/joint_command", names, time, np.arange(count), q, q[:, :0])
     name = "loaded" if loaded else "unloaded"
     return Session(
-        Path(f"{name}.mcap"), metadata, {"exit_status": "success"}, names, joint, motor_columns, None, marks
+        Path(f"{name}.mcap"), content, {"exit_status": "success"}, names, joint, motor_columns, sent, marks
     )
 
 
@@ -154,7 +169,9 @@ def _ns(time_s: float) -> int:
     return 1_700_000_000_000_000_000 + round(time_s * 1e9)
 
 
-def _columns(topic, names, time, sequence, position, effort) -> JointColumns:
+def _columns(
+    topic: str, names: Sequence[str], time: Array, sequence: Array, position: Array, effort: Array
+) -> JointColumns:
     publish = np.rint(time * 1e9).astype(np.int64)
     return JointColumns(
         topic=topic,
@@ -166,3 +183,13 @@ def _columns(topic, names, time, sequence, position, effort) -> JointColumns:
         velocity=np.zeros((len(time), 0)),
         effort=effort,
     )
+
+
+def true_base(identification: object) -> Array:
+    """True base parameters of an identification of this arm."""
+    base = identification.base  # type: ignore[attr-defined]
+    values = []
+    for name in base.structure.names:
+        link = int(name[-1])
+        values.append(truth()[name] if link < 8 else payload().get(name[:-1], 0.0))
+    return np.asarray(base.reduce(np.array(values)))
