@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from fri.errors import LwrError
+from fri.errors import LwrError, OperatorError
 
 # Before numpy is imported: the matrices are small, and a second BLAS thread costs more than it gives.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -61,6 +61,9 @@ class Verbs(click.Group):
         except LwrError as error:
             click.secho(f"{type(error).__name__}: {error}", fg="red", err=True)
             ctx.exit(error.exit_code)
+        except (KeyboardInterrupt, click.Abort):
+            click.echo("aborted", err=True)
+            ctx.exit(OperatorError.exit_code)
 
 
 @click.group(cls=Verbs, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})

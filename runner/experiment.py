@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -102,29 +103,29 @@ class Run:
         return records
 
     def _session(self, plan: SessionPlan, path: Path) -> Record:
-        bench = self.bench
-        bench.driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
+        bench, driver = self.bench, self.bench.driver
+        driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
         self._swap(plan)
-        state = bench.driver.state()
-        motion, preflight = session_motion(
-            self.experiment,
-            bench.arm,
-            bench.cell,
-            plan,
-            self.excite(state.period_s),
-            state.q_command,
-            self.folder,
-        )
-        preflight.enforce()
-        uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
-        self._rest = None
+        motion, preflight = self._prepare(plan)
         traced = self.experiment.motor_torque.source == "trace_file"
         if traced:
             bench.operator.start_trace()
-        bench.driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
-        outcome = self._drive(plan, motion)
-        recorded = bench.driver.end_record(outcome.status, outcome.reason)
-        link = bench.driver.state()
+        self._rest = None
+        with Interrupts(driver.request_stop, driver.drop_link):
+            driver.enter_command()
+            try:
+                if not np.array_equal(motion.q[0], driver.state().q_command):
+                    # The controller took up its set point anew as command mode began.
+                    motion, preflight = self._prepare(plan)
+                uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
+                driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
+                outcome = self._drive(plan, motion)
+                recorded = driver.end_record(outcome.status, outcome.reason)
+            finally:
+                bench.status.clear()
+                with contextlib.suppress(LwrError):
+                    driver.leave_command()
+        link = driver.state()
         if recorded.error:
             return Record(plan.name, path, "fail", f"the log could not be written: {recorded.error}", link)
         if traced:
@@ -133,6 +134,21 @@ class Run:
             self._rest = self._at_rest(plan.payload)
             self._progress.finish(plan.name, self._rest)
         return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error)
+
+    def _prepare(self, plan: SessionPlan) -> tuple[Motion, Preflight]:
+        """The motion of a session from where the arm is; RefusedError unless every check of it holds."""
+        state = self.bench.driver.state()
+        motion, preflight = session_motion(
+            self.experiment,
+            self.bench.arm,
+            self.bench.cell,
+            plan,
+            self.excite(state.period_s),
+            state.q_command,
+            self.folder,
+        )
+        preflight.enforce()
+        return motion, preflight
 
     def _swap(self, plan: SessionPlan) -> None:
         """Have the payload of the session on the flange, and make sure that it is the announced one."""
@@ -155,25 +171,18 @@ class Run:
         return Rest(measured.q, measured.tau, payload)
 
     def _drive(self, plan: SessionPlan, motion: Motion) -> Outcome:
-        """Command mode, the motion, and out of command mode again, whatever happens."""
-        driver, status = self.bench.driver, self.bench.status
+        """Execute the motion with the status line; Ctrl-C is in the hands of the caller."""
 
         def progress(now: MotionProgress) -> None:
             error = 1000 * float(np.max(now.state.tracking_error))
-            status.show(
+            self.bench.status.show(
                 f"{plan.name}: {now.phase}",
                 now.row / max(now.rows, 1),
                 f"{now.time_s:6.1f} of {motion.duration_s:.1f} s  {now.state.state} {now.state.quality}  "
                 f"tracking {error:.1f} mrad  missed {now.state.miss_counter}",
             )
 
-        with Interrupts(driver.request_stop, driver.drop_link):
-            driver.enter_command()
-            outcome = driver.execute(motion, progress)
-            status.clear()
-            if outcome.status != "fail":
-                driver.leave_command()
-        return outcome
+        return self.bench.driver.execute(motion, progress)
 
     def _import_trace(self, path: Path) -> None:
         """Give the log the motor torques of the controller's trace, where there is one."""
