@@ -126,9 +126,9 @@ class ControllerConfig:
     position_gain: Joints = (9e3, 9e3, 6e3, 6e3, 3e3, 2e3, 2e3)
     velocity_gain: Joints = (250.0, 250.0, 160.0, 160.0, 60.0, 40.0, 40.0)
     torque_gain: Joints = (0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5)
-    viscous: Joints = (13.0, 15.0, 6.5, 9.5, 4.5, 3.0, 1.7)
-    coulomb: Joints = (12.0, 13.0, 7.0, 8.0, 4.5, 3.5, 3.3)
-    coulomb_speed: float = 0.02
+    viscous: Joints = (15.0, 17.0, 7.1, 10.5, 4.9, 3.3, 1.8)
+    coulomb: Joints = (13.5, 15.0, 7.9, 9.0, 5.0, 4.0, 3.75)
+    coulomb_speed: float = 0.01
     torque_limit: Joints = (200.0, 200.0, 120.0, 120.0, 100.0, 50.0, 50.0)
     velocity_cutoff_hz: float = 150.0
     command_cutoff_hz: float = 40.0

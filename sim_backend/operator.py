@@ -53,6 +53,7 @@ class ScheduleEntry:
     def __post_init__(self) -> None:
         if self.command not in COMMANDS:
             raise ConfigurationError(f"command {self.command!r} is unknown; known: {', '.join(COMMANDS)}")
+        _check_arguments(self.command, self.arguments)
         if self.after_cycles < 0 or self.occurrence < 1:
             raise ConfigurationError(
                 f"after_cycles {self.after_cycles} must be at least 0, "
@@ -156,12 +157,8 @@ class Operator:
         """Do `command`; the result is what the pendant gets. Raises LwrError where it cannot be done."""
         if command not in COMMANDS:
             raise ConfigurationError(f"command {command!r} is unknown; known: {', '.join(COMMANDS)}")
-        method = getattr(self, command)
-        try:
-            inspect.signature(method).bind(**arguments)
-        except TypeError as error:
-            raise ConfigurationError(f"command `{command}`: {error}") from error
-        return method(**arguments)
+        _check_arguments(command, arguments)
+        return getattr(self, command)(**arguments)
 
     def status(self) -> dict[str, Any]:
         """Everything the pendant shows.
@@ -242,15 +239,24 @@ class Operator:
         """Load data of the controller."""
         self.cabinet.model.set_load(_load(mass, com, inertia))
 
-    def drives(self, on: bool) -> None:
-        """Drives on or off."""
-        if on and self.estopped:
+    def drives_on(self) -> None:
+        """Drives on; acknowledges drive errors, as on the real pendant."""
+        if self.estopped:
             raise RobotError("drives stay off: the emergency stop is pressed; release it first")
-        if on and self.cabinet.error_bits:
-            # Switching on acknowledges, as it does on the real pendant.
-            self.cabinet.error_bits = 0
-        self.cabinet.power(bool(on))
+        self.cabinet.error_bits = 0
+        self.cabinet.power(True)
         self.cabinet.tell_drives()
+
+    def drives_off(self) -> None:
+        """Drives off, brakes closed."""
+        self.cabinet.power(False)
+
+    def drives(self, on: bool) -> None:
+        """Drives on or off; in YAML write `drives_on` and `drives_off`, because `on` is a truth value there."""
+        if on:
+            self.drives_on()
+        else:
+            self.drives_off()
 
     def emergency_stop(self) -> None:
         """Emergency stop: command mode ends, brakes close."""
@@ -367,6 +373,13 @@ class Operator:
         self.ended = True
 
 
+def _check_arguments(command: str, arguments: Mapping[str, Any]) -> None:
+    try:
+        inspect.signature(getattr(Operator, command)).bind(None, **arguments)
+    except TypeError as error:
+        raise ConfigurationError(f"command `{command}`: {error}") from error
+
+
 def _load(mass: Any, com: Any, inertia: Any) -> LoadData:
     content = {
         "mass": mass,
@@ -382,6 +395,8 @@ COMMANDS = (
     "unmount",
     "set_load",
     "drives",
+    "drives_on",
+    "drives_off",
     "emergency_stop",
     "release_emergency_stop",
     "mode",

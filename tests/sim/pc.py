@@ -81,12 +81,12 @@ def gentle(seconds):
 
 
 @contextlib.contextmanager
-def emulator(port, settings=None, seed=1, period_ms=2, lock_step=True):
+def emulator(port, settings=None, seed=1, period_ms=2, config=None, lock_step=True):
     """An emulator in a thread of this process: far quicker to start than one of its own. Gives its
     pendant.
     """
     overrides = QUICK | {"seed": seed, "fri.period_ms": period_ms} | (settings or {})
-    service = Service(load_configuration(overrides=overrides), ("127.0.0.1", port))
+    service = Service(load_configuration(config or "emulator/default.yaml", overrides), ("127.0.0.1", port))
     thread = threading.Thread(target=service.run, args=(lock_step,))
     thread.start()
     try:

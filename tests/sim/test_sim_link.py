@@ -107,7 +107,7 @@ def test_a_long_burst_drops_command_mode_and_the_arm_stands():
     ("command", "arguments", "power"),
     [
         ("emergency_stop", {}, 0),
-        ("drives", {"on": False}, 0),
+        ("drives_off", {}, 0),
         ("mode", {"name": "T1"}, 0),
         ("drive_fault", {"joint": 3}, 0),
         ("degrade_quality", {"cycles": 300}, 0x7F),
@@ -172,7 +172,7 @@ def test_operator_at_the_pendant():
         with pytest.raises(RobotError, match="known"):
             pendant.request("dance")
         with pytest.raises(RobotError, match="missing a required argument"):
-            pendant.request("drives", of=False)
+            pendant.request("mode", nam="T1")
         pendant.emergency_stop()
         with pytest.raises(RobotError, match="emergency stop"):
             pendant.drives(True)
@@ -269,3 +269,28 @@ def test_other_physics_can_take_the_place_of_the_arm(monkeypatch):
     with Pc(port) as pc, emulator(port, settings={"robot.plant": plant}) as pendant:
         pc.run(100)
         assert pendant.status()["joint_torque"] == pytest.approx([4.0] * 7, abs=2.0)
+
+
+def test_a_pc_that_stops_answering_in_command_mode_is_dropped():
+    port = free_port()
+    with Pc(port, gentle) as pc, emulator(port, settings={"fri.patience_s": 0.02}) as pendant:
+        pc.run(500)
+        assert pendant.status()["state"] == "CMD"
+        states = (pendant.status()["state"] for _ in range(50_000))
+        assert "MON" in states
+        status = pendant.status()
+        assert status["events"][-1]["kind"] == "MISSES"
+        # In monitor mode it waits for the PC, however long that takes.
+        assert pendant.status()["cycle"] == status["cycle"]
+
+
+@pytest.mark.parametrize(
+    ("name", "power"), [("cold_start", 0), ("poor_link", 0x7F), ("late_motor_torque", 0x7F)]
+)
+def test_shipped_scenarios_run(name, power):
+    port = free_port()
+    with Pc(port, gentle) as pc, emulator(port, config=f"emulator/{name}.yaml") as pendant:
+        assert pc.run(900) == 900
+        status = pendant.status()
+        assert (status["power"], status["state"]) == (power, "CMD")
+        assert status["monitor"]["violations"] == 0
