@@ -51,74 +51,72 @@ class Violation:
 class Guard:
     """Watches the values that are sent, cycle by cycle.
 
-    limits : of the arm
+    limits : of the arm; where the controller has the arm outside the position limits already, it may rest
+        there and come back, but go no further
     period_s : time of one cycle [s]
     """
 
     def __init__(self, limits: Limits, period_s: float) -> None:
-        self._limits = limits
-        self._period = period_s
-        self._v_max = limits.v_max.copy()
-        self._q, self._v, self._a = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS)
-        self._v_error = self._a_error = 0.0
-        self._h1 = self._h2 = period_s
+        self._limits, self._period = limits, period_s
+        self._middle = 0.5 * (limits.q_low + limits.q_high)
+        self._half = 0.5 * (limits.q_high - limits.q_low)
+        # Distance from the middle, velocity, acceleration, jerk.
+        self._bounds = np.array([self._half, limits.v_max, limits.a_max, limits.j_max])
+        self._values = np.zeros((4, JOINTS))
+        self._errors = np.zeros((4, 1))
+        self._errors[0] = ROUNDING
+        self._excess = np.zeros((4, JOINTS))
+        self.reset(np.zeros(JOINTS, dtype=np.float32))
 
     def reset(self, q: NDArray[np.float32]) -> None:
-        """Begin at rest at the value q that was sent in this cycle; position limits do not apply to it."""
+        """Begin at rest at the value q that was sent in this cycle."""
         self._q = q.astype(np.float64)
         self._v, self._a = np.zeros(JOINTS), np.zeros(JOINTS)
         self._v_error = self._a_error = 0.0
         self._h1 = self._h2 = self._period
+        np.maximum(self._half, np.abs(self._q - self._middle), out=self._bounds[0])
+        self._outside = bool(np.any(self._bounds[0] > self._half))
 
     def scale_velocity(self, factor: float) -> None:
         """Shrink the velocity limit by the controller's `safety_limits`, where that is below 1."""
-        if 0.0 < factor < 1.0:
-            np.multiply(self._limits.v_max, factor, out=self._v_max)
-        else:
-            self._v_max[:] = self._limits.v_max
+        self._bounds[1] = self._limits.v_max * (factor if 0.0 < factor < 1.0 else 1.0)
 
     def check(self, q: NDArray[np.float32], cycles: int) -> Violation | None:
-        """Why q must not be sent `cycles` cycles after the last value sent, or None; accepted values are
-        remembered.
-        """
-        limits, h3 = self._limits, cycles * self._period
+        """Why q must not be sent `cycles` cycles after the last value, or None; then it is remembered."""
+        h3 = cycles * self._period
+        two, three = h3 + self._h2, h3 + self._h2 + self._h1
         x = q.astype(np.float64)
-        if not np.all(np.isfinite(x)):
-            joint = int(np.argmin(np.isfinite(x)))
-            return Violation("position", joint, float(x[joint]), float(limits.q_high[joint]))
         v = (x - self._q) / h3
+        a = (v - self._v) * (2.0 / two)
+        values, errors = self._values, self._errors
+        np.subtract(x, self._middle, out=values[0])
+        values[1], values[2] = v, a
+        np.multiply(a - self._a, 3.0 / three, out=values[3])
         v_error = 2.0 * ROUNDING / h3
-        a = 2.0 * (v - self._v) / (h3 + self._h2)
-        a_error = 2.0 * (v_error + self._v_error) / (h3 + self._h2)
-        j = 3.0 * (a - self._a) / (h3 + self._h2 + self._h1)
-        j_error = 3.0 * (a_error + self._a_error) / (h3 + self._h2 + self._h1)
-        excess = np.array(
-            [
-                np.maximum(limits.q_low - x, x - limits.q_high) - ROUNDING,
-                np.abs(v) - self._v_max - v_error,
-                np.abs(a) - limits.a_max - a_error,
-                np.abs(j) - limits.j_max - j_error,
-            ]
-        )
-        if excess.max() > _SLACK:
-            return self._violation(excess, x, v, a, j)
+        a_error = 2.0 * (v_error + self._v_error) / two
+        errors[1], errors[2], errors[3] = v_error, a_error, 3.0 * (a_error + self._a_error) / three
+        excess = np.abs(values, out=self._excess)
+        excess -= self._bounds
+        excess -= errors
+        # Also false for values that are no numbers.
+        if not excess.max() <= _SLACK:
+            return self._violation(x)
+        if self._outside:
+            # The way back is one-way.
+            np.maximum(self._half, np.abs(values[0]), out=self._bounds[0])
+            self._outside = bool(np.any(self._bounds[0] > self._half))
         self._q, self._v, self._a = x, v, a
         self._v_error, self._a_error = v_error, a_error
         self._h1, self._h2 = self._h2, h3
         return None
 
-    def _violation(
-        self,
-        excess: NDArray[np.float64],
-        x: NDArray[np.float64],
-        v: NDArray[np.float64],
-        a: NDArray[np.float64],
-        j: NDArray[np.float64],
-    ) -> Violation:
+    def _violation(self, x: NDArray[np.float64]) -> Violation:
         limits = self._limits
-        kind = int(np.argmax(excess.max(axis=1) > _SLACK))
-        joint = int(np.argmax(excess[kind]))
-        edge = limits.q_high if x[joint] > limits.q_high[joint] else limits.q_low
-        values = (x, np.abs(v), np.abs(a), np.abs(j))
-        bounds = (edge, self._v_max, limits.a_max, limits.j_max)
-        return Violation(tuple(_UNITS)[kind], joint, float(values[kind][joint]), float(bounds[kind][joint]))
+        broken = ~(self._excess <= _SLACK)
+        kind = int(np.argmax(broken.any(axis=1)))
+        joint = int(np.argmax(broken[kind]))
+        if kind == 0:
+            edge = limits.q_low if x[joint] < self._middle[joint] else limits.q_high
+            return Violation("position", joint, float(x[joint]), float(edge[joint]))
+        value, bound = abs(self._values[kind, joint]), self._bounds[kind, joint]
+        return Violation(tuple(_UNITS)[kind], joint, float(value), float(bound))

@@ -32,13 +32,29 @@ def test_rest_is_allowed_for_ever():
 
 
 def test_rest_where_the_controller_has_the_arm_is_allowed_but_nothing_further_out():
-    # The controller may have the arm inside our margin: holding there is no command of ours.
+    # The controller may have the arm within our margin.
     q = START.copy()
     q[0] = arm().q_high[0] + 0.01
     watch = guard(q=q)
+    for _ in range(5):
+        assert watch.check(q.astype(np.float32), 1) is None
+    q[0] += 1e-6
     violation = watch.check(q.astype(np.float32), 1)
     assert violation is not None
-    assert violation.quantity == "position"
+    assert violation.describe(NAMES).startswith("A1 position 2.9596 rad exceeds 2.9496")
+
+
+def test_way_back_into_the_limits_is_one_way():
+    outside = START.copy()
+    outside[0] = arm().q_high[0] + 0.01
+    t = np.linspace(0.0, 1.0, 2001)
+    back = np.tile(START, (2001, 1))
+    back[:, 0] = outside[0] - 0.2 * (10 * t**3 - 15 * t**4 + 6 * t**5)
+    watch = guard(q=outside)
+    for q in back:
+        assert watch.check(q.astype(np.float32), 1) is None
+    accepted = [q[0] for q in back[::-1] if watch.check(q.astype(np.float32), 1) is None]
+    assert max(accepted) <= arm().q_high[0] + 2e-7
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -96,9 +112,9 @@ def test_factor_that_shrinks_nothing_changes_nothing(factor):
     assert all(watch.check(q.astype(np.float32), 1) is None for q in motion.q)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
-    goal=st.lists(st.floats(-1.2, 1.2), min_size=7, max_size=7),
+    goal=st.lists(st.floats(-1.0, 1.0), min_size=7, max_size=7),
     period_ms=st.sampled_from([1, 2, 5, 10]),
     gaps=st.lists(st.integers(1, 9), min_size=1, max_size=40),
 )
@@ -115,7 +131,7 @@ def test_motion_within_limits_passes_whatever_packets_are_lost(goal, period_ms, 
         assert watch.check(motion.q[-1].astype(np.float32), 1) is None
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     row=st.integers(50, 400),
     joint=st.integers(0, 6),

@@ -227,7 +227,7 @@ def test_long_gap_ends_the_motion_even_if_the_controller_went_on(rig):
     # It holds where the controller has it, not where the motion would be, and asks for the end of command
     # mode.
     after = np.array(r.arrived.rows)[np.array(r.arrived.cycles) > lost_at]
-    assert len(after) > 1
+    assert len(after) >= 1
     assert np.ptp(after, axis=0).max() == 0.0
     assert r.mode is Mode.MIRROR
     assert r.session.last_event.kind is EventKind.STOPPED

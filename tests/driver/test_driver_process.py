@@ -1,4 +1,4 @@
-"""The driver with its own processes against the emulator in lock step: what a lab goes through in a session."""
+"""The driver and its processes against the emulator in lock step: what a lab goes through in a session."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_emergency_stop_ends_the_motion_for_good(lab):
     with pytest.raises(RobotError, match="drives are off") as error:
         outcome.check()
     assert len(error.value.rows) == 50
-    with pytest.raises(RobotError, match="not in command mode .* drives are off"):
+    with pytest.raises(RobotError, match=r"not in command mode .* drives are off"):
         driver.execute(lab.hop())
     driver.monitor(500)
     lab.emulator.pendant.release_emergency_stop()
@@ -334,7 +334,7 @@ def test_connecting_without_a_controller_says_what_to_check():
 
 
 def test_address_that_is_not_ours_is_refused():
-    with pytest.raises(NetworkError, match="cannot bind UDP 192.0.2.1"):
+    with pytest.raises(NetworkError, match=r"cannot bind UDP 192\.0\.2\.1"):
         Driver(arm(), LinkSettings(address="192.0.2.1", realtime="allow", lock_step=True)).connect()
 
 
@@ -343,7 +343,8 @@ def test_loop_ends_when_its_parent_is_killed():
         "import sys, time; sys.path.insert(0, 'tests/driver')\n"
         "from driver_rig import arm\n"
         "from lwr_driver.driver import Driver, LinkSettings\n"
-        "driver = Driver(arm(), LinkSettings(address='127.0.0.1', port=0, realtime='allow', lock_step=True))\n"
+        "link = LinkSettings(address='127.0.0.1', port=0, realtime='allow', lock_step=True)\n"
+        "driver = Driver(arm(), link)\n"
         "driver._wait = lambda *a, **k: None\n"
         "driver.connect()\n"
         "print(driver._loop.pid, driver._recorder.pid, flush=True)\n"
