@@ -24,7 +24,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
+from scipy.fft import irfft, next_fast_len, rfft
 
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import FloatArray, Problem
@@ -204,7 +204,8 @@ def jackknife(
     shifts = []
     for key, normal in normals.items():
         rest = information - normal
-        scale = np.sqrt(np.maximum(np.diag(rest), 1e-12 * np.diag(information)))
+        # Instruments that hardly follow the regressors can make a diagonal entry negative.
+        scale = np.sqrt(np.maximum(np.abs(np.diag(rest)), 1e-12 * np.abs(np.diag(information))))
         scaled = rest / np.outer(scale, scale)
         shifts.append(np.linalg.lstsq(scaled, sums[key] / scale, rcond=1e-10)[0] / scale)
     count = len(shifts)
@@ -289,7 +290,8 @@ def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatAr
             series = np.zeros(int(group.time_index[-1] - group.time_index[0]) + 1)
             series[group.time_index - group.time_index[0]] = residuals[index]
             lags = min(len(series), max(64, len(series) // 3))
-            correlation = fftconvolve(series, series[::-1])[len(series) - 1 :][:lags]
+            size = next_fast_len(len(series) + lags, real=True)
+            correlation = irfft(np.abs(rfft(series, size)) ** 2, size)[:lags]
             if len(correlation) > len(total):
                 total = np.pad(total, (0, len(correlation) - len(total)))
             total[: len(correlation)] += correlation

@@ -20,6 +20,7 @@ from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.solution import class_variances
 from ident.parameters import pseudo_inertia
 
 __all__ = ["BodyPrior", "PhysicallyConsistent", "nearest_consistent"]
@@ -28,6 +29,9 @@ Metric = Literal["pullback", "entropic", "euclidean"]
 
 _BODY = 10
 _ROOT2 = np.sqrt(2.0)
+_REWEIGHTINGS = 8
+# The solver resolves eight digits: no class is trusted beyond 1e-5 of its torque.
+_FINEST = 1e10
 
 
 @dataclass(frozen=True)
@@ -133,15 +137,20 @@ class PhysicallyConsistent:
         )
         assert linear.prior_scale is not None
         shares = effective_rows(problem, linear.residuals) / [max(c.rows, 1) for c in linear.classes]
-        factor = problem.weighted(linear.weights * np.minimum(shares, 1.0))
-        p = len(problem.names)
-        projection = self.prior.projection
-        quadratic = factor.r[:p, :p] @ projection
-        target = factor.r[:p, p]
-        standard = _Program(self.prior, self.metric, 1.0 / linear.prior_scale, self.margin).solve(
-            quadratic, target
-        )
-        values = projection @ standard
+        consumed = np.array([fit.parameters for fit in linear.classes])
+        program = _Program(self.prior, self.metric, 1.0 / linear.prior_scale, self.margin)
+        p, projection = len(problem.names), self.prior.projection
+        weights = np.minimum(linear.weights, _FINEST / _mean_squares(problem))
+        for _ in range(_REWEIGHTINGS):
+            # Where the constraints bind, the residual grows and its weight must fall with it.
+            factor = problem.weighted(weights * np.minimum(shares, 1.0))
+            standard = program.solve(factor.r[:p, :p] @ projection, factor.r[:p, p])
+            values = projection @ standard
+            before = weights
+            weights = 1.0 / class_variances(problem, values, consumed)
+            weights = np.minimum(weights, _FINEST / _mean_squares(problem))
+            if np.max(np.abs(weights / before - 1.0)) < 0.01:
+                break
         touching = _touching(self.prior, standard, self.margin)
         notes = (
             *linear.notes,
@@ -151,11 +160,18 @@ class PhysicallyConsistent:
             linear,
             method=f"physically consistent ({self.metric})",
             values=values,
+            weights=weights,
             residuals=problem.residuals(values),
             classes=_refit(linear, problem, values),
             notes=notes,
             standard=standard,
         )
+
+
+def _mean_squares(problem: Problem) -> FloatArray:
+    """Mean square torque of each class [Nm^2]."""
+    power = [float(c.factor.r[:, -1] @ c.factor.r[:, -1]) / max(c.factor.rows, 1) for c in problem.classes]
+    return np.maximum(np.array(power), np.finfo(float).tiny)
 
 
 def nearest_consistent(inertial: FloatArray, *, margin: float = 1e-2) -> FloatArray:

@@ -279,7 +279,7 @@ def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
     p = matrix.shape[1]
     gram = np.empty((p + 1, p + 1))
     gram[:p, :p] = matrix.T @ matrix
-    gram[:p, p] = matrix.T @ target
+    gram[:p, p] = gram[p, :p] = matrix.T @ target
     gram[p, p] = target @ target
     scale = np.sqrt(np.diag(gram))
     if not np.all(np.isfinite(scale)):

@@ -61,7 +61,7 @@ def class_variances(problem: Problem, values: FloatArray, consumed: FloatArray) 
             )
         result.append(row_class.factor.sum_of_squares(values) / freedom)
     variance = np.array(result)
-    floor = np.finfo(float).tiny + 1e-28 * max(float(variance.max()), _mean_square(problem))
+    floor = np.finfo(float).tiny + 1e-20 * max(float(variance.max()), _mean_square(problem))
     return np.maximum(variance, floor)
 
 

@@ -28,6 +28,9 @@ __all__ = ["TotalLeastSquares"]
 class TotalLeastSquares:
     """Minimises ||Y - Omega chi||^2 / (1 + chi^T D chi) over rows weighted as in WLS.
 
+    D holds the variances of the columns' errors over that of the torque's, which is what the residual leaves
+    when the columns' share is taken off; the two are solved for in turn.
+
     relative_noise : standard deviation of a column's error as a share of the column's root mean square, one
         for all or by parameter name. With a 10 Hz position filter and a 2 Hz parallel filter encoder noise
         leaves 1e-4 to 1e-3, which is why TLS and WLS agree on such data.
@@ -37,37 +40,38 @@ class TotalLeastSquares:
     relative_noise: float | Mapping[str, float] = 1e-3
     exact: str = r"off[lm]"
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
+    iterations: int = 50
 
     def fit(self, problem: Problem) -> Estimate:
         """Estimate (p,) from the smallest singular vector; the covariance from the scores of the
         criterion.
         """
-        values, weights, factor, done, converged = weighted_solution(problem)
+        values, weights, factor, _, _ = weighted_solution(problem)
         p = factor.parameters
-        level = self._noise(problem, factor.r[:, :p], factor.rows)
-        noisy, clean = np.flatnonzero(level > 0), np.flatnonzero(level == 0)
-        root = factor.inverse_root()
-        consumed = consumed_parameters(problem, weights, root)
-        if len(noisy):
-            values = _solve(factor.r, clean, noisy, level)
-        spread = level**2
+        column = self._noise(problem, factor.r[:, :p], factor.rows)
+        noisy, clean = np.flatnonzero(column > 0), np.flatnonzero(column == 0)
+        consumed = consumed_parameters(problem, weights, factor.inverse_root())
+        torque, done, converged = 1.0, 0, not len(noisy)
+        while not converged and done < self.iterations:
+            done += 1
+            new = _solve(factor.r, clean, noisy, column / torque)
+            spread = factor.sum_of_squares(new) / max(factor.rows - p, 1)
+            remaining = spread - float(new @ (column**2 * new))
+            if remaining < 1e-3 * spread:
+                raise DataError(
+                    "the assumed errors of the columns exceed the whole residual; lower `relative_noise`, "
+                    "1e-3 is "
+                    "typical for filtered positions"
+                )
+            converged = abs(np.sqrt(remaining) / torque - 1.0) < 1e-6
+            values, torque = new, float(np.sqrt(remaining))
+        spread = (column / torque) ** 2
         scale = 1.0 + float(values @ (spread * values))
         residuals = problem.residuals(values)
-        power = sum(
-            weights[number] * float(residual @ residual)
-            for residual, number in zip(residuals, problem.class_of_group, strict=True)
-        )
-        variance = power / scale / max(factor.rows - p, 1)
-        hessian = factor.normal - factor.rows * variance * np.diag(spread)
-        try:
-            lower = np.linalg.cholesky(hessian)
-        except np.linalg.LinAlgError as error:
-            raise DataError(
-                "total least squares has no minimum here: the assumed column errors outweigh what the motion "
-                "excites; lower `relative_noise`"
-            ) from error
-        inverse = np.linalg.inv(lower)
-        bread = inverse.T @ inverse
+        smallest = factor.sum_of_squares(values) / scale
+        hessian = (factor.normal - smallest * np.diag(spread)) / (torque**2 * scale)
+        bread = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+        weights = weights / (torque**2 * scale)
         # The criterion's gradient is a row's a w e + D chi w e^2 / scale; the second part, summed,
         # cancels the bias.
         correction = spread * values / scale
@@ -83,7 +87,7 @@ class TotalLeastSquares:
             problem,
             method="TLS (mixed, scaled)",
             values=values,
-            weights=weights / scale,
+            weights=weights,
             bread=bread,
             consumed=consumed,
             settings=self.covariance,
