@@ -22,9 +22,16 @@ VERBS = {
     "check": "dry run of an experiment file: every check, no motion",
     "emulator": "run the emulated controller and arm until interrupted",
     "identify": "estimate a model from session logs",
+    "validate": "hold a model against sessions that it has not seen",
+    "compare": "two models, parameter by parameter, with significance",
+    "payload": "the payload's ten parameters from a known arm and one session",
+    "export": "a model as URDF, MJCF, or stand-alone C and numpy code",
     "info": "what a session log contains",
     "recover": "make a session log whole whose recorder was killed",
+    "attach": "add a controller's trace file to a session log",
+    "import": "turn other people's CSV and NPZ files into a session log",
 }
+MODULES = {"import": "import_log"}
 
 EXIT_CODES = """\b
 Exit codes:
@@ -45,7 +52,7 @@ class Verbs(click.Group):
         """The command of that name, imported now."""
         if cmd_name not in VERBS:
             return None
-        module = importlib.import_module(f"runner.commands.{cmd_name}")
+        module = importlib.import_module(f"runner.commands.{MODULES.get(cmd_name, cmd_name)}")
         command: click.Command = module.command
         return command
 
