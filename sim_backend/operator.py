@@ -252,7 +252,7 @@ class Operator:
         self.cabinet.power(False)
 
     def drives(self, on: bool) -> None:
-        """Drives on or off; in YAML write `drives_on` and `drives_off`, because `on` is a truth value there."""
+        """Drives on or off; in YAML write `drives_on` or `drives_off`, for `on` is a truth value there."""
         if on:
             self.drives_on()
         else:
