@@ -83,7 +83,7 @@ def main(periods: str, seconds: float, config: str, two_cores: bool) -> None:
         # Inherited by the emulator.
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     click.echo(
-        " period   cycles   wall/cycle   x real time   emulator cpu/cycle   emulator alone, x real time"
+        "period     cycles  wall/cycle   x real time   cpu/cycle: emulator  client   x real time of both"
     )
     for period_ms in (int(text) for text in periods.split(",")):
         client = PlainClient()
