@@ -84,6 +84,11 @@ class CollisionChecker:
         self._geometry_data = geometry.createData()
 
     @property
+    def geometry(self) -> pin.GeometryModel:
+        """The shapes and the pairs that are watched, for planners that want derivatives; not to be changed."""
+        return self._geometry
+
+    @property
     def pairs(self) -> int:
         """Number of pairs of shapes that are watched."""
         return len(self._pairs)

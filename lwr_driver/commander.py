@@ -197,8 +197,7 @@ class Commander:
             if self._stop.finished:
                 self._end(*self._pending)
         else:
-            for _ in range(min(self._since_sent, 2)):
-                past[2], past[1], past[0] = past[1], past[0], self._hold
+            past[:] = self._hold
         self.target = target
         self._since_sent = 0
 

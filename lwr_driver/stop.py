@@ -132,6 +132,5 @@ def _let_go(limits: Limits, period_s: float, v: Rows, a: Rows) -> Rows:
     """
     excess = v + a * np.abs(a) / (2.0 * limits.j_max)
     half = 0.5 * period_s * limits.j_max
-    moved = np.clip(a - np.clip(excess / period_s, -half, half), -limits.a_max, limits.a_max)
-    # An acceleration above its limit by rounding is not moved further than the jerk allows.
+    moved = np.clip(a - excess / period_s, -limits.a_max, limits.a_max)
     return np.clip(moved, a - half, a + half)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -111,6 +112,13 @@ class Rig:
         self.commanding = False
         self.displacement = np.zeros(7)
         self.interpreter.advance(period_ms)
+
+    def replace_loop(self) -> None:
+        """Another client takes the place of the loop, as after a crash of this computer."""
+        port = self.loop.remote.address[1]
+        self.loop.remote.close()
+        settings = dataclasses.replace(self.settings, port=port)
+        self.loop = Loop(settings, self.arm.limits, self.control)
 
     def close(self) -> None:
         self.end.close()

@@ -7,7 +7,7 @@ import pytest
 from driver_rig import START, Rig, arm
 
 from fri.event import EventKind
-from fri.states import ALL_DRIVES, Quality, State
+from fri.states import ALL_DRIVES, Control, Quality, State
 from lwr_driver.control import Job, Mode, Result, Text, Word
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE, ROW, Ring
@@ -186,6 +186,34 @@ def test_program_is_not_left_with_a_request_to_start_after_a_fallback(rig):
     r.cycles(1000)
     assert r.session.state is State.MON
     assert r.session.counters()["starts"] == 1
+
+
+def test_program_that_another_client_left_started_is_started_anew(rig):
+    r = rig()
+    r.enter()
+    r.session.drop(EventKind.EXTERNAL, "the client crashed")
+    for _ in range(20):
+        r.cycle(lose_packet=True)
+    r.replace_loop()
+    r.enter()
+    assert r.mode is Mode.HOLD
+
+
+def test_drive_error_ends_the_motion_even_if_the_controller_stays_in_command_mode(rig):
+    r = rig()
+    in_motion(r, 200)
+    r.session.error = 0b10
+    assert r.until_done(20) is Result.ROBOT
+    assert "drives report an error" in r.reason
+    assert r.mode is Mode.MIRROR
+
+
+def test_controller_that_leaves_position_control_ends_the_motion(rig):
+    r = rig()
+    in_motion(r, 200)
+    r.session.control = Control.JNT_IMP
+    assert r.until_done(20) is Result.ROBOT
+    assert "control JNT_IMP" in r.reason
 
 
 def test_single_losses_are_bridged_and_the_motion_is_where_it_would_have_been(rig):
