@@ -55,9 +55,9 @@ class TotalLeastSquares:
         while not converged and done < self.iterations:
             done += 1
             new = _solve(factor.r, clean, noisy, column / torque)
-            spread = factor.sum_of_squares(new) / max(factor.rows - p, 1)
-            remaining = spread - float(new @ (column**2 * new))
-            if remaining < 1e-3 * spread:
+            power = factor.sum_of_squares(new) / max(factor.rows - p, 1)
+            remaining = power - float(new @ (column**2 * new))
+            if remaining < 1e-3 * power:
                 raise DataError(
                     "the assumed errors of the columns exceed the whole residual; lower `relative_noise`, "
                     "1e-3 is "
