@@ -250,7 +250,8 @@ def identify(
     """Identify the arm `chain` from one or more sessions, stacked.
 
     The payload of each session is the one its metadata names (`none`: the bare arm). A session without motor
-    torques adds its joint rows only. Raises DataError with advice for input that cannot be used.
+    torques adds its joint rows only, one without joint torques its motor rows. Raises DataError
+    with advice for input that cannot be used.
     """
     settings = settings or IdentificationSettings()
     if not sessions:
@@ -269,10 +270,22 @@ def identify(
         )
     if settings.model == 3:
         chosen = [session for session, has in zip(chosen, with_motor, strict=True) if has]
+    sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
+    if not sensed and settings.model != 2:
+        raise DataError(
+            f"Model {settings.model} needs joint torques, and no session has them; choose Model 2 "
+            "(`--model 2`), which then has motor rows only"
+        )
     payloads = [_payload(session) for session in chosen]
     carried = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
     structure = ModelStructure(
-        chain, settings.model, carried, settings.without, settings.couplings, settings.coulomb
+        chain,
+        settings.model,
+        carried,
+        settings.without,
+        settings.couplings,
+        settings.coulomb,
+        () if sensed else ("motor",),
     )
     prepared = [
         prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
@@ -379,7 +392,9 @@ def _conditions(
     found: dict[Condition, None] = {}
     for session, payload in zip(prepared, payloads, strict=True):
         sides: tuple[Side, ...] = tuple(
-            side for side in structure.sides if side == "joint" or session.has_motor
+            side
+            for side in structure.sides
+            if (session.has_joint or side == "motor") and (session.has_motor or side == "joint")
         )
         if sides:
             found[Condition(payload, sides)] = None

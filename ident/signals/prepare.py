@@ -92,6 +92,11 @@ class PreparedSession:
     warnings: tuple[str, ...]
 
     @property
+    def has_joint(self) -> bool:
+        """Whether the session has joint torques of any joint in any row."""
+        return any(bool(passage.joint_valid.any()) for passage in self.passages)
+
+    @property
     def has_motor(self) -> bool:
         """Whether the session has motor torques."""
         return any(passage.motor is not None for passage in self.passages)
@@ -115,10 +120,14 @@ def prepare(
     origin = int(_clock(session.joint)[0])
     times = np.asarray((_clock(session.joint) - origin) * 1e-9, dtype=np.float64)
     position, effort = session.joint.position, session.joint.effort
-    if not effort.shape[1]:
-        raise DataError(
-            f"{name}: /joint_states has no effort, so no joint torque; record it or choose motor rows only"
-        )
+    sensed = bool(effort.shape[1])
+    if not sensed:
+        if not motor or session.motor is None:
+            raise DataError(
+                f"{name}: /joint_states has no effort, so no joint torque; record it, or choose Model 2 with "
+                "a session that has motor torques"
+            )
+        effort = np.zeros_like(position)
     sequence = session.joint.sequence if session.joint.numbered else None
     dt = sample_period(times, sequence, f"{name}: /joint_states")
     warnings: list[str] = []
@@ -153,12 +162,16 @@ def prepare(
     motor_data = (
         _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
     )
-    delay = _delay(motor_data, motions, session.joint_names, settings) if motor_data is not None else None
+    delay = None
+    if motor_data is not None:
+        delay = _delay(motor_data, motions, session.joint_names, settings, sensed)
     passages = [
         passage
         for motion in motions
         if (passage := _passage(motion, grid, windows, motor_data, delay, settings)) is not None
     ]
+    if not sensed:
+        passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
     if not passages:
         need = 2.0 * (half_width(settings.decimate_hz, settings.attenuation_db) + settings.edge)
         raise DataError(
@@ -350,9 +363,12 @@ def _delay(
     motions: list[_Motion],
     names: tuple[str, ...],
     settings: SignalSettings,
+    sensed: bool,
 ) -> Delay:
     if settings.motor_delay_s != "estimate":
         return Delay(float(settings.motor_delay_s), 0.0, "stated")
+    if not sensed:
+        return Delay(0.0, 0.0, "no joint torque to hold the motor channel against")
     times, torque, _ = motor_data
     data = [
         DelayData(m.stretch.times, m.qd, m.qdd, m.torque, times, torque, m.usable(settings)) for m in motions
