@@ -3,9 +3,10 @@
     python benchmarks/reply_latency.py --period-ms 1 --seconds 10 [--json FILE]
 
 A sender process stands in for the controller: it sends at the FRI rate in command mode and clocks each answer
-from the moment its packet left. The loop under test is the driver's own process, with recorder, ring and guard,
-executing motions. How late the sender itself was is measured too: on a busy computer both wait for the same
-processor, and a packet that left late says nothing about the loop. Numbers are printed, nothing is asserted.
+from the moment its packet left. The loop under test is the driver's own process, with recorder, ring and
+guard, and it executes motions. How late the sender itself was is measured too: on a busy computer both wait
+for the same processor, and a packet that left late says nothing about the loop. Numbers are printed, nothing
+is asserted.
 """
 
 from __future__ import annotations
@@ -171,7 +172,8 @@ def main() -> None:
                 "none" if quantiles[str(q)] is None else f"{quantiles[str(q)]:.0f}" for q in QUANTILES
             )
             print(
-                f"{run['period_ms']:>4} ms {run['packets']:>8} {run['unanswered_in_time']:>7}  {row}  ({name})"
+                f"{run['period_ms']:>4} ms {run['packets']:>8} {run['unanswered_in_time']:>7}  "
+                f"{row}  ({name})"
             )
     if options.json is not None:
         options.json.write_text(json.dumps({"load": os.getloadavg(), "runs": runs}, indent=1))

@@ -85,7 +85,7 @@ class CollisionChecker:
 
     @property
     def geometry(self) -> pin.GeometryModel:
-        """The shapes and the pairs that are watched, for planners that want derivatives; not to be changed."""
+        """The shapes and the watched pairs, for planners that want derivatives; not to be changed."""
         return self._geometry
 
     @property
