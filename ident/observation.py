@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ __all__ = ["observe"]
 
 FloatArray = NDArray[np.float64]
 
-_ROWS = 32
+# Blocks of rows whose full-rate regressor is held at a time.
+_BLOCKS = 4
 
 
 def observe(
@@ -145,11 +147,10 @@ def _filtered(
     joints = structure.chain.n
     matrix = np.empty((joints, len(rows), len(columns)))
     target = np.empty((len(rows), joints))
-    for first in range(0, len(rows), _ROWS):
-        some = rows[first : first + _ROWS]
-        parallel = ParallelFilter(channel.times, some, settings.decimate_hz, settings.attenuation_db)
-        blocks = parallel.blocks()
-        low, high = blocks[0][1].start, blocks[-1][1].stop
+    parallel = ParallelFilter(channel.times, rows, settings.decimate_hz, settings.attenuation_db)
+    blocks = parallel.blocks()
+    while batch := list(islice(blocks, _BLOCKS)):
+        low, high = batch[0][1].start, batch[-1][1].stop
         wide = structure.regressor(
             channel.q[low:high],
             channel.qd[low:high],
@@ -160,12 +161,11 @@ def _filtered(
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
         flat = wide.T.reshape(len(columns) * joints, high - low)
-        for outputs, samples, weights in blocks:
+        for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
-            place = slice(first + outputs.start, first + outputs.stop)
-            matrix[:, place] = filtered.transpose(1, 2, 0)
-            target[place] = weights @ channel.torque[samples]
+            matrix[:, outputs] = filtered.transpose(1, 2, 0)
+            target[outputs] = weights @ channel.torque[samples]
     return matrix, target
 
 

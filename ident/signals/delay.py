@@ -91,18 +91,18 @@ def estimate_delay(
     if best in (0, len(grid) - 1):
         raise DataError(
             "the motor channel fits the joint channel best at the edge of the searched delays, "
-            f"{1e3 * grid[best]:.0f} "
-            "ms; check the motor channel's clock and sign, raise `delay_search_s`, or state `motor_delay_s`"
+            f"{1e3 * grid[best]:.0f} ms; check the channel's clock and sign, raise `delay_search_s`, or "
+            "state `motor_delay_s`"
         )
-    delay = float(grid[best])
-    std = 0.0
+    delay, std = float(grid[best]), 0.0
+    sampling = _sampling_error(parts)
     for stage in ("coarse", "fine"):
         for _ in range(_STEPS):
             step, std = _newton(parts, joint_names, delay, fine=stage == "fine")
+            std = float(np.hypot(std, sampling))
             delay = float(np.clip(delay + np.clip(step, -0.01, 0.01), -search_s, search_s))
-            if abs(step) < 0.05 * std or abs(step) < 1e-9:
+            if abs(step) < 0.1 * std or abs(step) < 1e-9:
                 break
-    std = float(np.hypot(std, _sampling_error(parts)))
     logger.info("motor channel is %.3f ms late (standard deviation %.3f ms)", 1e3 * delay, 1e3 * std)
     return Delay(delay, std, "estimated from the torque difference")
 

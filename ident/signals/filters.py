@@ -4,6 +4,7 @@ makes rows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -111,32 +112,38 @@ class ParallelFilter:
         return result.reshape(len(self.outputs), *flagged.shape[1:])
 
     def coverage(self) -> FloatArray:
-        """Share (K,) of the kernel's absolute area that the samples cover; a gap or an end leaves less than
-        1.
-        """
+        """Share (K,) of the kernel's absolute area that the samples cover: a gap or an end leaves less."""
         whole = np.linspace(-self.half_width, self.half_width, 2001)
         area = float(np.mean(np.abs(self._kernel(np.abs(whole))))) * 2.0 * self.half_width
         result = np.empty(len(self.outputs))
-        for rows, samples, _ in self.blocks():
-            distance = np.abs(self.outputs[rows, None] - self.times[None, samples])
-            result[rows] = np.abs(self._kernel(distance)) @ self.sample_weights[samples] / area
+        for rows, _, kernel in self._kernels():
+            result[rows] = np.abs(kernel).sum(axis=1) / area
         return result
 
-    def blocks(self, size: int = _OUTPUTS) -> list[tuple[slice, slice, FloatArray]]:
+    def blocks(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, FloatArray]]:
         """Rows, samples and dense weights (rows, samples) of a few outputs at a time; bounds the memory."""
-        half = self.half_width
-        weight = self.sample_weights
-        result = []
+        for rows, samples, kernel in self._kernels(size):
+            total = kernel.sum(axis=1, keepdims=True)
+            yield rows, samples, kernel / np.where(total != 0.0, total, 1.0)
+
+    def _kernels(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, FloatArray]]:
+        """Like `blocks`, not normalised. On a regular grid equal offsets share one kernel."""
+        half, weight = self.half_width, self.sample_weights
+        regular = _regular(self.times) and _regular(self.outputs)
+        known: dict[tuple[int, int, int], FloatArray] = {}
         for first in range(0, len(self.outputs), size):
             outputs = self.outputs[first : first + size]
             low = int(np.searchsorted(self.times, outputs[0] - half))
             high = int(np.searchsorted(self.times, outputs[-1] + half, side="right"))
-            distance = np.abs(outputs[:, None] - self.times[None, low:high])
-            kernel = self._kernel(distance) * weight[low:high]
-            total = kernel.sum(axis=1, keepdims=True)
-            kernel /= np.where(total != 0.0, total, 1.0)
-            result.append((slice(first, first + len(outputs)), slice(low, high), kernel))
-        return result
+            inner = regular and low > 0 and high < len(self.times)
+            key = (len(outputs), high - low, round(1e9 * (outputs[0] - self.times[low]))) if inner else None
+            kernel = known.get(key) if key is not None else None
+            if kernel is None:
+                distance = np.abs(outputs[:, None] - self.times[None, low:high])
+                kernel = self._kernel(distance) * weight[low:high]
+                if key is not None:
+                    known[key] = kernel
+            yield slice(first, first + len(outputs)), slice(low, high), kernel
 
     @cached_property
     def _table(self) -> tuple[FloatArray, FloatArray]:
@@ -148,6 +155,14 @@ class ParallelFilter:
     def _kernel(self, distance: FloatArray) -> FloatArray:
         time, value = self._table
         return np.interp(distance, time, value, right=0.0)
+
+
+def _regular(times: FloatArray) -> bool:
+    """Whether the times are equidistant to a nanosecond."""
+    if len(times) < 3:
+        return True
+    step = (times[-1] - times[0]) / (len(times) - 1)
+    return float(np.max(np.abs(times - times[0] - step * np.arange(len(times))))) < 1e-9
 
 
 def half_width(cutoff_hz: float, attenuation_db: float) -> float:

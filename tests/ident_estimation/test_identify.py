@@ -19,11 +19,14 @@ from ident.identify import Identification, IdentificationSettings, identify
 from ident.signals import SignalSettings
 
 NOISY = arm.Sensors(position=1e-5, joint=0.1, motor=0.5, correlation_s=0.2, motor_delay_s=0.004)
-TABLE_2 = """
-    Ia1 Fvm1 Fcm1 Ia2 Fvm2 Fcm2 offm2 Ia3 Fvm3 Fcm3 Ia4 Fvm4 Fcm4 Ia5 Fvm5 Fcm5 Ia6 Fvm6 Fcm6
-    Ia7 Fvm7 Fcm7 offm7 Fcl1 offl1 Fcl2 offl2 Fcl3 Fcl4 offl4 Fcl5 offl5 Fcl7 offl7 XX2R ZZ2R
-    MY2R XX4R ZZ4R MY4R MY5R MY6R XX8 YY8 YZ8 ZZ8 MY8 MZ8 M8
-""".split()
+# fmt: off
+TABLE_2 = [
+    "Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2", "offm2", "Ia3", "Fvm3", "Fcm3", "Ia4", "Fvm4", "Fcm4",
+    "Ia5", "Fvm5", "Fcm5", "Ia6", "Fvm6", "Fcm6", "Ia7", "Fvm7", "Fcm7", "offm7", "Fcl1", "offl1",
+    "Fcl2", "offl2", "Fcl3", "Fcl4", "offl4", "Fcl5", "offl5", "Fcl7", "offl7", "XX2R", "ZZ2R", "MY2R",
+    "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R", "XX8", "YY8", "YZ8", "ZZ8", "MY8", "MZ8", "M8",
+]
+# fmt: on
 
 
 @lru_cache
