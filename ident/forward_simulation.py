@@ -39,6 +39,7 @@ Floats = NDArray[np.float64]
 _WIDTH_RAD_S = 5e-3
 _IMPLICIT = 0.6
 _LOST_RAD = 1.0
+_NEAR_RAD = 0.1
 _ADVICE = (
     "the parameters belong to no real arm: drop those with a large RSD, or estimate with physical consistency"
 )
@@ -111,9 +112,9 @@ def simulate_session(
 ) -> ForwardSimulation:
     """Simulate the longest uninterrupted stretch of a session.
 
-    The reference is the commanded motion where the session has one, else the measured one. Motor torque is
-    simulated where the model has it, else joint torque. Raises DataError when the mass matrix of the model
-    is not positive definite.
+    The reference is the commanded motion where the session has one that the arm followed to 0.1 rad, else the
+    measured one. Motor torque is simulated where the model has it, else joint torque. Raises DataError when
+    the mass matrix of the model is not positive definite.
     """
     prepared = prepared_session(model, session, settings)
     side: Side = "motor" if "motor" in model.structure.sides and prepared.has_motor else "joint"
@@ -128,7 +129,11 @@ def simulate_session(
     joint = passage.joint
     measured = _resampled(joint.times, joint.q, times)
     command = _command(session, prepared, times)
-    reference, target = ("measured", measured) if command is None else ("commanded", command)
+    # A log may hold a command that is not that of its cycle: another clock, a plan that came later.
+    if command is None or np.abs(command - measured).max() > _NEAR_RAD:
+        reference, target = "measured", measured
+    else:
+        reference, target = "commanded", command
     payload = mounted(model, session)
     q, qd, torque = simulate(
         model, times, target, payload=payload, side=side, start=measured[0], bandwidth_hz=bandwidth_hz

@@ -40,7 +40,8 @@ def command(
     """Predict the torque of SESSIONS with MODEL and show what is left, per joint and side.
 
     Competitors appear beside it where they exist: the controller's own mass matrix and gravity (logged
-    through FRI), the inertials of the URDF, other models. A session that the model was estimated from is refused.
+    through FRI), the inertials of the URDF, other models. A session that the model was estimated from is
+    refused.
 
     \b
     lwr-run validate model.yaml check.mcap
