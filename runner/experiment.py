@@ -19,19 +19,20 @@ from lwr_driver.cell import Cell
 from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, Outcome
 from lwr_driver.driver import Progress as MotionProgress
 from lwr_driver.motion import Motion
+from lwr_driver.realtime import Rights
 from lwr_driver.session import session_metadata
 from lwr_driver.trace import import_trace
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.interrupt import Interrupts
 from runner.operator import Operator
 from runner.payload import Rest, check_payload
-from runner.preflight import Preflight
+from runner.preflight import Preflight, check_gravity, check_link, check_rights
 from runner.preparation import session_motion
 from runner.progress import Progress
 from runner.status import StatusLine
 from runner.versions import git_commit, software
 
-__all__ = ["Bench", "Record", "Run"]
+__all__ = ["Bench", "LinkReport", "Record", "Run"]
 
 Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]
@@ -40,14 +41,45 @@ REST_CYCLES_S = 0.5
 
 
 @dataclass(frozen=True)
+class LinkReport:
+    """How the link was during a session: counts of cycles, reply latency of the loop, tracking.
+
+    missed : answers that the controller did not get in time.
+    latency_s : quantiles since the connection began.
+    worst_tracking_error : (n,) [rad]
+    """
+
+    cycles: int
+    missed: int
+    lost: int
+    late: int
+    period_s: float
+    latency_s: dict[float, float]
+    worst_tracking_error: Vector
+
+    @classmethod
+    def between(cls, start: LinkState, end: LinkState) -> LinkReport:
+        """From the states before and after."""
+        return cls(
+            end.received - start.received,
+            end.miss_counter - start.miss_counter,
+            end.lost - start.lost,
+            end.late - start.late,
+            end.period_s,
+            end.latency_s,
+            end.tracking_error,
+        )
+
+
+@dataclass(frozen=True)
 class Record:
-    """How one session ended: its file, status, reason, and the state of the link at its end."""
+    """How one session ended: its file, status, reason, and how the link was."""
 
     name: str
     path: Path
     status: Status
     reason: str
-    link: LinkState | None = None
+    link: LinkReport | None = None
     error: LwrError | None = None
 
 
@@ -106,7 +138,9 @@ class Run:
         bench, driver = self.bench, self.bench.driver
         driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
         self._swap(plan)
-        motion, preflight = self._prepare(plan)
+        here = self._at_rest(plan.payload)
+        motion, preflight = self._prepare(plan, here)
+        start = driver.state()
         traced = self.experiment.motor_torque.source == "trace_file"
         if traced:
             bench.operator.start_trace()
@@ -116,7 +150,7 @@ class Run:
             try:
                 if not np.array_equal(motion.q[0], driver.state().q_command):
                     # The controller took up its set point anew as command mode began.
-                    motion, preflight = self._prepare(plan)
+                    motion, preflight = self._prepare(plan, here)
                 uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
                 driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
                 outcome = self._drive(plan, motion)
@@ -125,7 +159,7 @@ class Run:
                 bench.status.clear()
                 with contextlib.suppress(LwrError):
                     driver.leave_command()
-        link = driver.state()
+        link = LinkReport.between(start, driver.state())
         if recorded.error:
             return Record(plan.name, path, "fail", f"the log could not be written: {recorded.error}", link)
         if traced:
@@ -135,17 +169,22 @@ class Run:
             self._progress.finish(plan.name, self._rest)
         return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error)
 
-    def _prepare(self, plan: SessionPlan) -> tuple[Motion, Preflight]:
+    def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
         """The motion of a session from where the arm is; RefusedError unless every check of it holds."""
-        state = self.bench.driver.state()
+        bench, state = self.bench, self.bench.driver.state()
         motion, preflight = session_motion(
             self.experiment,
-            self.bench.arm,
-            self.bench.cell,
+            bench.arm,
+            bench.cell,
             plan,
             self.excite(state.period_s),
             state.q_command,
             self.folder,
+        )
+        preflight += (
+            check_link(state),
+            check_gravity(bench.arm, here),
+            check_rights(bench.driver.rights or Rights(), needed=not self.experiment.lock_step),
         )
         preflight.enforce()
         return motion, preflight

@@ -17,14 +17,30 @@ from fri.errors import RefusedError
 from lwr_driver.arm import Arm
 from lwr_driver.collision import CollisionChecker
 from lwr_driver.motion import Motion, extremes
+from lwr_driver.realtime import Rights
+from lwr_driver.state import LinkState
 from runner.experiment_file import Payload
+from runner.payload import Rest, gravity_torque
 
-__all__ = ["Item", "Preflight", "check_disk", "check_motion_limits", "check_path", "check_torque"]
+__all__ = [
+    "Item",
+    "Preflight",
+    "check_disk",
+    "check_gravity",
+    "check_link",
+    "check_motion_limits",
+    "check_path",
+    "check_rights",
+    "check_start",
+    "check_torque",
+]
 
 Vector = npt.NDArray[np.float64]
 
 BYTES_PER_CYCLE = 600.0
 TORQUE_SHARE = 0.8
+GRAVITY_SHARE = 0.3
+GRAVITY_FLOOR = 0.03
 
 
 @dataclass(frozen=True)
@@ -137,6 +153,47 @@ def check_start(arm: Arm, q: Vector, first: Vector, limit: float) -> Item:
         f"{limit:.2f} rad",
         bool(distance[joint] <= limit),
         "move the arm nearer to its home position by hand guidance or with the pendant",
+    )
+
+
+def check_rights(rights: Rights, *, needed: bool) -> Item:
+    """Real-time rights of the loop process; in lock step they do not matter."""
+    lacking = "; ".join(shortage.what for shortage in rights.missing)
+    return Item(
+        "real-time rights",
+        ("had" if needed else "not needed") if not lacking else f"missing: {lacking}",
+        "had, or waived" if needed else "none",
+        True,
+    )
+
+
+def check_link(state: LinkState) -> Item:
+    """The controller's own rating of the link, drives and errors."""
+    good = state.quality in ("OK", "PERFECT") and not state.error
+    return Item(
+        "link",
+        f"{state.quality}, answer rate {state.answer_rate:.3f}, drive errors 0x{state.error:02x}",
+        "OK, 0x00",
+        good,
+        "close other programs, check the cable, acknowledge messages at the pendant",
+    )
+
+
+def check_gravity(arm: Arm, rest: Rest) -> Item:
+    """Joint torques at rest against gravity of the nominal arm with its payload: signs, order, gross load.
+
+    The sign of the sensors is not documented; a joint whose torque opposes gravity gives itself away here.
+    """
+    expected = gravity_torque(arm, rest.q, rest.payload)
+    allowed = GRAVITY_SHARE * np.abs(expected) + GRAVITY_FLOOR * arm.tau_max
+    excess = np.abs(rest.tau - expected) / allowed
+    joint = int(np.argmax(excess))
+    return Item(
+        "torque at rest",
+        f"{arm.joint_names[joint]} {rest.tau[joint]:+.2f} Nm",
+        f"{expected[joint]:+.2f} ± {allowed[joint]:.2f} Nm",
+        bool(excess[joint] <= 1.0),
+        "check sign, order and zero of the torque sensors, and what is mounted",
     )
 
 

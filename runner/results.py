@@ -16,9 +16,8 @@ from ident.model import DynamicModel
 from ident.model_file import write_model
 from ident.signals.settings import SignalSettings
 from lwr_driver.arm import Arm
-from lwr_driver.driver import LinkState
 from lwr_driver.session import read_session
-from runner.experiment import Record
+from runner.experiment import LinkReport, Record
 from runner.experiment_file import Experiment
 from runner.versions import software, versions
 from sim_backend.truth import truth
@@ -125,15 +124,15 @@ def identified_model(found: Identification, robot: str, sessions: Sequence[str])
     )
 
 
-def _link(state: LinkState) -> dict[str, Any]:
+def _link(link: LinkReport) -> dict[str, Any]:
     return {
-        "cycles": state.received,
-        "missed": state.miss_counter,
-        "lost": state.lost,
-        "late": state.late,
-        "period_s": state.period_s,
-        "latency_s": {f"p{100 * quantile:g}": value for quantile, value in state.latency_s.items()},
-        "worst_tracking_error_rad": state.tracking_error.tolist(),
+        "cycles": link.cycles,
+        "missed": link.missed,
+        "lost": link.lost,
+        "late": link.late,
+        "period_s": link.period_s,
+        "latency_s": {f"p{100 * quantile:g}": value for quantile, value in link.latency_s.items()},
+        "worst_tracking_error_rad": link.worst_tracking_error.tolist(),
     }
 
 
