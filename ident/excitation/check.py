@@ -1,20 +1,22 @@
-"""The check that every planned motion must pass: on the continuous motion where theory allows, and on a 1 ms
-grid.
+"""The check that every planned motion must pass.
 
-Position, velocity, acceleration and jerk are compared at their exact extrema. Torque, flange position and
-collision are compared on the grid; `certificate` extends them to all instants between the samples.
+Position, velocity, acceleration and jerk are compared at their exact extrema on the continuous motion.
+Torque, flange position and collision are compared on a 1 ms grid and, on request, proven for every instant
+between the samples by the Lipschitz bounds of `certificate`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.excitation.chain import Chain, tip_path
+from ident.excitation.capsules import space_of
+from ident.excitation.certificate import Proof, prove, reach, speed_bound, torque_rate
 from ident.excitation.estimate import ArmEstimate
+from ident.excitation.mechanism import Mechanism, tip_path
 from ident.excitation.motion import Array, ParametricMotion, Samples
 from ident.excitation.torque import torque_bounds
 
@@ -26,13 +28,24 @@ KINEMATIC = (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s
 class Nearest(Protocol):
     """Tightest moment of a path: distance [m], the two bodies, the row."""
 
-    distance: float
-    pair: tuple[str, str]
-    row: int
+    @property
+    def distance(self) -> float:
+        """Clearance [m], below zero in collision."""
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the two bodies."""
+
+    @property
+    def row(self) -> int:
+        """Row of the path."""
 
 
 class PathChecker(Protocol):
     """What the check needs of a collision checker (`lwr_driver.collision.CollisionChecker`)."""
+
+    def clearance(self, q: Array) -> Nearest:
+        """Smallest distance in one posture (joints,)."""
 
     def check_path(self, q: Array, *, period_s: float = 0.0) -> Nearest:
         """Tightest moment of the path q (n, joints)."""
@@ -94,7 +107,10 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Margin:
-    """How far a motion stays from one limit. `slack` = room left, negative if violated, in `unit`."""
+    """How far a motion stays from one limit. `slack` = room left, negative if violated, in `unit`.
+
+    proven : False if a proof for the instants between the samples was asked for and not found.
+    """
 
     constraint: str
     subject: str
@@ -103,14 +119,15 @@ class Margin:
     slack: float
     unit: str
     time_s: float
+    proven: bool = True
 
     @property
     def ok(self) -> bool:
         """True if the limit is kept."""
-        return self.slack >= 0.0
+        return self.slack >= 0.0 and self.proven
 
     def __str__(self) -> str:
-        state = "keeps" if self.ok else "violates"
+        state = "violates" if self.slack < 0.0 else "keeps" if self.proven else "is not proven to keep"
         return (
             f"{self.subject} {self.constraint} {self.value:.4g} {self.unit} at t = {self.time_s:.3f} s "
             f"{state} {self.limit:.4g} {self.unit} by {abs(self.slack):.3g}"
@@ -150,7 +167,7 @@ class Check:
 
 def check_motion(
     motion: ParametricMotion,
-    chain: Chain,
+    mechanism: Mechanism,
     limits: Limits,
     *,
     workspace: Workspace | None = None,
@@ -160,28 +177,92 @@ def check_motion(
     clearance_m: float = 0.0,
     step_s: float = 1e-3,
     collision_step_s: float = 1e-2,
+    continuous: bool = False,
 ) -> Check:
-    """Compare a motion with every limit; see the module for what is exact and what is sampled at `step_s`."""
-    if motion.joints != chain.joints:
-        raise ConfigurationError(f"the motion has {motion.joints} joints, the arm {chain.joints}")
-    margins = _kinematic_margins(motion, chain, limits)
+    """Compare a motion with every limit.
+
+    step_s, collision_step_s : sampling of torque and flange, and of the collision checker's path
+    continuous : also prove torque, flange and clearance for every instant, if the samples are clean
+    """
+    if motion.joints != mechanism.joints:
+        raise ConfigurationError(f"the motion has {motion.joints} joints, the arm {mechanism.joints}")
+    margins = _kinematic_margins(motion, mechanism, limits)
     count = max(2, round(motion.duration / step_s))
     times = np.linspace(0.0, motion.duration, count, endpoint=False)
     samples = motion.sample(times)
     if estimate is not None:
-        margins += _torque_margins(samples, times, chain, limits, estimate, coverage)
+        margins += _torque_margins(samples, times, mechanism, limits, estimate, coverage)
     if workspace is not None:
-        margins += _workspace_margins(samples, times, chain, workspace)
+        margins += _workspace_margins(samples, times, mechanism, workspace)
     if checker is not None:
         margins.append(_clearance_margin(motion, checker, clearance_m, collision_step_s))
+    if continuous and all(margin.ok for margin in margins):
+        unproven = set()
+        if estimate is not None and not _torque_proof(motion, mechanism, limits, estimate, coverage).proven:
+            unproven |= {"joint torque", "motor torque"}
+        if workspace is not None:
+            unproven |= _workspace_proofs(motion, mechanism, workspace)
+        if checker is not None and not _clearance_proof(motion, mechanism, checker, clearance_m).proven:
+            unproven.add("clearance")
+        margins = [replace(m, proven=m.constraint not in unproven) for m in margins]
     return Check(tuple(margins))
 
 
-def _kinematic_margins(motion: ParametricMotion, chain: Chain, limits: Limits) -> list[Margin]:
+def _torque_proof(
+    motion: ParametricMotion, mechanism: Mechanism, limits: Limits, estimate: ArmEstimate, coverage: float
+) -> Proof:
+    bound_rate = torque_rate(motion, mechanism, estimate, coverage)
+
+    def slack(times: Array) -> Array:
+        bounds = torque_bounds(mechanism, motion.sample(times), estimate, coverage)
+        share = np.maximum(bounds.joint, bounds.motor) / limits.tau_max
+        return 1.0 - share.max(axis=1)
+
+    def rate(times: Array, half: float) -> Array:
+        return np.max(bound_rate(times, half) / limits.tau_max, axis=1)
+
+    return prove(motion, slack, rate)
+
+
+def _workspace_proofs(motion: ParametricMotion, mechanism: Mechanism, workspace: Workspace) -> set[str]:
+    """Constraints of the workspace that could not be proven."""
+    extents = np.zeros(mechanism.joints)
+    extents[-1] = np.linalg.norm(mechanism.tip)
+    rate = speed_bound(motion, reach(mechanism, extents))
+
+    def radius(times: Array) -> Array:
+        points = tip_path(mechanism, motion.sample(times).q)
+        return np.hypot(points[:, 0], points[:, 1]) - float(workspace.radius_m or 0.0)
+
+    def height(times: Array) -> Array:
+        return tip_path(mechanism, motion.sample(times).q)[:, 2] - float(workspace.height_m or 0.0)
+
+    unproven = set()
+    if workspace.radius_m is not None and not prove(motion, radius, rate).proven:
+        unproven.add("distance from axis 1")
+    if workspace.height_m is not None and not prove(motion, height, rate).proven:
+        unproven.add("height")
+    return unproven
+
+
+def _clearance_proof(
+    motion: ParametricMotion, mechanism: Mechanism, checker: PathChecker, clearance_m: float
+) -> Proof:
+    space, _ = space_of(mechanism, getattr(checker, "geometry", None))
+    rate = speed_bound(motion, reach(mechanism, space.extents(mechanism.joints)))
+
+    def slack(times: Array) -> Array:
+        postures = motion.sample(times).q
+        return np.array([checker.clearance(posture).distance for posture in postures]) - clearance_m
+
+    return prove(motion, slack, rate)
+
+
+def _kinematic_margins(motion: ParametricMotion, mechanism: Mechanism, limits: Limits) -> list[Margin]:
     margins = []
     for order, (constraint, unit) in enumerate(KINEMATIC):
         extrema = motion.extrema(order)
-        for joint, name in enumerate(chain.joint_names):
+        for joint, name in enumerate(mechanism.joint_names):
             if order == 0:
                 low, high = float(limits.q_low[joint]), float(limits.q_high[joint])
             else:
@@ -197,21 +278,28 @@ def _kinematic_margins(motion: ParametricMotion, chain: Chain, limits: Limits) -
 
 
 def _torque_margins(
-    samples: Samples, times: Array, chain: Chain, limits: Limits, estimate: ArmEstimate, coverage: float
+    samples: Samples,
+    times: Array,
+    mechanism: Mechanism,
+    limits: Limits,
+    estimate: ArmEstimate,
+    coverage: float,
 ) -> list[Margin]:
     margins = []
-    bounds = torque_bounds(chain, samples, estimate, coverage)
+    bounds = torque_bounds(mechanism, samples, estimate, coverage)
     for constraint, values in (("joint torque", bounds.joint), ("motor torque", bounds.motor)):
-        for joint, name in enumerate(chain.joint_names):
+        for joint, name in enumerate(mechanism.joint_names):
             row = int(np.argmax(values[:, joint]))
             value, limit = float(values[row, joint]), float(limits.tau_max[joint])
             margins.append(Margin(constraint, name, value, limit, limit - value, "Nm", float(times[row])))
     return margins
 
 
-def _workspace_margins(samples: Samples, times: Array, chain: Chain, workspace: Workspace) -> list[Margin]:
+def _workspace_margins(
+    samples: Samples, times: Array, mechanism: Mechanism, workspace: Workspace
+) -> list[Margin]:
     margins = []
-    points = tip_path(chain, samples.q)
+    points = tip_path(mechanism, samples.q)
     radius = np.hypot(points[:, 0], points[:, 1])
     for constraint, values, limit in (
         ("distance from axis 1", radius, workspace.radius_m),
