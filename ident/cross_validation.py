@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fri.errors import DataError
-from ident.identify import Identification, IdentificationSettings, identify
+from ident.identify import IdentificationSettings, identify
 from ident.kinematics import Chain
-from ident.model import DynamicModel
 from ident.validation import SessionScore, validate
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["CrossValidation", "cross_validate", "model_of"]
+__all__ = ["CrossValidation", "cross_validate"]
 
 
 @dataclass(frozen=True)
@@ -75,32 +74,8 @@ def cross_validate(
         except DataError as error:
             skipped.append(f"{session.path.name}: the others do not identify a model: {error}")
             continue
-        fold = validate(model_of(found, others), [session], settings=settings.signals)
+        fold = validate(found.model, [session], settings=settings.signals)
         scores += list(fold.scores)
     if not scores:
         raise DataError("no session can be predicted by the others: " + "; ".join(skipped))
     return CrossValidation(tuple(scores), tuple(skipped))
-
-
-def model_of(found: Identification, sessions: Sequence[Session], robot: str | None = None) -> DynamicModel:
-    """The model of an identification, with the uids of its sessions as provenance."""
-    return DynamicModel(
-        robot=robot if robot is not None else sessions[0].metadata.get("robot", ""),
-        structure=found.structure,
-        names=found.base.names,
-        values=found.estimate.values,
-        covariance=found.estimate.covariance.matrix,
-        base=found.base,
-        provenance={
-            "sessions": [
-                {
-                    "file": session.path.name,
-                    "uid": session.metadata.get("uid", ""),
-                    "payload": session.metadata.get("payload", "none"),
-                }
-                for session in sessions
-            ],
-            "estimator": found.estimate.method,
-            "covariance": found.estimate.covariance.kind,
-        },
-    )

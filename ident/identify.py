@@ -153,7 +153,10 @@ class Identification:
         return {
             "estimator": self.estimate.method,
             "covariance": self.estimate.covariance.kind,
-            "sessions": [session.name for session in self.prepared],
+            "sessions": [
+                {"file": session.name, "uid": session.uid, "payload": payload or "none"}
+                for session, payload in zip(self.prepared, self.payloads, strict=True)
+            ],
             "cutoff_hz": self.settings.signals.cutoff_hz,
             "decimate_hz": self.settings.signals.decimate_hz,
         }
@@ -343,11 +346,13 @@ def _instrumental(
     """Instrumental-variable estimate on the commanded motion, None where the sessions do not have it."""
     if settings.signals.average_periods:
         return None
-    motions = [commanded(session, one) for session, one in zip(sessions, prepared, strict=True)]
-    whole = [motion for motion in motions if motion is not None]
-    if len(whole) < len(motions):
-        return None
-    matrices = [g.matrix for g in observe(whole, payloads, structure, columns=base.columns).groups]
+    matrices: list[FloatArray] = []
+    for session, one, payload in zip(sessions, prepared, payloads, strict=True):
+        motion = commanded(session, one)
+        if motion is None:
+            return None
+        groups = observe([motion], [payload], structure, columns=base.columns).groups
+        matrices += [group.matrix for group in groups]
     return InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
 
 

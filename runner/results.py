@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -99,29 +100,17 @@ def write_results(
     """Write model.yaml, report.txt and summary.json into `folder`; returns the report."""
     report = _report(experiment, summary, found)
     if found is not None:
-        model = identified_model(found, arm.name, [entry["file"] for entry in summary["sessions"]])
+        model = identified_model(found, arm.name)
         write_model(model, folder / "model.yaml")
     (folder / "report.txt").write_text(report, encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     return report
 
 
-def identified_model(found: Identification, robot: str, sessions: Sequence[str]) -> DynamicModel:
+def identified_model(found: Identification, robot: str) -> DynamicModel:
     """The identified model with its covariance and where it comes from."""
-    return DynamicModel(
-        robot=robot,
-        structure=found.structure,
-        names=found.base.names,
-        values=found.estimate.values,
-        covariance=found.estimate.covariance.matrix,
-        base=found.base,
-        provenance={
-            "sessions": list(sessions),
-            "estimator": found.estimate.method,
-            "covariance": found.estimate.covariance.kind,
-            "software": software(),
-        },
-    )
+    provenance = {**found.model.provenance, "software": software()}
+    return dataclasses.replace(found.model, robot=robot, provenance=provenance)
 
 
 def _link(link: LinkReport) -> dict[str, Any]:

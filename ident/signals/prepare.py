@@ -74,7 +74,7 @@ class PreparedSession:
     periods.
     delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
     rows.
-    moving : joints that move. warnings : sentences for the report.
+    moving : joints that move. warnings : sentences for the report. uid : of the session, from its metadata.
     """
 
     name: str
@@ -90,6 +90,7 @@ class PreparedSession:
     moving: tuple[str, ...]
     counts: dict[str, int]
     warnings: tuple[str, ...]
+    uid: str = ""
 
     @property
     def has_joint(self) -> bool:
@@ -215,6 +216,7 @@ def prepare(
         moving=names,
         counts=counts,
         warnings=tuple(warnings),
+        uid=session.metadata.get("uid", ""),
     )
 
 

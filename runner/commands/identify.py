@@ -80,6 +80,5 @@ def command(
     found = identify(logs, chain, settings)
     click.echo(json.dumps(found.to_dict(), indent=1) if as_json else found.summary())
     if out is not None:
-        names = [path.name for path in sessions]
-        write_model(identified_model(found, logs[0].metadata.get("robot", "arm"), names), out)
+        write_model(identified_model(found, logs[0].metadata.get("robot", "arm")), out)
         click.echo(str(out), err=as_json)

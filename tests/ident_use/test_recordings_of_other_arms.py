@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.cross_validation import model_of
 from ident.identify import Identification, IdentificationSettings, identify
 from ident.import_log import LogMapping, import_log
 from ident.kinematics import Chain
@@ -125,7 +124,7 @@ def test_lwr4_repeat_is_predicted_and_another_trajectory_less_so(tmp_path: Path)
         sessions.append(read_session(path))
     chain = Chain.from_urdf(source / "kuka_lwr4_2016-04-11.urdf")
     found = identify(sessions[:1], chain, IdentificationSettings(model=1))
-    result = validate(model_of(found, sessions[:1]), sessions[1:])
+    result = validate(found.model, sessions[1:])
     repeat, other = (score.relative["joint"] for score in result.scores)
     assert repeat < 0.03
     assert 0.08 < other < 0.25

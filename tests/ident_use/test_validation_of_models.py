@@ -10,7 +10,9 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.competitors import competitor_scores
+from ident.cross_validation import cross_validate
 from ident.forward_simulation import simulate, simulate_session
+from ident.identify import IdentificationSettings, identify
 from ident.model import DynamicModel
 from ident.signals.settings import SignalSettings
 from ident.validation import Validation, validate
@@ -179,3 +181,21 @@ def test_a_model_of_no_real_arm_is_not_simulated(truth_model: Any) -> None:
     times = np.arange(0, 0.1, 1e-3)
     with pytest.raises(DataError, match="not positive definite"):
         simulate(wrong, times, np.zeros((len(times), 7)))
+
+
+def test_cross_validation_predicts_each_session_by_the_others(bench: Any, unloaded: Any, loaded: Any) -> None:
+    other = bench.session("second", seed=21, periods=2)
+    chain = bench.chain
+    settings = IdentificationSettings(model=1, signals=PLAIN)
+    result = cross_validate([unloaded, other, loaded], chain, settings)
+    assert [score.session for score in result.scores] == ["unloaded.mcap", "second.mcap"]
+    assert "loaded.mcap: payload 'load' is in no other session" in result.skipped[0]
+    assert not any(score.seen for score in result.scores)
+    for key, rms in result.rms.items():
+        assert key.endswith("joint")
+        assert rms == pytest.approx(0.05, rel=0.15)
+    with pytest.raises(DataError, match="two at least"):
+        cross_validate([unloaded], chain, settings)
+    found = identify([unloaded, other], chain, settings)
+    with pytest.raises(DataError, match="the estimate was made from this session"):
+        validate(found.model, [other], settings=PLAIN)
