@@ -39,7 +39,7 @@ from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["Identification", "IdentificationSettings", "identify"]
+__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "identify"]
 
 FloatArray = NDArray[np.float64]
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
@@ -61,6 +61,7 @@ _ESTIMATORS: dict[str, EstimatorFactory] = {
         cad_prior(base), covariance=covariance
     ),
 }
+ESTIMATORS = tuple(_ESTIMATORS)
 _WIDE_CONDITION = 100.0
 
 

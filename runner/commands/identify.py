@@ -8,14 +8,13 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
-from ident.identify import IdentificationSettings, identify
+from ident.identify import ESTIMATORS, IdentificationSettings, identify
 from ident.kinematics import Chain
 from ident.model_file import write_model
+from ident.mounting import find_mounting
 from ident.signals.settings import SignalSettings
 from lwr_driver.session import read_session
 from runner.results import identified_model
-
-ESTIMATORS = ("wls", "ols", "huber", "tukey", "tls")
 
 
 @click.command("identify")
@@ -35,6 +34,7 @@ ESTIMATORS = ("wls", "ols", "huber", "tukey", "tls")
 @click.option("--decimate-hz", default=2.0, show_default=True, help="Low-pass of the parallel decimation.")
 @click.option("--choose-cutoff", is_flag=True, help="Take the cut-off from the spectrum of the positions.")
 @click.option("--average-periods", is_flag=True, help="Average the periods of a periodic motion first.")
+@click.option("--tilt", is_flag=True, help="Find how the base leans, too, and identify under it.")
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
 )
@@ -49,6 +49,7 @@ def command(
     decimate_hz: float,
     choose_cutoff: bool,
     average_periods: bool,
+    tilt: bool,
     urdf: Path | None,
     out: Path | None,
     as_json: bool,
@@ -61,6 +62,7 @@ def command(
     \b
     lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
     lwr-run identify unloaded.mcap --model 1 --estimator huber
+    lwr-run identify short.mcap --model 1 --estimator physical --tilt
     """
     logs = [read_session(path) for path in sessions]
     if urdf is None and logs[0].robot_description is None:
@@ -77,8 +79,13 @@ def command(
         estimator=estimator,
         without=without,
     )
-    found = identify(logs, chain, settings)
-    click.echo(json.dumps(found.to_dict(), indent=1) if as_json else found.summary())
+    mounting = find_mounting(logs, chain, settings) if tilt else None
+    found = identify(logs, chain, settings) if mounting is None else mounting.identification
+    if as_json:
+        content = found.to_dict() | ({} if mounting is None else {"mounting": mounting.to_dict()})
+        click.echo(json.dumps(content, indent=1))
+    else:
+        click.echo(found.summary() if mounting is None else f"{found.summary()}\n\n{mounting}")
     if out is not None:
         write_model(identified_model(found, logs[0].metadata.get("robot", "arm")), out)
         click.echo(str(out), err=as_json)
