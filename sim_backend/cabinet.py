@@ -97,15 +97,17 @@ class Cabinet:
         model, drive = true_arm(self.config, self.file)
         payload = self.file.payload(robot.payload)
         own, others = seed.spawn(2)
+        self.effects: tuple[Effect, ...] = tuple(_load(effect) for effect in robot.effects)
         if robot.plant is not None:
             plant = _load(robot.plant, model, drive, np.random.default_rng(own))
             if not isinstance(plant, Plant):
                 raise ConfigurationError(
                     f"{robot.plant.type!r} lacks methods or arrays of sim_backend.plant.Plant"
                 )
-            self.effects: tuple[Effect, ...] = ()
+            # Such a plant has its own physics; of the effects only what the sensors do to it is left.
+            for effect, stream in zip(self.effects, others.spawn(len(self.effects)), strict=True):
+                effect.start(model.nv, np.random.default_rng(stream))
         else:
-            self.effects = tuple(_load(effect) for effect in robot.effects)
             plant = ElasticArm(model, drive, substeps=robot.substeps, effects=self.effects, random=others)
         plant.mount(payload)
         self.payload_name = robot.payload

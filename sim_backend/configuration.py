@@ -71,7 +71,7 @@ class RobotConfig:
     substeps : steps of the joint dynamics within 1 ms
     effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
     plant : other physics altogether, called with `model, drive, random, **options` (see
-    `sim_backend.plant.Plant`)
+    `sim_backend.plant.Plant`); of `effects` it gets what they do to the sensors
     """
 
     urdf: str = "lwr4plus.urdf"
