@@ -31,6 +31,7 @@ class ImportReport:
 
     rows : samples written of each topic. rows_in_source : samples that the recording holds.
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
+    holes : intervals longer than 1.75 periods, where the recording seems to have lost samples.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class ImportReport:
     period_s: float
     shortest_s: float
     longest_s: float
+    holes: int
     conversions: tuple[str, ...]
     digests: Mapping[str, str]
 
@@ -54,6 +56,11 @@ class ImportReport:
             f"  rows      {written} (recording: {self.rows_in_source})",
             f"  period    median {self.period_s * 1e3:.4g} ms, {self.shortest_s * 1e3:.4g} to "
             f"{self.longest_s * 1e3:.4g} ms, {jitter}",
+            *(
+                [f"  holes     {self.holes} intervals longer than 1.75 periods: lost samples"]
+                if self.holes
+                else []
+            ),
             *(f"  {line}" for line in self.conversions),
             *(f"  read      {name}  sha256 {digest[:16]}" for name, digest in self.digests.items()),
             f"  written   {self.path}  uid {self.uid}",
@@ -144,6 +151,7 @@ def import_log(
         period_s=float(np.median(steps)),
         shortest_s=float(steps.min()),
         longest_s=float(steps.max()),
+        holes=int(np.count_nonzero(steps > 1.75 * np.median(steps))),
         conversions=_conversions(mapping),
         digests=recording.digests,
     )

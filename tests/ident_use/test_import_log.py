@@ -237,6 +237,14 @@ def test_a_mapping_that_makes_no_sense_is_refused(changes: dict[str, Any], messa
         mapping(**changes)
 
 
+def test_lost_samples_are_counted_in_the_report(tmp_path: Path) -> None:
+    times = np.delete(np.arange(20) * 0.01, [5, 6, 12])
+    report = import_log(mapping(), write_csv(tmp_path, 17, t=times), tmp_path / "x.mcap")
+    assert report.holes == 2
+    assert "2 intervals longer than 1.75 periods" in str(report)
+    assert "kept as recorded" in str(report)
+
+
 def test_missing_column_and_missing_file_name_what_there_is(tmp_path: Path) -> None:
     write_csv(tmp_path)
     with pytest.raises(DataError, match="no column 'qz'; it has t, qa, qb, ta, tb"):

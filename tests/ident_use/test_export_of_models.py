@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from fri.errors import ConfigurationError
+from ident import parameters
+from ident.base import numeric_base
+from ident.export import Program, consistent_parameters, standard_model, to_mjcf, to_numpy, to_urdf
+from ident.kinematics import Chain
+from ident.model import DynamicModel
+from ident.structure import Coulomb, Coupling, ModelStructure
+
+
+def states(n: int, count: int = 30) -> np.ndarray:
+    return np.random.default_rng(4).normal(size=(3, count, n))
+
+
+def program(model: Any) -> dict[str, Any]:
+    space: dict[str, Any] = {}
+    exec(to_numpy(model), space)
+    return space
+
+
+@pytest.mark.parametrize("payload", [None, "load"])
+def test_code_of_a_model_has_its_torques(estimated: Callable[..., DynamicModel], payload: str | None) -> None:
+    model = estimated(1)
+    q, qd, qdd = states(7)
+    motor, joint = program(standard_model(model, payload=payload))["inverse_dynamics"](q, qd, qdd)
+    np.testing.assert_allclose(motor, model.torque(q, qd, qdd, payload=payload, side="motor"), atol=1e-9)
+    np.testing.assert_allclose(joint, model.torque(q, qd, qdd, payload=payload, side="joint"), atol=1e-9)
+    gravity = program(standard_model(model, payload=payload))["gravity"](q)
+    np.testing.assert_allclose(gravity, model.gravity(q, payload=payload), atol=1e-9)
+
+
+def test_code_of_coupled_drives_and_motor_torque_alone() -> None:
+    rng = np.random.default_rng(8)
+    chain = Chain.from_table(
+        [
+            {"r": 0.32},
+            {"alpha": -np.pi / 2, "theta": -np.pi / 2},
+            {"d": 0.225, "r": 0.035, "theta": np.pi / 2},
+            {"alpha": np.pi / 2, "r": 0.225},
+            {"alpha": -np.pi / 2},
+            {"alpha": np.pi / 2},
+        ]
+    )
+    structure = ModelStructure(
+        chain, 2, couplings=(Coupling(("q5", "q6")),), coulomb=Coulomb("tanh", 0.05), sides=("motor",)
+    )
+    base = numeric_base(structure)
+    model = DynamicModel("wrist", structure, base.names, rng.normal(size=len(base)), None, base)
+    q, qd, qdd = states(6)
+    found = program(standard_model(model))["inverse_dynamics"](q, qd, qdd)
+    np.testing.assert_allclose(found, model.torque(q, qd, qdd, side="motor"), atol=1e-9)
+
+
+def test_essential_parameters_alone_make_the_shortest_code(estimated: Callable[..., DynamicModel]) -> None:
+    model = estimated(1)
+    keep = [
+        k for k, name in enumerate(model.names) if name in {"XX2R", "ZZ2R", "MY2R", "XX4R", "ZZ4R", "MY4R"}
+    ]
+    small = replace(
+        model, names=tuple(model.names[k] for k in keep), values=model.values[keep], covariance=None
+    )
+    q, qd, qdd = states(7)
+    space = program(standard_model(small))
+    np.testing.assert_allclose(
+        space["inverse_dynamics"](q, qd, qdd)[1], small.torque(q, qd, qdd, side="joint"), atol=1e-9
+    )
+    few, many = (Program.of(standard_model(m)).operations["multiplications"] for m in (small, model))
+    assert few < 0.5 * many
+
+
+def test_urdf_of_a_true_model_reproduces_its_torques(truth_model: DynamicModel) -> None:
+    found = standard_model(truth_model, payload="load", consistent=True)
+    assert found.notes == ("Physically consistent bodies with exactly the identified torque.",)
+    reloaded = pin.buildModelFromXML(to_urdf(found))
+    data = reloaded.createData()
+    q, qd, qdd = states(7)
+    drive = truth_model.drive()
+    truth = truth_model.torque(q, qd, qdd, payload="load", side="joint")
+    for row in range(len(q)):
+        rigid = pin.rnea(reloaded, data, q[row], qd[row], qdd[row])
+        joint = rigid + drive["Fvl"] * qd[row] + drive["Fcl"] * np.sign(qd[row]) + drive["offl"]
+        np.testing.assert_allclose(joint, truth[row], rtol=0, atol=1e-6)
+
+
+def test_an_estimate_of_no_real_body_moves_by_its_uncertainty_and_says_so(
+    estimated: Callable[..., DynamicModel],
+) -> None:
+    model = estimated(2, 0.05)
+    found = consistent_parameters(model)
+    assert not found.projection.exact
+    table = found.vector.reshape(8, 17)[:, :10]
+    assert all(verdict.consistent for verdict in parameters.consistency(table))
+    assert found.projection.worst < 3.0
+    assert "nearest ones were taken" in found.notes[0]
+    q, qd, qdd = states(7, 200)
+    std = model.torque_std(q, qd, qdd, side="joint")
+    for text in (to_urdf, to_mjcf):
+        assert "RMS change of the joint torque" in text(standard_model(model, consistent=True))
+    assert np.all(found.torque_change_nm < 2.0 * np.sqrt(np.mean(std**2, axis=0)))
+    # Masses stay those of an arm although only combinations of them are identified.
+    assert 5.0 < table[:7, 9].sum() < 60.0
+
+
+def test_unsuitable_models_and_payloads_are_refused(truth_model: DynamicModel) -> None:
+    with pytest.raises(ConfigurationError, match="payload 'cup' is not in this model"):
+        standard_model(truth_model, payload="cup")
+    structure = ModelStructure(truth_model.structure.chain, 3)
+    difference = DynamicModel("drives", structure, ("Fvm1",), np.array([3.0]))
+    with pytest.raises(ConfigurationError, match="has no bodies"):
+        standard_model(difference, consistent=True)
+    assert "tau_difference" in to_numpy(standard_model(difference))
+    with pytest.raises(ConfigurationError, match="reference bodies have shape"):
+        standard_model(truth_model, consistent=True, reference=np.zeros((2, 10)))
+
+
+def test_effects_that_are_left_out_are_named(truth_model: DynamicModel) -> None:
+    extended = replace(truth_model, effects=({"name": "stribeck"},))
+    assert "Effects of the model that are not in this file: stribeck." in to_numpy(standard_model(extended))
