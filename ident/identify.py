@@ -31,7 +31,7 @@ from ident.estimators.weighted import WeightedLeastSquares
 from ident.instruments import commanded
 from ident.kinematics import Chain
 from ident.model import DynamicModel
-from ident.observation import observe
+from ident.observation import observe, stack
 from ident.signals.prepare import PreparedSession, prepare
 from ident.signals.settings import SignalSettings
 from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Side
@@ -100,7 +100,7 @@ class Identification:
     """Result of `identify`.
 
     base : the base parameters and their regrouping; estimate : values, covariance and residuals.
-    prepared : the sessions as filtered; problem : the stacked regression. warnings : sentences for the
+    prepared : the sessions as filtered, without their samples; problem : the stacked regression. warnings : sentences for the
     report.
     """
 
@@ -291,21 +291,29 @@ def identify(
         settings.coulomb,
         () if sensed else ("motor",),
     )
-    prepared = [
-        prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
-        for session in chosen
-    ]
+    mounted = payloads if settings.model != 3 else [None] * len(payloads)
+    base = numeric_base(structure, _conditions(structure, chosen, mounted))
+    prepared, problems, instruments = [], [], []
+    for session, payload in zip(chosen, mounted, strict=True):
+        # One session after the other: the full-rate signals of only one are in memory at a time.
+        whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
+        problems.append(
+            observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
+        )
+        motion = None if settings.signals.average_periods else commanded(session, whole)
+        if motion is not None:
+            instruments.append(observe([motion], [payload], structure, columns=base.columns))
+        prepared.append(whole.without_samples())
+        del whole, motion
     warnings = [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
-    mounted = payloads if settings.model != 3 else [None] * len(payloads)
-    base = numeric_base(structure, _conditions(structure, prepared, mounted))
-    problem = observe(prepared, mounted, structure, columns=base.columns, names=base.names, units=base.units)
+    problem = stack(problems)
     normalised = problem.require_rank()
     estimate = _estimator(settings, base, problem).fit(problem)
     assumptions = check_assumptions(
         problem,
         estimate,
-        instrumental=_instrumental(chosen, prepared, mounted, structure, base, problem, settings),
+        instrumental=_instrumental(problem, problems, instruments, settings),
         period_rows=_common_period(prepared),
     )
     essential = None
@@ -336,24 +344,15 @@ def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem
 
 
 def _instrumental(
-    sessions: Sequence[Session],
-    prepared: Sequence[PreparedSession],
-    payloads: Sequence[str | None],
-    structure: ModelStructure,
-    base: BaseSet,
     problem: Problem,
+    problems: Sequence[Problem],
+    instruments: Sequence[Problem],
     settings: IdentificationSettings,
 ) -> Estimate | None:
-    """Instrumental-variable estimate on the commanded motion, None where the sessions do not have it."""
-    if settings.signals.average_periods:
+    """Instrumental-variable estimate on the commanded motion, None where a session does not have it."""
+    if len(instruments) < len(problems):
         return None
-    matrices: list[FloatArray] = []
-    for session, one, payload in zip(sessions, prepared, payloads, strict=True):
-        motion = commanded(session, one)
-        if motion is None:
-            return None
-        groups = observe([motion], [payload], structure, columns=base.columns).groups
-        matrices += [group.matrix for group in groups]
+    matrices = [group.matrix for one in instruments for group in one.groups]
     return InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
 
 
@@ -393,14 +392,13 @@ def _every_joint_moves(prepared: Sequence[PreparedSession], chain: Chain) -> Non
 
 
 def _conditions(
-    structure: ModelStructure, prepared: Sequence[PreparedSession], payloads: Sequence[str | None]
+    structure: ModelStructure, sessions: Sequence[Session], payloads: Sequence[str | None]
 ) -> tuple[Condition, ...]:
     found: dict[Condition, None] = {}
-    for session, payload in zip(prepared, payloads, strict=True):
+    for session, payload in zip(sessions, payloads, strict=True):
+        joint, motor = bool(session.joint.effort.shape[1]), session.motor is not None
         sides: tuple[Side, ...] = tuple(
-            side
-            for side in structure.sides
-            if (session.has_joint or side == "motor") and (session.has_motor or side == "joint")
+            side for side in structure.sides if (joint or side == "motor") and (motor or side == "joint")
         )
         if sides:
             found[Condition(payload, sides)] = None

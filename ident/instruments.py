@@ -61,7 +61,7 @@ class _Motion:
     def __init__(self, part: Stretch, prepared: PreparedSession) -> None:
         self._part = part
         position = low_pass(part.values, part.dt, prepared.cutoff_hz, prepared.settings.order)
-        self._states = np.hstack([position, *differentiate(position, part.dt)])
+        self._states = (position, *differentiate(position, part.dt))
 
     def covers(self, channel: TorqueChannel | None) -> bool:
         """Whether the channel's times lie within the stretch."""
@@ -73,6 +73,6 @@ class _Motion:
 
     def at(self, channel: TorqueChannel) -> TorqueChannel:
         """The channel with the commanded motion at its times."""
-        states = interpolate_uniform(self._states, self._part.start, self._part.dt, channel.times)
-        q, qd, qdd = np.split(states, 3, axis=1)
+        start, dt = self._part.start, self._part.dt
+        q, qd, qdd = (interpolate_uniform(state, start, dt, channel.times) for state in self._states)
         return replace(channel, q=q, qd=qd, qdd=qdd)

@@ -8,7 +8,7 @@ only for a stretch of rows at a time, so the memory does not grow with the sampl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.estimators.problem import Nuisance, Problem, RowGroup
-from ident.signals.filters import ParallelFilter, interpolate_uniform
+from ident.signals.filters import ParallelFilter, block_means, interpolate_uniform, thinning
 from ident.signals.prepare import Passage, PreparedSession, TorqueChannel
 from ident.structure import ModelStructure, Side
 
-__all__ = ["observe"]
+__all__ = ["observe", "stack"]
 
 FloatArray = NDArray[np.float64]
 
@@ -78,6 +78,27 @@ def observe(
     )
 
 
+def stack(problems: Sequence[Problem]) -> Problem:
+    """One problem of the rows of several with the same parameters, record after record."""
+    if not problems:
+        raise DataError("no rows to stack; give at least one session")
+    groups: list[RowGroup] = []
+    nuisances: list[Nuisance] = []
+    names: list[str] = []
+    for problem in problems:
+        if problem.names != problems[0].names:
+            raise DataError("problems of different parameters cannot be stacked; observe the same columns")
+        first = len(groups)
+        groups += [replace(group, record=group.record + len(names)) for group in problem.groups]
+        nuisances += [
+            replace(nuisance, columns={first + k: column for k, column in nuisance.columns.items()})
+            for nuisance in problem.nuisances
+        ]
+        names += problem.record_names
+    one = problems[0]
+    return Problem(one.names, tuple(groups), one.sample_time_s, one.units, tuple(names), tuple(nuisances))
+
+
 @dataclass(frozen=True)
 class _Part:
     """Rows of one passage and side.
@@ -114,8 +135,11 @@ def _side(
         start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
         inside = (passage.motor.times >= start) & (passage.motor.times <= joint.times[-1])
         times = passage.motor.times[inside]
-        parallel = ParallelFilter(times, passage.rows, settings.decimate_hz, settings.attenuation_db)
-        target = target - parallel.apply(interpolate_uniform(joint.torque, start, dt, times))
+        factor = thinning(times, settings.decimate_hz)
+        torque = block_means(interpolate_uniform(joint.torque, start, dt, times), factor)
+        means = block_means(times, factor)
+        parallel = ParallelFilter(means, passage.rows, settings.decimate_hz, settings.attenuation_db)
+        target = target - parallel.apply(torque)
         valid = valid & passage.joint_valid
     return _Part(matrix, target, slope, valid, passage.index)
 
@@ -124,10 +148,10 @@ def _slope(channel: TorqueChannel, rows: FloatArray, session: PreparedSession) -
     """Time derivative (K, n) of the filtered torque: what a delay that is wrong by one second would add."""
     settings = session.settings
     step = 0.04 / settings.decimate_hz
+    factor = thinning(channel.times, settings.decimate_hz)
+    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
     ahead, behind = (
-        ParallelFilter(channel.times, rows + shift, settings.decimate_hz, settings.attenuation_db).apply(
-            channel.torque
-        )
+        ParallelFilter(times, rows + shift, settings.decimate_hz, settings.attenuation_db).apply(torque)
         for shift in (step, -step)
     )
     return (ahead - behind) / (2.0 * step)
@@ -147,25 +171,29 @@ def _filtered(
     joints = structure.chain.n
     matrix = np.empty((joints, len(rows), len(columns)))
     target = np.empty((len(rows), joints))
-    parallel = ParallelFilter(channel.times, rows, settings.decimate_hz, settings.attenuation_db)
-    blocks = parallel.blocks()
+    # Neighbouring samples are averaged first, which is a tenth of the work and again the same for both sides.
+    factor = thinning(channel.times, settings.decimate_hz)
+    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
+    mean = np.full(factor, 1.0 / factor)
+    blocks = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db).blocks()
     while batch := list(islice(blocks, _BLOCKS)):
         low, high = batch[0][1].start, batch[-1][1].stop
+        part = slice(low * factor, high * factor)
         wide = structure.regressor(
-            channel.q[low:high],
-            channel.qd[low:high],
-            channel.qdd[low:high],
+            channel.q[part],
+            channel.qd[part],
+            channel.qdd[part],
             payload=payload,
             sides=(side,),
             columns=columns,
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
-        flat = wide.T.reshape(len(columns) * joints, high - low)
+        flat = (wide.T.reshape(-1, factor) @ mean).reshape(len(columns) * joints, high - low)
         for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
             matrix[:, outputs] = filtered.transpose(1, 2, 0)
-            target[outputs] = weights @ channel.torque[samples]
+            target[outputs] = weights @ torque[samples]
     return matrix, target
 
 

@@ -135,11 +135,10 @@ class _Filtered:
             first - search_s - 0.5 / cutoff_hz, last + search_s + 0.5 / cutoff_hz, 0.125 / cutoff_hz
         )
         joint = ParallelFilter(data.times, outputs, cutoff_hz)
-        stacked = _columns(data.qd, data.qdd)
         smooth = ParallelFilter(data.motor_times, fine, cutoff_hz).apply(data.motor_torque)
         curve = make_interp_spline(fine, smooth, k=5)
         moving = joint.share(np.abs(data.qd) < standstill) < 0.05
-        torque, columns = joint.apply(data.joint_torque), joint.apply(stacked)
+        torque, columns = joint.apply(data.joint_torque), _columns(joint, data.qd, data.qdd)
         return cls(data, cutoff_hz, outputs, torque, columns, moving, curve, curve.derivative())
 
     def columns_at(self, delay: float) -> FloatArray:
@@ -155,12 +154,13 @@ class _Filtered:
         inside = (times >= data.times[0]) & (times <= data.times[-1])
         state = interpolate_uniform(np.hstack([data.qd, data.qdd]), float(data.times[0]), dt, times[inside])
         qd, qdd = np.split(state, 2, axis=1)
-        return ParallelFilter(times[inside], self.outputs, self.cutoff_hz).apply(_columns(qd, qdd))
+        return _columns(ParallelFilter(times[inside], self.outputs, self.cutoff_hz), qd, qdd)
 
 
-def _columns(qd: FloatArray, qdd: FloatArray) -> FloatArray:
-    """qdd, qd, sign(qd) and 1: (n, J, 4)."""
-    return np.stack([qdd, qd, np.sign(qd), np.ones_like(qd)], axis=2)
+def _columns(low_pass: ParallelFilter, qd: FloatArray, qdd: FloatArray) -> FloatArray:
+    """Filtered qdd, qd, sign(qd) and 1: (K, J, 4)."""
+    filtered = [low_pass.apply(qdd), low_pass.apply(qd), low_pass.apply(np.sign(qd))]
+    return np.stack([*filtered, np.ones_like(filtered[0])], axis=2)
 
 
 def _cost(parts: Sequence[_Filtered], delay: float) -> float:

@@ -9,13 +9,21 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 from scipy.signal import butter, kaiser_beta, sosfiltfilt
 
 from fri.errors import ConfigurationError
 
-__all__ = ["ParallelFilter", "differentiate", "interpolate_uniform", "low_pass"]
+__all__ = [
+    "ParallelFilter",
+    "block_means",
+    "differentiate",
+    "interpolate_uniform",
+    "low_pass",
+    "thinning",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -54,15 +62,47 @@ def interpolate_uniform(values: FloatArray, start: float, dt: float, times: Floa
     signals.
     """
     position = (times - start) / dt
-    base = np.clip(np.floor(position).astype(np.int64) - 2, 0, max(len(values) - 6, 0))
-    offset = position - base
-    nodes = np.arange(6.0)
-    result = np.zeros((len(times), values.shape[1]))
-    for node in range(6):
-        others = np.delete(nodes, node)
-        weight = np.prod((offset[:, None] - others) / (node - others), axis=1)
-        result += weight[:, None] * values[base + node]
+    nearest = np.rint(position)
+    if len(times) and float(np.max(np.abs(position - nearest))) < 1e-6:
+        return values[np.clip(nearest.astype(np.int64), 0, len(values) - 1)]
+    return _lagrange(np.ascontiguousarray(values), np.ascontiguousarray(position))
+
+
+@njit(cache=True)
+def _lagrange(values, position):  # type: ignore[no-untyped-def]
+    rows, columns = len(position), values.shape[1]
+    result = np.empty((rows, columns))
+    weight = np.empty(6)
+    for row in range(rows):
+        base = min(max(int(np.floor(position[row])) - 2, 0), max(len(values) - 6, 0))
+        offset = position[row] - base
+        for node in range(6):
+            product = 1.0
+            for other in range(6):
+                if other != node:
+                    product *= (offset - other) / (node - other)
+            weight[node] = product
+        for column in range(columns):
+            total = 0.0
+            for node in range(6):
+                total += weight[node] * values[base + node, column]
+            result[row, column] = total
     return result
+
+
+def thinning(times: FloatArray, cutoff_hz: float) -> int:
+    """Neighbouring samples that may be averaged before a low-pass at `cutoff_hz`: 40 means a period stay."""
+    if len(times) < 2:
+        return 1
+    return max(1, int(1.0 / (40.0 * cutoff_hz * float(np.median(np.diff(times))))))
+
+
+def block_means(values: NDArray[np.generic], factor: int) -> FloatArray:
+    """Means (m // factor, ...) of `factor` neighbours in (m, ...); a remainder at the end is left out."""
+    count = len(values) // factor
+    grouped = np.asarray(values[: count * factor], dtype=np.float64).reshape(count, factor, -1)
+    means = np.einsum("ijk->ik", grouped) / factor
+    return means.reshape(count, *values.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -101,8 +141,10 @@ class ParallelFilter:
             result[rows] = weights @ flat[samples]
         return result.reshape(len(self.outputs), *values.shape[1:])
 
-    def share(self, flagged: NDArray[np.bool_]) -> FloatArray:
-        """Share (K, ...) of the kernel's absolute weight that falls on flagged samples (m, ...)."""
+    def share(self, flagged: NDArray[np.generic]) -> FloatArray:
+        """Share (K, ...) of the kernel's absolute weight that falls on flagged samples (m, ...),
+        bool or 0 to 1.
+        """
         flat = flagged.reshape(len(flagged), -1)
         result = np.zeros((len(self.outputs), flat.shape[1]))
         if flat.any():

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.signals.delay import Delay, DelayData, estimate_delay
-from ident.signals.filters import ParallelFilter, differentiate, half_width, interpolate_uniform, low_pass
+from ident.signals.filters import (
+    ParallelFilter,
+    block_means,
+    differentiate,
+    half_width,
+    interpolate_uniform,
+    low_pass,
+    thinning,
+)
 from ident.signals.settings import SignalSettings
 from ident.signals.spectrum import advice, excitation_frequency, moving, optimal_cutoff
 from ident.signals.timebase import Stretch, flag_outliers, sample_period, stretches
@@ -96,6 +104,10 @@ class PreparedSession:
     def has_joint(self) -> bool:
         """Whether the session has joint torques of any joint in any row."""
         return any(bool(passage.joint_valid.any()) for passage in self.passages)
+
+    def without_samples(self) -> PreparedSession:
+        """The same without its passages: what the report needs, in no memory to speak of."""
+        return replace(self, passages=())
 
     @property
     def has_motor(self) -> bool:
@@ -272,18 +284,10 @@ class _Motion:
         if inside.sum() < 16:
             return None
         actual = actual[inside]
-        state = np.hstack([self.q, self.qd, self.qdd])
-        place = (actual - self.stretch.start) / self.stretch.dt
-        nearest = np.rint(place).astype(np.int64)
-        if np.max(np.abs(place - nearest)) < 1e-6:
-            state, bridged = state[nearest], self.flagged[nearest]
-        else:
-            state = interpolate_uniform(state, self.stretch.start, self.stretch.dt, actual)
-            bridged = self.flagged[np.clip(nearest, 0, len(self.flagged) - 1)]
-        q, qd, qdd = np.split(state, 3, axis=1)
-        lost = (
-            self.stretch.bridged[np.clip(nearest, 0, len(bridged) - 1)] if len(bridged) else np.zeros(0, bool)
-        )
+        start, dt = self.stretch.start, self.stretch.dt
+        q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
+        nearest = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
+        lost = self.stretch.bridged[nearest]
         return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside] | lost[:, None])
 
 
@@ -315,10 +319,13 @@ def _passage(
 
 def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -> BoolArray:
     """Rows (K, J) whose filter rests on enough true samples of a joint that moves."""
-    parallel = ParallelFilter(channel.times, rows, settings.decimate_hz, settings.attenuation_db)
+    factor = thinning(channel.times, settings.decimate_hz)
+    times = block_means(channel.times, factor)
+    parallel = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db)
     covered = parallel.coverage() >= 1.0 - settings.bridged_share
-    bridged = parallel.share(channel.flagged) <= settings.bridged_share
-    still = parallel.share(np.abs(channel.qd) < settings.standstill_rad_s)
+    bridged = parallel.share(block_means(channel.flagged, factor)) <= settings.bridged_share
+    slow = block_means(np.abs(channel.qd) < settings.standstill_rad_s, factor)
+    still = parallel.share(slow)
     return covered[:, None] & bridged & (still <= settings.standstill_share)
 
 

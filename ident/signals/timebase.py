@@ -117,15 +117,19 @@ def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int
     reversal of Coulomb friction is no outlier. Where over 1 % of a column is far, nothing of it is flagged:
     that is not an outlier but a property of the signal.
     """
-    padded = np.pad(values, ((2, 2), (0, 0)), mode="edge")
-    far_left, left, middle, right, far_right = (padded[i : i + len(values)] for i in range(5))
-    distance = np.abs(values - _median_of_five(far_left, left, middle, right, far_right))
-    cubic = np.abs(values - (4.0 * (left + right) - far_left - far_right) / 6.0)
-    robust = 1.4826 * np.median(cubic, axis=0)
-    low, high = np.percentile(values, [0.5, 99.5], axis=0)
-    flags = distance > np.maximum(scale * robust, 0.01 * (high - low))
-    crowded = [int(column) for column in np.flatnonzero(flags.mean(axis=0) > _TOO_MANY)]
-    flags[:, crowded] = False
+    flags = np.zeros(values.shape, dtype=bool)
+    crowded = []
+    for column, series in enumerate(values.T):
+        padded = np.pad(series, 2, mode="edge")
+        far_left, left, middle, right, far_right = (padded[i : i + len(series)] for i in range(5))
+        distance = np.abs(series - _median_of_five(far_left, left, middle, right, far_right))
+        cubic = np.abs(series - (4.0 * (left + right) - far_left - far_right) / 6.0)
+        low, high = np.percentile(series, [0.5, 99.5])
+        far = distance > max(scale * 1.4826 * float(np.median(cubic)), 0.01 * float(high - low))
+        if far.mean() > _TOO_MANY:
+            crowded.append(column)
+        else:
+            flags[:, column] = far
     return flags, crowded
 
 
