@@ -100,8 +100,8 @@ class Identification:
     """Result of `identify`.
 
     base : the base parameters and their regrouping; estimate : values, covariance and residuals.
-    prepared : the sessions as filtered, without their samples; problem : the stacked regression. warnings : sentences for the
-    report.
+    prepared : the sessions as filtered, without their samples. problem : the stacked regression.
+    warnings : sentences for the report.
     """
 
     settings: IdentificationSettings

@@ -39,7 +39,7 @@ def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | 
     dt = sample_period(times, command.sequence if command.numbered else None, where)
     bad: NDArray[np.bool_] = np.asarray(~np.isfinite(command.position).all(axis=1))
     parts, _ = stretches(times, command.position, bad, dt, prepared.settings.longest_bridge_s)
-    motions = [_Motion(part, prepared) for part in parts]
+    motions = [_Motion(parts.pop(0), prepared) for _ in range(len(parts))]
     passages = []
     for passage in prepared.passages:
         home = next((m for m in motions if m.covers(passage.joint) and m.covers(passage.motor)), None)
@@ -59,7 +59,7 @@ class _Motion:
     """The commanded motion of one stretch, filtered like the measured one."""
 
     def __init__(self, part: Stretch, prepared: PreparedSession) -> None:
-        self._part = part
+        self._start, self._dt, self._end = part.start, part.dt, part.end
         position = low_pass(part.values, part.dt, prepared.cutoff_hz, prepared.settings.order)
         self._states = (position, *differentiate(position, part.dt))
 
@@ -67,12 +67,13 @@ class _Motion:
         """Whether the channel's times lie within the stretch."""
         if channel is None:
             return True
-        slack = 0.5 * self._part.dt
-        first, last = self._part.start - slack, self._part.end + slack
+        slack = 0.5 * self._dt
+        first, last = self._start - slack, self._end + slack
         return bool(first <= channel.times[0] and channel.times[-1] <= last)
 
     def at(self, channel: TorqueChannel) -> TorqueChannel:
         """The channel with the commanded motion at its times."""
-        start, dt = self._part.start, self._part.dt
-        q, qd, qdd = (interpolate_uniform(state, start, dt, channel.times) for state in self._states)
+        q, qd, qdd = (
+            interpolate_uniform(state, self._start, self._dt, channel.times) for state in self._states
+        )
         return replace(channel, q=q, qd=qd, qdd=qdd)

@@ -64,7 +64,10 @@ def interpolate_uniform(values: FloatArray, start: float, dt: float, times: Floa
     position = (times - start) / dt
     nearest = np.rint(position)
     if len(times) and float(np.max(np.abs(position - nearest))) < 1e-6:
-        return values[np.clip(nearest.astype(np.int64), 0, len(values) - 1)]
+        index = np.clip(nearest.astype(np.int64), 0, len(values) - 1)
+        if np.all(np.diff(index) == 1):
+            return values[index[0] : index[-1] + 1]
+        return values[index]
     return _lagrange(np.ascontiguousarray(values), np.ascontiguousarray(position))
 
 
