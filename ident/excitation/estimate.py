@@ -15,8 +15,9 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident import parameters
-from ident.excitation.chain import Chain
+from ident.excitation.mechanism import Mechanism
 from ident.excitation.motion import Array
+from ident.model import DynamicModel
 from ident.parameters import DRIVE, INERTIAL
 from lwr_driver.configuration import read_mapping
 
@@ -145,9 +146,34 @@ class ArmEstimate:
         return tuple(body + [f"{kind}{link}" for link in range(1, self.joints + 1) for kind in DRIVE])
 
     @classmethod
-    def nominal(cls, chain: Chain, payload: Array | None = None) -> ArmEstimate:
+    def nominal(cls, mechanism: Mechanism, payload: Array | None = None) -> ArmEstimate:
         """The URDF's inertias, no friction, no drive inertia: what is known before the first experiment."""
-        return cls(chain.bodies.copy(), np.zeros((chain.joints, 7)), payload)
+        return cls(mechanism.bodies.copy(), np.zeros((mechanism.joints, 7)), payload)
+
+    @classmethod
+    def from_model(
+        cls, model: DynamicModel, payload: str | None = None, noise: Noise | None = None
+    ) -> ArmEstimate:
+        """Values and covariance of an identified model, with one of its payloads mounted.
+
+        After each re-identification this closes the loop: plan, estimate, plan again.
+        """
+        joints = model.structure.chain.n
+        bodies = model.inertial(None)
+        load = None if payload is None else model.inertial(payload)[-1] - bodies[-1]
+        drives = np.column_stack([model.drive()[kind] for kind in DRIVE])
+        names: tuple[str, ...] = ()
+        covariance = None
+        if model.covariance is not None:
+            last = None if payload is None else model.structure.payload_link(payload)
+            keep, renamed = [], []
+            for index, name in enumerate(model.names):
+                kind, link = split_name(name)
+                if link <= joints or (last is not None and link == last + 1):
+                    keep.append(index)
+                    renamed.append(f"{kind}{min(link, joints + 1)}")
+            names, covariance = tuple(renamed), model.covariance[np.ix_(keep, keep)]
+        return cls(bodies, drives, load, names, covariance, noise)
 
     @classmethod
     def from_file(cls, path: Path, joints: int, payload: str | None = None) -> ArmEstimate:
@@ -167,8 +193,7 @@ class ArmEstimate:
                 raise ConfigurationError(
                     f"{path}: parameter {name} belongs to link {link}, the arm has {joints}"
                 )
-            if not isinstance(value, (int, float)) or not np.isfinite(value):
-                raise ConfigurationError(f"{path}: parameter {name} is {value!r}, not a finite number")
+            value = _number(value, f"{path}: parameter {name}")
             if kind in BODY:
                 bodies[link - 1, BODY.index(kind)] = value
             else:
@@ -179,5 +204,17 @@ class ArmEstimate:
             if payload not in payloads:
                 known = ", ".join(payloads) or "none"
                 raise ConfigurationError(f"{path}: payload {payload!r} is not in `payloads`; known: {known}")
-            load = np.array([float(payloads[payload].get(kind, 0.0)) for kind in BODY])
+            entries = payloads[payload]
+            load = np.array([_number(entries.get(kind, 0.0), f"{path}: payload {payload}") for kind in BODY])
         return cls(bodies, drives, load)
+
+
+def _number(value: object, where: str) -> float:
+    """A finite number; YAML reads `1e-05` (no dot) as text, which is meant as a number here."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = np.nan
+    if isinstance(value, bool) or not np.isfinite(number):
+        raise ConfigurationError(f"{where} is {value!r}, not a finite number")
+    return number

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from fri.errors import RefusedError
-from ident.excitation.chain import Chain, tip_path
 from ident.excitation.check import Check, Limits, PathChecker, Workspace, check_motion
 from ident.excitation.estimate import ArmEstimate
 from ident.excitation.fourier import FourierBasis, FourierSeries
+from ident.excitation.mechanism import Mechanism, tip_path
 from ident.excitation.motion import Array, ParametricMotion
 from ident.excitation.plan import ExcitationPlan
 from lwr_driver.arm import Arm
@@ -51,25 +51,38 @@ def feasible_fourier(
     largest is taken. `estimate` defaults to the URDF's inertias without friction. Raises RefusedError where
     no posture or no motion passes, naming the limit that stands in the way most often.
     """
-    chain = Chain.from_urdf(arm.urdf)
+    mechanism = Mechanism.from_urdf(arm.urdf)
     limits = arm_limits(arm, speed_scale)
     space = workspace if workspace is not None else Workspace()
-    known = estimate if estimate is not None else ArmEstimate.nominal(chain)
+    known = estimate if estimate is not None else ArmEstimate.nominal(mechanism)
     basis = FourierBasis(period_s, harmonics)
     rng = np.random.default_rng(seed)
 
     def coarse(motion: ParametricMotion) -> Check:
         return check_motion(
-            motion, chain, limits, workspace=space, estimate=known, checker=checker, clearance_m=clearance_m,
-            step_s=period_s / 200, collision_step_s=period_s / 100,
-        )  # fmt: skip
+            motion,
+            mechanism,
+            limits,
+            workspace=space,
+            estimate=known,
+            checker=checker,
+            clearance_m=clearance_m,
+            step_s=period_s / 200,
+            collision_step_s=period_s / 100,
+        )
 
     def fine(motion: ParametricMotion) -> Check:
         return check_motion(
-            motion, chain, limits, workspace=space, estimate=known, checker=checker, clearance_m=clearance_m
+            motion,
+            mechanism,
+            limits,
+            workspace=space,
+            estimate=known,
+            checker=checker,
+            clearance_m=clearance_m,
         )
 
-    centres = _roomy_postures(rng, chain, limits, space)
+    centres = _roomy_postures(rng, mechanism, limits, space)
     best: tuple[float, FourierSeries] | None = None
     blocked: dict[str, int] = {}
     for trial in range(_DIRECTIONS):
@@ -98,12 +111,14 @@ def feasible_fourier(
     )
 
 
-def _roomy_postures(rng: np.random.Generator, chain: Chain, limits: Limits, space: Workspace) -> Array:
+def _roomy_postures(
+    rng: np.random.Generator, mechanism: Mechanism, limits: Limits, space: Workspace
+) -> Array:
     """Random postures, those with most room in the workspace first, (k, joints)."""
     middle = 0.5 * (limits.q_low + limits.q_high)
     half = 0.5 * (limits.q_high - limits.q_low)
-    postures = middle + half * rng.uniform(-0.6, 0.6, size=(_CENTRES, chain.joints))
-    points = tip_path(chain, postures)
+    postures = middle + half * rng.uniform(-0.6, 0.6, size=(_CENTRES, mechanism.joints))
+    points = tip_path(mechanism, postures)
     room = np.hypot(points[:, 0], points[:, 1]) - (space.radius_m or 0.0)
     if space.height_m is not None:
         room = np.minimum(room, points[:, 2] - space.height_m)

@@ -91,9 +91,7 @@ def _kinematics(rot0, trans, gravity, q, qd, qdd, cs, w, wd, vd, lin, ang):  # t
 
 
 @njit(cache=True, error_model="numpy")
-def forward(  # type: ignore[no-untyped-def]
-    rot0, trans, gravity, q, qd, qdd, first, parameter, chi, eps, z, tau
-):
+def forward(arm, motion, columns, chi, eps, z, tau):  # type: ignore[no-untyped-def]
     """Regressor columns and rigid-body torques of all samples.
 
     rot0 (n, 3, 3), trans (n, 3), gravity (3,): the chain. q, qd, qdd (m, n). `parameter` (c,) holds the
@@ -102,6 +100,9 @@ def forward(  # type: ignore[no-untyped-def]
     first[j] on, then qdd_j, qd_j, smoothed sign(qd_j) = tanh(qd_j / eps), 1; tau (k, m, n) rigid-body torque
     for each set.
     """
+    rot0, trans, gravity = arm
+    q, qd, qdd = motion
+    first, parameter = columns
     m, n = q.shape
     sets = chi.shape[0]
     c = parameter.shape[0]
@@ -152,13 +153,16 @@ def forward(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def backward(  # type: ignore[no-untyped-def]
-    rot0, trans, gravity, q, qd, qdd, first, parameter, chi, eps, zbar, taubar, qbar, qdbar, qddbar
-):
-    """Add the derivative with respect to q, qd, qdd (m, n) of a function of `forward`'s results.
+def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignore[no-untyped-def]
+    """Add the derivative with respect to q, qd, qdd of a function of `forward`'s results to `bars`, (m, n)
+    each.
 
     zbar (n, m, c + 4) and taubar (k, m, n) are the function's derivatives with respect to z and tau.
     """
+    rot0, trans, gravity = arm
+    q, qd, qdd = motion
+    first, parameter = columns
+    qbar, qdbar, qddbar = bars
     m, n = q.shape
     sets = chi.shape[0]
     c = parameter.shape[0]

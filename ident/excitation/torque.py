@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ident.excitation.chain import Chain
 from ident.excitation.estimate import BODY, ArmEstimate, split_name
+from ident.excitation.mechanism import Mechanism
 from ident.excitation.motion import Array, Samples
 from ident.excitation.sweep import forward
 
@@ -29,56 +29,45 @@ class TorqueBounds(NamedTuple):
     motor: Array
 
 
-def rigid_torque(chain: Chain, samples: Samples, bodies: Array) -> Array:
+def rigid_torque(mechanism: Mechanism, samples: Samples, bodies: Array) -> Array:
     """M(q) qdd + C qd + G for k sets of body parameters (k, joints, 10); (k, n, joints) [Nm]."""
     q, qd, qdd = (np.ascontiguousarray(part, dtype=np.float64) for part in samples[:3])
     n, joints = q.shape
     tau = np.empty((bodies.shape[0], n, joints))
     first = np.zeros(joints + 1, dtype=np.int64)
     scratch = np.empty((joints, n, 4))
-    forward(
-        chain.rotation,
-        chain.translation,
-        chain.gravity,
-        q,
-        qd,
-        qdd,
-        first,
-        _NO_COLUMNS,
-        bodies,
-        1.0,
-        scratch,
-        tau,
-    )
+    forward(mechanism.dynamics, (q, qd, qdd), (first, _NO_COLUMNS), bodies, 1.0, scratch, tau)
     return tau
 
 
-def joint_torque(chain: Chain, samples: Samples, estimate: ArmEstimate) -> Array:
+def joint_torque(mechanism: Mechanism, samples: Samples, estimate: ArmEstimate) -> Array:
     """Joint torque tau_l of equation (1) for each load case, (k, n, joints) [Nm]."""
     drives = estimate.drives
     friction = samples.qd * drives[:, _FVL] + np.sign(samples.qd) * drives[:, _FCL] + drives[:, _OFFL]
-    return rigid_torque(chain, samples, estimate.loads) + friction
+    return rigid_torque(mechanism, samples, estimate.loads) + friction
 
 
 def torque_bounds(
-    chain: Chain, samples: Samples, estimate: ArmEstimate, coverage: float = 3.0
+    mechanism: Mechanism, samples: Samples, estimate: ArmEstimate, coverage: float = 3.0
 ) -> TorqueBounds:
     """Worst magnitude of joint and motor torque at each sample over load cases and uncertainty."""
     drives = estimate.drives
-    rigid = rigid_torque(chain, samples, estimate.loads)
+    rigid = rigid_torque(mechanism, samples, estimate.loads)
     joint = rigid + samples.qd * drives[:, _FVL] + drives[:, _OFFL]
     motor = joint + samples.qdd * drives[:, _IA] + samples.qd * drives[:, _FVM] + drives[:, _OFFM]
     joint_bound = np.abs(joint) + np.abs(drives[:, _FCL])
     motor_bound = np.abs(motor) + np.abs(drives[:, _FCL]) + np.abs(drives[:, _FCM])
     if estimate.covariance is not None and coverage > 0.0:
         for load in range(rigid.shape[0]):
-            deviation = torque_deviation(chain, samples, estimate, loaded=load == 1)
+            deviation = torque_deviation(mechanism, samples, estimate, loaded=load == 1)
             joint_bound[load] += coverage * deviation.joint
             motor_bound[load] += coverage * deviation.motor
     return TorqueBounds(joint_bound.max(axis=0), motor_bound.max(axis=0))
 
 
-def torque_deviation(chain: Chain, samples: Samples, estimate: ArmEstimate, *, loaded: bool) -> TorqueBounds:
+def torque_deviation(
+    mechanism: Mechanism, samples: Samples, estimate: ArmEstimate, *, loaded: bool
+) -> TorqueBounds:
     """Standard deviation of joint and motor torque from the estimate's covariance, (n, joints) [Nm]."""
     q, qd, qdd = (np.ascontiguousarray(part, dtype=np.float64) for part in samples[:3])
     n, joints = q.shape
@@ -89,10 +78,7 @@ def torque_deviation(chain: Chain, samples: Samples, estimate: ArmEstimate, *, l
     first = np.arange(0, 10 * joints + 1, 10).astype(np.int64)
     z = np.zeros((joints, n, 10 * joints + 4))
     tau = np.empty((1, n, joints))
-    forward(
-        chain.rotation, chain.translation, chain.gravity, q, qd, qdd, first, columns, np.zeros((1, joints,
-        10)), 1e-3, z, tau
-    )  # fmt: skip
+    forward(mechanism.dynamics, (q, qd, qdd), (first, columns), np.zeros((1, joints, 10)), 1e-3, z, tau)
     place = 10 * joints
     for joint in range(joints):
         rows = np.zeros((2, n, len(estimate.covariance_names)))

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.excitation.chain import Chain
 from ident.excitation.check import Limits
 from ident.excitation.estimate import ArmEstimate, Noise
+from ident.excitation.mechanism import Mechanism
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import CONFIGS
 
@@ -18,8 +18,8 @@ def arm() -> Arm:
 
 
 @pytest.fixture(scope="session")
-def chain(arm: Arm) -> Chain:
-    return Chain.from_urdf(arm.urdf)
+def mechanism(arm: Arm) -> Mechanism:
+    return Mechanism.from_urdf(arm.urdf)
 
 
 @pytest.fixture(scope="session")
@@ -28,9 +28,9 @@ def limits(arm: Arm) -> Limits:
 
 
 @pytest.fixture(scope="session")
-def estimate(chain: Chain) -> ArmEstimate:
+def estimate(mechanism: Mechanism) -> ArmEstimate:
     path: Path = CONFIGS / "emulator/table2.yaml"
-    known = ArmEstimate.from_file(path, chain.joints, "paper_load")
+    known = ArmEstimate.from_file(path, mechanism.joints, "paper_load")
     return ArmEstimate(known.bodies, known.drives, known.payload, noise=Noise.published())
 
 

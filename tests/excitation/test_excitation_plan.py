@@ -8,8 +8,8 @@ import pytest
 
 from fri.errors import ConfigurationError, RefusedError
 from ident.excitation import ExcitationPlan, Workspace, arm_limits, check_motion, feasible_fourier
-from ident.excitation.chain import Chain, tip_path
 from ident.excitation.estimate import ArmEstimate
+from ident.excitation.mechanism import Mechanism, tip_path
 from lwr_driver.arm import Arm
 
 
@@ -19,14 +19,14 @@ def plan(arm: Arm) -> ExcitationPlan:
 
 
 def test_feasible_motion_keeps_every_limit_on_a_fine_grid(
-    arm: Arm, chain: Chain, plan: ExcitationPlan
+    arm: Arm, mechanism: Mechanism, plan: ExcitationPlan
 ) -> None:
     samples = plan.sample(np.arange(0.0, 20.0, 1e-3))
     assert plan.check.ok
     assert np.all((samples.q > arm.q_low) & (samples.q < arm.q_high))
     assert np.all(np.abs(samples.qd) < arm.v_max)
     assert np.all(np.abs(samples.qdd) < arm.a_max)
-    points = tip_path(chain, samples.q)
+    points = tip_path(mechanism, samples.q)
     assert np.hypot(points[:, 0], points[:, 1]).min() >= 0.3
     assert points[:, 2].min() >= -0.2
     assert np.ptp(samples.q, axis=0).min() > 0.1, "every joint moves"
@@ -67,11 +67,11 @@ def test_broken_plan_file_says_what_is_wrong(tmp_path: Path) -> None:
 
 
 def test_check_reports_the_violated_limit_with_value_and_time(
-    arm: Arm, chain: Chain, plan: ExcitationPlan
+    arm: Arm, mechanism: Mechanism, plan: ExcitationPlan
 ) -> None:
     limits = arm_limits(arm)
     narrow = replace(limits, v_max=np.where(np.arange(7) == 3, 0.05, limits.v_max))
-    result = check_motion(plan.motion, chain, narrow, workspace=Workspace(0.9, -0.2))
+    result = check_motion(plan.motion, mechanism, narrow, workspace=Workspace(0.9, -0.2))
     kinds = {(margin.subject, margin.constraint) for margin in result.violations}
     assert not result.ok
     assert kinds == {("A3", "velocity"), ("flange", "distance from axis 1")}
@@ -82,15 +82,17 @@ def test_check_reports_the_violated_limit_with_value_and_time(
     assert "violates" in str(worst)
 
 
-def test_torque_limits_count_friction_and_uncertainty(arm: Arm, chain: Chain, plan: ExcitationPlan) -> None:
-    known = ArmEstimate.nominal(chain)
+def test_torque_limits_count_friction_and_uncertainty(
+    arm: Arm, mechanism: Mechanism, plan: ExcitationPlan
+) -> None:
+    known = ArmEstimate.nominal(mechanism)
     drives = known.drives.copy()
     drives[:, 2] = 1.0
     with_friction = replace(known, drives=drives)
     uncertain = with_friction.with_relative_uncertainty(0.1)
     values = []
     for estimate in (known, with_friction, uncertain):
-        result = check_motion(plan.motion, chain, arm_limits(arm), estimate=estimate)
+        result = check_motion(plan.motion, mechanism, arm_limits(arm), estimate=estimate)
         values.append([margin.value for margin in result.margins if margin.constraint == "joint torque"])
     np.testing.assert_allclose(np.subtract(values[1], values[0]), 1.0, atol=1e-9)
     assert np.all(np.subtract(values[2], values[1]) > 0.29)

@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from ident.excitation.chain import Chain
+from ident.excitation.mechanism import Mechanism
 from ident.excitation.sweep import backward, forward
 from ident.parameters import from_pinocchio
 from lwr_driver.arm import Arm
@@ -16,23 +16,23 @@ def columns() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _run(
-    chain: Chain, samples: list[np.ndarray], columns: tuple, chi: np.ndarray
+    mechanism: Mechanism, samples: list[np.ndarray], columns: tuple, chi: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     n = samples[0].shape[0]
     z, tau = np.zeros((7, n, 74)), np.zeros((chi.shape[0], n, 7))
     parameter, first = columns
-    forward(chain.rotation, chain.translation, chain.gravity, *samples, first, parameter, chi, 0.05, z, tau)
+    forward(mechanism.dynamics, tuple(samples), (first, parameter), chi, 0.05, z, tau)
     return z, tau
 
 
 def test_regressor_and_torque_equal_pinocchio(
-    arm: Arm, chain: Chain, columns: tuple, rng: np.random.Generator
+    arm: Arm, mechanism: Mechanism, columns: tuple, rng: np.random.Generator
 ) -> None:
     model = pin.buildModelFromXML(arm.urdf)
     data = model.createData()
     samples = [rng.normal(size=(20, 7)) for _ in range(3)]
-    chi = np.stack([chain.bodies, rng.normal(size=(7, 10))])
-    z, tau = _run(chain, samples, columns, chi)
+    chi = np.stack([mechanism.bodies, rng.normal(size=(7, 10))])
+    z, tau = _run(mechanism, samples, columns, chi)
     for row, (q, qd, qdd) in enumerate(zip(*samples, strict=True)):
         regressor = from_pinocchio(pin.computeJointTorqueRegressor(model, data, q, qd, qdd).reshape(7, 7, 10))
         for joint in range(7):
@@ -44,7 +44,7 @@ def test_regressor_and_torque_equal_pinocchio(
 
 
 def test_reverse_sweep_is_the_derivative_of_the_forward_sweep(
-    chain: Chain, columns: tuple, rng: np.random.Generator
+    mechanism: Mechanism, columns: tuple, rng: np.random.Generator
 ) -> None:
     samples = [rng.normal(size=(6, 7)) for _ in range(3)]
     chi = rng.normal(size=(2, 7, 10))
@@ -53,11 +53,10 @@ def test_reverse_sweep_is_the_derivative_of_the_forward_sweep(
         zbar[joint, :, 10 * joint :] = rng.normal(size=(6, 74 - 10 * joint))
     gradient = [np.zeros((6, 7)) for _ in range(3)]
     parameter, first = columns
-    arm = (chain.rotation, chain.translation, chain.gravity)
-    backward(*arm, *samples, first, parameter, chi, 0.05, zbar, taubar, *gradient)
+    backward(mechanism.dynamics, tuple(samples), (first, parameter), chi, 0.05, zbar, taubar, tuple(gradient))
 
     def value(moved: list[np.ndarray]) -> float:
-        z, tau = _run(chain, moved, columns, chi)
+        z, tau = _run(mechanism, moved, columns, chi)
         return float(np.sum(z * zbar) + np.sum(tau * taubar))
 
     for which in range(3):

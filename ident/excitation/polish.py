@@ -1,0 +1,110 @@
+"""The last steps before a motion is handed out: sharpen, check against every limit, tighten what slipped,
+check again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ident.excitation.assembly import Assembled
+from ident.excitation.check import Check, Margin
+from ident.excitation.constraints import Constraints
+from ident.excitation.motion import ParametricMotion
+from ident.excitation.program import Program
+from ident.excitation.search import Candidate, restore
+from ident.excitation.sqp import minimise
+
+__all__ = ["Outcome", "polish"]
+
+_ROUNDS = 8
+_ORDERS = {"position": 0, "velocity": 1, "acceleration": 2, "jerk": 3}
+_SPACE_STEP = 2e-4
+_SHARE_STEP = 2e-4
+_BOUND_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A polished motion with its check; `bounds_kept` tells whether the bounds on other criteria hold."""
+
+    motion: ParametricMotion
+    check: Check
+    value: float
+    bounds_kept: bool
+    bound_excess: float
+
+
+def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -> Outcome:
+    """Optimise with sharp criteria and tight aggregation, then check and tighten until every limit is
+    proven.
+    """
+    setup = assembled.setup
+    with threadpool_limits(1):
+        program = setup.program()
+        x = candidate.x
+        program.sharpness, program.constraints.rate = 64.0, 1000.0
+        iterations = 15 if quick else 60
+        best: Outcome | None = None
+        for round_ in range(_ROUNDS):
+            program.constraints.refresh_deviation(program.signals(x))
+            x = minimise(program, x, iterations=iterations, tolerance=1e-5).x
+            outcome = _outcome(assembled, program, x)
+            if best is None or _worse(best) > _worse(outcome):
+                best = outcome
+            if outcome.check.ok and outcome.bounds_kept:
+                return outcome
+            tighten(program.constraints, outcome.check, setup.mechanism.joint_names)
+            tighten_bounds(program, outcome.bound_excess)
+            if round_ >= 2:
+                x = restore(setup, x).x
+            iterations = 30
+        assert best is not None
+        return best
+
+
+def _worse(outcome: Outcome) -> float:
+    shares = [-margin.slack / max(abs(margin.limit), 1e-9) for margin in outcome.check.violations]
+    return max([outcome.bound_excess, 0.0, *shares])
+
+
+def _outcome(assembled: Assembled, program: Program, x: np.ndarray) -> Outcome:
+    setup = assembled.setup
+    motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
+    check = assembled.check(motion)
+    excess = assembled.bound_excess(motion)
+    return Outcome(motion, check, program.exact(x), excess <= _BOUND_TOLERANCE, excess)
+
+
+def tighten(constraints: Constraints, check: Check, joint_names: tuple[str, ...]) -> None:
+    """Move each violated limit inwards by a little more than its violation."""
+    for margin in check.violations:
+        short = max(-margin.slack, 0.0)
+        if margin.constraint in _ORDERS:
+            joint = joint_names.index(margin.subject)
+            order = _ORDERS[margin.constraint]
+            constraints.half[order, joint] *= 1.0 - _SHARE_STEP - 1.2 * short / constraints.half[order, joint]
+        elif margin.constraint in ("joint torque", "motor torque"):
+            joint = joint_names.index(margin.subject)
+            share = short / constraints.limits.tau_max[joint]
+            constraints.torque_limit[joint] *= 1.0 - _SHARE_STEP - 1.2 * share
+        else:
+            _raise_floor(constraints, margin, short)
+
+
+def _raise_floor(constraints: Constraints, margin: Margin, short: float) -> None:
+    rows = {"distance from axis 1": [0], "height": [1]}.get(margin.constraint)
+    if rows is None:
+        rows = list(range(2, constraints.space.rows))
+    constraints.floor[rows] += _SPACE_STEP + 1.2 * short
+
+
+def tighten_bounds(program: Program, excess: float) -> None:
+    """Lower the limits of bounded criteria by a little more than they were exceeded."""
+    if excess > 0.0:
+        program.constraints.bounds = tuple(
+            type(bound)(bound.criterion, bound.limit - 1.2 * excess - 1e-5)
+            for bound in program.constraints.bounds
+        )

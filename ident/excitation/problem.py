@@ -1,0 +1,168 @@
+"""The planning problem as a file: arm, surroundings, what is known, what is wanted, how long to search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from fri.errors import ConfigurationError
+from ident.excitation.check import Workspace
+from lwr_driver.cell import PayloadShape
+from lwr_driver.configuration import find, parse, read_mapping
+
+__all__ = ["Knowledge", "MotionForm", "Objective", "PlanProblem", "Prior", "Search"]
+
+
+@dataclass(frozen=True)
+class MotionForm:
+    """Parametrisation. fourier: equation (9); bspline: degree 5, `control_points` free ones (Rackl et al.
+    2012).
+
+    period_s : base period T0, or duration of the spline [s]
+    periods : how often the motion is run in a session
+    """
+
+    type: Literal["fourier", "bspline"] = "fourier"
+    period_s: float = 20.0
+    harmonics: int = 5
+    control_points: int = 12
+    periods: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.period_s > 0:
+            raise ConfigurationError(f"period_s {self.period_s} s is not positive")
+        if self.periods < 1:
+            raise ConfigurationError(f"periods {self.periods} is below 1")
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Present estimate of the dynamics: a `model.yaml`, or a file of standard parameters.
+
+    payload : its name in that file; None if every session is unloaded
+    relative_uncertainty : of each parameter (one standard deviation), where the file has no covariance
+    coverage : standard deviations that the torque limits must hold for
+    noise_motor, noise_joint : standard deviation of each row [Nm]; empty: values that explain the published
+    Table 2
+    samples : independent samples in each session, for the predicted deviations
+    """
+
+    file: str = "emulator/table2.yaml"
+    payload: str | None = "paper_load"
+    relative_uncertainty: float = 0.1
+    coverage: float = 3.0
+    noise_motor: tuple[float, ...] = ()
+    noise_joint: tuple[float, ...] = ()
+    samples: float = 100.0
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What is minimised, and bounds that other criteria must keep meanwhile.
+
+    criterion : condition_number, d_optimality, mean_rsd, worst_rsd, or goal_attainment (equation (10))
+    scaling : of the columns in condition numbers
+    condition_at_most, mean_rsd_at_most, worst_rsd_at_most : bounds; None for no bound
+    goal_condition, goal_wrist : g and k_tau of equation (10)
+    wrist : the two joints of equation (10), counted from 1
+    """
+
+    criterion: Literal["condition_number", "d_optimality", "mean_rsd", "worst_rsd", "goal_attainment"] = (
+        "mean_rsd"
+    )
+    scaling: Literal["none", "columns", "parameters"] = "none"
+    condition_at_most: float | None = None
+    mean_rsd_at_most: float | None = None
+    worst_rsd_at_most: float | None = None
+    goal_condition: float = 35.0
+    goal_wrist: float = 0.9
+    wrist: tuple[int, ...] = (6, 7)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A motion that has been run already; the new one adds what it lacks.
+
+    plan : its plan file; sessions : the sessions recorded with it
+    """
+
+    plan: str
+    sessions: tuple[Literal["unloaded", "loaded"], ...] = ("unloaded", "loaded")
+
+
+@dataclass(frozen=True)
+class Search:
+    """How much to search. Seed and counts alone decide the result; a time limit makes it depend on the
+    computer.
+
+    starts : random starts; hops : perturbations tried afterwards; lanes : candidates that are hopped from at
+    first
+    jobs : processes, through joblib; its configured backend (loky, dask, ray) is used
+    """
+
+    seed: int = 1
+    starts: int = 8
+    hops: int = 120
+    lanes: int = 4
+    jobs: int = 1
+    time_limit_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.starts < 1 or self.hops < 0 or self.lanes < 1:
+            raise ConfigurationError(
+                f"search of {self.starts} starts, {self.hops} hops, {self.lanes} lanes; "
+                "at least 1, 0 and 1 are needed"
+            )
+
+
+@dataclass(frozen=True)
+class PlanProblem:
+    """Everything that `plan` needs; each key of the file has a default but `name`.
+
+    parameters : "base" (all base parameters), "model" (those of the estimate's file), or a list of names
+    sessions : which sessions are recorded with the motion, with what load
+    model : 1 joint rows, 2 motor and joint rows, 3 difference rows
+    clearance_m : distance to keep; None: the cell's own margin. speed_scale : share of the velocity limits
+    """
+
+    name: str
+    schema_version: int = 1
+    arm: str = "lwr4plus.yaml"
+    cell: str = "cell.yaml"
+    payload_shape: PayloadShape | None = None
+    motion: MotionForm = field(default_factory=MotionForm)
+    knowledge: Knowledge = field(default_factory=Knowledge)
+    parameters: str | tuple[str, ...] = "base"
+    sessions: tuple[Literal["unloaded", "loaded"], ...] = ("unloaded", "loaded")
+    model: Literal[1, 2, 3] = 2
+    objective: Objective = field(default_factory=Objective)
+    workspace: Workspace = field(default_factory=Workspace)
+    clearance_m: float | None = None
+    speed_scale: float = 1.0
+    prior: tuple[Prior, ...] = ()
+    search: Search = field(default_factory=Search)
+    source: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.schema_version != 1:
+            raise ConfigurationError(
+                f"schema_version {self.schema_version} is unknown; this software reads 1"
+            )
+        if not self.sessions:
+            raise ConfigurationError("sessions is empty; list `unloaded`, `loaded` or both")
+        if "loaded" in self.sessions and self.knowledge.payload is None:
+            raise ConfigurationError("a loaded session is planned but `knowledge.payload` names no payload")
+        if isinstance(self.parameters, str) and self.parameters not in ("base", "model"):
+            raise ConfigurationError(f"parameters {self.parameters!r}: write base, model or a list of names")
+
+    @classmethod
+    def load(cls, name: str | Path) -> PlanProblem:
+        """Read a problem file; ConfigurationError names file, key and remedy."""
+        path = find(name)
+        content = read_mapping(path)
+        if "source" in content:
+            raise ConfigurationError(f"{path}: unknown key `source`")
+        problem = parse(cls, content, str(path))
+        object.__setattr__(problem, "source", path)
+        return problem

@@ -1,0 +1,327 @@
+"""Distances in space along a motion, cheap and with derivatives: flange bounds, self-collision, ground and
+boxes.
+
+Every body is one or more capsules (segments with a radius) that enclose its collision shape; the distance of
+two capsules is that of two segments less the radii. The derivative follows from the witness points alone (the
+envelope theorem): a unit force pair along the connecting line, turned into joint torques. These distances
+steer the optimisation; the verdict comes from the collision checker's own shapes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from ident.excitation.mechanism import Mechanism
+from ident.excitation.motion import Array
+
+__all__ = ["Space", "distances", "row_gradient"]
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """What the flange and the links must keep away from, as arrays.
+
+    body (c,): joint frame that carries each capsule, -1 for the base; ends (c, 2, 3) [m] in that frame;
+    thickness (c,) pairs (p, 2): capsules to be kept apart
+    ground : height of the ground in frame 0 [m] (-inf: none); grounded (g,): capsules kept above it
+    boxes : half sizes (b, 3), placements (b, 3, 3), (b, 3) in frame 0; boxed (k, 2): (capsule, box) pairs
+    """
+
+    body: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    ends: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    thickness: Array = field(default_factory=lambda: np.zeros(0))
+    pairs: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    ground: float = -np.inf
+    grounded: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    box_size: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    box_rotation: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    box_centre: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    boxed: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+
+    @property
+    def rows(self) -> int:
+        """Number of distances at each sample: two of the flange, then pairs, ground, boxes."""
+        return 2 + len(self.pairs) + len(self.grounded) + len(self.boxed)
+
+    def extents(self, joints: int) -> Array:
+        """Distance of the farthest point of each body's capsules from the body's frame, (joints,) [m]."""
+        farthest = np.zeros(joints)
+        for body, ends, thickness in zip(self.body, self.ends, self.thickness, strict=True):
+            if body >= 0:
+                size = float(np.linalg.norm(ends, axis=1).max() + thickness)
+                farthest[body] = max(farthest[body], size)
+        return farthest
+
+    @property
+    def shapes(self) -> tuple:
+        """The fields in the order in which the compiled functions read them."""
+        return (
+            self.body,
+            self.ends,
+            self.thickness,
+            self.pairs,
+            self.ground,
+            self.grounded,
+            self.box_size,
+            self.box_rotation,
+            self.box_centre,
+            self.boxed,
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def _segments(p1, q1, p2, q2, out):  # type: ignore[no-untyped-def]
+    """Nearest points of two segments (Ericson, Real-Time Collision Detection, 5.1.9) into out[0], out[1];
+    distance.
+    """
+    d1x, d1y, d1z = q1[0] - p1[0], q1[1] - p1[1], q1[2] - p1[2]
+    d2x, d2y, d2z = q2[0] - p2[0], q2[1] - p2[1], q2[2] - p2[2]
+    rx, ry, rz = p1[0] - p2[0], p1[1] - p2[1], p1[2] - p2[2]
+    a = d1x * d1x + d1y * d1y + d1z * d1z
+    e = d2x * d2x + d2y * d2y + d2z * d2z
+    f = d2x * rx + d2y * ry + d2z * rz
+    tiny = 1e-12
+    s = 0.0
+    t = 0.0
+    if a <= tiny:
+        if e > tiny:
+            t = min(max(f / e, 0.0), 1.0)
+    else:
+        c = d1x * rx + d1y * ry + d1z * rz
+        if e <= tiny:
+            s = min(max(-c / a, 0.0), 1.0)
+        else:
+            b = d1x * d2x + d1y * d2y + d1z * d2z
+            denominator = a * e - b * b
+            if denominator > tiny * a * e:
+                s = min(max((b * f - c * e) / denominator, 0.0), 1.0)
+            t = (b * s + f) / e
+            if t < 0.0:
+                t = 0.0
+                s = min(max(-c / a, 0.0), 1.0)
+            elif t > 1.0:
+                t = 1.0
+                s = min(max((b - c) / a, 0.0), 1.0)
+    out[0, 0], out[0, 1], out[0, 2] = p1[0] + s * d1x, p1[1] + s * d1y, p1[2] + s * d1z
+    out[1, 0], out[1, 1], out[1, 2] = p2[0] + t * d2x, p2[1] + t * d2y, p2[2] + t * d2z
+    dx, dy, dz = out[0, 0] - out[1, 0], out[0, 1] - out[1, 1], out[0, 2] - out[1, 2]
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@njit(cache=True, error_model="numpy")
+def _box_distance(point, half, rotation, centre, normal):  # type: ignore[no-untyped-def]
+    """Signed distance of a point to a box and its gradient into `normal`."""
+    d = point - centre
+    local = np.empty(3)
+    outside = 0.0
+    inside = -np.inf
+    face = 0
+    for k in range(3):
+        local[k] = rotation[0, k] * d[0] + rotation[1, k] * d[1] + rotation[2, k] * d[2]
+        over = abs(local[k]) - half[k]
+        if over > 0.0:
+            outside += over * over
+        if over > inside:
+            inside = over
+            face = k
+    gradient = np.zeros(3)
+    if outside > 0.0:
+        distance = np.sqrt(outside)
+        for k in range(3):
+            over = abs(local[k]) - half[k]
+            if over > 0.0:
+                gradient[k] = np.sign(local[k]) * over / distance
+    else:
+        distance = inside
+        gradient[face] = 1.0 if local[face] >= 0.0 else -1.0
+    for k in range(3):
+        normal[k] = rotation[k, 0] * gradient[0] + rotation[k, 1] * gradient[1] + rotation[k, 2] * gradient[2]
+    return distance
+
+
+@njit(cache=True, error_model="numpy")
+def _frames(rotation, translation, q, turn, origin):  # type: ignore[no-untyped-def]
+    """World rotation and origin of each joint frame at one posture."""
+    n = q.shape[0]
+    for b in range(n):
+        c, s = np.cos(q[b]), np.sin(q[b])
+        for k in range(3):
+            r0, r1, r2 = rotation[b, k, 0], rotation[b, k, 1], rotation[b, k, 2]
+            x, y, z = c * r0 + s * r1, c * r1 - s * r0, r2
+            turn[b, k, 0], turn[b, k, 1], turn[b, k, 2] = x, y, z
+        if b == 0:
+            origin[0, 0] = origin[0, 1] = origin[0, 2] = 0.0
+        else:
+            for k in range(3):
+                origin[b, k] = origin[b - 1, k] + (
+                    turn[b - 1, k, 0] * translation[b, 0]
+                    + turn[b - 1, k, 1] * translation[b, 1]
+                    + turn[b - 1, k, 2] * translation[b, 2]
+                )
+            for column in range(3):
+                x, y, z = turn[b, 0, column], turn[b, 1, column], turn[b, 2, column]
+                for k in range(3):
+                    turn[b, k, column] = turn[b - 1, k, 0] * x + turn[b - 1, k, 1] * y + turn[b - 1, k, 2] * z
+
+
+@njit(cache=True, error_model="numpy")
+def _push(wrench, body, px, py, pz, fx, fy, fz):  # type: ignore[no-untyped-def]
+    """Add a force at a point to the wrench (about the world origin) on a body."""
+    if body >= 0:
+        wrench[body, 0] += fx
+        wrench[body, 1] += fy
+        wrench[body, 2] += fz
+        wrench[body, 3] += py * fz - pz * fy
+        wrench[body, 4] += pz * fx - px * fz
+        wrench[body, 5] += px * fy - py * fx
+
+
+@njit(cache=True, error_model="numpy")
+def _place(rotation, translation, tip, q, body, ends, turn, origin, world, point):  # type: ignore[no-untyped-def]
+    """Frames, capsule ends and flange in frame 0 at one posture."""
+    _frames(rotation, translation, q, turn, origin)
+    for c in range(body.shape[0]):
+        b = body[c]
+        for e in range(2):
+            for k in range(3):
+                world[c, e, k] = ends[c, e, k]
+            if b >= 0:
+                x, y, z = ends[c, e, 0], ends[c, e, 1], ends[c, e, 2]
+                for k in range(3):
+                    world[c, e, k] = origin[b, k] + turn[b, k, 0] * x + turn[b, k, 1] * y + turn[b, k, 2] * z
+    last = q.shape[0] - 1
+    for k in range(3):
+        point[k] = (
+            origin[last, k]
+            + turn[last, k, 0] * tip[0]
+            + turn[last, k, 1] * tip[1]
+            + turn[last, k, 2] * tip[2]
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def _segment_to_box(start, stop, half, rotation, centre, point, normal):  # type: ignore[no-untyped-def]
+    """Distance of a segment to a box; nearest point of the segment into `point`, gradient into `normal`."""
+    low, high = 0.0, 1.0
+    # the distance to a convex body is convex along the segment, so golden section finds its minimum
+    for _ in range(24):
+        left = high - 0.6180339887498949 * (high - low)
+        right = low + 0.6180339887498949 * (high - low)
+        for k in range(3):
+            point[k] = start[k] + left * (stop[k] - start[k])
+        at_left = _box_distance(point, half, rotation, centre, normal)
+        for k in range(3):
+            point[k] = start[k] + right * (stop[k] - start[k])
+        if at_left < _box_distance(point, half, rotation, centre, normal):
+            high = right
+        else:
+            low = left
+    share = 0.5 * (low + high)
+    for k in range(3):
+        point[k] = start[k] + share * (stop[k] - start[k])
+    return _box_distance(point, half, rotation, centre, normal)
+
+
+@njit(cache=True, error_model="numpy")
+def _distances(arm, q, value, shapes):  # type: ignore[no-untyped-def]
+    rotation, translation, tip = arm
+    body, ends, thickness, pairs, ground, grounded, box_size, box_rotation, box_centre, boxed = shapes
+    m, n = q.shape
+    turn, origin = np.empty((n, 3, 3)), np.empty((n, 3))
+    world, point = np.empty((body.shape[0], 2, 3)), np.empty(3)
+    near, normal = np.empty((2, 3)), np.empty(3)
+    for i in range(m):
+        _place(rotation, translation, tip, q[i], body, ends, turn, origin, world, point)
+        value[i, 0] = np.sqrt(point[0] * point[0] + point[1] * point[1])
+        value[i, 1] = point[2]
+        row = 2
+        for k in range(pairs.shape[0]):
+            first, second = pairs[k, 0], pairs[k, 1]
+            gap = _segments(world[first, 0], world[first, 1], world[second, 0], world[second, 1], near)
+            value[i, row + k] = gap - thickness[first] - thickness[second]
+        row += pairs.shape[0]
+        for k in range(grounded.shape[0]):
+            c = grounded[k]
+            value[i, row + k] = min(world[c, 0, 2], world[c, 1, 2]) - thickness[c] - ground
+        row += grounded.shape[0]
+        for k in range(boxed.shape[0]):
+            c, x = boxed[k, 0], boxed[k, 1]
+            gap = _segment_to_box(
+                world[c, 0], world[c, 1], box_size[x], box_rotation[x], box_centre[x], point, normal
+            )
+            value[i, row + k] = gap - thickness[c]
+
+
+@njit(cache=True, error_model="numpy")
+def row_gradient(arm, q, row, weight, qbar, shapes):  # type: ignore[no-untyped-def]
+    """Set qbar (m, n) to the derivative of sum_i weight_i * distance_i of one row; samples of weight 0 are
+    skipped.
+    """
+    rotation, translation, tip = arm
+    body, ends, _, pairs, _, grounded, box_size, box_rotation, box_centre, boxed = shapes
+    m, n = q.shape
+    turn, origin = np.empty((n, 3, 3)), np.empty((n, 3))
+    world, point = np.empty((body.shape[0], 2, 3)), np.empty(3)
+    near, normal = np.empty((2, 3)), np.empty(3)
+    wrench = np.empty((n, 6))
+    last = n - 1
+    for i in range(m):
+        for b in range(n):
+            qbar[i, b] = 0.0
+        if weight[i] == 0.0:
+            continue
+        _place(rotation, translation, tip, q[i], body, ends, turn, origin, world, point)
+        wrench[:] = 0.0
+        force = weight[i]
+        if row == 0:
+            scale = force / max(np.sqrt(point[0] * point[0] + point[1] * point[1]), 1e-9)
+            _push(wrench, last, point[0], point[1], point[2], scale * point[0], scale * point[1], 0.0)
+        elif row == 1:
+            _push(wrench, last, point[0], point[1], point[2], 0.0, 0.0, force)
+        elif row < 2 + pairs.shape[0]:
+            first, second = pairs[row - 2, 0], pairs[row - 2, 1]
+            gap = _segments(world[first, 0], world[first, 1], world[second, 0], world[second, 1], near)
+            scale = force / max(gap, 1e-9)
+            fx, fy, fz = (
+                scale * (near[0, 0] - near[1, 0]),
+                scale * (near[0, 1] - near[1, 1]),
+                scale * (near[0, 2] - near[1, 2]),
+            )
+            _push(wrench, body[first], near[0, 0], near[0, 1], near[0, 2], fx, fy, fz)
+            _push(wrench, body[second], near[1, 0], near[1, 1], near[1, 2], -fx, -fy, -fz)
+        elif row < 2 + pairs.shape[0] + grounded.shape[0]:
+            c = grounded[row - 2 - pairs.shape[0]]
+            e = 0 if world[c, 0, 2] < world[c, 1, 2] else 1
+            _push(wrench, body[c], world[c, e, 0], world[c, e, 1], world[c, e, 2], 0.0, 0.0, force)
+        else:
+            k = row - 2 - pairs.shape[0] - grounded.shape[0]
+            c, x = boxed[k, 0], boxed[k, 1]
+            _segment_to_box(
+                world[c, 0], world[c, 1], box_size[x], box_rotation[x], box_centre[x], point, normal
+            )
+            fx, fy, fz = force * normal[0], force * normal[1], force * normal[2]
+            _push(wrench, body[c], point[0], point[1], point[2], fx, fy, fz)
+        fx = fy = fz = mx = my = mz = 0.0
+        for b in range(n - 1, -1, -1):
+            fx += wrench[b, 0]
+            fy += wrench[b, 1]
+            fz += wrench[b, 2]
+            mx += wrench[b, 3]
+            my += wrench[b, 4]
+            mz += wrench[b, 5]
+            ox, oy, oz = origin[b, 0], origin[b, 1], origin[b, 2]
+            qbar[i, b] = (
+                turn[b, 0, 2] * (mx - oy * fz + oz * fy)
+                + turn[b, 1, 2] * (my - oz * fx + ox * fz)
+                + turn[b, 2, 2] * (mz - ox * fy + oy * fx)
+            )
+
+
+def distances(mechanism: Mechanism, space: Space, q: Array) -> Array:
+    """All distances at the postures q (m, n), as (m, rows) [m]."""
+    out = np.empty((q.shape[0], space.rows))
+    _distances(mechanism.geometry, np.ascontiguousarray(q), out, space.shapes)
+    return out
