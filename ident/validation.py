@@ -200,7 +200,11 @@ def validate(
         scores.append(
             score_session(prepared, predict, model.structure.sides, session, "identified model", seen=flag)
         )
-    return Validation(model.robot, tuple(scores))
+    notes: tuple[str, ...] = ()
+    if model.effects:
+        named = ", ".join(str(effect.get("name", "?")) for effect in model.effects)
+        notes = (f"The torque is that of the linear model; its effects are not in it: {named}.",)
+    return Validation(model.robot, tuple(scores), notes=notes)
 
 
 def predictor(model: DynamicModel, payload: str | None) -> Predictor:

@@ -108,6 +108,11 @@ def test_a_session_without_the_sides_of_the_model_says_so(truth_model: Any, benc
         validate(difference, [session], settings=PLAIN)
 
 
+def test_effects_that_are_not_computed_are_named(truth_model: Any, loaded: Any) -> None:
+    extended = replace(truth_model, effects=({"name": "stribeck"},))
+    assert "its effects are not in it: stribeck" in str(validate(extended, [loaded], settings=PLAIN))
+
+
 def test_results_print_and_serialise(truth_model: Any, unloaded: Any) -> None:
     result = validate(truth_model, [unloaded], settings=PLAIN)
     result = replace(result, competitors=competitor_scores(truth_model, [unloaded], settings=PLAIN))
