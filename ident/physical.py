@@ -75,8 +75,8 @@ def project(
     covariance : (b, b) of `base`; without it a parameter's scale is what the reference bodies contribute to
         it.
     margin : smallest pseudo-inertia allowed, as a share of that of the reference body.
-    firmness : weight w of the reference bodies where the base parameters must give way; 0.1 lets a body differ
-        by three times its own size for one standard deviation.
+    firmness : weight w of the reference bodies where the base parameters must give way; 0.1 lets a body
+        differ by three times its own size for one standard deviation.
 
     Raises ConfigurationError for shapes that do not fit or a reference body that cannot exist, DataError when
     the solver finds no bodies.
