@@ -20,16 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
-from fri.errors import ConfigurationError, DataError
+from fri.errors import ConfigurationError
 from ident.cad_prior import cad_prior
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance
 from ident.estimators.prior import MaximumAPosteriori, Prior
-from ident.estimators.problem import Problem, RowGroup
 from ident.identify import Identification, IdentificationSettings, identify
 from ident.kinematics import Chain
 from ident.observation import observe
-from ident.signals.prepare import Passage, PreparedSession, TorqueChannel
+from ident.signals.prepare import Passage, PreparedSession, TorqueChannel, prepare
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
@@ -136,7 +135,7 @@ def find_mounting(
     covariance = None
     while done < steps and not converged:
         done += 1
-        step, covariance = _step(found, axes, tilt, prior_std_rad)
+        step, covariance = _step(found, sessions, axes, tilt, prior_std_rad)
         tilt = tilt + step
         turned = replace(chain, gravity=_turned(chain.gravity, axes, tilt))
         found = identify(sessions, turned, inner)
@@ -171,14 +170,18 @@ def _turned(gravity: FloatArray, axes: FloatArray, tilt: FloatArray) -> FloatArr
 
 
 def _step(
-    found: Identification, axes: FloatArray, tilt: FloatArray, prior_std_rad: float
+    found: Identification,
+    sessions: Sequence[Session],
+    axes: FloatArray,
+    tilt: FloatArray,
+    prior_std_rad: float,
 ) -> tuple[FloatArray, Covariance]:
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
-    columns = [_column(found, -np.cross(axis, gravity)) for axis in axes]
+    columns = _columns(found, sessions, [-np.cross(axis, gravity) for axis in axes])
     groups = tuple(
-        replace(group, matrix=np.column_stack([group.matrix, *[c[number] for c in columns]]))
-        for number, group in enumerate(found.problem.groups)
+        replace(group, matrix=np.column_stack([group.matrix, column]))
+        for group, column in zip(found.problem.groups, columns, strict=True)
     )
     problem = replace(
         found.problem,
@@ -197,25 +200,30 @@ def _step(
     return estimate.values[-2:], stated
 
 
-def _column(found: Identification, gravity: FloatArray) -> list[FloatArray]:
-    """Torque (m,) of each row group at rest under `gravity`: what a change of gravity by it adds."""
-    structure = found.structure
-    resting = replace(
-        structure,
-        chain=replace(structure.chain, gravity=gravity),
-        without=(*structure.without, "offl", "offm"),
-    )
-    prepared = [_at_rest(session) for session in found.prepared]
-    problem: Problem = observe(prepared, found.payloads, resting, columns=found.base.columns)
-    _same_rows(problem.groups, found.problem.groups)
-    return [group.matrix @ found.estimate.values for group in problem.groups]
-
-
-def _same_rows(groups: Sequence[RowGroup], others: Sequence[RowGroup]) -> None:
-    if [(g.label, g.record, len(g.target)) for g in groups] != [
-        (g.label, g.record, len(g.target)) for g in others
-    ]:
-        raise DataError("the rows at rest differ from the rows in motion; identify the sessions one by one")
+def _columns(
+    found: Identification, sessions: Sequence[Session], directions: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Torque (m, 2) of each row group at rest under each gravity: what a change of gravity by it adds."""
+    structure, settings = found.structure, found.settings
+    structures = [
+        replace(
+            structure,
+            chain=replace(structure.chain, gravity=direction),
+            without=(*structure.without, "offl", "offm"),
+        )
+        for direction in directions
+    ]
+    result = []
+    for session, payload in zip(sessions, found.payloads, strict=True):
+        chosen = session.select(structure.chain.joint_names)
+        moving = prepare(
+            chosen, settings.signals, resonance_hz=settings.resonance_hz, motor=settings.model == 2
+        )
+        still = _at_rest(moving)
+        groups = [observe([still], [payload], s, columns=found.base.columns).groups for s in structures]
+        for pair in zip(*groups, strict=True):
+            result.append(np.column_stack([group.matrix @ found.estimate.values for group in pair]))
+    return result
 
 
 def _at_rest(session: PreparedSession) -> PreparedSession:
