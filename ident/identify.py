@@ -301,10 +301,11 @@ def identify(
             observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
         )
         motion = None if settings.signals.average_periods else commanded(session, whole)
+        prepared.append(whole.without_samples())
+        del whole
         if motion is not None:
             instruments.append(observe([motion], [payload], structure, columns=base.columns))
-        prepared.append(whole.without_samples())
-        del whole, motion
+            del motion
     warnings = [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
     problem = stack(problems)

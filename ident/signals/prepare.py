@@ -169,7 +169,9 @@ def prepare(
         )
     windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
-    motions = [_Motion.of(part, effort_flags, times, settings) for part in parts]
+    count, resampled = len(parts), any(part.resampled for part in parts)
+    del whole
+    motions = [_Motion.of(parts.pop(0), effort_flags, times, settings) for _ in range(count)]
     longest = max(motions, key=lambda motion: len(motion.qd))
     excitation = excitation_frequency(longest.qd, dt)
     motor_data = (
@@ -204,8 +206,8 @@ def prepare(
         "position_outliers": int(position_flags.sum()),
         "joint_torque_outliers": int(effort_flags.sum()),
         "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
-        "stretches": len(parts),
-        "resampled": int(any(part.resampled for part in parts)),
+        "stretches": count,
+        "resampled": int(resampled),
         "rows": sum(len(passage.rows) for passage in passages),
         "joint_rows_dropped": sum(int((~passage.joint_valid).sum()) for passage in passages),
         "motor_rows_dropped": sum(
@@ -236,7 +238,9 @@ def prepare(
 class _Motion:
     """Filtered motion of one stretch and its joint torque."""
 
-    stretch: Stretch
+    start: float
+    dt: float
+    bridged: BoolArray
     q: FloatArray
     qd: FloatArray
     qdd: FloatArray
@@ -259,18 +263,23 @@ class _Motion:
             flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
             good = ~flagged[:, joint]
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
-        return cls(part, q, qd, qdd, torque, flagged)
+        return cls(part.start, part.dt, part.bridged, q, qd, qdd, torque, flagged)
+
+    @property
+    def times(self) -> FloatArray:
+        """Sample times (n,) [s]."""
+        return self.start + self.dt * np.arange(len(self.q), dtype=np.float64)
 
     def usable(self, settings: SignalSettings) -> tuple[float, float]:
         """First and last time unaffected by the filter's start and end [s]."""
-        return self.stretch.start + settings.edge, self.stretch.end - settings.edge
+        return self.start + settings.edge, self.start + self.dt * (len(self.q) - 1) - settings.edge
 
     def channel(self, settings: SignalSettings) -> TorqueChannel:
         """The joint torque channel, without the filter's ends."""
-        cut = int(np.ceil(settings.edge / self.stretch.dt))
+        cut = int(np.ceil(settings.edge / self.dt))
         part = slice(cut, len(self.q) - cut)
         return TorqueChannel(
-            "joint", self.stretch.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
+            "joint", self.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
             self.flagged[part],
         )  # fmt: skip
 
@@ -284,10 +293,10 @@ class _Motion:
         if inside.sum() < 16:
             return None
         actual = actual[inside]
-        start, dt = self.stretch.start, self.stretch.dt
+        start, dt = self.start, self.dt
         q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
         nearest = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
-        lost = self.stretch.bridged[nearest]
+        lost = self.bridged[nearest]
         return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside] | lost[:, None])
 
 
@@ -379,9 +388,7 @@ def _delay(
     if not sensed:
         return Delay(0.0, 0.0, "no joint torque to hold the motor channel against")
     times, torque, _ = motor_data
-    data = [
-        DelayData(m.stretch.times, m.qd, m.qdd, m.torque, times, torque, m.usable(settings)) for m in motions
-    ]
+    data = [DelayData(m.times, m.qd, m.qdd, m.torque, times, torque, m.usable(settings)) for m in motions]
     rate = 1.0 / float(np.median(np.diff(times)))
     return estimate_delay(
         data,
