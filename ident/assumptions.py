@@ -178,8 +178,7 @@ def _serial_correlation(series: _Series) -> Check:
         "serially uncorrelated",
         p_value > _LEVEL,
         f"Ljung-Box p {p_value:.2g} ({series.labels[index]}, Durbin-Watson {watson[index]:.2f}); effective "
-        "rows "
-        f"{100 * min(share):.0f} to {100 * max(share):.0f} % of all",
+        f"rows {100 * min(share):.0f} to {100 * max(share):.0f} % of all",
         "the textbook standard deviations are too small; the stated robust ones hold",
         statistics[index],
         p_value,

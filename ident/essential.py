@@ -92,8 +92,7 @@ class Essential:
         """Counts and the reason for each elimination."""
         lines = [
             f"{len(self.names)} essential parameters, {len(self.eliminated)} eliminated; the weighted "
-            "residual grew by "
-            f"{self.loss_percent:.2f} %",
+            f"residual grew by {self.loss_percent:.2f} %",
             f"{'eliminated':<10} {'estimate':>11} {'RSD %':>9} {'F':>7} {'loss %':>7}  reason",
         ]
         lines += [

@@ -228,8 +228,8 @@ class Identification:
         """The result as text."""
         counts = self.counts
         lines = [
-            f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} not "
-            f"identifiable, {counts['regrouped']} regrouped, {counts['base']} base",
+            f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} "
+            f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base",
         ]
         for session, payload in zip(self.prepared, self.payloads, strict=True):
             delay = f", motor channel late by {session.delay}" if session.delay is not None else ""
@@ -269,8 +269,7 @@ def identify(
         raise DataError(
             f"Model {settings.model} needs motor torques, and {names} "
             f"ha{'s' if len(chosen) == 1 else 've'} no /motor_states; choose Model 1 (`--model 1`), or "
-            "record with a "
-            "motor torque source"
+            "record with a motor torque source"
         )
     if settings.model == 3:
         chosen = [session for session, has in zip(chosen, with_motor, strict=True) if has]
@@ -386,9 +385,8 @@ def _every_joint_moves(prepared: Sequence[PreparedSession], chain: Chain) -> Non
     if still:
         raise DataError(
             f"joint{'s' if len(still) > 1 else ''} {', '.join(still)} never "
-            f"move{'s' if len(still) == 1 else ''}; "
-            "plan an excitation that moves every joint, or identify with a chain in which these joints are "
-            "fixed"
+            f"move{'s' if len(still) == 1 else ''}; plan an excitation that moves every joint, or identify "
+            "with a chain in which these joints are fixed"
         )
 
 
@@ -417,8 +415,7 @@ def _payload_warnings(
     if structure.payloads and None not in payloads:
         found.append(
             "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into "
-            "the arm's; "
-            "add an unloaded session of the same arm"
+            "the arm's; add an unloaded session of the same arm"
         )
     for payload in structure.payloads:
         link = structure.payload_link(payload)
@@ -437,15 +434,13 @@ def _payload_warnings(
         if mass < 3.0 * std:
             found.append(
                 f"payload {payload!r}: the estimated mass {mass:.3f} ± {std:.3f} kg is not above zero; it "
-                "was announced "
-                "but not mounted, or mounted in the unloaded session too: correct the metadata or repeat "
-                "the session"
+                "was announced but not mounted, or mounted in the unloaded session too: correct the "
+                "metadata or repeat the session"
             )
         elif stated and abs(mass - stated[0]) > max(0.1 * stated[0], 3.0 * std):
             found.append(
                 f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg against {stated[0]:.3f} kg "
-                "stated; check "
-                "what was mounted, and the torque sensors' gain"
+                "stated; check what was mounted, and the torque sensors' gain"
             )
     return found
 
@@ -458,6 +453,5 @@ def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
     names = ", ".join(estimate.names[k] for k in worst)
     return [
         f"condition number of the normalised columns {normalised:.0f} exceeds {_WIDE_CONDITION:.0f}; the "
-        "motion hardly "
-        f"separates {names}: excite them, or judge them by their RSD"
+        f"motion hardly separates {names}: excite them, or judge them by their RSD"
     ]

@@ -217,8 +217,7 @@ def jackknife(
         matrix = correlation * np.outer(ratio, ratio)
     kind = (
         f"block jackknife ({count} blocks of {length * problem.sample_time_s:.2f} s left out): robust to "
-        "serial "
-        "correlation"
+        "serial correlation"
     )
     return Covariance(matrix, kind, degrees_of_freedom=max(1.0, count - 1.0))
 

@@ -53,8 +53,7 @@ class InstrumentalVariables:
             if not condition < 1e12:
                 raise DataError(
                     f"the instruments do not span the parameters (condition {condition:.1e}); simulate the "
-                    "same "
-                    "motion that was recorded, all joints moving"
+                    "same motion that was recorded, all joints moving"
                 )
             bread = np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale), dtype=np.float64)
             new = bread @ moment
@@ -97,8 +96,7 @@ class InstrumentalVariables:
             if matrix.shape != group.matrix.shape or not np.all(np.isfinite(matrix)):
                 raise DataError(
                     f"{group.label}: instruments of shape {matrix.shape} are not finite or do not match "
-                    "the rows "
-                    f"{group.matrix.shape}; evaluate them at the same times"
+                    f"the rows {group.matrix.shape}; evaluate them at the same times"
                 )
         return matrices
 

@@ -280,8 +280,7 @@ def _run(
     if status not in ("Solved", "AlmostSolved"):
         raise DataError(
             f"the physically consistent program ended with {status}; check the prior's masses and the "
-            "parameters' "
-            "units, or raise `strength`"
+            "parameters' units, or raise `strength`"
         )
     return scale * np.array(result.x)
 

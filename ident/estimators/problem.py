@@ -245,8 +245,7 @@ class Problem:
         if empty:
             raise DataError(
                 f"no row says anything about {_listed(empty)}; move these joints, add the session that "
-                "excites "
-                "them, or leave the parameters out of the model"
+                "excites them, or leave the parameters out of the model"
             )
         if self.rows < p:
             raise DataError(f"{self.rows} rows cannot determine {p} parameters; record a longer motion")

@@ -56,8 +56,7 @@ def class_variances(problem: Problem, values: FloatArray, consumed: FloatArray) 
         if freedom < 1.0:
             raise DataError(
                 f"{row_class.label}: {row_class.factor.rows} rows for {share:.1f} parameters leave no "
-                "residual; "
-                "record a longer motion or raise the output rate of the signals"
+                "residual; record a longer motion or raise the output rate of the signals"
             )
         result.append(row_class.factor.sum_of_squares(values) / freedom)
     variance = np.array(result)

@@ -60,8 +60,7 @@ class TotalLeastSquares:
             if remaining < 1e-3 * power:
                 raise DataError(
                     "the assumed errors of the columns exceed the whole residual; lower `relative_noise`, "
-                    "1e-3 is "
-                    "typical for filtered positions"
+                    "1e-3 is typical for filtered positions"
                 )
             converged = abs(np.sqrt(remaining) / torque - 1.0) < 1e-6
             values, torque = new, float(np.sqrt(remaining))

@@ -137,8 +137,8 @@ def prepare(
     if not sensed:
         if not motor or session.motor is None:
             raise DataError(
-                f"{name}: /joint_states has no effort, so no joint torque; record it, or choose Model 2 with "
-                "a session that has motor torques"
+                f"{name}: /joint_states has no effort, so no joint torque; record it, or choose Model 2 "
+                "with a session that has motor torques"
             )
         effort = np.zeros_like(position)
     sequence = session.joint.sequence if session.joint.numbered else None
@@ -150,8 +150,7 @@ def prepare(
         for column in columns:
             warnings.append(
                 f"{name}: {session.joint_names[column]} {what} jumps too often for outliers, nothing was "
-                "removed; "
-                "look at the channel"
+                "removed; look at the channel"
             )
     bad: BoolArray = np.asarray(position_flags.any(axis=1))
     parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
@@ -164,8 +163,7 @@ def prepare(
     if not names:
         raise DataError(
             f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone says "
-            "nothing "
-            "about inertia and friction"
+            "nothing about inertia and friction"
         )
     windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
@@ -191,8 +189,7 @@ def prepare(
         need = 2.0 * (half_width(settings.decimate_hz, settings.attenuation_db) + settings.edge)
         raise DataError(
             f"{name}: no stretch is longer than the filters' ends, {need:.1f} s; record a longer motion or "
-            "raise "
-            "`decimate_hz`"
+            "raise `decimate_hz`"
         )
     warnings += advice(
         settings,
@@ -357,8 +354,7 @@ def _motor(
         times = times + shift * 1e-9
         warnings.append(
             f"{name}: the motor channel's clock differs from the joint channel's by {shift * 1e-9:.3f} s; "
-            "aligned by "
-            "the host's times first, the rest is the estimated delay"
+            "aligned by the host's times first, the rest is the estimated delay"
         )
     sample_period(times, None, f"{name}: /motor_states")
     effort = session.motor.effort
@@ -366,8 +362,7 @@ def _motor(
     for column in crowded:
         warnings.append(
             f"{name}: {session.joint_names[column]} motor torque jumps too often for outliers, nothing was "
-            "removed; "
-            "look at the channel"
+            "removed; look at the channel"
         )
     effort = effort.copy()
     for joint in np.flatnonzero(flags.any(axis=0)):
@@ -410,8 +405,7 @@ def _check_finite(columns: JointColumns, name: str) -> None:
             row, joint = np.argwhere(~np.isfinite(values))[0]
             raise DataError(
                 f"{name}: {columns.topic} {what} of {columns.names[joint]} is {values[row, joint]} at "
-                f"sample {row}; "
-                "remove or repair the sample"
+                f"sample {row}; remove or repair the sample"
             )
 
 

@@ -59,8 +59,7 @@ class SignalSettings:
         if self.decimate_hz > self.cutoff_hz:
             raise ConfigurationError(
                 f"`decimate_hz` {self.decimate_hz} exceeds `cutoff_hz` {self.cutoff_hz}; the parallel "
-                "filter must be "
-                "the narrower one, lower `decimate_hz` or raise `cutoff_hz`"
+                "filter must be the narrower one, lower `decimate_hz` or raise `cutoff_hz`"
             )
         if self.rate_hz is not None and self.rate_hz <= 0:
             raise ConfigurationError(f"`rate_hz` is {self.rate_hz}, it must be positive")

@@ -68,8 +68,8 @@ def advice(
     if settings.decimate_hz < 2.0 * excitation_hz:
         found.append(
             f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest "
-            "excitation "
-            f"frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms reach there, raise `decimate_hz`"
+            f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms reach there, raise "
+            "`decimate_hz`"
         )
     if settings.cutoff_hz < 5.0 * excitation_hz:
         found.append(
@@ -86,21 +86,19 @@ def advice(
     if settings.cutoff_hz > 0.2 * joint_rate_hz:
         found.append(
             f"the position cut-off {settings.cutoff_hz:g} Hz is above a fifth of the sampling rate "
-            f"{joint_rate_hz:.0f} "
-            "Hz; differences lose accuracy there, lower `cutoff_hz`"
+            f"{joint_rate_hz:.0f} Hz; differences lose accuracy there, lower `cutoff_hz`"
         )
     if resonance_hz is not None:
         if excitation_hz > 0.5 * resonance_hz:
             found.append(
                 f"the motion reaches {excitation_hz:.2f} Hz, over half the lowest resonance "
-                f"{resonance_hz:g} Hz; the "
-                "joints' elasticity is excited and the rigid model is biased, plan a slower motion"
+                f"{resonance_hz:g} Hz; the joints' elasticity is excited and the rigid model is biased, "
+                "plan a slower motion"
             )
         if settings.decimate_hz > 0.5 * resonance_hz:
             found.append(
                 f"the parallel filter's cut-off {settings.decimate_hz:g} Hz lets the lowest resonance "
-                f"{resonance_hz:g} "
-                "Hz through; lower `decimate_hz`"
+                f"{resonance_hz:g} Hz through; lower `decimate_hz`"
             )
     return tuple(found)
 
