@@ -166,10 +166,11 @@ def honesty(data: Recordings) -> None:
     print(f"{'estimator, deviations':<34}" + "".join(f"{f'{a} : {b}':>20}" for a, b in pairs))
     cases = [("wls", "textbook"), ("wls", "hac"), ("wls", "stated"), ("huber", "stated")]
     cases += [(e, k) for e in ("map", "physical") for k in ("stated", DECIDED, "jackknife")]
+    cases.append((LEANING, "stated"))
     for estimator, kind in cases:
         cells = []
         for a, b in pairs:
-            first, second = (data.identified(runs, estimator) for runs in (a, b))
+            first, second = (data.found(runs, estimator) for runs in (a, b))
             z = deviation(first.estimate, second.estimate, "stated" if kind == DECIDED else kind)
             if kind == DECIDED:
                 z = z[data_decide(first) & data_decide(second)]

@@ -7,9 +7,15 @@ standard deviations of weighted least squares are 8.8 times too small there.
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from real_lwr4 import (
+    DATA,
+    chain,
     identified,
     joint_rms,
     mounted,
@@ -17,6 +23,10 @@ from real_lwr4 import (
     relative_percent,
     repeatability,
 )
+
+from ident.import_log import LogMapping, import_log
+from lwr_driver.configuration import find
+from runner.commands.identify import command
 
 pytestmark = needs_recordings
 
@@ -61,6 +71,14 @@ def test_posterior_deviations_hold_between_two_different_motions():
     assert np.mean(np.abs(z) < 2.0) >= 0.85
 
 
+def test_with_the_tilt_the_physical_estimators_deviations_hold_between_any_two_runs():
+    for one, other in (((1,), (2,)), ((1,), (3,)), ((2,), (3,)), ((1, 2), (3,))):
+        first, second = (mounted(runs).identification.estimate for runs in (one, other))
+        z = (first.values - second.values) / np.hypot(first.std, second.std)
+        assert np.sqrt(np.mean(z**2)) < 1.5
+        assert np.mean(np.abs(z) < 2.0) >= 0.85
+
+
 def test_the_base_leans_alike_in_every_run():
     tilts = [mounted((run,)) for run in (1, 2, 3)]
     for tilt in tilts:
@@ -77,3 +95,16 @@ def test_with_the_tilt_the_error_falls_and_joint_1_comes_near_the_floor(train, t
     upright, leaning = identified(train, "physical"), mounted(train).identification
     assert relative_percent(leaning, test) < bound < relative_percent(upright, test) + 0.1
     assert joint_rms(leaning, test)[0] < 1.4 * repeatability()[0] < joint_rms(upright, test)[0]
+
+
+def test_the_command_line_does_the_same(tmp_path):
+    mapping = dataclasses.replace(LogMapping.load("lwr4_flobaroid"), joints=chain().joint_names)
+    import_log(mapping, DATA / "measurements_3.npz", tmp_path / "run_3.mcap")
+    options = ["--model", "1", "--estimator", "physical", "--tilt", "--json"]
+    options += ["--urdf", str(find("lwr4plus.urdf"))]
+    result = CliRunner().invoke(command, [str(tmp_path / "run_3.mcap"), *options])
+    assert result.exit_code == 0, result.output
+    content = json.loads(result.stdout)
+    np.testing.assert_allclose(content["mounting"]["tilt_rad"], mounted((3,)).tilt_rad, rtol=1e-6)
+    values = [entry["estimate"] for entry in content["parameters"]]
+    np.testing.assert_allclose(values, mounted((3,)).identification.estimate.values, rtol=1e-6, atol=1e-9)
