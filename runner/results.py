@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ident.estimators.estimate import Estimate
 from ident.identify import Identification, IdentificationSettings, identify
 from ident.kinematics import Chain
 from ident.model import DynamicModel
@@ -85,6 +86,11 @@ def summarise(
     details = found.to_dict()
     details["signals"] = details.pop("sessions")
     summary.update(details)
+    summary["excitation"] = characteristics(found)
+    for entry, interval in zip(summary["parameters"], found.estimate.interval().tolist(), strict=True):
+        entry["interval_95"] = interval
+    if found.essential is not None:
+        summary["essential"]["parameters"] = _estimates(found.essential.estimate)
     known = true_base(experiment, found)
     for entry in summary["parameters"]:
         if entry["name"] in known:

@@ -1,0 +1,66 @@
+"""The published results that a run is held against.
+
+Kolyubin, Paramonov and Shiriaev, "Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+",
+IFAC-PapersOnLine 50-1 (2017): Table 1 (excitation trajectories) and Table 2 (essential base parameters).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["SOURCE", "TABLE_1", "TABLE_2", "PublishedMotion", "PublishedParameter"]
+
+SOURCE = (
+    "Kolyubin, Paramonov, Shiriaev: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
+    "IFAC-PapersOnLine 50-1 (2017)"
+)
+
+
+@dataclass(frozen=True)
+class PublishedMotion:
+    """A row of Table 1. mean_torque : mean |joint torque| of joints 1 to 7 with the payload [Nm]."""
+
+    name: str
+    constraints: str
+    condition: float
+    mean_torque: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class PublishedParameter:
+    """An entry of Table 2: estimate in SI units and its relative standard deviation [%]."""
+
+    name: str
+    estimate: float
+    rsd_percent: float
+
+
+TABLE_1 = (
+    PublishedMotion("Random points", "yes", 84.21, (3.05, 45.09, 6.78, 18.58, 2.17, 2.28, 1.04)),
+    PublishedMotion("Optimised, algorithm 1", "yes", 34.01, (3.12, 41.71, 9.30, 13.24, 2.12, 1.56, 0.92)),
+    PublishedMotion("Optimised, algorithm 2", "yes", 37.23, (4.63, 42.26, 10.23, 14.05, 1.56, 1.64, 1.64)),
+)
+
+_TABLE_2 = """
+Ia1 3.14 1.68    Fvm1 16.68 0.84   Fcm1 15.04 1.02   Ia2 2.58 5.42     Fvm2 19.09 1.29   Fcm2 16.48 1.43
+offm2 2.09 6.91  Ia3 2.14 1.85     Fvm3 7.87 1.14    Fcm3 8.77 1.12    Ia4 1.97 4.20     Fvm4 11.63 1.61
+Fcm4 9.96 2.11   Ia5 0.67 8.37     Fvm5 5.39 1.87    Fcm5 5.58 1.47    Ia6 0.38 6.51     Fvm6 3.64 1.63
+Fcm6 4.41 1.41   Ia7 0.42 3.18     Fvm7 2.03 1.78    Fcm7 4.16 1.62    offm7 -0.54 7.31  Fcl1 0.79 2.70
+offl1 0.28 7.33  Fcl2 0.41 2.24    offl2 -0.87 1.37  Fcl3 0.22 2.85    Fcl4 0.17 4.63    offl4 0.26 2.97
+Fcl5 0.35 2.47   offl5 0.10 8.12   Fcl7 0.34 6.05    offl7 0.29 6.96   XX2R 1.36 0.93    ZZ2R 1.40 1.01
+MY2R 3.46 0.06   XX4R 0.44 0.58    ZZ4R 0.45 0.73    MY4R -1.37 0.08   MY5R 0.04 1.89    MY6R 0.03 3.23
+XX8 0.09 2.65    YY8 0.07 3.85     YZ8 0.03 5.03     ZZ8 0.02 12.70    MY8 -0.22 0.55    MZ8 0.48 0.34
+M8 3.34 0.09
+"""
+
+
+def _entries(text: str) -> tuple[PublishedParameter, ...]:
+    words = text.split()
+    return tuple(
+        PublishedParameter(name, float(value), float(rsd))
+        for name, value, rsd in zip(words[::3], words[1::3], words[2::3], strict=True)
+    )
+
+
+TABLE_2 = _entries(_TABLE_2)
+"""The 49 essential base parameters of Model 2, in the order of the paper."""

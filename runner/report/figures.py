@@ -1,0 +1,290 @@
+"""The figures of a run, for the report and for notebooks.
+
+::
+
+    from runner.report.figures import torque_figure
+    torque_figure("experiments/lwr4plus-20260101-120000")                 # shows itself in a notebook
+    torque_figure(folder, session="loaded", side="motor").save("torque.svg")
+    residual_figure(folder).plotly()                                      # interactive
+
+Every function takes a folder of results, or a `ResultFolder` where several figures share the work.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from ident.parameters import PER_LINK
+from runner.published import TABLE_2
+from runner.report.curves import Curves
+from runner.report.folder import ResultFolder
+from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
+from runner.report.thinning import thin
+
+__all__ = ["motion_figure", "parameter_figure", "residual_figure", "torque_figure", "velocity_figure"]
+
+Floats = NDArray[np.float64]
+Results = ResultFolder | str | Path
+
+_POINTS = 900
+_BINS = 36
+_MOVING = 0.01
+
+
+def velocity_figure(results: Results, session: str | None = None) -> Figure:
+    """Figure 2a of the paper: joint velocities as logged and filtered, by joint."""
+    one = _choose(results, session, "joint")
+    panels = []
+    for k, joint in enumerate(one.joint_names):
+        fastest = float(np.max(np.abs(one.qd[:, k])))
+        panels.append(
+            Panel(
+                joint,
+                "time [s]",
+                "velocity [rad/s]",
+                (
+                    Line("logged", "differences of the logged positions", *thin(one.time, one.raw_velocity[:, k], _POINTS)),
+                    Line("measured", "filtered", *thin(one.time, one.qd[:, k], _POINTS)),
+                ),
+                f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s.",
+                f"at most {fastest:.2f} rad/s",
+            )
+        )
+    return Figure(f"velocity-{one.session}", f"Joint velocities, session {one.session}", tuple(panels))
+
+
+def motion_figure(results: Results, session: str | None = None, side: str = "joint") -> Figure:
+    """Figure 2b of the paper: torque as logged and filtered, by joint."""
+    one = _choose(results, session, side)
+    panels = []
+    for k, joint in enumerate(one.joint_names):
+        mean = float(np.mean(np.abs(one.torque[:, k])))
+        panels.append(
+            Panel(
+                joint,
+                "time [s]",
+                "torque [Nm]",
+                (
+                    Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
+                    Line("measured", f"low-pass {one.cutoff_hz:g} Hz", *thin(one.grid, one.measured[:, k], _POINTS)),
+                ),
+                f"{side.capitalize()} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm.",
+                f"mean |τ| {mean:.2f} Nm",
+            )
+        )
+    return Figure(f"torque-logged-{one.session}-{side}", f"{side.capitalize()} torques, session {one.session}", tuple(panels))
+
+
+def torque_figure(results: Results, session: str | None = None, side: str | None = None) -> Figure:
+    """Figure 3 of the paper: measured and computed torque with the relative error, by joint.
+
+    session : name; by default the loaded one. side : "joint" (default where there is one) or "motor".
+    The relative error is the residual over the largest measured torque of the joint in the session. Measured and
+    computed torque passed the same low-pass; the samples as logged stand behind them.
+    """
+    one = _choose(results, session, side)
+    panels = []
+    for k, joint in enumerate(one.joint_names):
+        error = one.relative_error(k)
+        score = one.scores[k]
+        rms = float(np.sqrt(np.nanmean(error**2)))
+        panels.append(
+            Panel(
+                joint,
+                "time [s]",
+                "torque [Nm]",
+                (
+                    Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
+                    Line("measured", "measured", *thin(one.grid, one.measured[:, k], _POINTS)),
+                    Line("computed", "computed", *thin(one.grid, one.computed[:, k], _POINTS)),
+                    Line("error", "relative error", *thin(one.grid, error, _POINTS), lower=True),
+                ),
+                f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
+                f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms.",
+                f"residual {score.band_rms:.3g} Nm in the band, error {rms:.2f} %",
+                lower_label="error [%]",
+            )
+        )
+    caption = f"Measured and computed {one.side} torque with relative error, session {one.session}"
+    return Figure(f"torque-{one.session}-{one.side}", caption, tuple(panels))
+
+
+def residual_figure(
+    results: Results, session: str | None = None, side: str | None = None, against: str = "time"
+) -> Figure:
+    """Residual torque against `time`, `position` or `velocity`, by joint.
+
+    Over time: every extreme as logged, and the residual in the pass band. Against position and velocity: mean and
+    spread (5 to 95 %) of the latter in bins, against position for each direction of motion on its own.
+    """
+    if against not in ("time", "position", "velocity"):
+        raise ConfigurationError(f"residuals against {against!r}: choose time, position or velocity")
+    one = _choose(results, session, side)
+    residual = one.measured - one.computed
+    panels = []
+    for k, joint in enumerate(one.joint_names):
+        rms = float(np.sqrt(np.nanmean(residual[:, k] ** 2)))
+        marks: tuple[Mark, ...]
+        if against == "time":
+            label = "time [s]"
+            marks = (
+                Line("logged", "as logged", *thin(one.time, one.error[:, k], _POINTS)),
+                Line("measured", f"low-pass {one.cutoff_hz:g} Hz", *thin(one.grid, residual[:, k], _POINTS)),
+            )
+        else:
+            label = "position [rad]" if against == "position" else "velocity [rad/s]"
+            marks = _binned(one, residual[:, k], k, against)
+        panels.append(
+            Panel(
+                joint,
+                label,
+                "residual [Nm]",
+                marks,
+                f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {rms:.3g} Nm rms.",
+                f"{rms:.3g} Nm rms",
+            )
+        )
+    caption = f"Residual {one.side} torque against {against}, session {one.session}"
+    return Figure(f"residual-{against}-{one.session}-{one.side}", caption, tuple(panels))
+
+
+def parameter_figure(results: Results) -> Figure:
+    """Base parameters with their 95 % intervals by kind and link, with the published values and any truth."""
+    folder = _folder(results)
+    entries = folder.summary.get("parameters", [])
+    published = {entry.name: entry.estimate for entry in TABLE_2}
+    links = tuple(dict.fromkeys(_link(entry["name"]) for entry in entries))
+    links = tuple(sorted((link for link in links if link.isdigit()), key=int))
+    panels = []
+    for symbol in PER_LINK:
+        mine = [e for e in entries if _symbol(e["name"]) == symbol and _link(e["name"]) in links]
+        if not mine:
+            continue
+        x = np.array([1.0 + links.index(_link(e["name"])) for e in mine])
+        values = np.array([e["estimate"] for e in mine])
+        marks: list[Mark] = [
+            Points(
+                "estimate",
+                "estimate with 95 % interval",
+                x,
+                values,
+                np.array([interval_95(e) for e in mine]),
+                tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine),
+            )
+        ]
+        known = [(place, e) for place, e in zip(x, mine, strict=True) if "truth" in e]
+        if known:
+            marks.append(
+                Points(
+                    "truth",
+                    "true value of the emulated arm",
+                    np.array([place for place, _ in known]),
+                    np.array([e["truth"] for _, e in known]),
+                    None,
+                    tuple(f"{e['name']} {e['truth']:.4g} {e['unit']}" for _, e in known),
+                )
+            )
+        printed = [(place, e["name"]) for place, e in zip(x, mine, strict=True) if e["name"] in published]
+        if printed:
+            marks.append(
+                Points(
+                    "published",
+                    "published (Table 2)",
+                    np.array([place for place, _ in printed]),
+                    np.array([published[name] for _, name in printed]),
+                    None,
+                    tuple(f"{name} {published[name]:g}" for _, name in printed),
+                )
+            )
+        unit = pretty_unit(mine[0]["unit"])
+        listed = ", ".join(f"{e['name']} {e['estimate']:.3g}" for e in mine)
+        panels.append(
+            Panel(
+                symbol,
+                "link",
+                unit,
+                tuple(marks),
+                f"Estimates of {symbol} by link with their 95 % intervals: {listed} {unit}.",
+                x_names=links,
+            )
+        )
+    return Figure("parameters", "Base parameters with their 95 % intervals", tuple(panels))
+
+
+def pretty_unit(unit: str) -> str:
+    """A unit as it is printed: kg m², Nm s/rad."""
+    return unit.replace("^2", "²")
+
+
+def interval_95(entry: dict[str, float]) -> tuple[float, float]:
+    """95 % interval of a parameter of summary.json; from its standard deviation where none is stated."""
+    stated = entry.get("interval_95")
+    if isinstance(stated, list):
+        return float(stated[0]), float(stated[1])
+    return entry["estimate"] - 1.96 * entry["std"], entry["estimate"] + 1.96 * entry["std"]
+
+
+def _binned(one: Curves, residual: Floats, joint: int, against: str) -> tuple[Mark, ...]:
+    moving = np.isfinite(residual)
+    q = np.interp(one.grid[moving], one.time, one.q[:, joint])
+    qd = np.interp(one.grid[moving], one.time, one.qd[:, joint])
+    residual = residual[moving]
+    if against == "velocity":
+        x, mean, low, high = _bins(qd, residual)
+        return (
+            Band("spread", "5 to 95 % of the samples", x, low, high),
+            Line("measured", "mean", x, mean),
+        )
+    x, _, low, high = _bins(q, residual)
+    marks: list[Mark] = [Band("spread", "5 to 95 % of the samples", x, low, high)]
+    for role, label, chosen in (
+        ("forward", "mean, joint moving up", qd > _MOVING),
+        ("backward", "mean, joint moving down", qd < -_MOVING),
+    ):
+        if np.count_nonzero(chosen) > _BINS:
+            x, mean, _, _ = _bins(q[chosen], residual[chosen])
+            marks.append(Line(role, label, x, mean))  # type: ignore[arg-type]
+    return tuple(marks)
+
+
+def _bins(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Centres, means, 5 % and 95 % quantiles of y in bins of x that hold three samples or more."""
+    edges = np.linspace(x.min(), x.max(), _BINS + 1)
+    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)
+    rows = []
+    for k in range(_BINS):
+        mine = y[place == k]
+        if len(mine) >= 3:
+            rows.append((0.5 * (edges[k] + edges[k + 1]), mine.mean(), *np.quantile(mine, [0.05, 0.95])))
+    centre, mean, low, high = np.array(rows).reshape(-1, 4).T
+    return centre, mean, low, high
+
+
+def _folder(results: Results) -> ResultFolder:
+    return results if isinstance(results, ResultFolder) else ResultFolder.load(results)
+
+
+def _choose(results: Results, session: str | None, side: str | None) -> Curves:
+    folder = _folder(results)
+    found = [
+        one
+        for one in folder.curves
+        if (session is None or one.session == session) and (side is None or one.side == side)
+    ]
+    if not found:
+        known = ", ".join(one.label for one in folder.curves) or "none"
+        wanted = ", ".join(word for word in (session, side) if word) or "any session"
+        raise ConfigurationError(f"{folder.path}: no torque of {wanted} to show; there is: {known}")
+    return found[0]
+
+
+def _symbol(name: str) -> str:
+    return name.removesuffix("R").rstrip("0123456789")
+
+
+def _link(name: str) -> str:
+    return name.removesuffix("R")[len(_symbol(name)) :]

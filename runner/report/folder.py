@@ -1,0 +1,116 @@
+"""The folder of an experiment as the report sees it: read once, and honest about what is not there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from fri.errors import ConfigurationError, DataError, LwrError
+from ident.model import DynamicModel
+from ident.model_file import read_model
+from lwr_driver.session import Session, read_session
+from runner.report.curves import Curves, curves
+
+__all__ = ["ResultFolder"]
+
+
+@dataclass(frozen=True)
+class ResultFolder:
+    """Results of one experiment. What the run did not come to (no model, no diagnosis) is None or empty.
+
+    path : the folder; summary : content of summary.json.
+    """
+
+    path: Path
+    summary: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: str | Path) -> ResultFolder:
+        """Read `summary.json` of a folder. ConfigurationError where there is none, DataError if it is broken."""
+        folder = Path(path)
+        file = folder / "summary.json"
+        if not file.is_file():
+            raise ConfigurationError(
+                f"{folder}: holds no summary.json; name the folder of an experiment, the last line that "
+                "`lwr-run experiment` prints"
+            )
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            if not isinstance(content, dict) or "exit_status" not in content:
+                raise ValueError("no `exit_status`")
+        except (OSError, ValueError) as error:
+            raise DataError(f"{file}: is no summary of an experiment: {error}; run the experiment again") from error
+        return cls(folder, content)
+
+    @cached_property
+    def model(self) -> DynamicModel | None:
+        """The identified model, None where the run did not come to one."""
+        file = self.path / "model.yaml"
+        return read_model(file) if file.is_file() else None
+
+    @cached_property
+    def sessions(self) -> dict[str, Session]:
+        """The session logs that can be read, by name of the session."""
+        found: dict[str, Session] = {}
+        for entry in self.summary.get("sessions", []):
+            file = self.path / entry["file"]
+            try:
+                found[entry["name"]] = read_session(file)
+            except (LwrError, OSError):
+                continue
+        return found
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """Names of the sessions whose log is missing or broken."""
+        return tuple(e["name"] for e in self.summary.get("sessions", []) if e["name"] not in self.sessions)
+
+    @cached_property
+    def diagnosis(self) -> Mapping[str, Any] | None:
+        """Content of diagnosis.json, None where there is none. DataError if it is broken."""
+        file = self.path / "diagnosis.json"
+        if not file.is_file():
+            return None
+        try:
+            content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{file}: cannot be read: {error}; run `lwr-run diagnose` again") from error
+        return content
+
+    @cached_property
+    def preflights(self) -> dict[str, list[dict[str, Any]]]:
+        """Conditions checked before the motion, by session."""
+        found = {}
+        for name, session in self.sessions.items():
+            text = session.attachments.get("preflight.json")
+            if text is not None:
+                found[name] = json.loads(text)
+        return found
+
+    @cached_property
+    def curves(self) -> tuple[Curves, ...]:
+        """Measured and computed torque of each session and side, the loaded session first."""
+        if self.model is None:
+            return ()
+        cutoffs = {entry["name"]: entry["cutoff_hz"] for entry in self.summary.get("signals", [])}
+        found = []
+        for name, session in self.sessions.items():
+            if session.end is not None and session.end.get("exit_status") == "success":
+                found += curves(self.model, session, name, cutoff_hz=cutoffs.get(session.path.name))
+        return tuple(sorted(found, key=lambda one: (one.payload is None, one.session, one.side)))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints of the arm in kinematic order."""
+        for session in self.sessions.values():
+            return session.joint_names
+        return tuple(next(iter(self.summary.get("torque_rms", {}).values()), ()))
+
+    def text(self, name: str) -> str | None:
+        """Text of a file of the folder, None where there is none."""
+        file = self.path / name
+        return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else None

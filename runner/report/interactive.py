@@ -1,0 +1,235 @@
+"""Panels as plotly charts: as plain dictionaries for the page, as one `plotly` figure for notebooks."""
+
+from __future__ import annotations
+
+import base64
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from runner.report.plot import STYLES, Band, Figure, Line, Mark, Panel, Points, limits
+
+__all__ = ["INSTALL", "heatmap_chart", "panel_chart", "plotly_figure", "plotly_script"]
+
+Floats = NDArray[np.float64]
+
+INSTALL = "the extra `view` is not installed; run `pip install 'lwr-identification[view]'`"
+FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Helvetica, Arial, sans-serif", "size": 11, "color": "#1a1a1a"}
+_SYMBOLS = {"circle": "circle", "cross": "x-thin-open", "diamond": "diamond-open"}
+_GRID = "#e3e3e3"
+_SPLIT = 0.32
+_DIVERGING = [[0.0, "#d55e00"], [0.25, "#f2b98c"], [0.5, "#ffffff"], [0.75, "#8cbfdd"], [1.0, "#0072b2"]]
+
+
+def plotly_script() -> str:
+    """The plotly library as script text. ConfigurationError where the extra `view` is not installed."""
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise ConfigurationError(f"report.html: {INSTALL}") from error
+    return str(get_plotlyjs())
+
+
+def panel_chart(panel: Panel) -> dict[str, Any]:
+    """A panel as plotly `data` and `layout`; long columns as base64 of float32."""
+    data = [trace for mark in panel.marks for trace in _traces(mark)]
+    span = (0.5, len(panel.x_names) + 0.5) if panel.x_names else limits([m.x for m in panel.marks], pad=0.0)
+    layout: dict[str, Any] = {
+        "margin": {"l": 52, "r": 10, "t": 6, "b": 36},
+        "font": FONT,
+        "showlegend": False,
+        "hovermode": "x unified" if not panel.x_names else "closest",
+        "hoverlabel": {"font": {"size": 11}, "namelength": -1},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "#ffffff",
+        "xaxis": {
+            **_axis(panel.x_label),
+            "range": list(span),
+            "anchor": "y2" if panel.split else "y",
+            **({"showspikes": False} if panel.x_names else {}),
+        },
+        "yaxis": {**_axis(panel.y_label), "domain": [_SPLIT + 0.05, 1.0] if panel.split else [0.0, 1.0]},
+    }
+    if panel.x_names:
+        layout["xaxis"] |= {
+            "tickvals": list(range(1, len(panel.x_names) + 1)),
+            "ticktext": list(panel.x_names),
+        }
+    if panel.split:
+        layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 4}
+    return {"data": data, "layout": layout}
+
+
+def heatmap_chart(names: tuple[str, ...], matrix: Floats) -> dict[str, Any]:
+    """A square matrix of values from -1 to 1 as plotly `data` and `layout`."""
+    values = np.asarray(matrix, dtype=np.float64)
+    return {
+        "data": [
+            {
+                "type": "heatmap",
+                "x": list(names),
+                "y": list(names),
+                "z": {**_packed(values.ravel()), "shape": f"{values.shape[0]}, {values.shape[1]}"},
+                "zmin": -1,
+                "zmax": 1,
+                "colorscale": _DIVERGING,
+                "colorbar": {"thickness": 10, "len": 0.8, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+                "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
+            }
+        ],
+        "layout": {
+            "margin": {"l": 52, "r": 10, "t": 6, "b": 52},
+            "font": {**FONT, "size": 9},
+            "paper_bgcolor": "rgba(0,0,0,0)",
+            "plot_bgcolor": "#ffffff",
+            "xaxis": {"tickangle": -90, "showgrid": False, "constrain": "domain"},
+            "yaxis": {"autorange": "reversed", "showgrid": False, "scaleanchor": "x", "constrain": "domain"},
+        },
+    }
+
+
+def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:
+    """All panels of a figure as subplots of one `plotly.graph_objects.Figure`."""
+    try:
+        import plotly.graph_objects as go
+        from plotly.subplots import make_subplots
+    except ImportError as error:
+        raise ConfigurationError(f"plotly figure: {INSTALL}") from error
+    rows = math.ceil(len(figure.panels) / columns)
+    heights: list[float] = []
+    split = any(panel.split for panel in figure.panels)
+    for _ in range(rows):
+        heights += [0.7, 0.3] if split else [1.0]
+    titles = [
+        figure.panels[row * columns + column].title if row * columns + column < len(figure.panels) else ""
+        for row in range(rows)
+        for part in range(2 if split else 1)
+        for column in range(columns)
+        if part == 0 or True
+    ]
+    if split:
+        titles = [
+            title if (index // columns) % 2 == 0 else "" for index, title in enumerate(titles)
+        ]
+    whole = make_subplots(
+        rows=len(heights),
+        cols=columns,
+        row_heights=heights,
+        subplot_titles=titles,
+        vertical_spacing=0.25 / len(heights),
+    )
+    known: set[str] = set()
+    for index, panel in enumerate(figure.panels):
+        row, column = (index // columns) * (2 if split else 1) + 1, index % columns + 1
+        for mark in panel.marks:
+            for trace in _traces(mark):
+                trace.pop("yaxis", None)
+                plain = {key: _unpacked(value) for key, value in trace.items()}
+                name = str(plain.get("name", ""))
+                plain["showlegend"] = bool(name) and name not in known and plain.pop("keyed", True)
+                plain["legendgroup"] = name
+                known.add(name)
+                plain.pop("keyed", None)
+                whole.add_trace(
+                    go.Scatter(**{k: v for k, v in plain.items() if k != "type"}),
+                    row=row + (1 if mark.lower else 0),
+                    col=column,
+                )
+        whole.update_yaxes(title_text=panel.y_label, row=row, col=column)
+        if panel.split:
+            whole.update_yaxes(title_text=panel.lower_label, row=row + 1, col=column)
+    whole.update_layout(
+        template="plotly_white", font=FONT, height=170 * len(heights) + 120, legend={"orientation": "h", "y": 1.06}
+    )
+    return whole
+
+
+def _traces(mark: Mark) -> list[dict[str, Any]]:
+    style = STYLES[mark.role]
+    axis = {"yaxis": "y2"} if mark.lower else {}
+    if isinstance(mark, Line):
+        dash = ", ".join(f"{part}px" for part in style.dash.split()) if style.dash else "solid"
+        return [
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": mark.label,
+                "x": _column(mark.x),
+                "y": _column(mark.y),
+                "line": {"color": style.colour, "width": style.width, "dash": dash},
+                "hovertemplate": "%{y:.4g}",
+                **axis,
+            }
+        ]
+    if isinstance(mark, Band):
+        plain = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip", "x": _column(mark.x)}
+        fill = {"fill": "tonexty", "fillcolor": _transparent(style.colour), "name": mark.label}
+        return [
+            {**plain, "y": _column(mark.low), "name": "", **axis},
+            {**plain, "y": _column(mark.high), **fill, **axis},
+        ]
+    trace: dict[str, Any] = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": mark.label,
+        "x": _column(mark.x),
+        "y": _column(mark.y),
+        "text": list(mark.texts),
+        "marker": {
+            "color": style.colour,
+            "size": 7,
+            "symbol": _SYMBOLS[style.symbol],
+            "line": {"width": 1.4, "color": style.colour},
+        },
+        "hovertemplate": "%{text}<extra>" + mark.label + "</extra>" if mark.texts else "%{y:.4g}",
+        **axis,
+    }
+    if mark.interval is not None:
+        trace["error_y"] = {
+            "type": "data",
+            "symmetric": False,
+            "array": _column(mark.interval[:, 1] - mark.y),
+            "arrayminus": _column(mark.y - mark.interval[:, 0]),
+            "color": style.colour,
+            "thickness": 1.4,
+            "width": 3,
+        }
+    return [trace]
+
+
+def _axis(label: str) -> dict[str, Any]:
+    return {
+        "title": {"text": label, "standoff": 4},
+        "gridcolor": _GRID,
+        "zerolinecolor": "#c4c4c4",
+        "linecolor": "#8c8c8c",
+        "mirror": True,
+        "ticks": "outside",
+        "ticklen": 3,
+        "nticks": 6,
+    }
+
+
+def _transparent(colour: str) -> str:
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},0.55)"
+
+
+def _column(values: Floats) -> Any:
+    column = np.asarray(values, dtype=np.float64)
+    return column.tolist() if len(column) < 20 else _packed(column)
+
+
+def _packed(values: Floats) -> dict[str, str]:
+    return {"dtype": "f4", "bdata": base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")}
+
+
+def _unpacked(value: Any) -> Any:
+    if isinstance(value, dict):
+        if "bdata" in value:
+            return np.frombuffer(base64.b64decode(value["bdata"]), dtype="<f4")
+        return {key: _unpacked(entry) for key, entry in value.items()}
+    return value
