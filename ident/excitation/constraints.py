@@ -29,6 +29,7 @@ __all__ = ["Bound", "Constraints", "Row"]
 _IA, _FVL, _FCL, _OFFL, _FVM, _FCM, _OFFM = range(7)
 _NAMES = ("position", "velocity", "acceleration", "jerk")
 _FAR = 0.6
+_FAR_TORQUE = 0.2
 _SPACE_SCALE = 0.1
 _FLANGE_SCALE = 0.3
 
@@ -149,7 +150,7 @@ class Constraints:
             block = -(self._kinematic_weight[order] / self.half[order]).T @ evaluator.matrices[order]
             out[rows, np.arange(n)] = block
         for joint in range(n):
-            if near[4 * n + joint]:
+            if self.latest[4 * n + joint] < _FAR_TORQUE:
                 out[4 * n + joint] = -self._torque_gradient(joint)
         qbar = np.empty_like(self._q)
         mechanism = evaluator.mechanism

@@ -19,6 +19,8 @@ from ident.excitation.motion import Array
 
 __all__ = ["Space", "distances", "row_gradient"]
 
+_FAR = 0.15
+
 
 @dataclass(frozen=True, eq=False)
 class Space:
@@ -233,13 +235,28 @@ def _distances(arm, q, value, shapes):  # type: ignore[no-untyped-def]
     turn, origin = np.empty((n, 3, 3)), np.empty((n, 3))
     world, point = np.empty((body.shape[0], 2, 3)), np.empty(3)
     near, normal = np.empty((2, 3)), np.empty(3)
+    middle = np.empty((body.shape[0], 4))
     for i in range(m):
         _place(rotation, translation, tip, q[i], body, ends, turn, origin, world, point)
         value[i, 0] = np.sqrt(point[0] * point[0] + point[1] * point[1])
         value[i, 1] = point[2]
         row = 2
+        for c in range(body.shape[0]):
+            half = 0.0
+            for k in range(3):
+                middle[c, k] = 0.5 * (world[c, 0, k] + world[c, 1, k])
+                half += (world[c, 0, k] - middle[c, k]) ** 2
+            middle[c, 3] = np.sqrt(half) + thickness[c]
         for k in range(pairs.shape[0]):
             first, second = pairs[k, 0], pairs[k, 1]
+            dx = middle[first, 0] - middle[second, 0]
+            dy = middle[first, 1] - middle[second, 1]
+            dz = middle[first, 2] - middle[second, 2]
+            apart = np.sqrt(dx * dx + dy * dy + dz * dz) - middle[first, 3] - middle[second, 3]
+            if apart > _FAR:
+                # far pairs need no exact distance: that of the enclosing spheres is a lower bound
+                value[i, row + k] = apart
+                continue
             gap = _segments(world[first, 0], world[first, 1], world[second, 0], world[second, 1], near)
             value[i, row + k] = gap - thickness[first] - thickness[second]
         row += pairs.shape[0]
@@ -321,7 +338,9 @@ def row_gradient(arm, q, row, weight, qbar, shapes):  # type: ignore[no-untyped-
 
 
 def distances(mechanism: Mechanism, space: Space, q: Array) -> Array:
-    """All distances at the postures q (m, n), as (m, rows) [m]."""
+    """All distances at the postures q (m, n), as (m, rows) [m]; beyond 0.15 m a lower bound may stand for
+    them.
+    """
     out = np.empty((q.shape[0], space.rows))
     _distances(mechanism.geometry, np.ascontiguousarray(q), out, space.shapes)
     return out

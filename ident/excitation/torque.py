@@ -19,6 +19,7 @@ from ident.excitation.sweep import forward
 __all__ = ["TorqueBounds", "joint_torque", "torque_bounds", "torque_deviation"]
 
 _NO_COLUMNS = np.zeros(0, dtype=np.int64)
+_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
 _IA, _FVL, _FCL, _OFFL, _FVM, _FCM, _OFFM = range(7)
 
 
@@ -81,22 +82,31 @@ def torque_deviation(
     forward(mechanism.dynamics, (q, qd, qdd), (first, columns), np.zeros((1, joints, 10)), 1e-3, z, tau)
     place = 10 * joints
     for joint in range(joints):
-        rows = np.zeros((2, n, len(estimate.covariance_names)))
+        signals: list[Array] = []
+        used: list[int] = []
+        joint_side: list[bool] = []
         for index, name in enumerate(estimate.covariance_names):
             kind, link = split_name(name)
-            if kind in BODY:
-                if link == joints + 1:
-                    if loaded:
-                        rows[:, :, index] = z[joint, :, 10 * (joints - 1) + BODY.index(kind)]
-                elif link > joint:
-                    rows[:, :, index] = z[joint, :, 10 * (link - 1) + BODY.index(kind)]
-            elif link == joint + 1:
-                column = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}[kind]
-                signal = np.ones(n) if column >= 2 else z[joint, :, place + column]
-                rows[1, :, index] = signal
-                if kind in ("Fvl", "Fcl", "offl"):
-                    rows[0, :, index] = signal
-        for side in range(2):
-            variance = np.einsum("np,pq,nq->n", rows[side], estimate.covariance, rows[side], optimize=True)
-            sigma[side, :, joint] = np.sqrt(np.maximum(variance, 0.0))
+            if kind in BODY and joint < link <= joints + loaded:
+                signals.append(z[joint, :, 10 * (min(link, joints) - 1) + BODY.index(kind)])
+                joint_side.append(True)
+            elif kind not in BODY and link == joint + 1:
+                column = _SIGNAL[kind]
+                # Coulomb friction and offset count with a magnitude of one at every instant
+                signals.append(np.ones(n) if column >= 2 else z[joint, :, 10 * joints + column])
+                joint_side.append(kind in ("Fvl", "Fcl", "offl"))
+            else:
+                continue
+            used.append(index)
+        if used:
+            rows, covariance = np.column_stack(signals), estimate.covariance[np.ix_(used, used)]
+            own = np.array(joint_side)
+            sigma[0, :, joint] = _deviation(rows[:, own], covariance[np.ix_(own, own)])
+            sigma[1, :, joint] = _deviation(rows, covariance)
     return TorqueBounds(sigma[0], sigma[1])
+
+
+def _deviation(rows: Array, covariance: Array) -> Array:
+    """sqrt(y C y^T) of each row y."""
+    variance = np.einsum("ij,ij->i", rows @ covariance, rows)
+    return np.sqrt(np.maximum(variance, 0.0))
