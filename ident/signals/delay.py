@@ -13,8 +13,8 @@ it must be known before Ia can be believed.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,11 +39,19 @@ _GRID = 41
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of the motor channel [s] (positive: late), its standard deviation [s], and how it was found."""
+    """Delay of the motor channel [s] (positive: late), its standard deviation [s], and how it was found.
+
+    by_joint : delay that each moving joint would have by itself, and its standard deviation [s].
+    disagreement : how many times more the joints scatter than their standard deviations allow; the stated
+        standard deviation is already larger by that. Elastic joints and other physics of the drives shift
+        the reversals of a joint and so look like a delay of its own.
+    """
 
     seconds: float
     std: float
     how: str
+    by_joint: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    disagreement: float = 1.0
 
     def __str__(self) -> str:
         if self.std > 0:
@@ -94,17 +102,26 @@ def estimate_delay(
             f"{1e3 * grid[best]:.0f} ms; check the channel's clock and sign, raise `delay_search_s`, or "
             "state `motor_delay_s`"
         )
-    delay, std = float(grid[best]), 0.0
+    delay = float(grid[best])
     sampling = _sampling_error(parts)
     for stage in ("coarse", "fine"):
         for _ in range(_STEPS):
-            step, std = _newton(parts, joint_names, delay, fine=stage == "fine")
-            std = float(np.hypot(std, sampling))
-            delay = float(np.clip(delay + np.clip(step, -0.01, 0.01), -search_s, search_s))
-            if abs(step) < 0.1 * std or abs(step) < 1e-9:
+            steps, stds, _ = _newton(parts, joint_names, delay, fine=stage == "fine")
+            delay = float(np.clip(delay + np.clip(steps[0], -0.01, 0.01), -search_s, search_s))
+            if abs(steps[0]) < 0.1 * np.hypot(stds[0], sampling) or abs(steps[0]) < 1e-9:
                 break
+    std = float(np.hypot(stds[0], sampling))
+    steps, stds, names = _newton(parts, joint_names, delay, fine=True, separate=True)
+    own = np.hypot(stds, sampling * np.sqrt(len(stds)))
+    mean = float(np.sum(steps / own**2) / np.sum(1.0 / own**2))
+    chi = float(np.sqrt(np.sum(((steps - mean) / own) ** 2) / max(len(steps) - 1, 1)))
+    disagreement = max(1.0, chi)
+    std *= disagreement
+    by_joint = {
+        name: (delay + float(step), float(s)) for name, step, s in zip(names, steps, own, strict=True)
+    }
     logger.info("motor channel is %.3f ms late (standard deviation %.3f ms)", 1e3 * delay, 1e3 * std)
-    return Delay(delay, std, "estimated from the torque difference")
+    return Delay(delay, std, "estimated from the torque difference", by_joint, disagreement)
 
 
 @dataclass(frozen=True)
@@ -197,9 +214,14 @@ def _sampling_error(parts: Sequence[_Filtered]) -> float:
 
 
 def _newton(
-    parts: Sequence[_Filtered], joint_names: Sequence[str], delay: float, *, fine: bool
-) -> tuple[float, float]:
-    """Gauss-Newton step of the delay [s] and its standard deviation [s]."""
+    parts: Sequence[_Filtered],
+    joint_names: Sequence[str],
+    delay: float,
+    *,
+    fine: bool,
+    separate: bool = False,
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Gauss-Newton step of the delay (1,) or of each joint's own (J,) [s], standard deviations, joints."""
     groups, names = [], []
     active = [
         joint
@@ -210,6 +232,7 @@ def _newton(
         raise DataError(
             "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
         )
+    delays = len(active) if separate else 1
     columns = [part.columns_at(delay) if fine else part.columns for part in parts]
     for place, joint in enumerate(active):
         names += [f"{symbol} {joint_names[joint]}" for symbol in ("Ia", "Fvm", "Fcm", "offm")]
@@ -218,12 +241,12 @@ def _newton(
             if not len(rows):
                 continue
             times = part.outputs[rows] + delay
-            matrix = np.zeros((len(rows), 4 * len(active) + 1))
+            matrix = np.zeros((len(rows), 4 * len(active) + delays))
             matrix[:, 4 * place : 4 * place + 4] = columns[record][rows, joint]
-            matrix[:, -1] = -part.slope(times)[:, joint]
+            matrix[:, 4 * len(active) + (place if separate else 0)] = -part.slope(times)[:, joint]
             target = part.curve(times)[:, joint] - part.joint_torque[rows, joint]
             groups.append(RowGroup(joint_names[joint], "difference", record, matrix, target, rows))
     step = float(parts[0].outputs[1] - parts[0].outputs[0])
-    problem = Problem((*names, "delay"), tuple(groups), step)
-    estimate = WeightedLeastSquares(CovarianceSettings("hac")).fit(problem)
-    return float(estimate.values[-1]), float(estimate.std[-1])
+    titles = (*names, *(f"delay {k}" for k in range(delays)))
+    estimate = WeightedLeastSquares(CovarianceSettings("hac")).fit(Problem(titles, tuple(groups), step))
+    return estimate.values[-delays:], estimate.std[-delays:], tuple(joint_names[joint] for joint in active)

@@ -40,6 +40,8 @@ BoolArray = NDArray[np.bool_]
 
 logger = logging.getLogger(__name__)
 
+_DISAGREEMENT = 3.0
+
 
 @dataclass(frozen=True)
 class TorqueChannel:
@@ -178,6 +180,13 @@ def prepare(
     delay = None
     if motor_data is not None:
         delay = _delay(motor_data, motions, session.joint_names, settings, sensed)
+        if delay.disagreement > _DISAGREEMENT:
+            spread = ", ".join(f"{joint} {1e3 * own:.1f}" for joint, (own, _) in delay.by_joint.items())
+            warnings.append(
+                f"{name}: the joints disagree about the motor channel's delay ({spread} ms), "
+                f"{delay.disagreement:.1f} times beyond their standard deviations; elastic joints do that, "
+                "and the stated deviation of the delay allows for it"
+            )
     passages = [
         passage
         for motion in motions
