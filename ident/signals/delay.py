@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,8 @@ FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _STEPS = 12
+# Scatter of the joints, in their standard deviations, beyond which reversals are not trusted.
+_TOLERATED = 2.0
 _GRID = 41
 
 
@@ -102,8 +104,22 @@ def estimate_delay(
             f"{1e3 * grid[best]:.0f} ms; check the channel's clock and sign, raise `delay_search_s`, or "
             "state `motor_delay_s`"
         )
-    delay = float(grid[best])
-    sampling = _sampling_error(parts)
+    delay = _refined(parts, joint_names, float(grid[best]), search_s, "all rows")
+    if delay.disagreement > _TOLERATED:
+        quiet = [part.between_reversals() for part in parts]
+        quiet = [part for part in quiet if part.moving.sum() >= 16]
+        if quiet:
+            delay = _refined(quiet, joint_names, delay.seconds, search_s, "rows between reversals")
+    logger.info("motor channel: delay %s", delay)
+    return delay
+
+
+def _refined(
+    parts: Sequence[_Filtered], joint_names: Sequence[str], start: float, search_s: float, which: str
+) -> Delay:
+    """Gauss-Newton from `start`, then each joint by itself to see whether they agree."""
+    delay = start
+    sampling = _sampling_error(parts) if which == "all rows" else 0.0
     for stage in ("coarse", "fine"):
         for _ in range(_STEPS):
             steps, stds, _ = _newton(parts, joint_names, delay, fine=stage == "fine")
@@ -116,12 +132,11 @@ def estimate_delay(
     mean = float(np.sum(steps / own**2) / np.sum(1.0 / own**2))
     chi = float(np.sqrt(np.sum(((steps - mean) / own) ** 2) / max(len(steps) - 1, 1)))
     disagreement = max(1.0, chi)
-    std *= disagreement
     by_joint = {
         name: (delay + float(step), float(s)) for name, step, s in zip(names, steps, own, strict=True)
     }
-    logger.info("motor channel is %.3f ms late (standard deviation %.3f ms)", 1e3 * delay, 1e3 * std)
-    return Delay(delay, std, "estimated from the torque difference", by_joint, disagreement)
+    how = f"estimated from the torque difference, {which}"
+    return Delay(delay, std * disagreement, how, by_joint, disagreement)
 
 
 @dataclass(frozen=True)
@@ -136,6 +151,7 @@ class _Filtered:
     joint_torque: FloatArray
     columns: FloatArray
     moving: NDArray[np.bool_]
+    one_way: NDArray[np.bool_]
     curve: Any
     slope: Any
 
@@ -155,8 +171,14 @@ class _Filtered:
         smooth = ParallelFilter(data.motor_times, fine, cutoff_hz).apply(data.motor_torque)
         curve = make_interp_spline(fine, smooth, k=5)
         moving = joint.share(np.abs(data.qd) < standstill) < 0.05
+        forward = joint.share(data.qd > 0.0)
+        one_way = np.minimum(forward, 1.0 - forward) < 0.02
         torque, columns = joint.apply(data.joint_torque), _columns(joint, data.qd, data.qdd)
-        return cls(data, cutoff_hz, outputs, torque, columns, moving, curve, curve.derivative())
+        return cls(data, cutoff_hz, outputs, torque, columns, moving, one_way, curve, curve.derivative())
+
+    def between_reversals(self) -> _Filtered:
+        """Only rows in whose filter the joint moves one way."""
+        return replace(self, moving=self.moving & self.one_way)
 
     def columns_at(self, delay: float) -> FloatArray:
         """The columns filtered at the motor channel's own sample times less the delay.

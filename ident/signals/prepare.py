@@ -40,7 +40,7 @@ BoolArray = NDArray[np.bool_]
 
 logger = logging.getLogger(__name__)
 
-_DISAGREEMENT = 3.0
+_DISAGREEMENT = 2.0
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,6 @@ class _Motion:
 
     start: float
     dt: float
-    bridged: BoolArray
     q: FloatArray
     qd: FloatArray
     qdd: FloatArray
@@ -269,7 +268,7 @@ class _Motion:
             flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
             good = ~flagged[:, joint]
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
-        return cls(part.start, part.dt, part.bridged, q, qd, qdd, torque, flagged)
+        return cls(part.start, part.dt, q, qd, qdd, torque, flagged)
 
     @property
     def times(self) -> FloatArray:
@@ -292,7 +291,11 @@ class _Motion:
     def motor_channel(
         self, times: FloatArray, torque: FloatArray, flags: BoolArray, delay: float, settings: SignalSettings
     ) -> TorqueChannel | None:
-        """The motor torque with the motion at its own times less the delay."""
+        """The motor torque with the motion at its own times less the delay.
+
+        Where positions were lost the motion is the bridge's, which at this bandwidth is as good as a
+        measurement.
+        """
         first, last = self.usable(settings)
         actual = times - delay
         inside = (actual >= first) & (actual <= last)
@@ -301,9 +304,7 @@ class _Motion:
         actual = actual[inside]
         start, dt = self.start, self.dt
         q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
-        nearest = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
-        lost = self.bridged[nearest]
-        return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside] | lost[:, None])
+        return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside])
 
 
 def _passage(

@@ -324,3 +324,32 @@ def test_no_motion_is_refused():
     session = arm.session(motor=False, still=tuple(range(7)))
     with pytest.raises(DataError, match="no joint moves"):
         prepare(session)
+
+
+def test_one_lost_sample_in_twenty_costs_no_rows():
+    random = np.random.default_rng(0)
+    lost = tuple(np.sort(random.choice(np.arange(10, 6490), 320, replace=False)).tolist())
+    sensors = arm.Sensors(joint=1e-3, motor_step_s=0.012, lost=lost)
+    prepared = prepare(arm.session(sensors=sensors))
+    assert prepared.counts["lost"] == 320
+    assert prepared.counts["joint_rows_dropped"] + prepared.counts["motor_rows_dropped"] < 30
+    problem = observe([prepared], [None], ModelStructure(arm.chain(), 1))
+    chi = np.array([arm.truth()[name] for name in problem.names])
+    for group in problem.groups:
+        assert np.abs(group.target - group.matrix @ chi).max() < 0.05
+
+
+def test_a_drive_that_reverses_late_is_not_taken_for_a_delay():
+    session = arm.session(sensors=arm.Sensors(position=1e-6, joint=0.02, motor=0.05, motor_delay_s=0.004))
+    effort = session.motor.effort.copy()
+    time = session.motor.publish_time * 1e-9 - 0.004 - 3.0
+    for joint, late in ((1, 0.05), (4, -0.04), (6, 0.06)):
+        friction = arm.drive("Fcm")[joint]
+        now = np.sign(arm.fourier(time, 10.0, 5)[1][:, joint])
+        then = np.sign(arm.fourier(time - late, 10.0, 5)[1][:, joint])
+        effort[:, joint] += friction * (then - now)
+    motor = dataclasses.replace(session.motor, effort=effort)
+    prepared = prepare(dataclasses.replace(session, motor=motor))
+    assert "between reversals" in prepared.delay.how
+    assert abs(prepared.delay.seconds - 0.004) < max(3 * prepared.delay.std, 5e-4)
+    assert prepared.delay.std < 2e-3
