@@ -27,8 +27,8 @@ def cad_prior(
     """Prior of the base set's arm: the inertials of the URDF, within `relative_std` of themselves.
 
     payload_masses : stated mass [kg] by payload name; a payload is otherwise as good as unknown. Inertials
-    that belong to no rigid body are replaced by the nearest that do. Raises ConfigurationError for a chain
-    without URDF and for a structure without rigid bodies (Model 3).
+        that belong to no rigid body are replaced by the nearest that do. Raises ConfigurationError for a
+        chain without URDF and for a structure without rigid bodies (Model 3).
     """
     structure = base.structure
     if "difference" in structure.sides:

@@ -33,8 +33,8 @@ class EssentialSettings:
     """When a parameter may go.
 
     significance : level of the F test against zero. largest_loss_percent : bound on the growth of the
-    weighted residual rms, all eliminations together. keep : parameters that stay, drop : parameters that go
-    first and untested; names with or without their `R`, or a symbol for all links (`Fvl`).
+        weighted residual rms, all eliminations together. keep : parameters that stay, drop : parameters that
+        go first and untested; names with or without their `R`, or a symbol for all links (`Fvl`).
     """
 
     significance: float = 0.01
@@ -56,8 +56,8 @@ class EssentialSettings:
 
 @dataclass(frozen=True)
 class Elimination:
-    """One parameter set to zero: its estimate and RSD just before, the F statistic and what the fit lost by
-    it.
+    """One parameter set to zero: its estimate and RSD just before,
+    the F statistic and what the fit lost by it.
     """
 
     name: str

@@ -73,8 +73,8 @@ class IdentificationSettings:
     estimator : one of `ESTIMATORS`, or a factory that gets the base set, the problem and the covariance
         settings and returns an estimator. "wls" (default) takes nothing but the data; "physical" (consistent
         bodies near the URDF's, within 20 % of themselves) is the one to predict motions that were not
-        recorded, above all after a short or weakly exciting one: on three runs of a real LWR4+ it errs by
-        3 to 4 % where least squares errs by 9 to 14 % (`benchmarks/real_data.py`).
+        recorded, above all after a short or weakly exciting one: on three runs of a real LWR4+ it errs by 3
+        to 4 % where least squares errs by 9 to 14 % (`benchmarks/real_data.py`).
     without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
     resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
     essential : how essential parameters are found; None leaves that out.
@@ -136,8 +136,8 @@ class Identification:
 
     @cached_property
     def essential_model(self) -> DynamicModel:
-        """The identified model with the essential parameters only. Raises ConfigurationError if none were
-        sought.
+        """The identified model with the essential parameters only.
+        Raises ConfigurationError if none were sought.
         """
         if self.essential is None:
             raise ConfigurationError("essential parameters were not sought; set `essential` in the settings")

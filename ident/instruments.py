@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 
 
 def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | None:
-    """`prepared` with the motion commanded in place of the one measured; None without the whole command
-    channel.
+    """`prepared` with the motion commanded in place of the one
+    measured; None without the whole command channel.
     """
     if session.command is None or not session.command.position.shape[1]:
         return None

@@ -39,9 +39,9 @@ def observe(
 ) -> Problem:
     """Stacked problem of the sessions, each with the payload mounted in it.
 
-    columns : indices of the structure's columns (default all active ones); names : their names in the result.
-    Sessions without a motor channel contribute their joint rows only. Rows of a joint that stood still or
-    whose samples are missing are left out. Raises DataError when no row is left.
+    columns : indices of the structure's columns (default all active ones); names : their names in the
+        result. Sessions without a motor channel contribute their joint rows only. Rows of a joint that stood
+        still or whose samples are missing are left out. Raises DataError when no row is left.
     """
     chosen = np.flatnonzero(structure.active) if columns is None else np.asarray(columns, dtype=np.int64)
     titles = [structure.names[c] for c in chosen] if names is None else list(names)
@@ -64,9 +64,8 @@ def observe(
     if not groups:
         raise DataError(
             f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a "
-            "joint stood "
-            "still, samples were missing or the channel was absent; check the phases and channels of the "
-            "sessions"
+            "joint stood still, samples were missing or the channel was absent; check the phases and "
+            "channels of the sessions"
         )
     return Problem(
         tuple(titles),

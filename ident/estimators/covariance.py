@@ -73,8 +73,8 @@ class Scores:
         coefficients: Sequence[FloatArray],
         matrices: Sequence[FloatArray] | None = None,
     ) -> Scores:
-        """Scores with a coefficient for each row (weight times residual); `matrices` replace the
-        regressors.
+        """Scores with a coefficient for each row (weight times
+        residual); `matrices` replace the regressors.
         """
         spans: dict[int, tuple[int, int]] = {}
         for group in problem.groups:
@@ -124,8 +124,8 @@ class Scores:
         return Scores(tuple(_block_sums(record, factor) for record in self.records))
 
     def bandwidth(self, bread: FloatArray) -> float:
-        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own
-        scores.
+        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in
+        samples, over the parameters' own scores.
         """
         numerator = denominator = 0.0
         directions = bread.T / np.maximum(np.sqrt(np.abs(np.diag(bread))), 1e-300)
@@ -186,8 +186,8 @@ def jackknife(
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
     coefficients : weight times residual of each row; row_weights : what multiplies a row's a a^T in the
-    inverse of `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p, p)
-    covariance whose correlations are taken over.
+        inverse of `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p,
+        p) covariance whose correlations are taken over.
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
@@ -275,8 +275,8 @@ def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int,
 
 
 def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatArray:
-    """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's initial
-    sequence.
+    """Number of independent rows of each class: n / (1 + 2 sum of
+    autocorrelations) by Geyer's initial sequence.
     """
     result = []
     for row_class in problem.classes:

@@ -40,7 +40,7 @@ class ClassFit:
 
     sigma : std of the rows with the correct degrees of freedom [Nm]; rms : plain root mean square [Nm];
     parameters : share of the p parameters that these rows consumed (the trace of their part of the hat
-    matrix);
+        matrix);
     n_eff : number of independent rows that the serial correlation leaves.
     """
 
@@ -63,9 +63,9 @@ class Estimate:
     """Result of an estimator.
 
     values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed,
-    by name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y - A
-    chi [Nm] of each row group. standard : standard parameters, where the estimator finds them; prior_scale :
-    factor s on the prior's covariance, where there is a prior.
+        by name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y
+        - A chi [Nm] of each row group. standard : standard parameters, where the estimator finds them;
+        prior_scale : factor s on the prior's covariance, where there is a prior.
     """
 
     method: str

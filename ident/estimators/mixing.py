@@ -32,7 +32,7 @@ class RegressorExtensionMixing:
     """Element-wise estimates that need no persistent excitation.
 
     memory_s : time constant of the extension [s]; it runs on from one session to the next. every : instants
-    between two mixings.
+        between two mixings.
     initial, initial_std : values (p,) to begin with and their standard deviation (a number or (p,)); what is
         never excited stays there. sigma : standard deviation of the rows by class, None takes the root mean
         square of the torque by class as a scale, which needs no solution of the whole problem.
@@ -120,8 +120,8 @@ def _influence(
     forgetting: float,
     values: FloatArray,
 ) -> tuple[Scores, FloatArray]:
-    """Influence of every instant on the estimate, as scores, and the covariance for uncorrelated
-    residuals.
+    """Influence of every instant on the estimate, as scores, and
+    the covariance for uncorrelated residuals.
     """
     p = len(values)
     records: dict[int, list[tuple[int, FloatArray]]] = {}

@@ -94,8 +94,8 @@ class BodyPrior:
         return total
 
     def prior(self, metric: Metric) -> Prior:
-        """The same as a normal prior of the base parameters; those with a drive parameter in them stay
-        free.
+        """The same as a normal prior of the base parameters; those
+        with a drive parameter in them stay free.
         """
         n = self.projection.shape[1]
         inertial = np.zeros(n, dtype=bool)
@@ -115,13 +115,13 @@ class BodyPrior:
 class PhysicallyConsistent:
     """Minimises sum of (n_eff / n) ||e_c||^2 / sigma_c^2 + distance(x, x_0) / s over consistent x.
 
-    metric : distance of a body from its prior: "pullback" (quadratic, invariant), "entropic" (log-determinant
-        divergence, keeps away from the boundary), "euclidean".
+    metric : distance of a body from its prior: "pullback" (quadratic, invariant), "entropic"
+        (log-determinant divergence, keeps away from the boundary), "euclidean".
     strength : s; 1 takes the prior as stated, "evidence" and "cross_validation" let the data choose, see
         `MaximumAPosteriori`. Data with model errors choose too loose a prior, which costs accuracy on other
         motions.
-    margin : smallest eigenvalue of a pseudo-inertia relative to the prior's smallest.
-    The result's `standard` holds the standard parameters (n,).
+    margin : smallest eigenvalue of a pseudo-inertia relative to the prior's smallest. The result's
+        `standard` holds the standard parameters (n,).
     """
 
     prior: BodyPrior
@@ -286,8 +286,8 @@ def _run(
 
 
 def _svec(matrix: FloatArray) -> FloatArray:
-    """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD
-    cone.
+    """Upper triangle (..., k (k + 1) / 2) column by column,
+    off-diagonals times sqrt(2): clarabel's PSD cone.
     """
     size = matrix.shape[-1]
     entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]

@@ -59,7 +59,7 @@ class Prior:
         """Prior of base parameters chi_B = P chi from one of standard parameters.
 
         mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool,
-        base parameters that the prior speaks of, the others stay free.
+            base parameters that the prior speaks of, the others stay free.
         """
         chosen = np.flatnonzero(known)
         part = projection[chosen]

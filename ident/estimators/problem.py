@@ -32,8 +32,8 @@ class RowGroup:
 
     matrix : (m, p), rows of the observation matrix.
     target : (m,), measured torques [Nm].
-    time_index : (m,) int64, strictly increasing number of the output sample within its session; neighbours in
-        time differ by one, excluded samples leave a gap.
+    time_index : (m,) int64, strictly increasing number of the output sample within its session; neighbours
+        in time differ by one, excluded samples leave a gap.
     record : number of the session (or of an uninterrupted part of it); time runs on only within a record.
     """
 
@@ -75,8 +75,8 @@ class TriangularFactor:
 
     @classmethod
     def of(cls, matrix: FloatArray, target: FloatArray) -> TriangularFactor:
-        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky where that is safe, blocked QR
-        otherwise.
+        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky
+        where that is safe, blocked QR otherwise.
         """
         if not len(target):
             return cls(np.zeros((matrix.shape[1] + 1,) * 2), 0)
@@ -128,8 +128,8 @@ class TriangularFactor:
 class Nuisance:
     """A quantity that was estimated before and acts on the rows, such as the delay of a channel.
 
-    std : its standard deviation. columns : by number of the row group, d(target) / d(quantity), (m,).
-    Its uncertainty is added to the covariance of every estimate.
+    std : its standard deviation. columns : by number of the row group, d(target) / d(quantity), (m,). Its
+        uncertainty is added to the covariance of every estimate.
     """
 
     name: str
@@ -235,8 +235,8 @@ class Problem:
         )
 
     def require_rank(self) -> float:
-        """Condition number of the column-normalised stack; DataError that names the parameters if rank is
-        lost.
+        """Condition number of the column-normalised stack; DataError
+        that names the parameters if rank is lost.
         """
         factor = self.weighted(np.ones(len(self.classes)))
         p = factor.parameters

@@ -28,7 +28,7 @@ class RecursiveFilter:
     """Square-root information filter for p constant or slowly drifting parameters.
 
     initial : (p + 1, p + 1) triangular factor of the initial information [A y]. forgetting : factor per
-    update on the information gathered so far, 1 keeps all.
+        update on the information gathered so far, 1 keeps all.
     """
 
     def __init__(self, initial: FloatArray, forgetting: float = 1.0) -> None:
@@ -90,7 +90,7 @@ class RecursiveLeastSquares:
     memory_s : time constant of the forgetting [s], None keeps all; then the result is that of WLS.
     prior : where to begin; None begins without information (a standard deviation of `initial_std`).
     sigma : standard deviation of the rows by class label ("A1 motor"); None takes those of a WLS over the
-    problem.
+        problem.
     """
 
     memory_s: float | None = None

@@ -35,8 +35,8 @@ class RobustLeastSquares:
     tolerance: float = 1e-6
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,); the covariance is the M-estimator's sandwich with the scores psi(e / sigma) /
-        sigma.
+        """Estimate (p,); the covariance is the M-estimator's
+        sandwich with the scores psi(e / sigma) / sigma.
         """
         values, weights, factor, _, _ = weighted_solution(problem)
         consumed = consumed_parameters(problem, weights, factor.inverse_root())

@@ -89,10 +89,11 @@ def estimate_from(
 ) -> Estimate:
     """Results object with the covariances that `settings` asks for.
 
-    bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each row
-    (default: class weight times residual). matrices : what multiplies them (default: the regressors; the
-    instruments of an instrumental-variable estimate). row_weights : what multiplies a a^T of each row in the
-    inverse of `bread` (default: class weight). plain : the estimator's own textbook covariance.
+    bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each
+        row (default: class weight times residual). matrices : what multiplies them (default: the regressors;
+        the instruments of an instrumental-variable estimate). row_weights : what multiplies a a^T of each
+        row in the inverse of `bread` (default: class weight). plain : the estimator's own textbook
+        covariance.
     scores : in place of coefficients and matrices. offset : (p, p), added to the robust covariances.
     """
     residuals = problem.residuals(values)

@@ -14,8 +14,8 @@ __all__ = ["Instant", "instants"]
 
 @dataclass(frozen=True)
 class Instant:
-    """All rows of one instant: matrix (k, p), target (k,), class of each row (k,), number of the record and
-    time.
+    """All rows of one instant: matrix (k, p), target (k,), class of
+    each row (k,), number of the record and time.
     """
 
     record: int

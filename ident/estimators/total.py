@@ -43,8 +43,8 @@ class TotalLeastSquares:
     iterations: int = 50
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,) from the smallest singular vector; the covariance from the scores of the
-        criterion.
+        """Estimate (p,) from the smallest singular vector; the
+        covariance from the scores of the criterion.
         """
         values, weights, factor, _, _ = weighted_solution(problem)
         p = factor.parameters

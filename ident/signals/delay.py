@@ -222,8 +222,8 @@ def _cost(parts: Sequence[_Filtered], delay: float) -> float:
 
 
 def _sampling_error(parts: Sequence[_Filtered]) -> float:
-    """Standard error [s] that a slow channel leaves: each reversal is seen to one sample, evenly
-    distributed.
+    """Standard error [s] that a slow channel leaves: each
+    reversal is seen to one sample, evenly distributed.
     """
     reversals, period = 0, 0.0
     for part in parts:

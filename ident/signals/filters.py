@@ -58,8 +58,8 @@ def differentiate(values: FloatArray, dt: float) -> tuple[FloatArray, FloatArray
 
 
 def interpolate_uniform(values: FloatArray, start: float, dt: float, times: FloatArray) -> FloatArray:
-    """Values (n, k) sampled at start + i dt, at other times (m,): six-point Lagrange, for band-limited
-    signals.
+    """Values (n, k) sampled at start + i dt, at other times (m,):
+    six-point Lagrange, for band-limited signals.
     """
     position = (times - start) / dt
     nearest = np.rint(position)
@@ -114,8 +114,9 @@ class ParallelFilter:
     columns.
 
     times : (m,) sample times [s], need not be equidistant; outputs : (K,) times of the rows [s]. A row is
-    sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time that sample i stands for. Any such
-    mean of Y = Omega chi holds for the same chi, so irregular or slow sampling does not bias the estimate.
+        sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time that sample i stands for. Any
+        such mean of Y = Omega chi holds for the same chi, so irregular or slow sampling does not bias the
+        estimate.
     """
 
     times: FloatArray

@@ -48,7 +48,7 @@ class TorqueChannel:
     """Torque of one side as measured, and the filtered motion at its sample times.
 
     times : (m,) [s], delay removed; q, qd, qdd, torque : (m, J); flagged : (m, J), bridged or outlying
-    samples.
+        samples.
     """
 
     side: str
@@ -81,9 +81,9 @@ class PreparedSession:
     """A session ready for any regressor.
 
     row_time_s : time between rows; period_rows : rows in one period of the excitation, None if it has no
-    periods.
+        periods.
     delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
-    rows.
+        rows.
     moving : joints that move. warnings : sentences for the report. uid : of the session, from its metadata.
     """
 
@@ -348,8 +348,8 @@ def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -
 def _motor(
     session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor
-    channel.
+    """Times (m,) [s] on the joint channel's clock, torques (m, J)
+    and outlier flags (m, J) of the motor channel.
     """
     assert session.motor is not None
     _check_finite(session.motor, name)

@@ -14,20 +14,22 @@ __all__ = ["SignalSettings"]
 class SignalSettings:
     """How raw channels become rows. The defaults are those of the paper, section 5.
 
-    cutoff_hz, order : Butterworth low-pass on the positions, run forward and back. Phase is zero, the gain is the
-        square of the filter's: -6 dB at `cutoff_hz`, and the roll-off of order 2 x `order`.
-    decimate_hz : -6 dB frequency of the parallel low-pass, the one filter that torque and every regressor column
-        pass alike, Coulomb columns included, so that it cannot bias the estimate.
+    cutoff_hz, order : Butterworth low-pass on the positions, run forward and back. Phase is zero, the gain
+        is the square of the filter's: -6 dB at `cutoff_hz`, and the roll-off of order 2 x `order`.
+    decimate_hz : -6 dB frequency of the parallel low-pass, the one filter that torque and every regressor
+        column pass alike, Coulomb columns included, so that it cannot bias the estimate.
     rate_hz : rate of the rows, None takes 2.5 x `decimate_hz` (decimation that keeps 80 % of the band).
     attenuation_db : stop band of the parallel low-pass.
     choose_cutoff : take `cutoff_hz` from the spectrum of the positions instead.
     average_periods : average the rows of all periods; their scatter gives the noise variance.
-    edge_s : time lost at each end of an uninterrupted stretch to the transients of the Butterworth filter, None
-        takes 2 / `cutoff_hz`.
-    longest_bridge_s : lost samples up to this long are bridged by interpolation, a longer gap splits the record.
-    bridged_share : a row in which bridged samples have more than this share of the filter's weight is dropped.
-    standstill_rad_s, standstill_share : below that speed the Coulomb torque of a joint is unknown; its row is
-        dropped where such samples have more than that share of the filter's weight. Share 1 keeps all.
+    edge_s : time lost at each end of an uninterrupted stretch to the transients of the Butterworth filter,
+        None takes 2 / `cutoff_hz`.
+    longest_bridge_s : lost samples up to this long are bridged by interpolation, a longer gap splits the
+        record.
+    bridged_share : a row in which bridged samples have more than this share of the filter's weight is
+        dropped.
+    standstill_rad_s, standstill_share : below that speed the Coulomb torque of a joint is unknown; its row
+        is dropped where such samples have more than that share of the filter's weight. Share 1 keeps all.
     outlier_scale : distance from the running median, in robust standard deviations, that makes an outlier.
     motor_delay_s : how late the motor channel's times are [s], or "estimate" to find it in the data.
     delay_search_s : largest delay, either way, that is looked for.

@@ -19,7 +19,7 @@ def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) 
     """Frequency [Hz] below which lies `share` of the power of the fastest-changing joint velocity.
 
     velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest
-    harmonic.
+        harmonic.
     """
     highest = 0.0
     power_of_joint = np.var(velocity, axis=0)
@@ -35,9 +35,9 @@ def optimal_cutoff(position: FloatArray, dt: float, order: int = 4) -> float:
     """Cut-off [Hz] that minimises the expected square error of the accelerations, from the data.
 
     position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; what stands
-    above it is signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward pass,
-    the error is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by their
-    signal's power. The answer is bounded to 0.02 to 0.4 of the sampling rate.
+        above it is signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward
+        pass, the error is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by
+        their signal's power. The answer is bounded to 0.02 to 0.4 of the sampling rate.
     """
     rate = 1.0 / dt
     grid = np.geomspace(0.002 * rate, 0.4 * rate, 240)
@@ -61,8 +61,8 @@ def advice(
     motor_rate_hz: float | None = None,
     resonance_hz: float | None = None,
 ) -> tuple[str, ...]:
-    """Warnings about the cut-offs against the excitation n_f w0, the sampling rates and the lowest
-    resonance.
+    """Warnings about the cut-offs against the excitation n_f w0,
+    the sampling rates and the lowest resonance.
     """
     found: list[str] = []
     if settings.decimate_hz < 2.0 * excitation_hz:

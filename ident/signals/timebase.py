@@ -23,7 +23,8 @@ _TOO_MANY = 0.01
 class Stretch:
     """Equidistant samples without a long gap.
 
-    start : time of the first sample [s]; dt : sample time [s]; values : (n, k), bridged where `bridged` (n,);
+    start : time of the first sample [s]; dt : sample time [s]; values : (n, k), bridged where `bridged`
+        (n,);
     resampled : whether the source's times were irregular, so that all values are interpolated.
     """
 
