@@ -242,7 +242,10 @@ def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
     make it far smaller, so the efficient difference V_IV - V_LS is taken with that sum's hundredth as a
     floor.
     """
-    consequence = "noise in positions biases the estimate: lower `cutoff_hz`, or use instrumental variables"
+    consequence = (
+        "noise in the positions, or physics that the model lacks, goes with the regressor: lower `cutoff_hz`, "
+        "use instrumental variables, or extend the model"
+    )
     if instrumental is None:
         return Check("exogeneity", None, "needs the commanded motion as instruments", "record /joint_command")
     shift = instrumental.values - estimate.values
