@@ -243,8 +243,8 @@ def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
     floor.
     """
     consequence = (
-        "noise in the positions, or physics that the model lacks, goes with the regressor: lower `cutoff_hz`, "
-        "use instrumental variables, or extend the model"
+        "noise in the positions, or physics that the model lacks, goes with the regressor: lower "
+        "`cutoff_hz`, use instrumental variables, or extend the model"
     )
     if instrumental is None:
         return Check("exogeneity", None, "needs the commanded motion as instruments", "record /joint_command")
