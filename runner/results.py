@@ -19,6 +19,7 @@ from ident.model_file import write_model
 from ident.signals.settings import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import read_session
+from runner.characteristics import characteristics
 from runner.experiment import LinkReport, Record
 from runner.experiment_file import Experiment
 from runner.versions import software, versions
@@ -117,6 +118,18 @@ def identified_model(found: Identification, robot: str) -> DynamicModel:
     """The identified model with its covariance and where it comes from."""
     provenance = {**found.model.provenance, "software": software()}
     return dataclasses.replace(found.model, robot=robot, provenance=provenance)
+
+
+def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
+    columns = zip(
+        estimate.names,
+        estimate.units or [""] * len(estimate.names),
+        estimate.values.tolist(),
+        estimate.std.tolist(),
+        estimate.rsd_percent.tolist(),
+        strict=True,
+    )
+    return [dict(zip(("name", "unit", "estimate", "std", "rsd_percent"), row, strict=True)) for row in columns]
 
 
 def _link(link: LinkReport) -> dict[str, Any]:
