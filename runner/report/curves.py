@@ -13,7 +13,7 @@ from ident.signals.filters import ParallelFilter
 from ident.signals.prepare import Passage, PreparedSession
 from ident.signals.settings import SignalSettings
 from ident.structure import Side
-from ident.validation import Score, mounted, prepared_session, predictor, score_session
+from ident.validation import Score, mounted, predictor, prepared_session, score_session
 from lwr_driver.session import Session
 
 __all__ = ["Curves", "curves"]
@@ -83,7 +83,9 @@ def curves(
     for side in model.structure.sides:
         if side not in scored.relative or side == "difference":
             continue
-        parts = [part for passage in prepared.passages if (part := _part(passage, side, model, payload, prepared))]
+        parts = [
+            part for passage in prepared.passages if (part := _part(passage, side, model, payload, prepared))
+        ]
         if not parts:
             continue
         stacked = [np.concatenate(column) for column in zip(*parts, strict=True)]

@@ -25,7 +25,14 @@ from runner.report.folder import ResultFolder
 from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
 from runner.report.thinning import thin
 
-__all__ = ["motion_figure", "parameter_figure", "residual_figure", "torque_figure", "velocity_figure"]
+__all__ = [
+    "every_figure",
+    "motion_figure",
+    "parameter_figure",
+    "residual_figure",
+    "torque_figure",
+    "velocity_figure",
+]
 
 Floats = NDArray[np.float64]
 Results = ResultFolder | str | Path
@@ -47,7 +54,11 @@ def velocity_figure(results: Results, session: str | None = None) -> Figure:
                 "time [s]",
                 "velocity [rad/s]",
                 (
-                    Line("logged", "differences of the logged positions", *thin(one.time, one.raw_velocity[:, k], _POINTS)),
+                    Line(
+                        "logged",
+                        "differences of the logged positions",
+                        *thin(one.time, one.raw_velocity[:, k], _POINTS),
+                    ),
                     Line("measured", "filtered", *thin(one.time, one.qd[:, k], _POINTS)),
                 ),
                 f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s.",
@@ -70,13 +81,21 @@ def motion_figure(results: Results, session: str | None = None, side: str = "joi
                 "torque [Nm]",
                 (
                     Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
-                    Line("measured", f"low-pass {one.cutoff_hz:g} Hz", *thin(one.grid, one.measured[:, k], _POINTS)),
+                    Line(
+                        "measured",
+                        f"low-pass {one.cutoff_hz:g} Hz",
+                        *thin(one.grid, one.measured[:, k], _POINTS),
+                    ),
                 ),
                 f"{side.capitalize()} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm.",
                 f"mean |τ| {mean:.2f} Nm",
             )
         )
-    return Figure(f"torque-logged-{one.session}-{side}", f"{side.capitalize()} torques, session {one.session}", tuple(panels))
+    return Figure(
+        f"torque-logged-{one.session}-{side}",
+        f"{side.capitalize()} torques, session {one.session}",
+        tuple(panels),
+    )
 
 
 def torque_figure(results: Results, session: str | None = None, side: str | None = None) -> Figure:
@@ -105,7 +124,7 @@ def torque_figure(results: Results, session: str | None = None, side: str | None
                 ),
                 f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
                 f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms.",
-                f"residual {score.band_rms:.3g} Nm in the band, error {rms:.2f} %",
+                f"residual {score.band_rms:.2g} Nm, error {rms:.2f} %",
                 lower_label="error [%]",
             )
         )
@@ -215,9 +234,27 @@ def parameter_figure(results: Results) -> Figure:
     return Figure("parameters", "Base parameters with their 95 % intervals", tuple(panels))
 
 
+def every_figure(results: Results) -> list[Figure]:
+    """All figures that a folder allows."""
+    folder = _folder(results)
+    figures = []
+    for one in folder.curves:
+        if one.side == "joint":
+            figures.append(velocity_figure(folder, one.session))
+        figures.append(motion_figure(folder, one.session, one.side))
+        figures.append(torque_figure(folder, one.session, one.side))
+        figures += [
+            residual_figure(folder, one.session, one.side, against)
+            for against in ("time", "position", "velocity")
+        ]
+    if folder.summary.get("parameters"):
+        figures.append(parameter_figure(folder))
+    return figures
+
+
 def pretty_unit(unit: str) -> str:
     """A unit as it is printed: kg m², Nm s/rad."""
-    return unit.replace("^2", "²")
+    return unit.replace("^2", "²").replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def interval_95(entry: dict[str, float]) -> tuple[float, float]:

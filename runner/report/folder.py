@@ -43,7 +43,9 @@ class ResultFolder:
             if not isinstance(content, dict) or "exit_status" not in content:
                 raise ValueError("no `exit_status`")
         except (OSError, ValueError) as error:
-            raise DataError(f"{file}: is no summary of an experiment: {error}; run the experiment again") from error
+            raise DataError(
+                f"{file}: is no summary of an experiment: {error}; run the experiment again"
+            ) from error
         return cls(folder, content)
 
     @cached_property

@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from runner.report.plot import STYLES, Band, Figure, Line, Mark, Panel, Points, limits
+from runner.report.plot import STYLES, Band, Figure, Line, Mark, Panel, limits
 
 __all__ = ["INSTALL", "heatmap_chart", "panel_chart", "plotly_figure", "plotly_script"]
 
 Floats = NDArray[np.float64]
 
 INSTALL = "the extra `view` is not installed; run `pip install 'lwr-identification[view]'`"
-FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Helvetica, Arial, sans-serif", "size": 11, "color": "#1a1a1a"}
+FONT = {
+    "family": "system-ui, -apple-system, 'Segoe UI', Helvetica, Arial, sans-serif",
+    "size": 11,
+    "color": "#1a1a1a",
+}
 _SYMBOLS = {"circle": "circle", "cross": "x-thin-open", "diamond": "diamond-open"}
 _GRID = "#e3e3e3"
 _SPLIT = 0.32
@@ -58,7 +62,19 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
             "tickvals": list(range(1, len(panel.x_names) + 1)),
             "ticktext": list(panel.x_names),
         }
+        layout["yaxis"]["automargin"] = True
     if panel.split:
+        # The x axis belongs to the lower part, so the frame of the upper one is drawn.
+        frame = {
+            "type": "rect",
+            "xref": "paper",
+            "yref": "paper",
+            "x0": 0,
+            "x1": 1,
+            "y0": _SPLIT + 0.05,
+            "y1": 1,
+        }
+        layout["shapes"] = [{**frame, "line": {"color": "#8c8c8c", "width": 1}}]
         layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 4}
     return {"data": data, "layout": layout}
 
@@ -76,7 +92,12 @@ def heatmap_chart(names: tuple[str, ...], matrix: Floats) -> dict[str, Any]:
                 "zmin": -1,
                 "zmax": 1,
                 "colorscale": _DIVERGING,
-                "colorbar": {"thickness": 10, "len": 0.8, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+                "colorbar": {
+                    "thickness": 10,
+                    "len": 0.8,
+                    "outlinewidth": 0,
+                    "tickvals": [-1, -0.5, 0, 0.5, 1],
+                },
                 "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
             }
         ],
@@ -111,9 +132,7 @@ def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:
         if part == 0 or True
     ]
     if split:
-        titles = [
-            title if (index // columns) % 2 == 0 else "" for index, title in enumerate(titles)
-        ]
+        titles = [title if (index // columns) % 2 == 0 else "" for index, title in enumerate(titles)]
     whole = make_subplots(
         rows=len(heights),
         cols=columns,
@@ -142,7 +161,10 @@ def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:
         if panel.split:
             whole.update_yaxes(title_text=panel.lower_label, row=row + 1, col=column)
     whole.update_layout(
-        template="plotly_white", font=FONT, height=170 * len(heights) + 120, legend={"orientation": "h", "y": 1.06}
+        template="plotly_white",
+        font=FONT,
+        height=170 * len(heights) + 120,
+        legend={"orientation": "h", "y": 1.06},
     )
     return whole
 
@@ -165,7 +187,13 @@ def _traces(mark: Mark) -> list[dict[str, Any]]:
             }
         ]
     if isinstance(mark, Band):
-        plain = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip", "x": _column(mark.x)}
+        plain = {
+            "type": "scatter",
+            "mode": "lines",
+            "line": {"width": 0},
+            "hoverinfo": "skip",
+            "x": _column(mark.x),
+        }
         fill = {"fill": "tonexty", "fillcolor": _transparent(style.colour), "name": mark.label}
         return [
             {**plain, "y": _column(mark.low), "name": "", **axis},

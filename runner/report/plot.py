@@ -36,9 +36,9 @@ class Style:
 
 STYLES: dict[Role, Style] = {
     "logged": Style("#9ecae9", 0.8),
-    "measured": Style("#0072b2", 1.6),
-    "computed": Style("#d55e00", 1.8, "2 3"),
-    "error": Style("#000000", 1.0, "5 3"),
+    "measured": Style("#0072b2", 1.8),
+    "computed": Style("#d55e00", 1.8, "3 4"),
+    "error": Style("#000000", 0.8, "5 3"),
     "commanded": Style("#009e73", 1.4, "6 3"),
     "limit": Style("#767676", 1.2, "4 4"),
     "forward": Style("#0072b2", 1.8),

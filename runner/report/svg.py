@@ -143,9 +143,7 @@ def _mark(mark: Mark, at: object) -> str:
     parts = []
     if mark.interval is not None:
         lows, highs = place(mark.x, mark.interval[:, 0]), place(mark.x, mark.interval[:, 1])
-        bars = "".join(
-            f"M{x:.1f} {y:.1f}V{end:.1f}" for (x, y), (_, end) in zip(lows, highs, strict=True)
-        )
+        bars = "".join(f"M{x:.1f} {y:.1f}V{end:.1f}" for (x, y), (_, end) in zip(lows, highs, strict=True))
         parts.append(f"<path d='{bars}' stroke='{style.colour}' stroke-width='{style.width:g}'/>")
     parts += [_symbol(style.symbol, x, y, style.colour) for x, y in place(mark.x, mark.y)]
     return "".join(parts)
@@ -153,13 +151,9 @@ def _mark(mark: Mark, at: object) -> str:
 
 def _symbol(symbol: Symbol, x: float, y: float, colour: str) -> str:
     if symbol == "cross":
-        return (
-            f"<path d='M{x - 4:.1f} {y - 4:.1f}l8 8m0-8l-8 8' stroke='{colour}' stroke-width='1.4' fill='none'/>"
-        )
+        return f"<path d='M{x - 4:.1f} {y - 4:.1f}l8 8m0-8l-8 8' stroke='{colour}' stroke-width='1.4' fill='none'/>"
     if symbol == "diamond":
-        return (
-            f"<path d='M{x:.1f} {y - 5:.1f}l5 5l-5 5l-5-5Z' stroke='{colour}' stroke-width='1.4' fill='none'/>"
-        )
+        return f"<path d='M{x:.1f} {y - 5:.1f}l5 5l-5 5l-5-5Z' stroke='{colour}' stroke-width='1.4' fill='none'/>"
     return f"<circle cx='{x:.1f}' cy='{y:.1f}' r='3' fill='{colour}'/>"
 
 

@@ -1,0 +1,293 @@
+"""The planned motion to look at before anything moves: in 3D, with limits, clearance and the tightest moment."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from ident.excitation import ExcitationPlan
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Cell
+from lwr_driver.collision import Clearance
+from lwr_driver.configuration import find, read_mapping
+from lwr_driver.motion import Motion
+from runner.experiment_file import Experiment, Payload
+from runner.planning import checker, excitation_rows, plan_excitation
+from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
+from runner.preparation import session_motion
+from runner.report.markup import table
+from runner.report.plot import Line, Panel, Points
+from runner.report.svg import panel_svg
+from runner.scene import ALARM, BODY, ArmShape, Colour, add_cell, start_server
+
+__all__ = ["Planned", "planned_motion", "preview_html", "serve"]
+
+Floats = NDArray[np.float64]
+
+_FRAMES_PER_S = 20.0
+_MOST_FRAMES = 1500
+_CLEARANCES = 400
+_POINTS = 300
+_FREE: Colour = (0, 114, 178)
+_NEAR: Colour = (230, 159, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """A motion with everything that is known of it beforehand.
+
+    title : what it is. tightest : nearest moment to anything; margin : distance that must be kept [m].
+    time (k,) [s], distance (k,) [m] : clearance along the motion.
+    """
+
+    title: str
+    arm: Arm
+    cell: Cell
+    payload: Payload | None
+    motion: Motion
+    preflight: Preflight
+    tightest: Clearance
+    margin: float
+    time: Floats
+    distance: Floats
+
+
+def planned_motion(file: str, *, session: str | None = None, period_s: float = 0.005) -> Planned:
+    """The motion of an experiment file or of a plan file.
+
+    session : of the experiment; by default the one with the heaviest payload. A plan is shown with the default
+    arm and cell. Raises ConfigurationError for a file that is neither.
+    """
+    path = find(file)
+    if read_mapping(path).get("kind") == "excitation plan":
+        return _of_plan(path, period_s)
+    experiment = Experiment.load(path)
+    arm = Arm.load(experiment.arm, beside=experiment.folder)
+    cell = Cell.load(experiment.cell, beside=experiment.folder)
+    plans = {plan.name: plan for plan in experiment.sessions}
+    if session is not None and session not in plans:
+        raise ConfigurationError(f"session {session!r} is not in {path}; it has {', '.join(plans)}")
+    heaviest = max(experiment.sessions, key=lambda one: 0.0 if one.payload is None else one.payload.mass)
+    plan = plans[session] if session is not None else heaviest
+    excite = excitation_rows(plan_excitation(experiment, arm, cell), experiment.excitation.periods)
+    home = experiment.home(len(arm.joint_names))
+    motion, preflight = session_motion(experiment, arm, cell, plan, excite(period_s), home)
+    margin = max(experiment.moves.clearance_m, cell.margin_m)
+    title = f"{experiment.name}, session {plan.name}"
+    return _planned(title, arm, cell, plan.payload, motion, preflight, margin)
+
+
+def _of_plan(path: Path, period_s: float) -> Planned:
+    arm, cell = Arm.load(), Cell.load()
+    plan = ExcitationPlan.load(path)
+    if plan.joint_names != arm.joint_names:
+        raise ConfigurationError(
+            f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}; preview an experiment file "
+            "that names the arm"
+        )
+    motion = excitation_rows(plan, 1)(period_s)
+    items = [
+        *check_motion_limits(arm, motion),
+        check_torque(arm, motion, None),
+        check_path(checker(arm, cell, None), motion, cell.margin_m),
+    ]
+    return _planned(f"plan {path.name}", arm, cell, None, motion, Preflight(tuple(items)), cell.margin_m)
+
+
+def _planned(
+    title: str,
+    arm: Arm,
+    cell: Cell,
+    payload: Payload | None,
+    motion: Motion,
+    preflight: Preflight,
+    margin: float,
+) -> Planned:
+    watch = checker(arm, cell, payload)
+    rows = np.unique(np.linspace(0, len(motion) - 1, _CLEARANCES).astype(np.int64))
+    distance = np.array([watch.clearance(motion.q[row]).distance for row in rows])
+    tightest = watch.check_path(motion.q, period_s=motion.period_s)
+    return Planned(
+        title, arm, cell, payload, motion, preflight, tightest, margin, rows * motion.period_s, distance
+    )
+
+
+def build_scene(server: Any, planned: Planned) -> ArmShape:
+    """Cell, path of the flange coloured by clearance, tightest moment, and the arm at the start of the motion."""
+    scene = server.scene
+    add_cell(scene, planned.cell)
+    arm = ArmShape(scene, planned.arm, "/arm", payload=planned.payload)
+    motion = planned.motion
+    rows = np.round(planned.time / motion.period_s).astype(np.int64)
+    path = np.array([arm.tip(motion.q[row]) for row in rows])
+    near = np.minimum(planned.distance[1:], planned.distance[:-1])
+    colours = np.array([_colour(float(value), planned.margin) for value in near], dtype=np.uint8)
+    if len(path) > 1:
+        segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
+        doubled = np.repeat(colours[:, None, :], 2, axis=1)
+        scene.add_line_segments("/path", segments, doubled, thickness=2.5, thickness_units="screen")
+    tight = planned.tightest
+    ghost = ArmShape(
+        scene, planned.arm, "/tightest/arm", payload=planned.payload, colour=ALARM, opacity=0.28
+    )
+    ghost.pose(tight.q)
+    points = tight.points.astype(np.float32)[None]
+    scene.add_line_segments("/tightest/gap", points, ALARM, thickness=5.0, thickness_units="screen")
+    scene.add_label(
+        "/tightest/label",
+        f"tightest: {1000 * tight.distance:.0f} mm, {' to '.join(tight.pair)}, t = {tight.time_s:.2f} s",
+        position=tuple(tight.points.mean(axis=0)),
+    )
+    arm.pose(motion.q[0])
+    return arm
+
+
+def preview_html(planned: Planned) -> str:
+    """One self-contained page: the motion in 3D with a time slider, the limits, and what is nearest when."""
+    server = start_server()
+    try:
+        arm = build_scene(server, planned)
+        recording = server.get_scene_serializer()
+        rows, step = _frames(planned.motion)
+        for row in rows:
+            arm.pose(planned.motion.q[row])
+            recording.insert_sleep(step)
+        scene = recording.as_html()
+    finally:
+        server.stop()
+    style = resources.files("runner").joinpath("preview.css").read_text(encoding="utf-8")
+    ok = planned.preflight.ok
+    verdict = "every condition holds" if ok else "refused: not every condition holds"
+    mark = "\N{CHECK MARK}" if ok else "\N{MULTIPLICATION X}"
+    tight = planned.tightest
+    return (
+        "<!doctype html><html lang=en><head><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width, initial-scale=1'>"
+        f"<title>Preview of {escape(planned.title)}</title><link rel=icon href='data:,'><style>{style}</style></head>"
+        "<body><main>"
+        f"<section class=view><iframe title='The planned motion in 3D, with time slider' srcdoc='{_quoted(scene)}'>"
+        "</iframe><p class=key><span class=free></span>path of the flange, free <span class=near></span>near "
+        "<span class=alarm></span>tightest moment</p></section>"
+        f"<section class=facts><h1>Preview of {escape(planned.title)}</h1>"
+        f"<p class='verdict {'good' if ok else 'bad'}'>{mark} {verdict}</p>"
+        f"<p>{planned.motion.duration_s:.1f} s. Tightest moment: <b>{1000 * tight.distance:.0f} mm</b>, "
+        f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; {1000 * planned.margin:.0f} mm must be kept."
+        f"</p>{_conditions(planned)}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
+        f"<h2>Joints within their limits</h2><div class=joints>{''.join(map(panel_svg, _joint_panels(planned)))}</div>"
+        "</section></main></body></html>\n"
+    )
+
+
+def serve(planned: Planned, port: int = 8080) -> None:
+    """Show the motion in a viser server with play and time slider until Ctrl-C."""
+    server = start_server(port)
+    try:
+        arm = build_scene(server, planned)
+        duration = planned.motion.duration_s
+        with server.gui.add_folder("Motion"):
+            play = server.gui.add_checkbox("play", True)
+            at = server.gui.add_slider("time [s]", 0.0, round(duration, 2), 0.01, 0.0)
+            phase = server.gui.add_markdown("")
+            show = server.gui.add_checkbox("tightest moment", True)
+        lines = [
+            f"{'✓' if item.ok else '✗'} **{item.subject}**: {item.value}, limit {item.limit}"
+            for item in planned.preflight.items
+        ]
+        server.gui.add_markdown("  \n".join(lines))
+        tightest = server.scene.add_frame("/tightest", show_axes=False)
+        while True:
+            if play.value:
+                at.value = round((at.value + 1.0 / _FRAMES_PER_S) % duration, 2)
+            row = min(round(at.value / planned.motion.period_s), len(planned.motion) - 1)
+            arm.pose(planned.motion.q[row])
+            phase.content = f"phase **{_phase(planned.motion, row)}**"
+            tightest.visible = show.value
+            time.sleep(1.0 / _FRAMES_PER_S)
+    finally:
+        server.stop()
+
+
+def _frames(motion: Motion) -> tuple[list[int], float]:
+    count = int(min(max(2, motion.duration_s * _FRAMES_PER_S), _MOST_FRAMES))
+    rows = np.linspace(0, len(motion) - 1, count).astype(np.int64)
+    return rows.tolist(), motion.duration_s / count
+
+
+def _phase(motion: Motion, row: int) -> str:
+    name = ""
+    for first, phase in motion.phases:
+        if first <= row:
+            name = phase
+    return name.replace("_", " ")
+
+
+def _colour(distance: float, margin: float) -> Colour:
+    if distance < margin:
+        return ALARM
+    return _NEAR if distance < 3.0 * margin else _FREE
+
+
+def _conditions(planned: Planned) -> str:
+    rows = [
+        [item.subject, item.value, item.limit, "held" if item.ok else "NOT HELD"]
+        for item in planned.preflight.items
+    ]
+    return table(("condition", "found", "limit", ""), rows, "Conditions before the motion")
+
+
+def _clearance_panel(planned: Planned) -> Panel:
+    span = np.array([0.0, planned.motion.duration_s])
+    tight = planned.tightest
+    return Panel(
+        "smallest distance",
+        "time [s]",
+        "[mm]",
+        (
+            Line("limit", "must be kept", span, np.full(2, 1000.0 * planned.margin)),
+            Line("measured", "clearance", planned.time, 1000.0 * planned.distance),
+            Points("published", "tightest", np.array([tight.time_s]), np.array([1000.0 * tight.distance])),
+        ),
+        f"Smallest distance over time: {1000 * tight.distance:.0f} mm at {tight.time_s:.2f} s, limit "
+        f"{1000 * planned.margin:.0f} mm.",
+        f"tightest {1000 * tight.distance:.0f} mm at {tight.time_s:.2f} s (diamond)",
+    )
+
+
+def _joint_panels(planned: Planned) -> Sequence[Panel]:
+    motion, limits = planned.motion, planned.arm.limits
+    rows = np.unique(np.linspace(0, len(motion) - 1, _POINTS).astype(np.int64))
+    time_s, span = rows * motion.period_s, np.array([0.0, motion.duration_s])
+    panels = []
+    for k, joint in enumerate(planned.arm.joint_names):
+        q = np.degrees(motion.q[:, k])
+        low, high = np.degrees(limits.q_low[k]), np.degrees(limits.q_high[k])
+        room = min(high - q.max(), q.min() - low)
+        panels.append(
+            Panel(
+                joint,
+                "time [s]",
+                "position [°]",
+                (
+                    Line("limit", "limit", span, np.full(2, low)),
+                    Line("limit", "", span, np.full(2, high)),
+                    Line("measured", "planned", time_s, q[rows]),
+                ),
+                f"Planned position of {joint}: {q.min():.0f} to {q.max():.0f} degrees, limits {low:.0f} to {high:.0f}.",
+                f"{room:.0f}° to the limit",
+            )
+        )
+    return panels
+
+
+def _quoted(text: str) -> str:
+    """Text as the value of an attribute in single quotes."""
+    return text.replace("&", "&amp;").replace("'", "&#39;")

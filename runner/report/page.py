@@ -1,0 +1,130 @@
+"""`report.html`: one file that opens anywhere, without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+
+from runner.report.diagnosis import diagnosis_section
+from runner.report.folder import ResultFolder
+from runner.report.interactive import plotly_script
+from runner.report.sections import (
+    assumption_section,
+    motion_section,
+    parameter_section,
+    provenance_section,
+    residual_section,
+    session_section,
+    table_1_section,
+    table_2_section,
+    torque_section,
+)
+from runner.report.verdicts import Verdict, headline, verdicts
+
+__all__ = ["REPORT", "report_html", "write_report"]
+
+REPORT = "report.html"
+
+_MARKS = {"good": "\N{CHECK MARK} good", "look": "! look", "bad": "\N{MULTIPLICATION X} bad"}
+_PARTS = (
+    ("sessions", "Sessions"),
+    ("table-1", "Table 1"),
+    ("table-2", "Table 2"),
+    ("motion", "Figure 2"),
+    ("torque", "Figure 3"),
+    ("residuals", "Residuals"),
+    ("assumptions", "Assumptions"),
+    ("diagnosis", "Diagnosis"),
+    ("parameters", "Parameters"),
+    ("correlation", "Correlation"),
+    ("provenance", "Provenance"),
+)
+
+
+def write_report(folder: str | Path) -> Path:
+    """Write `report.html` into a folder of results; returns its path.
+
+    ConfigurationError where the folder holds no results or the extra `view` is not installed.
+    """
+    results = ResultFolder.load(folder)
+    target = results.path / REPORT
+    draft = target.with_suffix(".html.part")
+    draft.write_text(report_html(results), encoding="utf-8")
+    draft.replace(target)
+    return target
+
+
+def report_html(results: ResultFolder) -> str:
+    """The text of the report."""
+    script = plotly_script()
+    lines = verdicts(results)
+    body = [session_section(results)]
+    if results.summary.get("parameters"):
+        body += [table_1_section(results), table_2_section(results)]
+    body += [
+        motion_section(results),
+        torque_section(results),
+        residual_section(results),
+        assumption_section(results),
+        diagnosis_section(results),
+        parameter_section(results),
+        provenance_section(results),
+    ]
+    content = "".join(body)
+    links = "".join(
+        f"<a href='#{anchor}'>{title}</a>" for anchor, title in _PARTS if f"<section id='{anchor}'" in content
+    )
+    level, sentence = headline(lines)
+    name = escape(str(results.summary["experiment"]))
+    style = _asset("page.css")
+    return (
+        "<!doctype html><html lang=en><head><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width, initial-scale=1'>"
+        f"<title>{name}: {escape(sentence)}</title><link rel=icon href='data:,'><style>{style}</style></head><body>"
+        f"<header><h1>{_subtitle(results)}</h1>"
+        f"<p class=verdict><span class='badge {level}'>{_MARKS[level]}</span><span>{escape(sentence)}</span></p>"
+        f"{_verdict_table(lines)}<nav aria-label='Parts of the report'>{links}</nav></header>"
+        f"<main>{content}</main>"
+        f"<footer>Written by {escape(str(results.summary.get('versions', {}).get('software', '')))}. This file needs no "
+        "network; print it or keep it beside the logs.</footer>"
+        f"<script>{script}</script><script>{_asset('page.js')}</script></body></html>\n"
+    )
+
+
+def _subtitle(results: ResultFolder) -> str:
+    summary = results.summary
+    logs = list(results.sessions.values())
+    robot = (
+        f"{logs[0].metadata.get('robot', '')} {logs[0].metadata.get('serial', '')}".strip() if logs else ""
+    )
+    emulated = " (emulated)" if "within_3_sigma" in summary else ""
+    started = logs[0].metadata.get("utc_start", "")[:10] if logs and not emulated else ""
+    parts = [
+        f"Experiment {summary['experiment']}",
+        f"{robot}{emulated}" if robot else "",
+        started,
+        results.path.resolve().name,
+    ]
+    return " · ".join(escape(part) for part in parts if part)
+
+
+def _verdict_table(lines: Sequence[Verdict]) -> str:
+    rows = []
+    for line in lines:
+        subject = escape(line.subject)
+        linked = f"<a href='#{line.section}'>{subject}</a>" if line.section else subject
+        rows.append(
+            f"<tr><th scope=row>{linked}</th><td>{escape(line.found)}</td><td class=wanted>{escape(line.wanted)}</td>"
+            f"<td class=mark><span class='badge {line.level}'>{_MARKS[line.level]}</span></td></tr>"
+        )
+    return (
+        "<table class=verdicts><caption class=hidden>Was the run good?</caption><thead><tr><th scope=col>question</th>"
+        "<th scope=col>found</th><th scope=col>wanted</th><th scope=col>verdict</th></tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table>"
+    )
+
+
+def _asset(name: str) -> str:
+    return resources.files("runner.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,428 @@
+"""The parts of the report below its first table: what ran, the paper's tables, figures, parameters, provenance."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+
+import numpy as np
+
+from runner.published import SOURCE, TABLE_1, TABLE_2
+from runner.report.figures import (
+    interval_95,
+    motion_figure,
+    parameter_figure,
+    pretty_unit,
+    residual_figure,
+    torque_figure,
+    velocity_figure,
+)
+from runner.report.folder import ResultFolder
+from runner.report.interactive import heatmap_chart
+from runner.report.markup import Cell, Number, chart_html, figure_html, fold, paragraph, section, table
+
+__all__ = [
+    "assumption_section",
+    "motion_section",
+    "parameter_section",
+    "provenance_section",
+    "residual_section",
+    "session_section",
+    "table_1_section",
+    "table_2_section",
+    "torque_section",
+]
+
+_STRONG_CORRELATION = 0.7
+_PAIRS = 12
+
+
+def session_section(results: ResultFolder) -> str:
+    """Sessions with their link, and the conditions checked before each motion."""
+    links = results.summary.get("link", {})
+    rows: list[list[Cell]] = []
+    for entry in results.summary["sessions"]:
+        name = entry["name"]
+        log, link = results.sessions.get(name), links.get(name, {})
+        payload = (
+            "–"
+            if log is None
+            else _payload(log.metadata.get("payload", ""), log.metadata.get("payload_mass"))
+        )
+        key = f"link.{name}"
+        latency = link.get("latency_s", {})
+        rows.append(
+            [
+                name,
+                entry["exit_status"] + (f": {entry['reason']}" if entry["reason"] else ""),
+                payload,
+                Number(None if log is None else log.duration_s, ".1f"),
+                *(
+                    Number(link.get(what), "d", f"{key}.{what}")
+                    for what in ("cycles", "missed", "lost", "late")
+                ),
+                Number(_micro(latency.get("p50")), ".0f"),
+                Number(_micro(latency.get("p99")), ".0f"),
+                Number(_micro(latency.get("p100")), ".0f"),
+                Number(1000 * max(link["worst_tracking_error_rad"]) if link else None, ".1f"),
+            ]
+        )
+    head = (
+        "session", "ended", "payload", "lasted [s]", "cycles", "missed", "lost", "late", "reply 50 % [µs]",
+        "99 % [µs]", "worst [µs]", "tracking [mrad]",
+    )  # fmt: skip
+    parts = [table(head, rows, "Sessions and their link")]
+    if results.unread:
+        parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
+    for name, items in results.preflights.items():
+        conditions = [
+            [i["subject"], i["value"], i["limit"], "held" if i["ok"] else "NOT HELD"] for i in items
+        ]
+        parts.append(
+            fold(
+                f"Conditions before the motion of {name}: {sum(i['ok'] for i in items)} of {len(items)} held",
+                table(
+                    ("condition", "found", "limit", ""), conditions, f"Conditions before the motion of {name}"
+                ),
+            )
+        )
+    return section("sessions", "Sessions, link and limits", *parts)
+
+
+def table_1_section(results: ResultFolder) -> str:
+    """The paper's Table 1 with this run in it."""
+    excitation = results.summary.get("excitation", {})
+    condition, torque = excitation.get("condition", {}), excitation.get("mean_torque_nm", {})
+    joints = results.joint_names
+    kept = all(item["ok"] for items in results.preflights.values() for item in items)
+    rows: list[list[Cell]] = [
+        [
+            entry.name,
+            entry.constraints,
+            Number(entry.condition, ".2f"),
+            *(Number(v, ".2f") for v in entry.mean_torque),
+        ]
+        for entry in TABLE_1
+    ]
+    payloads = {s.path.name: s.metadata.get("payload", "none") for s in results.sessions.values()}
+    for file, means in sorted(torque.items(), key=lambda item: payloads.get(item[0], "none") == "none"):
+        rows.append(
+            [
+                f"This run, {file.removesuffix('.mcap')}",
+                ("yes" if kept else "no") if results.preflights else "–",
+                Number(condition.get("paper"), ".2f", "excitation.condition.paper"),
+                *(Number(means.get(j), ".2f", f"excitation.mean_torque_nm.{file}.{j}") for j in joints),
+            ]
+        )
+    head = (
+        "motion",
+        "constraints kept",
+        "condition number",
+        *(f"|τ{k + 1}| [Nm]" for k in range(len(joints) or 7)),
+    )
+    strong = range(len(TABLE_1), len(rows))
+    note = (
+        "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number is that of the unscaled observation matrix of all "
+        "sessions over the 49 parameters of Table 2, the definition with which the published numbers agree; "
+    )
+    others = [
+        f"over all base parameters it is {condition['base']:.1f}" if condition.get("base") else "",
+        f"over the essential ones of this run {condition['essential']:.1f}"
+        if condition.get("essential")
+        else "",
+    ]
+    note += ", ".join(text for text in others if text) + "." if any(others) else ""
+    return section(
+        "table-1",
+        "Table 1: the exciting motion",
+        table(head, rows, "Table 1 with the published values and this run", strong=list(strong)),
+        paragraph(note, "soft"),
+    )
+
+
+def table_2_section(results: ResultFolder) -> str:
+    """The paper's Table 2 beside the estimates of this run."""
+    essential = (results.summary.get("essential") or {}).get("parameters", [])
+    kept = {entry["name"]: (entry, f"essential.parameters.{i}") for i, entry in enumerate(essential)}
+    base = {e["name"]: (e, f"parameters.{i}") for i, e in enumerate(results.summary.get("parameters", []))}
+    rows: list[list[Cell]] = []
+    for printed in TABLE_2:
+        entry, key = kept.get(printed.name) or base.get(printed.name) or (None, "")
+        truth = base.get(printed.name, ({}, ""))[0].get("truth")
+        name = printed.name if printed.name in kept or not kept else f"{printed.name} *"
+        rows.append(
+            [
+                name,
+                pretty_unit(entry["unit"]) if entry else "",
+                Number(entry["estimate"] if entry else None, ".4f", f"{key}.estimate"),
+                Number(entry["rsd_percent"] if entry else None, ".2f", f"{key}.rsd_percent"),
+                Number(printed.estimate, ".2f"),
+                Number(printed.rsd_percent, ".2f"),
+                Number(100 * (entry["estimate"] / printed.estimate - 1) if entry else None, "+.1f"),
+                *([Number(truth, ".4f")] if "within_3_sigma" in results.summary else []),
+            ]
+        )
+    head = ["parameter", "unit", "this run", "RSD %", "published", "RSD %", "difference %"]
+    head += ["truth"] if "within_3_sigma" in results.summary else []
+    half = math.ceil(len(rows) / 2)
+    label = "Table 2, estimates of this run and published ones"
+    printed_names = {entry.name for entry in TABLE_2}
+    others = [
+        [e["name"], pretty_unit(e["unit"]), *_estimate(e, k)]
+        for n, (e, k) in kept.items()
+        if n not in printed_names
+    ]
+    parts = [
+        "<div class=halves>",
+        table(head, rows[:half], f"{label}, first half"),
+        table(head, rows[half:], f"{label}, second half"),
+        "</div>",
+    ]
+    if any(str(row[0]).endswith("*") for row in rows):
+        parts.append(
+            paragraph("* not essential in this run; the estimate is that of the full base set.", "soft")
+        )
+    if others:
+        title = f"{len(others)} further essential parameters of this run, not in Table 2"
+        parts.append(fold(title, table(("parameter", "unit", "estimate", "std", "RSD %"), others, title)))
+    eliminated = (results.summary.get("essential") or {}).get("eliminated", [])
+    if eliminated:
+        title = f"{len(eliminated)} parameters eliminated, in this order"
+        lines: list[list[Cell]] = [
+            [
+                e["name"],
+                Number(e["estimate"]),
+                Number(e["rsd_percent"], ".1f"),
+                Number(e["f"], ".2f"),
+                e["reason"],
+            ]
+            for e in eliminated
+        ]
+        parts.append(fold(title, table(("parameter", "estimate", "RSD %", "F", "reason"), lines, title)))
+    parts.append(
+        paragraph(f"Published: {SOURCE}; the arm and the payload were others than those of this run.", "soft")
+    )
+    return section("table-2", "Table 2: essential base parameters", *parts)
+
+
+def motion_section(results: ResultFolder) -> str:
+    """Figure 2 for each session."""
+    parts, first = [], True
+    for one in results.curves:
+        if one.side == "joint":
+            velocity = figure_html(velocity_figure(results, one.session))
+            parts.append(fold(f"2a, joint velocities, {one.session}", velocity, is_open=first))
+        torque = figure_html(motion_figure(results, one.session, one.side))
+        parts.append(fold(f"2b, {one.side} torques, {one.session}", torque, is_open=first))
+        first = False
+    return section("motion", "Figure 2: velocities and torques of the motion", *parts) if parts else ""
+
+
+def torque_section(results: ResultFolder) -> str:
+    """Figure 3 for each session and side, with the numbers of the computed-torque test."""
+    if not results.curves:
+        return ""
+    head = (
+        "joint",
+        "rms [Nm]",
+        "rms, % of torque",
+        "bias [Nm]",
+        "worst [Nm]",
+        "at [s]",
+        "in the band [Nm]",
+        "floor [Nm]",
+    )
+    parts = [
+        paragraph(
+            "Computed torque from the filtered measured motion, against the torque measured. Both lines passed the "
+            "same low-pass; what was logged stands behind them, every spike included. These are the sessions that the "
+            "estimate was made from: `lwr-run validate` holds a model against others. The relative error is that of "
+            "the largest torque of the joint. In the band: in the pass band of the estimation; floor: scatter between "
+            "the periods of the motion, which no model can explain."
+        )
+    ]
+    for index, one in enumerate(results.curves):
+        rows: list[list[Cell]] = [
+            [
+                score.joint,
+                Number(score.rms, ".3f"),
+                Number(100 * score.relative, ".2f"),
+                Number(score.bias, ".3f"),
+                Number(score.worst, ".3f"),
+                Number(score.worst_time_s, ".2f"),
+                Number(score.band_rms, ".4f"),
+                Number(score.floor_rms, ".4f"),
+            ]
+            for score in one.scores
+        ]
+        parts.append(
+            fold(
+                f"{one.label}: relative error of all joints {100 * one.relative:.2f} % as logged",
+                figure_html(torque_figure(results, one.session, one.side)),
+                table(head, rows, f"Residuals, {one.label}"),
+                is_open=index < 2,
+            )
+        )
+    return section("torque", "Figure 3: measured and computed torque", *parts)
+
+
+def residual_section(results: ResultFolder) -> str:
+    """Residuals against time, position and velocity."""
+    parts = []
+    for index, one in enumerate(results.curves):
+        for against in ("time", "position", "velocity"):
+            figure = figure_html(residual_figure(results, one.session, one.side, against))
+            parts.append(fold(f"against {against}: {one.label}", figure, is_open=index == 0))
+    return section("residuals", "Residuals against time, position and velocity", *parts) if parts else ""
+
+
+def assumption_section(results: ResultFolder) -> str:
+    """Verdicts on what the standard deviations rest upon."""
+    checks = results.summary.get("assumptions")
+    if not checks:
+        return ""
+    rows: list[list[Cell]] = [
+        [
+            name,
+            {"VIOLATED": "violated"}.get(check["verdict"], check["verdict"]),
+            check["finding"],
+            Number(check["p_value"], ".2g", f"assumptions.{name}.p_value"),
+        ]
+        for name, check in checks.items()
+    ]
+    parts = [
+        table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
+        paragraph(
+            f"Standard deviations: {results.summary['covariance']}. They do not rest on uncorrelated residuals of "
+            "equal variance; a lack of fit or of exogeneity they cannot cover.",
+            "soft",
+        ),
+    ]
+    if results.summary.get("warnings"):
+        items = "".join(f"<li>{escape(warning)}</li>" for warning in results.summary["warnings"])
+        parts.append(f"<h3>Warnings</h3><ul>{items}</ul>")
+    return section("assumptions", "Assumptions", *parts)
+
+
+def parameter_section(results: ResultFolder) -> str:
+    """All base parameters with intervals, and how they are correlated."""
+    entries = results.summary.get("parameters")
+    if not entries:
+        return ""
+    truth = "within_3_sigma" in results.summary
+    rows: list[list[Cell]] = []
+    for index, entry in enumerate(entries):
+        low, high = interval_95(entry)
+        key = f"parameters.{index}"
+        rows.append(
+            [
+                entry["name"],
+                pretty_unit(entry["unit"]),
+                Number(entry["estimate"], ".5g", f"{key}.estimate"),
+                Number(entry["std"], ".3g", f"{key}.std"),
+                Number(low, ".5g"),
+                Number(high, ".5g"),
+                Number(entry["rsd_percent"], ".2f", f"{key}.rsd_percent"),
+                *([Number(entry.get("truth"), ".5g", f"{key}.truth")] if truth else []),
+            ]
+        )
+    head = ["parameter", "unit", "estimate", "std", "95 % from", "to", "RSD %", *(["truth"] if truth else [])]
+    counts = results.summary["counts"]
+    intro = (
+        f"Model {results.summary['model']}: {counts['standard']} parameters, {counts['not_identifiable']} not "
+        f"identifiable, {counts['regrouped']} regrouped, {counts['base']} base. R marks regrouped parameters, link 8 "
+        "is the payload."
+    )
+    parts = [
+        paragraph(intro),
+        figure_html(parameter_figure(results)),
+        fold(f"All {len(rows)} base parameters as a table", table(head, rows, "Base parameters")),
+    ]
+    return section("parameters", "Parameters and their intervals", *parts) + _correlation(results)
+
+
+def _correlation(results: ResultFolder) -> str:
+    model = results.model
+    if model is None or model.covariance is None or model.std is None:
+        return ""
+    std = np.where(model.std > 0, model.std, 1.0)
+    matrix = np.clip(model.covariance / np.outer(std, std), -1.0, 1.0)
+    first, second = np.triu_indices(len(matrix), 1)
+    order = np.argsort(-np.abs(matrix[first, second]))[:_PAIRS]
+    strong = int(np.sum(np.abs(matrix[first, second]) > _STRONG_CORRELATION))
+    rows: list[list[Cell]] = [
+        [
+            f"{model.names[first[k]]} and {model.names[second[k]]}",
+            Number(float(matrix[first[k], second[k]]), ".3f"),
+        ]
+        for k in order
+    ]
+    alt = (
+        f"Correlation matrix of {len(matrix)} parameters. {strong} pairs are correlated by more than "
+        f"{_STRONG_CORRELATION}; the strongest: {rows[0][0]}."
+    )
+    return section(
+        "correlation",
+        "Correlation of the parameters",
+        paragraph(
+            f"{strong} pairs are correlated by more than {_STRONG_CORRELATION} either way: their sum or difference is "
+            "known better than each of them."
+        ),
+        chart_html(heatmap_chart(model.names, matrix), alt, "square"),
+        fold(
+            "The strongest pairs",
+            table(("pair", "correlation"), rows, "Strongest correlations"),
+            is_open=True,
+        ),
+    )
+
+
+def provenance_section(results: ResultFolder) -> str:
+    """What ran, with what, on what, and where the files are."""
+    versions = results.summary.get("versions", {})
+    rows: list[list[Cell]] = [[name.replace("_", " "), str(value)] for name, value in versions.items()]
+    logs: list[list[Cell]] = []
+    for name, session in results.sessions.items():
+        meta = session.metadata
+        robot = f"{meta.get('robot', '')} {meta.get('serial', '')}".strip()
+        logs.append(
+            [name, robot, meta.get("uid", ""), meta.get("parent_uid", "") or "–", meta.get("utc_start", ""),
+             meta.get("motor_torque_source", ""), str(session.missing)]
+        )  # fmt: skip
+    head = ("session", "robot", "uid", "goes on from", "started", "motor torque", "missing")
+    parts = ["<div class=halves>", table(("", "version"), rows, "Versions")]
+    files: list[list[Cell]] = [
+        [path.name, Number(path.stat().st_size / 1e3, ".1f")]
+        for path in sorted(results.path.iterdir())
+        if path.is_file() and path.name != "report.html"
+    ]
+    parts += [table(("file", "kB"), files, "Files of this run"), "</div>"]
+    parts.append(table(head, logs, "Session logs"))
+    for name, title in (
+        ("experiment.yaml", "The experiment file"),
+        ("plan.yaml", "The plan of the motion, with its seed"),
+    ):
+        text = results.text(name)
+        if text is not None:
+            parts.append(fold(f"{title}, {name}", f"<pre tabindex=0>{escape(text)}</pre>"))
+    parts.append(
+        "<p>The logs are ordinary MCAP files: <code>rerun session.mcap</code>, PlotJuggler, Foxglove and Lichtblick open "
+        "them as they are.</p>"
+    )
+    return section("provenance", "Provenance", *parts)
+
+
+def _estimate(entry: dict[str, float], key: str) -> list[Cell]:
+    return [
+        Number(entry["estimate"], ".4g", f"{key}.estimate"),
+        Number(entry["std"], ".3g", f"{key}.std"),
+        Number(entry["rsd_percent"], ".2f", f"{key}.rsd_percent"),
+    ]
+
+
+def _payload(name: str, mass: str | None) -> str:
+    return name + (f", {mass} kg" if mass and name != "none" else "")
+
+
+def _micro(seconds: float | None) -> float | None:
+    return None if seconds is None else 1e6 * seconds

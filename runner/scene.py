@@ -1,0 +1,179 @@
+"""The arm and its cell as primitive shapes in a viser scene, for preview and live view.
+
+viser is part of the extra `view`; nothing else imports this module.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from contextlib import redirect_stdout
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Cell, PayloadShape
+from runner.experiment_file import Payload
+
+__all__ = ["ALARM", "BODY", "GHOST", "ArmShape", "Colour", "add_cell", "start_server"]
+
+Floats = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+BODY: Colour = (222, 226, 230)
+JOINT: Colour = (0, 114, 178)
+GHOST: Colour = (0, 158, 115)
+ALARM: Colour = (213, 94, 0)
+CARRIED: Colour = (86, 86, 86)
+_UNKNOWN_RADIUS = 0.04
+
+
+def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
+    """A viser server that only this computer reaches. ConfigurationError without the extra `view`.
+
+    port : 0 takes any that is free.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        from runner.report.interactive import INSTALL
+
+        raise ConfigurationError(f"3D view: {INSTALL}") from error
+    # The package announces connections on its own loggers and on standard output.
+    logging.getLogger("websockets").setLevel(logging.ERROR)
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=host, port=port or _free_port(host), verbose=False)
+    server.scene.set_up_direction("+z")
+    server.initial_camera.position = (1.7, -1.5, 1.15)
+    server.initial_camera.look_at = (0.0, 0.0, 0.5)
+    return server
+
+
+def _free_port(host: str) -> int:
+    import socket
+
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+class ArmShape:
+    """The links of an arm under one node of the scene; `pose` moves them.
+
+    scene : viser scene. name : node. colour : of the links; None takes the usual ones. opacity : 0 to 1.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        arm: Arm,
+        name: str,
+        *,
+        payload: Payload | None = None,
+        colour: Colour | None = None,
+        opacity: float | None = None,
+    ) -> None:
+        self._model = pin.buildModelFromXML(arm.urdf)
+        self._data = self._model.createData()
+        shapes = pin.buildGeomFromUrdfString(self._model, arm.urdf, pin.GeometryType.VISUAL)
+        self.root = scene.add_frame(name, show_axes=False)
+        self._frames = []
+        node = name
+        for joint in range(1, self._model.njoints):
+            placement = self._model.jointPlacements[joint]
+            node = f"{node}/joint_{joint}"
+            frame = scene.add_frame(
+                node, show_axes=False, position=tuple(placement.translation), wxyz=_wxyz(placement.rotation)
+            )
+            self._frames.append((frame, placement.rotation.copy(), node))
+        for index, shape in enumerate(shapes.geometryObjects):
+            joint = int(shape.parentJoint)
+            parent = name if joint == 0 else self._frames[joint - 1][2]
+            ball = isinstance(shape.geometry, coal.Sphere)
+            _add_shape(
+                scene,
+                f"{parent}/shape_{index}",
+                shape.geometry,
+                shape.placement,
+                colour or (JOINT if ball else BODY),
+                opacity,
+            )
+        if payload is not None:
+            tip = self._frames[-1][2]
+            geometry, placement = _payload_shape(payload)
+            _add_shape(scene, f"{tip}/payload", geometry, placement, colour or CARRIED, opacity)
+
+    def pose(self, q: Floats) -> None:
+        """Put the arm into the posture q, (7,) [rad]."""
+        for (frame, rotation, _), angle in zip(self._frames, q, strict=True):
+            frame.wxyz = _wxyz(rotation @ _about_z(float(angle)))
+
+    def tip(self, q: Floats) -> Floats:
+        """Position (3,) of the last frame of the URDF, the flange, in the posture q, (7,) [rad]."""
+        pin.framesForwardKinematics(self._model, self._data, np.asarray(q, dtype=np.float64))
+        return np.array(self._data.oMf[self._model.nframes - 1].translation)
+
+
+def add_cell(scene: Any, cell: Cell) -> None:
+    """Ground and boxes of the cell."""
+    height = 0.0 if cell.ground_z_m is None else cell.ground_z_m
+    scene.add_grid(
+        "/ground", width=3.0, height=3.0, cell_size=0.1, section_size=0.5, position=(0.0, 0.0, height - 0.001)
+    )
+    for box in cell.boxes:
+        scene.add_box(
+            f"/cell/{box.name}",
+            color=(178, 178, 178),
+            dimensions=box.size_m,
+            position=box.centre_m,
+            wxyz=_wxyz(pin.rpy.rpyToMatrix(np.radians(np.array(box.rpy_deg)))),
+            opacity=0.6,
+        )
+
+
+def _payload_shape(payload: Payload) -> tuple[Any, pin.SE3]:
+    shape = payload.shape
+    if shape is None:
+        return coal.Sphere(_UNKNOWN_RADIUS), pin.SE3(np.eye(3), np.asarray(payload.com, dtype=np.float64))
+    turn = pin.rpy.rpyToMatrix(np.radians(np.array(shape.rpy_deg)))
+    return _solid(shape), pin.SE3(turn, np.array(shape.centre_m))
+
+
+def _solid(shape: PayloadShape) -> Any:
+    size = shape.size_m
+    if shape.shape == "sphere":
+        return coal.Sphere(size[0])
+    return coal.Cylinder(size[0], size[1]) if shape.shape == "cylinder" else coal.Box(np.array(size))
+
+
+def _add_shape(
+    scene: Any, name: str, geometry: Any, placement: pin.SE3, colour: Colour, opacity: float | None
+) -> None:
+    where = {"position": tuple(placement.translation), "wxyz": _wxyz(placement.rotation)}
+    look = {"color": colour, "opacity": opacity}
+    if isinstance(geometry, coal.Sphere):
+        scene.add_icosphere(name, radius=float(geometry.radius), **look, **where)
+    elif isinstance(geometry, coal.Cylinder):
+        height = 2.0 * float(geometry.halfLength)
+        scene.add_cylinder(name, radius=float(geometry.radius), height=height, **look, **where)
+    elif isinstance(geometry, coal.Box):
+        scene.add_box(name, dimensions=tuple(2.0 * np.asarray(geometry.halfSide)), **look, **where)
+    else:
+        raise ConfigurationError(
+            f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the URDF"
+        )
+
+
+def _about_z(angle: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _wxyz(rotation: Floats) -> tuple[float, float, float, float]:
+    x, y, z, w = pin.Quaternion(np.asarray(rotation)).coeffs()
+    return float(w), float(x), float(y), float(z)
