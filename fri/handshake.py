@@ -16,7 +16,15 @@ import numpy as np
 from fri.errors import ConfigurationError
 from fri.states import STRATEGY_BY_CONTROL, Control, State
 
-__all__ = ["HANDSHAKES", "Handshake", "RcprgHandshake", "RosHandshake", "StanfordHandshake", "find_handshake"]
+__all__ = [
+    "HANDSHAKES",
+    "Handshake",
+    "IdentificationHandshake",
+    "RcprgHandshake",
+    "RosHandshake",
+    "StanfordHandshake",
+    "find_handshake",
+]
 
 
 class Handshake(Protocol):
@@ -152,9 +160,71 @@ class RcprgHandshake:
         cmd["krl_bool"] |= 1
 
 
+class IdentificationHandshake:
+    """The program of this project, configs/krl/lwr_identification.src.
+
+    ``$FRI_FRM_INT[16]`` asks for 1 monitor mode, 2 command mode, 3 the end. ``$FRI_TO_INT[16]`` tells the
+    phase: 1 monitor mode, 2 and 3 on the way to command mode, 4 command mode, 5 ended, 6 command mode was
+    lost and the PC must ask for monitor mode before anything else. ``[14]`` numbers the load data in
+    ``$FRI_FRM_REA[1..7]`` and tells which are in force.
+    """
+
+    name = "lwr_identification"
+    can_close = True
+
+    def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
+        """2 in [16]; the program knows position control only."""
+        cmd["krl_int"][15] = 2
+
+    def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """1 in [16]."""
+        cmd["krl_int"][15] = 1
+
+    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
+        """3 in [16], taken in monitor mode."""
+        cmd["krl_int"][15] = 3
+
+    def opened(self, msr: np.ndarray) -> bool:
+        """Any phase but the end."""
+        return bool(1 <= msr["krl_int"][15] <= 4)
+
+    def started(self, msr: np.ndarray) -> bool:
+        """4 in [16], state CMD."""
+        return bool(msr["krl_int"][15] == 4 and msr["state"] == State.CMD)
+
+    def stopped(self, msr: np.ndarray) -> bool:
+        """1 in [16], state MON."""
+        return bool(msr["krl_int"][15] == 1 and msr["state"] == State.MON)
+
+    def request_load(self, cmd: np.ndarray, msr: np.ndarray, load: np.ndarray) -> None:
+        """Put load data in force: mass [kg], centre of mass in the flange frame [mm] (3), inertia about it
+        JX JY JZ [kg m2]; (7,) float. Repeat until `load_taken`.
+        """
+        wanted = np.asarray(load, dtype=np.float32)
+        if int(cmd["krl_int"][13]) == 0 or not np.array_equal(cmd["krl_real"][:7], wanted):
+            cmd["krl_real"][:7] = wanted
+            cmd["krl_int"][13] = max(int(cmd["krl_int"][13]), int(msr["krl_int"][13])) + 1
+
+    def load_taken(self, cmd: np.ndarray, msr: np.ndarray) -> bool:
+        """Whether the load data last asked for are in force."""
+        return bool(cmd["krl_int"][13] != 0 and cmd["krl_int"][13] == msr["krl_int"][13])
+
+    def load(self, msr: np.ndarray) -> np.ndarray:
+        """Mass [kg] and centre of mass in the flange frame [mm] that the controller compensates, (4,)."""
+        return np.array(msr["krl_real"][7:11], dtype=np.float64)
+
+
 #: The handshakes by the name of the KRL program.
 HANDSHAKES: Mapping[str, Handshake] = MappingProxyType(
-    {handshake.name: handshake for handshake in (StanfordHandshake(), RosHandshake(), RcprgHandshake())}
+    {
+        handshake.name: handshake
+        for handshake in (
+            IdentificationHandshake(),
+            StanfordHandshake(),
+            RosHandshake(),
+            RcprgHandshake(),
+        )
+    }
 )
 
 

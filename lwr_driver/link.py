@@ -12,7 +12,7 @@ from lwr_driver.state import LinkState
 
 __all__ = ["LinkSettings", "advise_command", "advise_connect", "advise_leave", "advise_quality"]
 
-_POSITION_PROGRAMS = ("stanford", "ros_control")
+_POSITION_PROGRAMS = ("lwr_identification", "stanford", "ros_control")
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class LinkSettings:
     address, port : where this computer listens; only this address is bound. Port 0 takes a free one
     controller : IP address of the controller; None takes the first that speaks, and then only that
     lock_step : the other side waits for each answer and nothing runs between commands (the emulator only)
-    handshake : KRL program on the controller: `stanford`, `ros_control`
+    handshake : KRL program on the controller: `lwr_identification`, `stanford`, `ros_control`
     realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; in lock step
         they
         do not matter and are not asked for

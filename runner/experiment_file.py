@@ -128,7 +128,7 @@ class Link:
     address: str = "127.0.0.1"
     port: int = 49938
     controller: str | None = None
-    handshake: str = "stanford"
+    handshake: str = "lwr_identification"
     quality_s: float = 1.0
 
     def __post_init__(self) -> None:

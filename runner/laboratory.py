@@ -72,7 +72,7 @@ class Laboratory:
                 lock_step=experiment.lock_step,
                 fri_host=experiment.link.address,
                 fri_port=port,
-                settings=experiment.emulator_settings,
+                settings={"fri.program": experiment.link.handshake, **experiment.emulator_settings},
             )
             self.emulator = stack.enter_context(emulator)
             known = robot_file(load_configuration(experiment.emulator_path)).payloads

@@ -16,12 +16,13 @@ import numpy as np
 
 from fri.errors import ConfigurationError, RobotError
 from fri.krc import KrcLimits, KrcSession, Sample
-from fri.krl import PROGRAMS, Interpreter, KrlProgram
+from fri.krl import Interpreter, KrlProgram
 from fri.packets import CMD_OFFSETS, CMD_SIZE
 from fri.states import ALL_DRIVES, State
 from lwr_driver.arm import Arm
-from sim_backend.configuration import EmulatorConfig, Plugin
+from sim_backend.configuration import EmulatorConfig, LoadData, Plugin
 from sim_backend.controller import ControllerModel, PositionController
+from sim_backend.krl_program import OWN_PROGRAM, krl_program
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
 from sim_backend.recording import ControllerTrace, KrlReals
@@ -32,6 +33,9 @@ from sim_backend.truth import robot_file, true_arm
 __all__ = ["Cabinet"]
 
 log = logging.getLogger(__name__)
+
+FLANGE_MM = (0.0, 0.0, 78.0)
+"""Origin of the flange frame in the frame of link 7, which is parallel to it [mm]."""
 
 _JNT_POS = CMD_OFFSETS["jnt_pos"]
 _STILL_MS = 100
@@ -70,6 +74,7 @@ class Cabinet:
         )
         self.controller = PositionController(config.controller)
         self.krl_reals = KrlReals(config.krl_reals, self.joints)
+        self.currents = np.zeros(self.joints)
         self.trace = ControllerTrace(config.trace, self.arm.joint_names)
         self.program_name: str = config.fri.program
         self.period_ms = config.fri.period_ms
@@ -147,13 +152,12 @@ class Cabinet:
         """Select and start a KRL program; None keeps what was configured or chosen last."""
         name = self.program_name if name is None else name
         period_ms = self.period_ms if period_ms is None else period_ms
-        if name not in PROGRAMS:
-            raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(PROGRAMS)}")
         if not 1 <= period_ms <= 100:
             raise ConfigurationError(f"period {period_ms} ms is outside 1 to 100 ms")
+        program = krl_program(name, period_ms, self)
         self.stop_program()
         self.program_name, self.period_ms = name, period_ms
-        self.program = PROGRAMS[name](period_ms)
+        self.program = program
         self.interpreter = Interpreter(self.session, self.program)
 
     def stop_program(self) -> None:
@@ -166,6 +170,21 @@ class Cabinet:
     def running(self) -> bool:
         """Whether a KRL program is at work."""
         return self.program is not None and not self.program.finished
+
+    @property
+    def load(self) -> tuple[float, ...]:
+        """Load data as KRL has them: mass [kg], centre of mass in the flange frame [mm], JX JY JZ [kg m2]."""
+        load = self.model.load
+        centre = (1000.0 * value - origin for value, origin in zip(load.com, FLANGE_MM, strict=True))
+        xx, _, _, yy, _, zz = load.inertia
+        return (load.mass, *centre, xx, yy, zz)
+
+    def set_load(self, load: tuple[float, ...]) -> None:
+        """Load data from KRL, as `load` gives them; the axes of the inertia are those of the flange."""
+        mass, x, y, z, xx, yy, zz = load
+        right, up, out = FLANGE_MM
+        centre = ((x + right) / 1000.0, (y + up) / 1000.0, (z + out) / 1000.0)
+        self.model.set_load(LoadData(mass, centre, (xx, 0.0, 0.0, yy, 0.0, zz)))
 
     def power(self, on: bool) -> None:
         """Drives on: brakes open, the setpoint is where the arm stands. Off: brakes closed.
@@ -266,6 +285,8 @@ class Cabinet:
             effect.sense_motor(time_s, plant, reading)
         plant.step(torque)
         self.milliseconds += 1
-        if self.config.krl_reals.enabled:
+        if self.program_name == OWN_PROGRAM:
+            self.currents = self.krl_reals.late(reading.motor_torque)
+        elif self.config.krl_reals.enabled:
             self.krl_reals.millisecond(reading.motor_torque, self.session.to_real, self.session.to_int)
         self.trace.millisecond(time_s, reading.motor_torque, reading.position)

@@ -229,13 +229,14 @@ class TraceConfig:
 class FriConfig:
     """The link: `friSetup` and `friOpen`, the KRL program, and the limits the controller enforces.
 
-    program : KRL program by its name in `fri.krl.PROGRAMS`. autostart : it runs from the beginning
+    program : KRL program by its name in `fri.krl.PROGRAMS`, or `lwr_identification`: the text of
+    configs/krl/lwr_identification.src itself. autostart : it runs from the beginning
     velocity [rad/s], acceleration [rad/s^2] : limits beyond which the controller drops the session
     answer_delay_s : age of an undisturbed answer in lock step
     patience_s : in lock step and command mode, wall time after which an answer counts as missing
     """
 
-    program: Literal["stanford", "ros_control", "rcprg"] = "stanford"
+    program: Literal["lwr_identification", "stanford", "ros_control", "rcprg"] = "stanford"
     autostart: bool = True
     period_ms: int = 1
     local_host: str = "127.0.0.1"

@@ -56,7 +56,7 @@ class KrlReals:
 
     def millisecond(self, motor_torque: np.ndarray, to_real: np.ndarray, to_int: np.ndarray) -> None:
         """One millisecond: `motor_torque` (7,) as measured; the KRL variables (16,) are written at a tick."""
-        late = self._delay.put(motor_torque)
+        late = self.late(motor_torque)
         self._elapsed += 1
         if self._elapsed < self.config.tick_ms:
             return
@@ -64,6 +64,10 @@ class KrlReals:
         self._count = (self._count + 1) & 0x7FFFFFFF
         to_real[self._indices] = late
         to_int[self._counter] = self._count
+
+    def late(self, motor_torque: np.ndarray) -> np.ndarray:
+        """Take `motor_torque` (7,) of this millisecond in, give that of `delay_ms` ago; do not keep it."""
+        return self._delay.put(motor_torque)
 
 
 class ControllerTrace:

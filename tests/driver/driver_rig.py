@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fri.controller_end import ControllerEnd
 from fri.krc import KrcSession, Setpoint
-from fri.krl import PROGRAMS, Interpreter
+from fri.krl import Interpreter
 from fri.packets import CMD, CMD_SIZE
 from fri.policy import KrcLimits, KrcPolicy
 from fri.sample import Sample
@@ -23,6 +23,7 @@ from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
+from sim_backend.krl_program import krl_program
 
 DEG = np.pi / 180.0
 START = np.array([0.1, 0.5, -0.2, -1.3, 0.3, 0.8, -0.1])
@@ -96,7 +97,7 @@ class Rig:
         self.period_ms, self.period_s = period_ms, period_ms * 1e-3
         hard = KrcLimits(self.arm.q_min, self.arm.q_max, 1.2 * self.arm.v_max, np.full(7, 20.0))
         self.session = KrcSession(hard, q, KrcPolicy(**{**POLICY, **(policy or {})}))
-        self.interpreter = Interpreter(self.session, PROGRAMS[program](period_ms))
+        self.interpreter = Interpreter(self.session, krl_program(program, period_ms))
         self.sample = Sample()
         self.sample.msr_jnt_pos[:] = q
         self.control = Control.create(200_000)

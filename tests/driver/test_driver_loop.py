@@ -54,7 +54,7 @@ def test_outside_command_mode_the_controllers_set_point_is_mirrored(rig):
     assert r.session.quality >= Quality.OK
 
 
-@pytest.mark.parametrize("program", ["stanford", "ros_control"])
+@pytest.mark.parametrize("program", ["lwr_identification", "stanford", "ros_control"])
 def test_command_mode_is_entered_and_left_with_each_handshake(rig, program):
     r = rig(program=program)
     r.enter()

@@ -10,8 +10,9 @@ from fri.krc import EventKind
 from fri.krl import PROGRAMS, Interpreter, StanfordProgram
 from fri.packets import new_cmd, new_msr
 from fri.states import ALL_DRIVES, Control, State
+from sim_backend.krl_program import OWN_PROGRAM, krl_program
 
-NAMES = sorted(PROGRAMS)
+NAMES = sorted((OWN_PROGRAM, *PROGRAMS))
 # Cycles of 2 ms within which every granted request must be visible.
 BOUND = 400
 
@@ -22,7 +23,7 @@ class Cell:
     def __init__(self, name: str, sample_time_ms: int = 2) -> None:
         self.rig = Rig()
         self.session = self.rig.session
-        self.program = PROGRAMS[name](sample_time_ms)
+        self.program = krl_program(name, sample_time_ms)
         self.interpreter = Interpreter(self.session, self.program)
         self.handshake = find_handshake(name)
         self.krl = self.rig.cmd
@@ -109,7 +110,7 @@ def test_program_that_is_started_again_does_not_obey_an_old_request(name):
     cell = Cell(name)
     cell.start()
     cell.session.fri_close()
-    cell.interpreter = Interpreter(cell.session, PROGRAMS[name](5))
+    cell.interpreter = Interpreter(cell.session, krl_program(name, 5))
     cell.krl["krl_int"] = 0
     cell.krl["krl_bool"] = 0
     for _ in range(BOUND):
@@ -205,7 +206,7 @@ def test_rcprg_opens_again_with_another_period():
     cell.until(lambda msr: msr["cmd_sample_time"] == np.float32(0.01))
 
 
-@pytest.mark.parametrize("name", ["stanford", "ros_control"])
+@pytest.mark.parametrize("name", ["lwr_identification", "stanford", "ros_control"])
 def test_waiting_for_quality_ends_when_the_request_is_withdrawn(name):
     cell = Cell(name)
     cell.until(cell.handshake.opened)
@@ -270,5 +271,5 @@ def test_background_publishes_sample_and_hold():
 
 def test_unknown_program_is_named_with_the_known_ones():
     assert sorted(HANDSHAKES) == NAMES
-    with pytest.raises(ConfigurationError, match="known are rcprg, ros_control, stanford"):
+    with pytest.raises(ConfigurationError, match=r"known are lwr_id.*, rcprg, ros_control, stanford"):
         find_handshake("kuka")

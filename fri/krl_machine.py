@@ -1,0 +1,388 @@
+"""Running KRL text on the emulated controller: the program that a lab loads is the program that runs.
+
+``SourceProgram`` is a `KrlProgram` made from the text of a module. It knows the system variables and
+functions of the interface (``$FRI_TO_INT``, ``$FRISTATE``, ``friOpen`` ...), position control, motor currents
+and load data. Between two waits a program takes no time; a wait lasts whole ticks of the interpreter.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Generator, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from fri.krc import KrcSession
+from fri.krl import TICK_MS
+from fri.krl_source import (
+    Assign,
+    Binary,
+    Branch,
+    Call,
+    Constant,
+    Expression,
+    For,
+    Leave,
+    Loop,
+    Move,
+    Name,
+    Source,
+    Statement,
+    Switch,
+    Unary,
+    WaitFor,
+    WaitSeconds,
+    parse_source,
+)
+from fri.states import State
+
+__all__ = ["AXES", "LOAD", "Machinery", "SourceProgram"]
+
+#: Where the axes of KRL (A1 to A6, then E1) stand in the kinematic order A1 A2 E1 A3 A4 A5 A6.
+AXES = (0, 1, 3, 4, 5, 6, 2)
+#: Load data in the order of ``Machinery.load``: mass [kg], centre of mass [mm], inertia about it [kg m2].
+LOAD = (".M", ".CM.X", ".CM.Y", ".CM.Z", ".J.X", ".J.Y", ".J.Z")
+
+_LONGEST_RUN = 2000
+_READ_ONLY = ("$FRI_FRM_INT", "$FRI_FRM_REA", "$FRI_FRM_BOOL", "$FRISTATE", "$FRIQUALITY", "$CURR_ACT")
+_ARRAYS = {"$FRI_TO_INT": 16, "$FRI_TO_REA": 16, "$FRI_TO_BOOL": 16, "$CURR_ACT": 7} | {
+    "$FRI_FRM_INT": 16,
+    "$FRI_FRM_REA": 16,
+    "$FRI_FRM_BOOL": 16,
+}
+_PLAIN = ("$FRISTATE", "$FRIQUALITY", "$STIFFNESS.STRATEGY", "$STIFFNESS.COMMIT", "$ADVANCE", "$LOAD")
+_GOALS = ("$AXIS_ACT", "$AXIS_ACT_MES")
+_FUNCTIONS = {"FRISETUP": 3, "FRIOPEN": 1, "FRISTART": 1, "FRISTOP": 0, "FRICLOSE": 0, "BAS": 2}
+_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
+    "AND": lambda a, b: a and b,
+    "OR": lambda a, b: a or b,
+    "==": operator.eq,
+    "<>": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+    "<=": operator.le,
+    ">=": operator.ge,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+}
+
+Flow = Generator[None, None, str]
+
+
+class Machinery(Protocol):
+    """What a program reaches of the controller besides the FRI session."""
+
+    currents: np.ndarray
+    """(7,) motor currents in kinematic order, in the unit that the emulated drives report."""
+
+    @property
+    def load(self) -> tuple[float, ...]:
+        """Load data in force in the order of `LOAD`."""
+
+    def set_load(self, load: tuple[float, ...]) -> None:
+        """Put load data in force."""
+
+
+class NoMachinery:
+    """Drives without current and load data that are only kept."""
+
+    def __init__(self) -> None:
+        self.currents = np.zeros(7)
+        self.load: tuple[float, ...] = (0.0,) * len(LOAD)
+
+    def set_load(self, load: tuple[float, ...]) -> None:
+        """Keep `load`."""
+        self.load = load
+
+
+class SourceProgram:
+    """A KRL module at work.
+
+    Parameters
+    ----------
+    text, data : str
+        Content of the `.src` and the `.dat` file.
+    settings : mapping
+        Values in place of those of the data list, as a person would edit them there, e.g. ``LWR_CYCLE``.
+    machinery : Machinery or None
+        Motor currents and load data; None takes drives without current.
+    name : str
+
+    Raises
+    ------
+    ConfigurationError
+        The text is no program, or names a variable or function that there is not; with the line.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        data: str = "",
+        settings: Mapping[str, float | int | str] | None = None,
+        machinery: Machinery | None = None,
+        name: str = "KRL program",
+    ) -> None:
+        self.name = name
+        self.finished = False
+        self.source = parse_source(text, data, name)
+        self.machinery: Any = machinery if machinery is not None else NoMachinery()
+        self._session: KrcSession | None = None
+        self._strategy = 10
+        self._tick = 0
+        self._flow: Flow | None = None
+        _Check(self.source, name).module()
+        self._variables: dict[str, Any] = {}
+        for declared in self.source.declarations.values():
+            empty: Any = (0.0,) * len(LOAD) if declared.kind == "LOAD" else 0
+            self._variables[declared.name] = empty if declared.value is None else declared.value.value
+        for key, value in (settings or {}).items():
+            if key.upper() not in self._variables:
+                known = ", ".join(sorted(self._variables))
+                raise ConfigurationError(f"{name}: has no variable {key}; it has {known}")
+            self._variables[key.upper()] = value
+
+    def step(self, session: KrcSession) -> None:
+        """One tick of the interpreter: on to the next wait."""
+        self._session = session
+        self._tick += 1
+        if self._flow is None:
+            self._flow = self._subprogram(self.source.main)
+        try:
+            next(self._flow)
+        except StopIteration:
+            self.finished = True
+
+    # -- statements ------------------------------------------------------------------------------------------
+
+    def _subprogram(self, name: str) -> Flow:
+        yield from self._block(self.source.subprograms[name])
+        return ""
+
+    def _block(self, statements: tuple[Statement, ...]) -> Flow:
+        """Run statements; the result is EXIT or RETURN where one of them ended the block, else empty."""
+        for statement in statements:
+            if isinstance(statement, Assign):
+                self._write(statement.target, self._value(statement.value))
+            elif isinstance(statement, Call):
+                yield from self._call(statement)
+            elif isinstance(statement, Leave):
+                return statement.what
+            else:
+                left = yield from self._compound(statement)
+                if left:
+                    return left
+        return ""
+
+    def _compound(self, statement: Statement) -> Flow:
+        if isinstance(statement, Branch):
+            chosen = statement.then if self._value(statement.condition) else statement.otherwise
+            return (yield from self._block(chosen))
+        if isinstance(statement, Switch):
+            return (yield from self._block(self._case(statement)))
+        if isinstance(statement, Loop):
+            return (yield from self._loop(statement))
+        if isinstance(statement, For):
+            for value in range(int(self._value(statement.first)), int(self._value(statement.last)) + 1):
+                self._write(statement.variable, value)
+                left = yield from self._block(statement.body)
+                if left:
+                    return "" if left == "EXIT" else left
+        elif isinstance(statement, WaitFor):
+            while not self._value(statement.condition):
+                yield
+        elif isinstance(statement, WaitSeconds):
+            for _ in range(math.ceil(round(1000 * float(self._value(statement.seconds)) / TICK_MS, 9))):
+                yield
+        elif isinstance(statement, Move):
+            yield from self._move()
+        return ""
+
+    def _case(self, statement: Switch) -> tuple[Statement, ...]:
+        subject = self._value(statement.subject)
+        for values, block in statement.cases:
+            if any(self._value(value) == subject for value in values):
+                return block
+        return statement.default
+
+    def _loop(self, statement: Loop) -> Flow:
+        passes = 0
+        while True:
+            if statement.condition is not None and not self._value(statement.condition):
+                return ""
+            tick = self._tick
+            left = yield from self._block(statement.body)
+            if left:
+                return "" if left == "EXIT" else left
+            passes = passes + 1 if tick == self._tick else 0
+            if passes > _LONGEST_RUN:
+                raise ConfigurationError(f"{self.name}, line {statement.line}: the loop never waits")
+
+    def _move(self) -> Generator[None, None, None]:
+        """The set point of KRL goes to where the arm stands, once nothing moves it."""
+        session = self._need()
+        while session.ramping:
+            yield
+        if session.state is not State.CMD:
+            session.resync()
+
+    def _call(self, call: Call) -> Flow:
+        if call.name in self.source.subprograms:
+            yield from self._subprogram(call.name)
+        else:
+            self._function(call)
+        return ""
+
+    # -- values ----------------------------------------------------------------------------------------------
+
+    def _need(self) -> KrcSession:
+        assert self._session is not None
+        return self._session
+
+    def _value(self, expression: Expression) -> Any:
+        if isinstance(expression, Constant):
+            return expression.value
+        if isinstance(expression, Name):
+            return self._read(expression)
+        if isinstance(expression, Binary):
+            left, right = self._value(expression.left), self._value(expression.right)
+            if expression.operator == "/":
+                # KRL divides whole numbers without remainder.
+                whole = isinstance(left, int) and isinstance(right, int)
+                return int(left / right) if whole else left / right
+            return _OPERATORS[expression.operator](left, right)
+        if isinstance(expression, Unary):
+            value = self._value(expression.operand)
+            return not value if expression.operator == "NOT" else -value
+        return self._function(expression)
+
+    def _read(self, name: Name) -> Any:
+        session, (title, field) = self._need(), _split(name.name)
+        if title in self._variables or title == "$LOAD":
+            value = self.machinery.load if title == "$LOAD" else self._variables[title]
+            return value if not field else value[LOAD.index(field)]
+        if name.index is None:
+            if title == "$FRISTATE":
+                return f"#{session.state.name}"
+            return f"#{session.quality.name}" if title == "$FRIQUALITY" else self._strategy
+        place = self._place(name)
+        if title == "$CURR_ACT":
+            return float(self.machinery.currents[AXES[place]])
+        if title.endswith("_BOOL"):
+            return bool((session.to_bool if "_TO_" in title else session.from_bool) >> place & 1)
+        if title.endswith("_INT"):
+            return int((session.to_int if "_TO_" in title else session.from_int)[place])
+        return float((session.to_real if "_TO_" in title else session.from_real)[place])
+
+    def _write(self, name: Name, value: Any) -> None:
+        session, (title, field) = self._need(), _split(name.name)
+        if field:
+            load = list(self._read(Name(title)))
+            load[LOAD.index(field)] = float(value)
+            value = tuple(load)
+        if title == "$LOAD":
+            self.machinery.set_load(value)
+        elif title in self._variables:
+            self._variables[title] = value
+        elif title == "$STIFFNESS.STRATEGY":
+            self._strategy = int(value)
+        elif title == "$STIFFNESS.COMMIT":
+            session.set_strategy(self._strategy)
+        elif title == "$FRI_TO_INT":
+            session.to_int[self._place(name)] = int(value)
+        elif title == "$FRI_TO_REA":
+            session.to_real[self._place(name)] = float(value)
+        elif title == "$FRI_TO_BOOL":
+            bit = 1 << self._place(name)
+            session.to_bool = session.to_bool | bit if value else session.to_bool & ~bit
+
+    def _place(self, name: Name) -> int:
+        assert name.index is not None
+        number = int(self._value(name.index))
+        if not 1 <= number <= _ARRAYS[name.name]:
+            raise ConfigurationError(
+                f"{self.name}: {name.name}[{number}] is outside 1 to {_ARRAYS[name.name]}"
+            )
+        return number - 1
+
+    def _function(self, call: Call) -> Any:
+        session = self._need()
+        values = [self._value(argument) for argument in call.arguments]
+        if call.name == "FRIOPEN":
+            return f"#{session.fri_open(int(values[0])).name}"
+        if call.name == "FRISTART":
+            return f"#{session.fri_start(float(values[0])).name}"
+        if call.name == "FRISTOP":
+            return f"#{session.fri_stop().name}"
+        if call.name == "FRICLOSE":
+            return f"#{session.fri_close().name}"
+        # friSetup and BAS: address, tool and velocities are the emulator's own.
+        return f"#{session.state.name}"
+
+
+def _split(name: str) -> tuple[str, str]:
+    """A name of load data and its field, `$LOAD` and `.CM.X`; any other name and nothing."""
+    for field in LOAD:
+        if name.endswith(field):
+            return name.removesuffix(field), field
+    return name, ""
+
+
+class _Check:
+    """Whether a module names only what there is."""
+
+    def __init__(self, source: Source, name: str) -> None:
+        self._source, self._name = source, name
+
+    def module(self) -> None:
+        for block in self._source.subprograms.values():
+            self._part(block, 0, written=False)
+
+    def _statement(self, statement: Statement) -> None:
+        for value in vars(statement).values():
+            self._part(value, statement.line, written=False)
+        if isinstance(statement, (Assign, For)):
+            target = statement.target if isinstance(statement, Assign) else statement.variable
+            self._variable(target, statement.line, written=True)
+
+    def _part(self, value: Any, line: int, *, written: bool) -> None:
+        if isinstance(value, tuple):
+            for item in value:
+                self._part(item, line, written=written)
+        elif isinstance(value, Name):
+            self._variable(value, line, written=written)
+        elif isinstance(value, Statement) and not isinstance(value, Call):
+            self._statement(value)
+        elif isinstance(value, Call):
+            wanted = _FUNCTIONS.get(value.name, 0 if value.name in self._source.subprograms else None)
+            if wanted is None:
+                raise self._error(value.line, f"there is no function {value.name}")
+            if wanted != len(value.arguments):
+                raise self._error(
+                    value.line, f"{value.name} takes {wanted} arguments, not {len(value.arguments)}"
+                )
+            self._part(value.arguments, value.line, written=False)
+        elif isinstance(value, (Unary, Binary)):
+            for inner in vars(value).values():
+                self._part(inner, line, written=False)
+
+    def _variable(self, name: Name, line: int, *, written: bool) -> None:
+        title, field = _split(name.name)
+        declared = self._source.declarations.get(title)
+        if field and title != "$LOAD" and (declared is None or declared.kind != "LOAD"):
+            raise self._error(line, f"there is no variable {name.name}")
+        if declared is None:
+            if title not in (*_ARRAYS, *_PLAIN, *_GOALS):
+                raise self._error(line, f"there is no variable {title}")
+            if title in _ARRAYS and name.index is None:
+                raise self._error(line, f"{title} needs an index")
+            if written and title in (*_READ_ONLY, *_GOALS):
+                raise self._error(line, f"{title} cannot be written")
+        if name.index is not None:
+            self._part(name.index, line, written=False)
+
+    def _error(self, line: int, text: str) -> ConfigurationError:
+        return ConfigurationError(f"{self._name}, line {line}: {text}")

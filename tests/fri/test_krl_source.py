@@ -1,0 +1,223 @@
+"""KRL text: what it means, and what is refused with its line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fri_rig import Rig
+
+from fri.errors import ConfigurationError
+from fri.handshake import IdentificationHandshake
+from fri.krl import Interpreter
+from fri.krl_machine import AXES, NoMachinery, SourceProgram
+from fri.packets import JOINT_NAMES, new_cmd, new_msr
+from fri.states import Control, State
+from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
+from sim_backend.krl_program import krl_program
+
+
+def run(body: str, ticks: int = 5, data: str = "", **settings: int) -> tuple[SourceProgram, Rig]:
+    rig = Rig()
+    program = SourceProgram(f"DEF p( )\n{body}\nEND\n", data, settings)
+    for _ in range(ticks):
+        if not program.finished:
+            program.step(rig.session)
+    return program, rig
+
+
+def ints(body: str, **options: object) -> list[int]:
+    _, rig = run(body, **options)
+    return rig.session.to_int.tolist()
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("2+3*4", 14),
+        ("(2+3)*4", 20),
+        ("-7/2", -3),
+        ("10-3-2", 5),
+        ("7/2*2", 6),
+    ],
+)
+def test_arithmetic_is_that_of_krl(expression: str, value: int) -> None:
+    assert ints(f"$FRI_TO_INT[1]={expression}")[0] == value
+
+
+@pytest.mark.parametrize(
+    ("condition", "holds"),
+    [
+        ("1==1 AND 2<>2 OR 3<4", True),
+        ("NOT 1==1", False),
+        ("NOT (1==2) AND (2<=2)", True),
+        ("$FRISTATE==#MON", False),
+        ("$FRISTATE==#OFF", True),
+    ],
+)
+def test_conditions(condition: str, holds: bool) -> None:
+    found = ints(f"IF {condition} THEN\n$FRI_TO_INT[2]=1\nELSE\n$FRI_TO_INT[2]=2\nENDIF")
+    assert found[1] == (1 if holds else 2)
+
+
+def test_loops_and_switch() -> None:
+    body = """
+    INT I, N=0
+    FOR I=1 TO 10
+      SWITCH I
+      CASE 1, 2
+        N=N+100
+      CASE 3
+        N=N+10
+      DEFAULT
+        N=N+1
+      ENDSWITCH
+      IF I==5 THEN
+        EXIT
+      ENDIF
+    ENDFOR
+    WHILE N<300
+      N=N+50
+    ENDWHILE
+    $FRI_TO_INT[I]=N   ; I stands where EXIT left it
+    """
+    assert ints(body)[4] == 312
+
+
+def test_a_wait_lasts_whole_ticks() -> None:
+    program, _ = run("WAIT SEC 0.036", ticks=3)
+    assert not program.finished
+    program, _ = run("WAIT SEC 0.036", ticks=4)
+    assert program.finished
+
+
+def test_settings_take_the_place_of_the_data_list() -> None:
+    data = 'DEFDAT p\nDECL INT N=3 ; three\nDECL CHAR HOST[4]\nHOST[]="abcd"\nENDDAT'
+    assert ints("$FRI_TO_INT[1]=N", data=data)[0] == 3
+    assert ints("$FRI_TO_INT[1]=N", data=data, n=4)[0] == 4
+    with pytest.raises(ConfigurationError, match="no variable Q; it has HOST, N"):
+        run("", data=data, Q=1)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("X=1", "line 2: there is no variable X"),
+        ("$FRISTATE=1", "line 2: .FRISTATE cannot be written"),
+        ("$FRI_TO_INT=1", "line 2: .FRI_TO_INT needs an index"),
+        ("friOpen()", "line 2: FRIOPEN takes 1 arguments, not 0"),
+        ("kick()", "line 2: there is no function KICK"),
+        ("IF 1==1 THEN\nENDLOOP", "line 3: ENDLOOP closes nothing; ELSE or ENDIF is expected"),
+        ("LOOP", "line 3: END closes nothing; ENDLOOP is expected"),
+        ("WAIT 3", "line 2: WAIT takes FOR or SEC"),
+        ("$FRI_TO_INT[1]=", "line 2: the line ends"),
+        ("$FRI_TO_INT[1]=1 2", "line 2: '2' is too much"),
+        ("$FRI_TO_INT[1]=?", "line 2: .* is not understood"),
+        ("$LOAD.CM.Q=1", "line 2: there is no variable"),
+    ],
+)
+def test_what_is_not_krl_is_refused_with_its_line(body: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        run(body)
+
+
+def test_a_loop_that_never_waits_and_a_wrong_index_are_found_when_they_run() -> None:
+    with pytest.raises(ConfigurationError, match="line 2: the loop never waits"):
+        run("LOOP\nENDLOOP")
+    with pytest.raises(ConfigurationError, match=r"FRI_TO_INT\[17\] is outside 1 to 16"):
+        run("INT I=17\n$FRI_TO_INT[I]=1")
+
+
+class Bench:
+    """Our own program beside a client that speaks its handshake."""
+
+    def __init__(self) -> None:
+        self.machinery = NoMachinery()
+        self.rig = Rig(sample_time_ms=2)
+        self.program = krl_program("lwr_identification", 2, self.machinery)
+        self.interpreter = Interpreter(self.rig.session, self.program)
+        self.handshake = IdentificationHandshake()
+
+    def cycles(self, count: int) -> list[np.ndarray]:
+        seen = []
+        for _ in range(count):
+            if self.rig.session.state is State.OFF:
+                self.rig.session.close_cycle()
+            else:
+                self.rig.cycle()
+                seen.append(self.rig.msr.copy())
+            self.interpreter.advance(2)
+        return seen
+
+
+def test_currents_arrive_in_kinematic_order_each_with_a_new_count() -> None:
+    bench = Bench()
+    bench.cycles(20)
+    krl_order = ("A1", "A2", "A3", "A4", "A5", "A6", "E1")
+    assert tuple(JOINT_NAMES[place] for place in AXES) == krl_order
+    seen = []
+    for step in range(60):
+        bench.machinery.currents[:] = step + 0.1 * np.arange(7)
+        seen += bench.cycles(1)
+    rows = np.array(seen)
+    decoder = KrlTorqueDecoder(KrlMotorTorque())
+    times = np.arange(len(rows)) * 2_000_000
+    fresh = decoder.decode(times, times, rows["krl_real"], rows["krl_int"])
+    assert decoder.torn == decoder.lost == decoder.restarts == 0
+    assert np.allclose(np.diff(fresh.log_time), 12_000_000)
+    assert np.allclose(fresh.effort - fresh.effort[:, :1], 0.1 * np.arange(7), atol=1e-5)
+
+
+def test_load_data_are_taken_in_monitor_mode_only_and_reported() -> None:
+    bench = Bench()
+    bench.cycles(40)
+    load = np.array([3.34, 0.0, -66.0, 66.0, 0.01, 0.02, 0.03])
+    bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, load)
+    bench.cycles(20)
+    assert bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
+    assert bench.machinery.load == pytest.approx(load)
+    assert bench.handshake.load(bench.rig.msr) == pytest.approx([3.34, 0.0, -66.0, 66.0])
+    # The same load is not asked for again, another one is; in command mode it has to wait.
+    bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, load)
+    assert bench.rig.cmd["krl_int"][13] == 1
+    bench.handshake.request_start(bench.rig.cmd, bench.rig.msr, Control.POSITION)
+    bench.cycles(200)
+    assert bench.handshake.started(bench.rig.msr)
+    bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, np.zeros(7))
+    bench.cycles(60)
+    assert not bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
+    bench.handshake.request_stop(bench.rig.cmd, bench.rig.msr)
+    bench.cycles(60)
+    assert bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
+    assert bench.machinery.load == (0.0,) * 7
+
+
+@pytest.mark.parametrize("mass", [-1.0, 15.0])
+def test_a_load_that_cannot_be_is_not_taken(mass: float) -> None:
+    bench = Bench()
+    bench.cycles(40)
+    bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, np.array([mass, 0, 0, 0, 0, 0, 0]))
+    bench.cycles(40)
+    assert not bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
+    assert bench.machinery.load == (0.0,) * 7
+
+
+def test_the_program_ends_when_it_is_asked_to() -> None:
+    bench = Bench()
+    bench.cycles(40)
+    bench.handshake.request_close(bench.rig.cmd, bench.rig.msr)
+    seen = bench.cycles(300)
+    assert bench.program.finished
+    assert bench.rig.session.state is State.OFF
+    assert seen[-1]["krl_int"][15] == 5
+    assert not bench.handshake.opened(seen[-1])
+
+
+def test_phases_on_the_wire() -> None:
+    handshake, cmd, msr = IdentificationHandshake(), new_cmd(), new_msr()
+    msr["krl_int"][15], msr["state"] = 6, State.MON
+    assert not handshake.opened(msr)
+    assert not handshake.stopped(msr)
+    handshake.request_start(cmd, msr, Control.POSITION)
+    assert cmd["krl_int"][15] == 2
+    msr["krl_int"][15], msr["state"] = 4, State.MON
+    assert not handshake.started(msr)
