@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from ident.identify import Identification
 from runner.published import TABLE_2
 
@@ -31,14 +29,8 @@ def characteristics(found: Identification) -> dict[str, Any]:
 
 
 def _mean_torque(found: Identification) -> dict[str, dict[str, float]]:
-    means: dict[str, dict[str, float]] = {}
-    for session in found.prepared:
-        parts = []
-        for passage in session.passages:
-            inside = (passage.joint.times >= passage.rows[0]) & (passage.joint.times <= passage.rows[-1])
-            parts.append(np.abs(passage.joint.torque[inside]))
-        torque = np.concatenate(parts)
-        if torque.shape[1]:
-            values = torque.mean(axis=0).tolist()
-            means[session.name] = dict(zip(session.joint_names, values, strict=True))
-    return means
+    return {
+        session.name: dict(zip(session.joint_names, session.mean_torque, strict=True))
+        for session in found.prepared
+        if session.mean_torque
+    }

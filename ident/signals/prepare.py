@@ -85,6 +85,7 @@ class PreparedSession:
     delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
         rows.
     moving : joints that move. warnings : sentences for the report. uid : of the session, from its metadata.
+    mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
     """
 
     name: str
@@ -101,6 +102,7 @@ class PreparedSession:
     counts: dict[str, int]
     warnings: tuple[str, ...]
     uid: str = ""
+    mean_torque: tuple[float, ...] = ()
 
     @property
     def has_joint(self) -> bool:
@@ -237,7 +239,17 @@ def prepare(
         counts=counts,
         warnings=tuple(warnings),
         uid=session.metadata.get("uid", ""),
+        mean_torque=_mean_torque(passages) if sensed else (),
     )
+
+
+def _mean_torque(passages: list[Passage]) -> tuple[float, ...]:
+    sums, count = np.zeros(passages[0].joint.torque.shape[1]), 0
+    for passage in passages:
+        inside = (passage.joint.times >= passage.rows[0]) & (passage.joint.times <= passage.rows[-1])
+        sums += np.abs(passage.joint.torque[inside]).sum(axis=0)
+        count += int(inside.sum())
+    return tuple((sums / max(count, 1)).tolist())
 
 
 @dataclass(frozen=True)
