@@ -1,21 +1,78 @@
-"""Planning of exciting motions: parametrisations, objectives, constraints, solver, and the plan that comes
-out.
+"""Planning of exciting motions: parametrisations, criteria, constraints, search, and the plan that comes out.
+
+`plan(PlanProblem.load("plans/default.yaml"))` does everything. `feasible_fourier` gives a safe motion without
+optimisation, `random_points` the baseline, `trade_off` a front between two criteria, `check_motion` the
+verdict on any motion.
+
+Many processes or computers: the search runs through `joblib`, so its configured backend spreads it without a
+line here. On a Dask cluster, with `search.jobs: -1` in the problem file::
+
+    import joblib, distributed
+    from ident.excitation import PlanProblem, plan
+
+    client = distributed.Client("tcp://scheduler:8786")
+    with joblib.parallel_config(backend="dask"):
+        result = plan(PlanProblem.load("plans/default.yaml"))
+
+The result depends on the seed and the counts of the problem file, not on the backend or the number of
+processes.
 """
 
+from ident.excitation.assembly import Assembled, assemble
+from ident.excitation.bspline import SplineBasis, SplineMotion
 from ident.excitation.check import Check, Limits, Margin, Workspace, check_motion
+from ident.excitation.estimate import ArmEstimate, Noise
 from ident.excitation.feasible import arm_limits, feasible_fourier
 from ident.excitation.fourier import FourierBasis, FourierSeries
+from ident.excitation.mechanism import Mechanism
+from ident.excitation.pareto import FrontPoint, hypervolume, not_dominated, trade_off
 from ident.excitation.plan import ExcitationPlan
+from ident.excitation.planner import Progress, plan
+from ident.excitation.point_to_point import PointToPoint, random_points
+from ident.excitation.problem import (
+    Knowledge,
+    MotionForm,
+    Objective,
+    PlanProblem,
+    Prior,
+    Search,
+)
+from ident.excitation.table import TableRow, plan_report, table, table_row
 
 __all__ = [
+    "ArmEstimate",
+    "Assembled",
     "Check",
     "ExcitationPlan",
     "FourierBasis",
     "FourierSeries",
+    "FrontPoint",
+    "Knowledge",
     "Limits",
     "Margin",
+    "Mechanism",
+    "MotionForm",
+    "Noise",
+    "Objective",
+    "PlanProblem",
+    "PointToPoint",
+    "Prior",
+    "Progress",
+    "Search",
+    "SplineBasis",
+    "SplineMotion",
+    "TableRow",
     "Workspace",
     "arm_limits",
+    "assemble",
     "check_motion",
     "feasible_fourier",
+    "hypervolume",
+    "not_dominated",
+    "plan",
+    "plan_report",
+    "random_points",
+    "table",
+    "table_row",
+    "trade_off",
 ]

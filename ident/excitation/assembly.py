@@ -45,6 +45,7 @@ __all__ = ["Assembled", "Criteria", "assemble", "motion_view"]
 _FLANGE_RESERVE = 2e-3
 _CLEARANCE_RESERVE = 3e-3
 _PAYLOAD_NAME = "load"
+_NEGLIGIBLE = 1e-9  # parameters this small are zero up to arithmetic
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,22 +312,22 @@ def _criteria(
     prior_plain = _prior(problem, mechanism, estimate, columns, names, None, beside)
     prior_weighted = _prior(problem, mechanism, estimate, columns, names, noise, beside)
     # a parameter near zero has no meaningful relative deviation; its own noise floor would rule the mean
-    known = np.where(np.abs(values) > 0.0, np.abs(values), np.inf)
+    known = np.where(np.abs(values) > _NEGLIGIBLE, np.abs(values), np.inf)
     usable = np.isfinite(known)
-    judged = weighted
+    judged, judged_prior = weighted, prior_weighted
     if not usable.all():
         kept = tuple(name for name, use in zip(names, usable, strict=True) if use)
         judged = Assembly(columns, kept, weighted.rows)
         if prior_weighted is not None:
-            prior_weighted = prior_weighted[np.ix_(usable, usable)]
+            judged_prior = prior_weighted[np.ix_(usable, usable)]
         known = known[usable]
     condition = ConditionNumber(plain, label, "none", None, prior_plain)
     return Criteria(
         condition=condition,
         condition_columns=ConditionNumber(plain, label, "columns", None, prior_plain),
-        d_optimality=DOptimality(judged, label, noise.samples, prior_weighted),
-        rsd_mean=RelativeDeviation(judged, known, label, "mean", noise.samples, prior_weighted),
-        rsd_worst=RelativeDeviation(judged, known, label, "worst", noise.samples, prior_weighted),
+        d_optimality=DOptimality(weighted, label, noise.samples, prior_weighted),
+        rsd_mean=RelativeDeviation(judged, known, label, "mean", noise.samples, judged_prior),
+        rsd_worst=RelativeDeviation(judged, known, label, "worst", noise.samples, judged_prior),
     )
 
 

@@ -66,12 +66,11 @@ class SplineMotion:
 
     def extrema(self, derivative: int) -> Extrema:
         """Exact extreme values: knots and the roots of the next derivative, piece by piece."""
-        spline = self._spline().derivative(derivative) if derivative else self._spline()
-        pieces = PPoly.from_spline(spline)
-        edges = np.unique(pieces.x)
+        knots = _knots(self.duration_s, self.points.shape[1])
+        edges = np.unique(knots)
         found = np.empty((4, self.joints))
         for joint in range(self.joints):
-            single = PPoly(pieces.c[..., joint], pieces.x)
+            single = PPoly.from_spline((knots, self.points[joint], DEGREE)).derivative(derivative)
             roots = single.derivative().roots(extrapolate=False)
             times = np.concatenate([edges, roots[np.isfinite(roots)]])
             values = np.asarray(single(times))

@@ -22,6 +22,7 @@ from ident.excitation.torque import torque_bounds
 
 __all__ = ["Check", "Limits", "Margin", "PathChecker", "Workspace", "check_motion"]
 
+_ROUNDING = 1e-12
 KINEMATIC = (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"), ("jerk", "rad/s³"))
 
 
@@ -123,11 +124,11 @@ class Margin:
 
     @property
     def ok(self) -> bool:
-        """True if the limit is kept."""
-        return self.slack >= 0.0 and self.proven
+        """True if the limit is kept, to rounding."""
+        return self.slack >= -_ROUNDING * abs(self.limit) and self.proven
 
     def __str__(self) -> str:
-        state = "violates" if self.slack < 0.0 else "keeps" if self.proven else "is not proven to keep"
+        state = "keeps" if self.ok else "violates" if self.proven else "is not proven to keep"
         return (
             f"{self.subject} {self.constraint} {self.value:.4g} {self.unit} at t = {self.time_s:.3f} s "
             f"{state} {self.limit:.4g} {self.unit} by {abs(self.slack):.3g}"

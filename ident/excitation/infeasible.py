@@ -11,7 +11,7 @@ from ident.excitation.assembly import Assembled
 from ident.excitation.constraints import Row
 from ident.excitation.fourier import FourierBasis
 from ident.excitation.motion import Array, ParametricMotion
-from ident.excitation.polish import Outcome
+from ident.excitation.polish import Outcome, shortfall
 from ident.excitation.search import Setup, restore
 
 __all__ = ["explain", "refuse_impossible"]
@@ -99,6 +99,7 @@ def _refuse_static(assembled: Assembled) -> None:
     for _ in range(_STATIC_STARTS):
         posture = middle + half * rng.uniform(-0.7, 0.7, size=middle.size)
         program = still.program(target=None)
+        program.anchor = posture
         program.constraints.refresh_deviation(program.signals(posture))
         found = restore(still, posture, iterations=60)
         if found.violation < 1e-3:
@@ -131,10 +132,6 @@ def explain(assembled: Assembled, outcomes: Sequence[Outcome]) -> str:
     """Why no candidate passed: the violations of the one that came nearest."""
     if not outcomes:
         return "no motion was found; raise `search.starts`"
-
-    def shortfall(outcome: Outcome) -> float:
-        shares = [-margin.slack / max(abs(margin.limit), 1e-9) for margin in outcome.check.violations]
-        return max([outcome.bound_excess, 0.0, *shares])
 
     nearest = min(outcomes, key=shortfall)
     reasons = [str(margin) for margin in nearest.check.violations[:3]]

@@ -15,9 +15,11 @@ import numpy.typing as npt
 import yaml
 
 from fri.errors import ConfigurationError
+from ident.excitation.bspline import SplineMotion
 from ident.excitation.check import Check, Margin
 from ident.excitation.fourier import FourierSeries
 from ident.excitation.motion import Array, ParametricMotion, Samples
+from ident.excitation.point_to_point import PointToPoint
 from lwr_driver.configuration import read_mapping
 
 __all__ = ["ExcitationPlan"]
@@ -154,6 +156,17 @@ def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
             "a": motion.a.tolist(),
             "b": motion.b.tolist(),
         }
+    if isinstance(motion, SplineMotion):
+        return {"type": "bspline", "duration_s": float(motion.duration_s), "points": motion.points.tolist()}
+    if isinstance(motion, PointToPoint):
+        return {
+            "type": "point to point",
+            "postures": motion.postures.tolist(),
+            "v_max": np.asarray(motion.v_max).tolist(),
+            "a_max": np.asarray(motion.a_max).tolist(),
+            "j_max": np.asarray(motion.j_max).tolist(),
+            "dwell_s": float(motion.dwell_s),
+        }
     raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
 
 
@@ -165,6 +178,13 @@ def _motion_from_mapping(content: Any) -> ParametricMotion:
             np.array(content["a"]),
             np.array(content["b"]),
         )
+    if content["type"] == "bspline":
+        return SplineMotion(float(content["duration_s"]), np.array(content["points"]))
+    if content["type"] == "point to point":
+        v_max, a_max, j_max = (
+            np.array(content[key], dtype=np.float64) for key in ("v_max", "a_max", "j_max")
+        )
+        return PointToPoint(np.array(content["postures"]), v_max, a_max, j_max, float(content["dwell_s"]))
     raise ConfigurationError(f"motion type {content['type']!r} is unknown")
 
 
@@ -177,6 +197,7 @@ def _margin_to_mapping(margin: Margin) -> dict[str, Any]:
         "slack": float(margin.slack),
         "unit": margin.unit,
         "time_s": float(margin.time_s),
+        "proven": bool(margin.proven),
     }
 
 
@@ -189,4 +210,5 @@ def _margin_from_mapping(entry: Any) -> Margin:
         float(entry["slack"]),
         str(entry["unit"]),
         float(entry["time_s"]),
+        bool(entry.get("proven", True)),
     )

@@ -17,9 +17,11 @@ from ident.excitation.program import Program
 from ident.excitation.search import Candidate, restore
 from ident.excitation.sqp import minimise
 
-__all__ = ["Outcome", "polish"]
+__all__ = ["Outcome", "polish", "shortfall"]
 
-_ROUNDS = 8
+_ROUNDS = 6
+_GRID_TOLERANCE = 5e-3
+_HOPELESS = 0.05
 _ORDERS = {"position": 0, "velocity": 1, "acceleration": 2, "jerk": 3}
 _SPACE_STEP = 2e-4
 _SHARE_STEP = 2e-4
@@ -46,26 +48,28 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
         program = setup.program()
         x = candidate.x
         program.sharpness, program.constraints.rate = 64.0, 1000.0
-        iterations = 15 if quick else 60
         best: Outcome | None = None
         for round_ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))
-            x = minimise(program, x, iterations=iterations, tolerance=1e-5).x
+            solution = minimise(program, x, iterations=15 if quick else 60, tolerance=1e-5)
+            x = solution.x
+            if solution.constraints.min(initial=0.0) < -_GRID_TOLERANCE and round_ < _ROUNDS - 1:
+                x = restore(setup, x).x
+                continue
             outcome = _outcome(assembled, program, x)
-            if best is None or _worse(best) > _worse(outcome):
+            if best is None or shortfall(best) > shortfall(outcome):
                 best = outcome
             if outcome.check.ok and outcome.bounds_kept:
                 return outcome
+            if outcome.bound_excess > _HOPELESS:
+                break
             tighten(program.constraints, outcome.check, setup.mechanism.joint_names)
             tighten_bounds(program, outcome.bound_excess)
-            if round_ >= 2:
-                x = restore(setup, x).x
-            iterations = 30
-        assert best is not None
-        return best
+        return best if best is not None else _outcome(assembled, program, x)
 
 
-def _worse(outcome: Outcome) -> float:
+def shortfall(outcome: Outcome) -> float:
+    """Worst violation of a limit or bound, as a share of it."""
     shares = [-margin.slack / max(abs(margin.limit), 1e-9) for margin in outcome.check.violations]
     return max([outcome.bound_excess, 0.0, *shares])
 

@@ -266,6 +266,10 @@ def _distances(arm, q, value, shapes):  # type: ignore[no-untyped-def]
         row += grounded.shape[0]
         for k in range(boxed.shape[0]):
             c, x = boxed[k, 0], boxed[k, 1]
+            apart = _box_distance(middle[c, :3], box_size[x], box_rotation[x], box_centre[x], normal)
+            if apart - middle[c, 3] > _FAR:
+                value[i, row + k] = apart - middle[c, 3]
+                continue
             gap = _segment_to_box(
                 world[c, 0], world[c, 1], box_size[x], box_rotation[x], box_centre[x], point, normal
             )

@@ -80,7 +80,6 @@ def torque_deviation(
     z = np.zeros((joints, n, 10 * joints + 4))
     tau = np.empty((1, n, joints))
     forward(mechanism.dynamics, (q, qd, qdd), (first, columns), np.zeros((1, joints, 10)), 1e-3, z, tau)
-    place = 10 * joints
     for joint in range(joints):
         signals: list[Array] = []
         used: list[int] = []

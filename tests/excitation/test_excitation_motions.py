@@ -1,0 +1,96 @@
+"""B-splines and the point-to-point baseline: the same interface, the same exactness as the Fourier series."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fri.errors import ConfigurationError, RefusedError
+from ident.excitation import ExcitationPlan, PointToPoint, SplineBasis, Workspace, check_motion, random_points
+from ident.excitation.check import Limits
+from ident.excitation.mechanism import Mechanism
+from ident.excitation.motion import ParametricMotion
+
+
+@pytest.fixture
+def spline(rng: np.random.Generator) -> ParametricMotion:
+    basis = SplineBasis(15.0, 9)
+    return basis.motion(rng.normal(size=(7, basis.free)))
+
+
+@pytest.fixture
+def points(mechanism: Mechanism, limits: Limits) -> PointToPoint:
+    return random_points(mechanism, limits, count=5, seed=2)
+
+
+@pytest.mark.parametrize("kind", ["spline", "points"])
+def test_derivatives_extrema_and_rest(kind: str, request: pytest.FixtureRequest) -> None:
+    motion: ParametricMotion = request.getfixturevalue(kind)
+    t, h = np.linspace(0.01, motion.duration - 0.01, 400), 1e-6
+    before, here, after = (motion.sample(t + shift) for shift in (-h, 0.0, h))
+    for order in range(3):
+        slope = (after[order] - before[order]) / (2 * h)
+        np.testing.assert_allclose(slope, here[order + 1], atol=2e-3 if order == 2 else 1e-6)
+    dense = motion.sample(np.linspace(0.0, motion.duration, 20001))
+    for order in range(4):
+        extrema = motion.extrema(order)
+        peak = np.abs(dense[order]).max()
+        assert np.all(extrema.high >= dense[order].max(axis=0) - 1e-9 * peak)
+        assert np.all(extrema.low <= dense[order].min(axis=0) + 1e-9 * peak)
+        np.testing.assert_allclose(extrema.high, dense[order].max(axis=0), atol=2e-3 * peak)
+    ends = motion.sample([0.0, motion.duration])
+    np.testing.assert_allclose(ends.qd, 0.0, atol=1e-9)
+    np.testing.assert_allclose(ends.qdd, 0.0, atol=1e-6)
+    np.testing.assert_allclose(ends.q[0], ends.q[1], atol=1e-9)
+
+
+def test_spline_basis_inverts(spline: ParametricMotion) -> None:
+    basis = SplineBasis(15.0, 9)
+    x = basis.coefficients(spline)
+    np.testing.assert_allclose(basis.motion(x).sample([1.0, 7.3]).q, spline.sample([1.0, 7.3]).q, atol=1e-12)
+    np.testing.assert_allclose(basis.matrix([1.0, 7.3], 2) @ x.T, spline.sample([1.0, 7.3]).qdd, atol=1e-10)
+    with pytest.raises(ConfigurationError, match="no spline of this basis"):
+        SplineBasis(15.0, 8).coefficients(spline)
+
+
+def test_points_reach_a_limit_on_every_segment_and_break_none(
+    mechanism: Mechanism, limits: Limits, points: PointToPoint
+) -> None:
+    check = check_motion(points, mechanism, limits, workspace=Workspace())
+    assert check.ok, check
+    speeds = [np.abs(points.extrema(order).high) for order in (1, 2)]
+    assert max((speeds[0] / limits.v_max).max(), (speeds[1] / limits.a_max).max()) > 0.99
+    for posture in points.postures:
+        assert (
+            np.abs(points.sample(np.linspace(0, points.duration, 5001)).q - posture).max(axis=1).min() < 0.02
+        )
+    slow = random_points(mechanism, limits, count=5, seed=2, speed_scale=0.5)
+    np.testing.assert_array_equal(slow.postures, points.postures)
+    assert slow.duration > points.duration
+
+
+def test_points_obey_the_jerk_limit(mechanism: Mechanism, limits: Limits) -> None:
+    smooth = replace(limits, j_max=np.full(7, 20.0))
+    motion = random_points(mechanism, smooth, count=3, seed=2)
+    jerk = motion.extrema(3)
+    assert max(jerk.high.max(), -jerk.low.min()) == pytest.approx(20.0, rel=1e-9)
+
+
+def test_points_in_an_impossible_workspace_are_refused(mechanism: Mechanism, limits: Limits) -> None:
+    with pytest.raises(RefusedError, match="no posture within the workspace"):
+        random_points(mechanism, limits, workspace=Workspace(radius_m=2.0))
+
+
+@pytest.mark.parametrize("kind", ["spline", "points"])
+def test_plan_files_keep_every_kind_of_motion(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    motion: ParametricMotion = request.getfixturevalue(kind)
+    plan = ExcitationPlan(motion, tuple("abcdefg"), provenance={"seed": 1})
+    plan.save(tmp_path / "plan.yaml")
+    read = ExcitationPlan.load(tmp_path / "plan.yaml")
+    t = np.linspace(0.0, motion.duration, 50)
+    np.testing.assert_array_equal(read.motion.sample(t).qd, motion.sample(t).qd)

@@ -1,0 +1,275 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import coal
+import joblib
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from fri.errors import ConfigurationError, OperatorError, RefusedError
+from ident.excitation import (
+    ExcitationPlan,
+    Knowledge,
+    MotionForm,
+    Objective,
+    PlanProblem,
+    Prior,
+    Progress,
+    Search,
+    Workspace,
+    assemble,
+    hypervolume,
+    not_dominated,
+    plan,
+    plan_report,
+    table,
+    table_row,
+    trade_off,
+)
+from ident.excitation.point_to_point import random_points
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Box, Cell
+from lwr_driver.configuration import CONFIGS
+
+CONDITION = "condition number, essential 49, unscaled"
+
+
+@pytest.fixture(scope="module")
+def problem() -> PlanProblem:
+    default = PlanProblem.load("plans/default.yaml")
+    return replace(
+        default,
+        objective=Objective(criterion="condition_number"),
+        search=Search(seed=3, starts=2, hops=4, lanes=2),
+    )
+
+
+@pytest.fixture(scope="module")
+def solved(problem: PlanProblem) -> ExcitationPlan:
+    return plan(problem)
+
+
+def test_plan_is_good_and_keeps_every_limit_by_an_independent_check(
+    arm: Arm, problem: PlanProblem, solved: ExcitationPlan
+) -> None:
+    """Pinocchio, coal and plain differences; nothing of the planner but the samples."""
+    assert solved.objectives[CONDITION] < 50.0
+    assert all(margin.ok and margin.proven for margin in solved.check.margins)
+    t = np.arange(0.0, 20.0, 1e-3)
+    q = solved.sample(t).q
+    qd, qdd = (np.gradient(part, 1e-3, axis=0, edge_order=2) for part in (q, solved.sample(t).qd))
+    assert np.all((q >= arm.q_low) & (q <= arm.q_high))
+    assert np.all(np.abs(qd) <= 0.95 * arm.v_max + 1e-5)
+    assert np.all(np.abs(qdd) <= arm.a_max)
+    model = pin.buildModelFromXML(arm.urdf)
+    data = model.createData()
+    geometry = pin.buildGeomFromUrdfString(model, arm.urdf, pin.GeometryType.COLLISION)
+    ground = pin.GeometryObject(
+        "ground", 0, pin.SE3.Identity(), coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+    )
+    index = geometry.addGeometryObject(ground)
+    for first, a in enumerate(geometry.geometryObjects):
+        for second, b in enumerate(geometry.geometryObjects):
+            far = b.parentJoint - a.parentJoint >= 3 and index not in (first, second)
+            if far or (second == index and a.parentJoint >= 2):
+                geometry.addCollisionPair(pin.CollisionPair(first, second))
+    found = geometry.createData()
+    flange = model.getFrameId("flange")
+    for posture in q[::20]:
+        pin.framesForwardKinematics(model, data, posture)
+        x, y, z = data.oMf[flange].translation
+        assert np.hypot(x, y) >= 0.3
+        assert z - 0.3105 >= -0.2
+        nearest = pin.computeDistances(model, data, geometry, found, posture)
+        assert found.distanceResults[nearest].min_distance >= 0.02
+
+
+@pytest.mark.slow
+def test_seed_and_counts_decide_not_the_number_of_processes(
+    problem: PlanProblem, solved: ExcitationPlan
+) -> None:
+    again = plan(replace(problem, search=replace(problem.search, jobs=2)))
+    np.testing.assert_array_equal(again.sample(3.3).q, solved.sample(3.3).q)
+
+
+def test_the_search_runs_on_a_dask_cluster(problem: PlanProblem) -> None:
+    distributed = pytest.importorskip("distributed")
+    small = replace(problem, search=Search(seed=3, starts=2, hops=0, jobs=-1))
+    alone = plan(replace(small, search=replace(small.search, jobs=1)))
+    with (
+        distributed.Client(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None),
+        joblib.parallel_config(backend="dask"),
+    ):
+        spread = plan(small)
+    np.testing.assert_array_equal(spread.sample(3.3).q, alone.sample(3.3).q)
+
+
+def test_progress_counts_up_and_only_improves(problem: PlanProblem) -> None:
+    heard: list[Progress] = []
+    plan(replace(problem, search=Search(seed=3, starts=2, hops=2, lanes=1)), heard.append)
+    assert [event.stage for event in heard if event.done == 0] == ["starts", "hops", "polish"]
+    best = [event.best for event in heard if event.best is not None]
+    assert best == sorted(best, reverse=True)
+    assert heard[-1].done == heard[-1].total == 1
+
+
+def test_interruption_returns_the_best_so_far_and_says_so(problem: PlanProblem) -> None:
+    def interrupt(event: Progress) -> None:
+        if event.stage == "starts" and event.done == 1:
+            raise KeyboardInterrupt
+
+    found = plan(problem, interrupt)
+    assert found.check.ok
+    assert found.provenance["interrupted"] is True
+
+    def at_once(event: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(OperatorError, match="before any motion was found"):
+        plan(problem, at_once)
+
+
+def test_bounds_on_other_criteria_are_kept(problem: PlanProblem, solved: ExcitationPlan) -> None:
+    mean = "mean predicted relative deviation, essential 49 [%]"
+    objective = Objective(criterion="mean_rsd", condition_at_most=45.0)
+    bounded = plan(replace(problem, objective=objective, search=Search(starts=1, hops=0)))
+    assert bounded.objectives[CONDITION] <= 45.0 * (1 + 1e-9)
+    assert bounded.objectives[mean] < solved.objectives[mean]
+    with pytest.raises(RefusedError, match=r"condition number.*exceeds the bound 10"):
+        plan(
+            replace(
+                problem,
+                objective=Objective(criterion="mean_rsd", condition_at_most=10.0),
+                search=Search(starts=1, hops=0),
+            )
+        )
+
+
+def test_a_spline_plan_keeps_every_limit(problem: PlanProblem) -> None:
+    spline = replace(
+        problem, motion=MotionForm(type="bspline", control_points=8), search=Search(starts=1, hops=0)
+    )
+    assert plan(spline).check.ok
+
+
+def test_a_motion_run_before_makes_the_next_one_complement_it(
+    problem: PlanProblem, solved: ExcitationPlan, tmp_path: Path
+) -> None:
+    path = tmp_path / "before.plan.yaml"
+    solved.save(path)
+    follow = assemble(replace(problem, prior=(Prior(str(path)),)))
+    alone = assemble(problem)
+    view = alone.view(solved.motion)
+    single = alone.criteria.rsd_mean.deviations(view)
+    double = follow.criteria.rsd_mean.deviations(follow.view(solved.motion))
+    # the prior ran the same motion for the same time: the same information once more
+    np.testing.assert_allclose(double, single / np.sqrt(2.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"motion": MotionForm(period_s=0.5)}, ConfigurationError, r"n_f w0 = 5 / 0\.5 s = 10 Hz reaches"),
+        ({"workspace": Workspace(radius_m=1.2)}, RefusedError, r"radius_m 1\.200 m is 0\.332 m beyond reach"),
+        (
+            {"workspace": Workspace(radius_m=0.8, height_m=0.8)},
+            RefusedError,
+            "no posture can be held.*falls short by",
+        ),
+        ({"clearance_m": 0.4}, RefusedError, "no posture can be held.*falls short by"),
+    ],
+)
+def test_impossible_problems_are_refused_at_once_with_limit_and_amount(
+    problem: PlanProblem, changes: dict, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        plan(replace(problem, **changes))
+
+
+def test_a_payload_too_heavy_to_hold_is_refused_with_joint_and_torque(
+    problem: PlanProblem, tmp_path: Path
+) -> None:
+    heavy = tmp_path / "heavy.yaml"
+    text = (CONFIGS / "emulator/table2.yaml").read_text(encoding="utf-8")
+    heavy.write_text(text.replace("M: 3.34", "M: 60.0"), encoding="utf-8")
+    with pytest.raises(RefusedError, match=r"A\d torque exceeds|E1 torque exceeds"):
+        plan(replace(problem, knowledge=Knowledge(file=str(heavy)), workspace=Workspace(radius_m=0.6)))
+
+
+def test_obstacles_of_the_cell_are_avoided(problem: PlanProblem, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(
+        "schema_version: 1\nname: tight\nboxes:\n"
+        "  - {name: cabinet, size_m: [0.4, 2.0, 1.0], centre_m: [0.75, 0.0, 0.5]}\n"
+    )
+    found = plan(replace(problem, cell=str(cell), search=Search(seed=5, starts=2, hops=0)))
+    cabinet = Box("cabinet", (0.4, 2.0, 1.0), (0.75, 0.0, 0.5))
+    assert Cell.load(str(cell)).boxes == (cabinet,)
+    assert found.check.ok
+
+
+def test_problem_file_is_strict(tmp_path: Path) -> None:
+    path = tmp_path / "problem.yaml"
+    path.write_text("name: x\nobjective: {criterion: condition_numbr}\n")
+    with pytest.raises(ConfigurationError, match="condition_numbr"):
+        PlanProblem.load(path)
+    path.write_text("name: x\nhopps: 3\n")
+    with pytest.raises(ConfigurationError, match="unknown key `hopps`"):
+        PlanProblem.load(path)
+    path.write_text("name: x\nparameters: [ZZ9]\n")
+    with pytest.raises(ConfigurationError, match="ZZ9"):
+        assemble(PlanProblem.load(path))
+
+
+def test_default_parameters_are_the_102_base_parameters(problem: PlanProblem) -> None:
+    assembled = assemble(replace(problem, parameters="base"))
+    assert len(assembled.criteria.condition.assembly.names) == 102
+    values = dict(
+        zip(assembled.criteria.rsd_mean.assembly.names, assembled.criteria.rsd_mean.values, strict=True)
+    )
+    # Table 2 of the paper, to its two digits
+    for name, published in {"MY2R": 3.46, "XX2R": 1.36, "ZZ4R": 0.45, "MY4R": 1.37, "M8": 3.34}.items():
+        assert values[name] == pytest.approx(published, abs=0.005)
+
+
+def test_table_and_report_name_what_they_show(problem: PlanProblem, solved: ExcitationPlan) -> None:
+    assembled = assemble(problem)
+    setup = assembled.setup
+    random = random_points(setup.mechanism, setup.limits, count=4, workspace=problem.workspace)
+    rows = [
+        table_row("random", assembled, random),
+        table_row("planned", assembled, solved.motion, solved.check),
+    ]
+    text = table(rows, "Table 1")
+    assert text.splitlines()[0] == "Table 1"
+    assert "planned" in text
+    assert f"{solved.objectives[CONDITION]:.2f}" in text
+    assert rows[1].condition < rows[0].condition
+    report = plan_report(solved)
+    assert CONDITION in report
+    assert "tightest margins" in report
+
+
+def test_trade_off_gives_motions_within_their_bounds(problem: PlanProblem) -> None:
+    assembled = assemble(problem)
+    criteria = assembled.criteria
+    limits = [np.log(45.0), np.log(60.0)]
+    points = trade_off(assembled, criteria.rsd_mean, criteria.condition, limits, starts=1, hops=0)
+    assert len(points) == 2
+    for point in points:
+        assert point.bounded <= point.limit * (1 + 1e-9)
+        assert assembled.check(point.motion).ok
+    assert points[0].minimised >= points[1].minimised - 0.05, "a looser bound is no worse"
+
+
+def test_hypervolume_of_boxes() -> None:
+    assert hypervolume(np.array([[1.0, 2.0]]), np.array([3.0, 4.0])) == pytest.approx(4.0)
+    two = np.array([[0.0, 2.0], [2.0, 0.0]])
+    assert hypervolume(two, np.array([3.0, 3.0])) == pytest.approx(3.0 + 3.0 - 1.0)
+    # the paper's two trajectories with the random one as reference
+    paper = np.array([[34.01, -1.56, -0.92], [37.23, -1.64, -1.64]])
+    assert hypervolume(paper, np.array([84.21, 0.0, 0.0])) == pytest.approx(131.0, abs=1.0)
+    np.testing.assert_array_equal(not_dominated(np.array([[1, 2], [2, 1], [2, 2]])), [True, True, False])
