@@ -14,8 +14,8 @@ def characteristics(found: Identification) -> dict[str, Any]:
     """Condition numbers and mean torques of the sessions that an identification was made from.
 
     condition : of the unscaled, unweighted observation matrix, over all base parameters (`base`), the
-        essential parameters of this run (`essential`) and the 49 of the paper's Table 2 (`paper`, the definition that
-        its Table 1 agrees with); null where the run does not have them.
+        essential parameters of this run (`essential`) and the 49 of the paper's Table 2 (`paper`, the
+        definition that its Table 1 agrees with); null where the run does not have them.
     mean_torque_nm : by session file and joint, mean |joint torque sensor| over the excitation [Nm].
     """
     names = list(found.problem.names)
