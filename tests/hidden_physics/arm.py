@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from hidden_physics.bristles import FILM_ROW, HOUSING_ROW, STATES, advance
-from hidden_physics.traits import TRAITS, trait_rows
 from numpy.typing import NDArray
 
+from hidden_physics.bristles import FILM_ROW, HOUSING_ROW, STATES, advance
+from hidden_physics.traits import TRAITS, trait_rows
 from sim_backend.plant import CYCLE_S, Drive
 from sim_backend.rigid_body import Payload, with_payload
 

@@ -1,4 +1,9 @@
-"""Exciting motions from seeds, for sessions of the same length."""
+"""Exciting motions of all hidden sessions.
+
+Each schedule is three motions: without payload, with payload, and one held out, with payload. They were chosen
+among thirty random feasible Fourier motions so that the parameters found on the first two predict the third
+within a third of the noise: what is then wrong in a prediction is what was hidden.
+"""
 
 from __future__ import annotations
 
@@ -6,32 +11,29 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from hidden_physics.recording import PERIOD_MS
 
-from fri.errors import RefusedError
-from ident.excitation import ExcitationPlan, feasible_fourier
+from hidden_physics.recording import PERIOD_MS
+from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
 from lwr_driver.motion import Motion, check_motion
 
-__all__ = ["PERIODS", "PERIOD_S", "REST_S", "exciting_motion"]
+__all__ = ["PERIODS", "PERIOD_S", "REST_S", "SCHEDULES", "exciting_motion"]
 
 PERIOD_S = 10.0
 PERIODS = 2
 REST_S = 0.4
 """Rest before and after the periods [s]."""
 
-_HARMONICS = 5
-_SPEED_SCALE = 0.8
+SCHEDULES = ("A", "B", "C", "D")
+"""Schedule X has the motions X1 (no payload), X2 (payload) and X3 (payload, held out)."""
+
+_FOLDER = Path(__file__).parent / "plans"
 
 
-def exciting_motion(seed: int, store: Path | None = None, periods: int = PERIODS) -> Motion:
-    """Motion number `seed`: rest, whole periods of a Fourier series, rest; at rest where they join.
-
-    store : folder in which plans are kept, so that the same seed need not be planned twice
-    """
-    plan = _plan(seed, store)
+@cache
+def exciting_motion(name: str, periods: int = PERIODS) -> Motion:
+    """The motion `name`: rest, whole periods of a Fourier series, rest; at rest where they join."""
+    plan = ExcitationPlan.load(_FOLDER / f"{name}.yaml")
     period = PERIOD_MS * 1e-3
     q = plan.rows(period, periods)
     length, rest = (len(q) - 1) // periods, round(REST_S / period)
@@ -44,32 +46,3 @@ def exciting_motion(seed: int, store: Path | None = None, periods: int = PERIODS
     motion = Motion(rows, period, phases)
     check_motion(Arm.load(), motion)
     return motion
-
-
-@cache
-def _plan(seed: int, store: Path | None) -> ExcitationPlan:
-    path = None if store is None else store / f"motion_{seed}.yaml"
-    if path is not None and path.is_file():
-        return ExcitationPlan.load(path)
-    arm = Arm.load()
-    checker = CollisionChecker(arm, Cell.load("cell.yaml"))
-    for trial in range(20):
-        try:
-            plan = feasible_fourier(
-                arm,
-                checker,
-                period_s=PERIOD_S,
-                harmonics=_HARMONICS,
-                periods=PERIODS,
-                seed=1000 * seed + trial,
-                speed_scale=_SPEED_SCALE,
-            )
-        except RefusedError:
-            continue
-        break
-    else:
-        raise RuntimeError(f"no motion for seed {seed}")
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        plan.save(path)
-    return plan

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from hidden_physics.traits import JOINTS
 from numba import njit
 
+from hidden_physics.traits import JOINTS
 from sim_backend.plant import Effect, Plant, Reading
 
 __all__ = ["FAULTS", "SensorChain"]

@@ -24,7 +24,7 @@ _HEALTHY: dict[str, float] = {
     "hardening": 0.0,
     # bristles: reach [rad], ratio of the reaches of neighbours, a second family with a long reach [rad] and
     # its share of the Coulomb torque
-    "presliding": 2e-4,
+    "presliding": 1e-4,
     "spread": 2.0,
     "long_reach": 1e-2,
     "long_share": 0.0,

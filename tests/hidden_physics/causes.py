@@ -1,0 +1,668 @@
+"""What can be hidden: every cause of the catalogue, and some that no catalogue has.
+
+A cause is drawn once (its joint, its shape, when it happens) and then has a size that can be turned up and
+down. Size one is near what a person begins to see in a plot of the held-out error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hidden_physics.motions import PERIOD_S, PERIODS, REST_S
+from hidden_physics.robots import SESSIONS, Encoder, Setting
+from hidden_physics.traits import JOINTS, every
+
+__all__ = ["CATALOGUE", "CAUSES", "OUTSIDE", "Cause", "Hidden", "Scene"]
+
+COULOMB = (15.04, 16.48, 8.77, 9.96, 5.58, 4.41, 4.16)
+VISCOUS = (16.68, 19.09, 7.87, 11.63, 5.39, 3.64, 2.03)
+FULL_SCALE = (176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0)
+MOTOR_NOISE = (0.4, 0.42, 0.26, 0.25, 0.18, 0.085, 0.1)
+JOINT_NOISE = (0.155, 0.16, 0.096, 0.105, 0.098, 0.037, 0.045)
+
+Random = np.random.Generator
+Settings = tuple[Setting, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a cause may depend on besides chance.
+
+    peaks : (7,) largest joint torque of the healthy twin [Nm]. begin_s : cabinet's clock as motions begin [s]
+    """
+
+    peaks: tuple[float, ...]
+    begin_s: float
+
+    def moment(self, random: Random, low: float = 0.2, high: float = 0.8) -> float:
+        """A time within the periods, on the cabinet's clock [s]."""
+        return self.begin_s + REST_S + PERIODS * PERIOD_S * random.uniform(low, high)
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One hidden cause, of one size: the truth.
+
+    cause : name in the catalogue, or of an effect that it does not have. joints : 1 to 7, empty for the arm
+    settings : of each session. parameters : what a diagnosis may state, by its name; time in seconds from the
+    first row of the motion. depends_on : variables, for causes outside the catalogue
+    """
+
+    cause: str
+    side: str
+    joints: tuple[int, ...]
+    size: float
+    settings: Settings
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    depends_on: tuple[str, ...] = ()
+    variant: str = ""
+
+    @property
+    def listed(self) -> bool:
+        """Whether the catalogue has it."""
+        return self.cause in CATALOGUE
+
+
+Draw = Callable[[Random, int, Scene], Callable[[float], Hidden]]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A way to hide something.
+
+    joints : where it can be; (0,) for the whole arm. encoder : side that must be published, None for either
+    absorbed : the base parameters take most of it up, so that little shows without a reference
+    """
+
+    name: str
+    side: str
+    draw: Draw
+    joints: tuple[int, ...] = tuple(range(1, JOINTS + 1))
+    encoder: Encoder | None = None
+    absorbed: bool = False
+
+
+def _everywhere(setting: Setting) -> Settings:
+    return (setting,) * SESSIONS
+
+
+def _sign(random: Random) -> float:
+    return float(random.choice((-1.0, 1.0)))
+
+
+def _log(random: Random, low: float, high: float) -> float:
+    return float(np.exp(random.uniform(math.log(low), math.log(high))))
+
+
+def _trait(joint: int, **values: float) -> Setting:
+    return Setting(traits={name: {joint: value} for name, value in values.items()})
+
+
+def _fault(joint: int, **values: float) -> Setting:
+    return Setting(faults={name: {joint: value} for name, value in values.items()})
+
+
+# -- friction --------------------------------------------------------------------------------------------------
+
+
+def _stribeck(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    speed, shape = _log(random, 0.03, 0.2), random.uniform(0.8, 2.0)
+
+    def sized(size: float) -> Hidden:
+        rise = size * 2.5 * MOTOR_NOISE[joint - 1]
+        setting = _trait(
+            joint, stribeck=rise / COULOMB[joint - 1], stribeck_speed=speed, stribeck_shape=shape
+        )
+        truth = {"amplitude": rise, "velocity": speed}
+        return Hidden("stribeck", "motor", (joint,), size, _everywhere(setting), truth)
+
+    return sized
+
+
+def _viscous(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    corner, falls = random.uniform(0.1, 0.5), random.random() < 0.8
+
+    def sized(size: float) -> Hidden:
+        change = min(0.7, size * 6.0 * MOTOR_NOISE[joint - 1] / VISCOUS[joint - 1])
+        power = 1.0 - change if falls else 1.0 + change
+        setting = _trait(joint, viscous_power=power, viscous_corner=corner)
+        return Hidden("viscous_nonlinear", "motor", (joint,), size, _everywhere(setting))
+
+    return sized
+
+
+def _asymmetry(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    sign = _sign(random)
+
+    def sized(size: float) -> Hidden:
+        coulomb = sign * min(0.4, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        viscous = sign * min(0.6, size * 4.0 * MOTOR_NOISE[joint - 1] / VISCOUS[joint - 1])
+        setting = _trait(joint, forward_coulomb=coulomb, forward_viscous=viscous)
+        return Hidden("friction_asymmetry", "motor", (joint,), size, _everywhere(setting))
+
+    return sized
+
+
+def _load(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    def sized(size: float) -> Hidden:
+        share = size * 4.0 * MOTOR_NOISE[joint - 1] / scene.peaks[joint - 1]
+        setting = _trait(joint, load_share=share)
+        return Hidden("friction_load", "motor", (joint,), size, _everywhere(setting), {"share": share})
+
+    return sized
+
+
+def _temperature(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    between = random.random() < 0.5
+    warm = random.permutation((0.0, random.uniform(6.0, 14.0), random.uniform(12.0, 25.0)))
+
+    def sized(size: float) -> Hidden:
+        share = size * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1]
+        if between:
+            settings = tuple(_trait(joint, warmth=0.1 * share, start_warm=start) for start in warm)
+            return Hidden(
+                "friction_temperature", "motor", (joint,), size, settings, variant="between sessions"
+            )
+        # A thin film that warms up within the session by 5 to 15 K.
+        power = COULOMB[joint - 1] * 0.35
+        setting = _trait(joint, warmth=0.4 * share, film_capacity=power / 0.9, film_conductance=power / 12.0)
+        return Hidden(
+            "friction_temperature", "motor", (joint,), size, _everywhere(setting), variant="within a session"
+        )
+
+    return sized
+
+
+def _position(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    wave, count = random.random() < 0.7, float(random.integers(1, 4))
+    phase, centre, width = (
+        random.uniform(-math.pi, math.pi),
+        random.uniform(-0.6, 0.6),
+        random.uniform(0.15, 0.5),
+    )
+
+    def sized(size: float) -> Hidden:
+        share = min(0.6, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        if wave:
+            setting = _trait(joint, wave=share, wave_count=count, wave_phase=phase)
+        else:
+            setting = _trait(joint, bump=1.5 * share, bump_centre=centre, bump_width=width)
+        variant = f"{count:.0f} waves" if wave else "bump"
+        return Hidden("friction_position", "motor", (joint,), size, _everywhere(setting), variant=variant)
+
+    return sized
+
+
+def _presliding(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    reach = _log(random, 5e-3, 4e-2)
+
+    def sized(size: float) -> Hidden:
+        share = min(0.9, size * 4.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        setting = _trait(joint, long_share=share, long_reach=reach)
+        return Hidden("presliding_hysteresis", "motor", (joint,), size, _everywhere(setting))
+
+    return sized
+
+
+# -- drive -----------------------------------------------------------------------------------------------------
+
+
+def _gear_ripple(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    twice, phase = bool(random.random() < 0.5), random.uniform(-math.pi, math.pi)
+    turns = 160.0 if joint == 5 else 100.0
+
+    def sized(size: float) -> Hidden:
+        amplitude = size * 1.5 * MOTOR_NOISE[joint - 1]
+        name = "twice" if twice else "once"
+        setting = _trait(joint, **{f"ripple_{name}": amplitude, f"ripple_{name}_phase": phase})
+        truth = {"cycles_per_turn": turns * (2.0 if twice else 1.0), "amplitude": amplitude}
+        return Hidden("gear_ripple", "motor", (joint,), size, _everywhere(setting), truth, variant=name)
+
+    return sized
+
+
+def _motor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    sign = _sign(random)
+
+    def sized(size: float) -> Hidden:
+        error = sign * min(0.3, size * 0.05)
+        setting = _trait(joint, motor_gain=1.0 + error)
+        return Hidden(
+            "motor_torque_gain", "motor", (joint,), size, _everywhere(setting), {"gain": 1.0 / (1.0 + error)}
+        )
+
+    return sized
+
+
+def _backlash(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    softness = random.uniform(0.0, 0.06)
+
+    def sized(size: float) -> Hidden:
+        setting = _trait(joint, play=size * 1.0e-3, play_softness=max(softness, 1e-3))
+        return Hidden("backlash", "joint", (joint,), size, _everywhere(setting), {"width": 2e-3 * size})
+
+    return sized
+
+
+def _elasticity(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    hardening = random.uniform(0.0, 3e3)
+
+    def sized(size: float) -> Hidden:
+        setting = _trait(joint, stiffness=1.0 / (1.0 + size), hardening=hardening)
+        return Hidden("joint_elasticity", "joint", (joint,), size, _everywhere(setting))
+
+    return sized
+
+
+# -- links -----------------------------------------------------------------------------------------------------
+
+
+def _cable(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    kind = str(random.choice(("hardening", "slack", "rubbing")))
+    centre, slack = random.uniform(-0.5, 0.5), random.uniform(0.2, 0.8)
+
+    def sized(size: float) -> Hidden:
+        torque = size * 3.0 * JOINT_NOISE[joint - 1]
+        if kind == "hardening":
+            setting = _trait(joint, cable=torque, cable_cubic=0.7 * torque, cable_centre=centre)
+        elif kind == "slack":
+            setting = _trait(joint, cable=2.0 * torque, cable_centre=centre, cable_slack=slack)
+        else:
+            setting = _trait(
+                joint,
+                cable=1.5 * torque,
+                cable_cubic=0.3 * torque,
+                cable_centre=centre,
+                cable_rub=0.3 * torque,
+                cable_reach=0.15,
+            )
+        return Hidden("cable_spring", "joint", (joint,), size, _everywhere(setting), variant=kind)
+
+    return sized
+
+
+def _tilt(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    direction = random.uniform(-math.pi, math.pi)
+
+    def sized(size: float) -> Hidden:
+        angle = math.radians(0.5 * size)
+        rx, ry = angle * math.cos(direction), angle * math.sin(direction)
+        truth = {"tilt_x": rx, "tilt_y": ry}
+        return Hidden("base_tilt", "joint", (), size, _everywhere(Setting(tilt=(rx, ry))), truth)
+
+    return sized
+
+
+def _payload_error(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    mass, moment = random.uniform(-0.25, 0.25), random.normal(0.0, 0.02, 3)
+
+    def sized(size: float) -> Hidden:
+        load = {"mass": size * mass, "moment": [float(v) for v in size * moment]}
+        return Hidden(
+            "payload_error", "joint", (), size, _everywhere(Setting(load=load)), {"mass": size * mass}
+        )
+
+    return sized
+
+
+def _payload_change(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    kind = str(random.choice(("drop", "shift", "loose")))
+    time_s, direction = scene.moment(random), random.normal(0.0, 1.0, 3)
+    direction /= np.linalg.norm(direction)
+
+    def sized(size: float) -> Hidden:
+        load: dict[str, object]
+        if kind == "drop":
+            load = {"mass": -min(1.5, 0.08 * size), "moment": [0.0, 0.0, -min(0.2, 0.011 * size)]}
+        elif kind == "shift":
+            load = {"moment": [float(v) for v in 0.015 * size * direction]}
+        else:
+            load = {"rattle": 0.006 * size}
+        loaded = Setting(load={**load, "from_s": time_s})
+        after = Setting(load=load)
+        truth = {"time": time_s - scene.begin_s}
+        return Hidden("payload_change", "joint", (), size, (Setting(), loaded, after), truth, variant=kind)
+
+    return sized
+
+
+def _zero(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    sign = _sign(random)
+
+    def sized(size: float) -> Hidden:
+        angle = sign * math.radians(0.4 * size)
+        setting = _trait(joint, zero=angle)
+        return Hidden("joint_zero_offset", "joint", (joint,), size, _everywhere(setting), {"offset": angle})
+
+    return sized
+
+
+def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    direction = random.normal(0.0, 1.0, 3)
+    direction /= np.linalg.norm(direction)
+    link, length = int(random.integers(4, 8)), random.uniform(0.4, 1.5)
+    drag = random.random() < 0.3
+    train, test = int(random.integers(0, 2)), SESSIONS - 1
+    times = {train: scene.moment(random), test: scene.moment(random)}
+
+    def sized(size: float) -> Hidden:
+        settings = [Setting() for _ in range(SESSIONS)]
+        for session, time_s in times.items():
+            episode = {
+                "start_s": time_s,
+                "length_s": length,
+                "link": link,
+                "force": [float(v) for v in (0.0 if drag else 12.0 * size) * direction],
+                "stiffness": 60.0 * size if drag else 0.0,
+            }
+            settings[session] = Setting(contacts=(episode,))
+        truth = {"time": times[train] - scene.begin_s + 0.5 * length}
+        return Hidden(
+            "contact", "joint", (), size, tuple(settings), truth, variant="drag" if drag else "push"
+        )
+
+    return sized
+
+
+# -- sensors and timing ----------------------------------------------------------------------------------------
+
+
+def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    sign = _sign(random)
+
+    def sized(size: float) -> Hidden:
+        gain = 1.0 + sign * min(0.3, 0.03 * size)
+        return Hidden(
+            "sensor_gain", "sensor", (joint,), size, _everywhere(_fault(joint, gain=gain)), {"gain": gain}
+        )
+
+    return sized
+
+
+def _crosstalk(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    others = [other for other in range(1, JOINTS + 1) if other != joint and scene.peaks[other - 1] > 8.0]
+    source, sign = int(random.choice(others)), _sign(random)
+
+    def sized(size: float) -> Hidden:
+        share = sign * size * 3.0 * JOINT_NOISE[joint - 1] / scene.peaks[source - 1]
+        setting = Setting(leak={joint: {source: share}})
+        truth = {"source": float(source), "share": share}
+        return Hidden("sensor_crosstalk", "sensor", (joint,), size, _everywhere(setting), truth)
+
+    return sized
+
+
+def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    share = random.uniform(0.5, 1.0)
+
+    def sized(size: float) -> Hidden:
+        width = min(0.4 * scene.peaks[joint - 1], size * 1.2 * JOINT_NOISE[joint - 1])
+        setting = _fault(joint, play=width / share, play_share=share)
+        return Hidden("sensor_hysteresis", "sensor", (joint,), size, _everywhere(setting))
+
+    return sized
+
+
+def _saturation(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    def sized(size: float) -> Hidden:
+        clip = scene.peaks[joint - 1] * (1.0 - min(0.7, 0.12 * size))
+        return Hidden(
+            "sensor_saturation",
+            "sensor",
+            (joint,),
+            size,
+            _everywhere(_fault(joint, clip=clip)),
+            {"limit": clip},
+        )
+
+    return sized
+
+
+def _drift(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    kind, sign = str(random.choice(("drift", "creep", "between"))), _sign(random)
+    zeros = random.permutation((-1.0, 0.2, 1.0))
+    time_constant = random.uniform(4.0, 12.0)
+
+    def sized(size: float) -> Hidden:
+        torque = sign * size * 1.5 * JOINT_NOISE[joint - 1]
+        settings = _everywhere(_fault(joint, drift=2.0 * torque / (PERIODS * PERIOD_S)))
+        if kind == "creep":
+            settings = _everywhere(_fault(joint, creep=2.0 * torque, creep_time=time_constant))
+        elif kind == "between":
+            settings = tuple(_fault(joint, zero=torque * float(zero)) for zero in zeros)
+        return Hidden("sensor_offset_drift", "sensor", (joint,), size, settings, variant=kind)
+
+    return sized
+
+
+def _sensor_ripple(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    geared = random.random() < 0.4
+    turns = 160.0 if joint == 5 else 100.0
+    count = turns * float(random.integers(1, 3)) if geared else float(random.integers(2, 7))
+    phase = random.uniform(-math.pi, math.pi)
+
+    def sized(size: float) -> Hidden:
+        amplitude = size * 1.5 * JOINT_NOISE[joint - 1]
+        setting = _fault(joint, ripple=amplitude, ripple_count=count, ripple_phase=phase)
+        truth = {"cycles_per_turn": count, "amplitude": amplitude}
+        return Hidden(
+            "sensor_ripple",
+            "sensor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            truth,
+            variant="motor angle" if geared else "joint angle",
+        )
+
+    return sized
+
+
+def _motor_late(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    def sized(size: float) -> Hidden:
+        late = min(0.04, 4e-3 * size)
+        setting = Setting(faults={"motor_late": every([late] * JOINTS)})
+        return Hidden("motor_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
+
+    return sized
+
+
+def _joint_late(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    def sized(size: float) -> Hidden:
+        late = min(0.04, 4e-3 * size)
+        setting = Setting(faults={"late": every([late] * JOINTS)})
+        return Hidden("joint_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
+
+    return sized
+
+
+def _held(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    what, every_s = str(random.choice(("packet", "torque"))), random.uniform(0.4, 1.5)
+
+    def sized(size: float) -> Hidden:
+        held = {"every_s": every_s, "length_s": min(0.2, 0.05 * size), "what": what}
+        return Hidden("lost_samples", "timing", (), size, _everywhere(Setting(held=held)), variant=what)
+
+    return sized
+
+
+# -- outside the catalogue -------------------------------------------------------------------------------------
+
+
+def _other(random: Random, joint: int) -> int:
+    return int(random.choice([other for other in range(1, JOINTS + 1) if other != joint]))
+
+
+def _other_friction(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    other, phase = _other(random, joint), random.uniform(-math.pi, math.pi)
+
+    def sized(size: float) -> Hidden:
+        share = min(0.6, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        setting = _trait(joint, other_friction=share, other=float(other), other_phase=phase)
+        depends = (f"qd{joint}", f"q{other}")
+        return Hidden(
+            "friction by a neighbour's angle",
+            "motor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            depends_on=depends,
+        )
+
+    return sized
+
+
+def _other_drag(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    other, sign = _other(random, joint), _sign(random)
+
+    def sized(size: float) -> Hidden:
+        drag = sign * size * 3.0 * MOTOR_NOISE[joint - 1]
+        setting = _trait(joint, other_drag=drag, other=float(other))
+        return Hidden(
+            "drag by a neighbour's speed",
+            "motor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            depends_on=(f"qd{other}",),
+        )
+
+    return sized
+
+
+def _memory(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    past_s, sign = random.uniform(0.5, 2.0), _sign(random)
+
+    def sized(size: float) -> Hidden:
+        drag = sign * size * 4.0 * MOTOR_NOISE[joint - 1]
+        setting = _trait(joint, memory=drag, memory_time=past_s)
+        return Hidden(
+            "drag by past speed",
+            "motor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            depends_on=(f"qd{joint}", "history"),
+        )
+
+    return sized
+
+
+def _inertial(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    def sized(size: float) -> Hidden:
+        share = min(1.0, size * 2.5 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        setting = _trait(joint, inertial_friction=share)
+        return Hidden(
+            "friction by acceleration",
+            "motor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            depends_on=(f"qd{joint}", f"qdd{joint}"),
+        )
+
+    return sized
+
+
+def _shake(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    # Not a multiple of the excitation's base frequency, so it differs from period to period.
+    rate = random.uniform(0.6, 4.0)
+
+    def sized(size: float) -> Hidden:
+        setting = _trait(joint, shake=size * 1.5 * MOTOR_NOISE[joint - 1], shake_hz=rate)
+        return Hidden(
+            "shaking from outside", "motor", (joint,), size, _everywhere(setting), depends_on=("time",)
+        )
+
+    return sized
+
+
+def _bent_sensor(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    other, phase = _other(random, joint), random.uniform(-math.pi, math.pi)
+
+    def sized(size: float) -> Hidden:
+        scale = size * 4.0 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1]
+        setting = _fault(joint, other=float(other), other_scale=scale, other_phase=phase)
+        return Hidden(
+            "sensor scale by a neighbour's angle",
+            "sensor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            depends_on=(f"q{other}", f"tau{joint}"),
+        )
+
+    return sized
+
+
+def _dead_current(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    def sized(size: float) -> Hidden:
+        dead = min(COULOMB[joint - 1], size * 6.0 * MOTOR_NOISE[joint - 1])
+        setting = _fault(joint, motor_dead=dead)
+        return Hidden(
+            "small currents not reported",
+            "motor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            depends_on=(f"tau{joint}",),
+        )
+
+    return sized
+
+
+_ARM = (0,)
+_LOADED = (2, 3, 4)
+
+CAUSES: Mapping[str, Cause] = {
+    cause.name: cause
+    for cause in (
+        Cause("stribeck", "motor", _stribeck),
+        Cause("viscous_nonlinear", "motor", _viscous),
+        Cause("friction_asymmetry", "motor", _asymmetry, absorbed=True),
+        Cause("friction_load", "motor", _load),
+        Cause("friction_temperature", "motor", _temperature),
+        Cause("friction_position", "motor", _position),
+        Cause("presliding_hysteresis", "motor", _presliding),
+        Cause("gear_ripple", "motor", _gear_ripple),
+        Cause("motor_torque_gain", "motor", _motor_gain, absorbed=True),
+        Cause("backlash", "joint", _backlash, encoder="motor"),
+        Cause("joint_elasticity", "joint", _elasticity, joints=(1, 2, 3, 4, 5), encoder="motor"),
+        Cause("cable_spring", "joint", _cable),
+        Cause("base_tilt", "joint", _tilt, _ARM),
+        Cause("payload_error", "joint", _payload_error, _ARM, absorbed=True),
+        Cause("payload_change", "joint", _payload_change, _ARM),
+        Cause("joint_zero_offset", "joint", _zero, joints=(2, 3, 4, 5, 6, 7), absorbed=True),
+        Cause("contact", "joint", _contact, _ARM),
+        Cause("sensor_gain", "sensor", _sensor_gain, absorbed=True),
+        Cause("sensor_crosstalk", "sensor", _crosstalk),
+        Cause("sensor_hysteresis", "sensor", _hysteresis),
+        Cause("sensor_saturation", "sensor", _saturation),
+        Cause("sensor_offset_drift", "sensor", _drift),
+        Cause("sensor_ripple", "sensor", _sensor_ripple),
+        Cause("motor_torque_delay", "timing", _motor_late, _ARM, absorbed=True),
+        Cause("joint_torque_delay", "timing", _joint_late, _ARM),
+        Cause("lost_samples", "timing", _held, _ARM),
+    )
+}
+"""Causes of the catalogue by name."""
+
+CATALOGUE = frozenset(CAUSES)
+
+OUTSIDE: Mapping[str, Cause] = {
+    cause.name: cause
+    for cause in (
+        Cause("friction by a neighbour's angle", "motor", _other_friction),
+        Cause("drag by a neighbour's speed", "motor", _other_drag),
+        Cause("drag by past speed", "motor", _memory),
+        Cause("friction by acceleration", "motor", _inertial),
+        Cause("shaking from outside", "motor", _shake),
+        Cause("sensor scale by a neighbour's angle", "sensor", _bent_sensor, joints=_LOADED),
+        Cause("small currents not reported", "motor", _dead_current),
+    )
+}
+"""Causes that no catalogue has."""
