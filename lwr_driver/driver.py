@@ -40,7 +40,7 @@ from fri.errors import (
 from fri.states import Quality
 from lwr_driver.arm import Arm
 from lwr_driver.commander import BRAKE, HOLD
-from lwr_driver.control import Control, Job, Mode, Result, Text, Word
+from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
 from lwr_driver.link import (
     LinkSettings,
     advise_command,
@@ -170,6 +170,12 @@ class Driver:
     def port(self) -> int:
         """UDP port on which the loop listens."""
         return self._need(self._loop).port
+
+    @property
+    def ring_name(self) -> str:
+        """Name of the shared memory with every cycle, for onlookers (`Ring.attach`, `Ring.peek`)."""
+        name: str = self._need(self._ring).name
+        return name
 
     def close(self) -> None:
         """Stop, leave command mode, end the session and both processes. Safe at any time and repeatedly."""
@@ -339,6 +345,18 @@ class Driver:
         """Snapshot of the link at this moment; never waits."""
         control, ring = self._need(self._control), self._need(self._ring)
         return snapshot(control, time.monotonic_ns(), ring.overruns)
+
+    def last_rows(self, count: int = ROWS_KEPT) -> NDArray[Any]:
+        """Copy of the last cycles, at most `count` and 64, oldest first, dtype `lwr_driver.ring.ROW`."""
+        return self._rows(count)
+
+    def latency_histogram(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Reply latencies since the connection began: upper edges of the bins [s] and counts; the last bin
+        holds all that is longer.
+        """
+        counts = self._need(self._control).latency.copy()
+        edges = np.arange(1, len(counts) + 1, dtype=np.float64) * (BIN_NS * 1e-9)
+        return edges, counts
 
     # -- recording -------------------------------------------------------------------------------------------
 

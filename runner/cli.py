@@ -18,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 __all__ = ["main"]
 
 VERBS = {
+    "doctor": "is this computer ready, and the link, and the controller?",
     "experiment": "plan, drive, log, swap the payload, estimate: the whole chain",
     "check": "dry run of an experiment file: every check, no motion",
     "emulator": "run the emulated controller and arm until interrupted",

@@ -1,0 +1,222 @@
+"""What this computer brings to the link: address, port, real-time rights, kernel, clock, disk, versions."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import platform
+import shutil
+import socket
+import struct
+import textwrap
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from fri.errors import LwrError, NetworkError, RefusedError
+from lwr_driver.realtime import assess
+from runner.versions import versions
+
+__all__ = ["Finding", "Interface", "Verdict", "examine_computer", "find_interface"]
+
+Verdict = Literal["ok", "advice", "fail"]
+
+LEAST_DISK_MB = 2000.0
+_SIOCGIFADDR = 0x8915
+_NET = Path("/sys/class/net")
+_GOOD_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter")
+_CLOCK_UNSYNCHRONISED = 5
+_TIMEX_BYTES = 256
+_MARKS = {"ok": "ok  ", "advice": "note", "fail": "FAIL"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at: what was found, what is wanted, and what to do.
+
+    who : the error that a failure stands for, by who must act; it gives the exit code
+    """
+
+    subject: str
+    value: str
+    limit: str
+    verdict: Verdict
+    advice: str = ""
+    who: type[LwrError] = RefusedError
+
+    def __str__(self) -> str:
+        text = f"{_MARKS[self.verdict]} {self.subject:<22} {self.value:<44} {self.limit}".rstrip()
+        if self.verdict == "ok" or not self.advice:
+            return text
+        lines = textwrap.wrap(self.advice, 100, break_long_words=False, break_on_hyphens=False)
+        return "\n".join([text, f"     → {lines[0]}", *(f"       {line}" for line in lines[1:])])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        content = asdict(self)
+        content.pop("who")
+        return content | {"exit_code": self.who.exit_code if self.verdict == "fail" else 0}
+
+
+@dataclass(frozen=True)
+class Interface:
+    """A network interface by name, and the counters that the kernel keeps of it."""
+
+    name: str
+
+    def read(self, what: str) -> str:
+        """Content of a file of the interface (`operstate`, `statistics/rx_packets`), empty if unreadable."""
+        with contextlib.suppress(OSError):
+            return (_NET / self.name / what).read_text().strip()
+        return ""
+
+    @property
+    def received(self) -> int:
+        """Packets received since the start of the computer."""
+        return int(self.read("statistics/rx_packets") or 0)
+
+
+def find_interface(address: str) -> Interface | None:
+    """The interface that carries the IPv4 address, None if none does."""
+    wanted = socket.inet_aton(address)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
+            with contextlib.suppress(OSError):
+                request = struct.pack("256s", name.encode()[:15])
+                if fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, request)[20:24] == wanted:
+                    return Interface(name)
+    return None
+
+
+def examine_computer(address: str, port: int, folder: Path, *, realtime: bool) -> list[Finding]:
+    """Look at everything that needs no controller.
+
+    address, port : where the PC's end listens. folder : where the logs go
+    realtime : whether real-time rights are needed, as they are for a real arm
+    """
+    return [
+        _interface(address),
+        _port(address, port),
+        *_rights(needed=realtime),
+        _processors(),
+        _clock_source(),
+        _clock_time(),
+        _disk(folder),
+        _versions(),
+    ]
+
+
+def _interface(address: str) -> Finding:
+    found = find_interface(address)
+    if found is None:
+        known = ", ".join(name for _, name in socket.if_nameindex())
+        return Finding(
+            "interface",
+            f"none has {address}",
+            "one",
+            "fail",
+            f"set `link.address` to an address of this computer, or give the network card this one: "
+            f"sudo ip address add {address}/24 dev CARD (CARD of {known})",
+            NetworkError,
+        )
+    state, errors = found.read("operstate"), int(found.read("statistics/rx_errors") or 0)
+    speed = found.read("speed")
+    shown = f"{address} on {found.name}, {state}" + (f", {speed} Mbit/s" if speed.isdigit() else "")
+    if state not in ("up", "unknown"):
+        advice = "plug the cable in; the controller must be switched on"
+        return Finding("interface", shown, "up", "fail", advice, NetworkError)
+    if errors:
+        advice = "change the cable or the card if the number rises"
+        return Finding("interface", f"{shown}, {errors} receive errors", "up, 0 errors", "advice", advice)
+    return Finding("interface", shown, "up", "ok")
+
+
+def _port(address: str, port: int) -> Finding:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, port))
+        except OSError as error:
+            advice = (
+                f"end the other FRI client (`sudo ss -lunp | grep {port}` names it), or choose another port"
+            )
+            value = f"UDP {address}:{port}: {error.strerror}"
+            return Finding("port", value, "free", "fail", advice, NetworkError)
+    return Finding("port", f"UDP {address}:{port}", "free", "ok")
+
+
+def _rights(*, needed: bool) -> list[Finding]:
+    rights = assess()
+    found = [
+        Finding("real-time rights", lack.what, "granted", "fail", lack.remedy, NetworkError)
+        if needed
+        else Finding("real-time rights", lack.what, "for a real arm", "advice", lack.remedy)
+        for lack in rights.missing
+    ]
+    if rights.ok:
+        found.append(Finding("real-time rights", "SCHED_FIFO and locked memory granted", "granted", "ok"))
+    kernel = [advice for advice in rights.advice if advice.what.startswith("kernel")]
+    if kernel:
+        found.append(Finding("kernel", kernel[0].what, "PREEMPT_RT for 1 ms", "advice", kernel[0].remedy))
+    else:
+        found.append(Finding("kernel", f"{platform.release()}, PREEMPT_RT", "PREEMPT_RT for 1 ms", "ok"))
+    return found
+
+
+def _processors() -> Finding:
+    count = len(os.sched_getaffinity(0))
+    governors = set()
+    for path in Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"):
+        with contextlib.suppress(OSError):
+            governors.add(path.read_text().strip())
+    value = f"{count}" + (f", governor {'/'.join(sorted(governors))}" if governors else "")
+    if count < 2:
+        return Finding("processors", value, "2", "advice", "the loop shares one with everything else")
+    if governors - {"performance"}:
+        return Finding(
+            "processors", value, "performance", "advice", "sudo cpupower frequency-set -g performance"
+        )
+    return Finding("processors", value, "2", "ok")
+
+
+def _clock_source() -> Finding:
+    path = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    try:
+        source = path.read_text().strip()
+    except OSError:
+        return Finding("clock source", "unknown", "a fast one", "advice", f"{path} cannot be read")
+    if source not in _GOOD_CLOCKS:
+        advice = "reading it takes microseconds; see the kernel's messages for why tsc was given up"
+        return Finding("clock source", source, "tsc", "advice", advice)
+    return Finding("clock source", source, "tsc or as good", "ok")
+
+
+def _clock_time() -> Finding:
+    """Whether the clock is kept right; the logs carry its time. Measurements do not depend on it."""
+    status = -1
+    with contextlib.suppress(OSError, AttributeError):
+        status = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
+    if status < 0 or status == _CLOCK_UNSYNCHRONISED:
+        advice = "the dates in the logs may be wrong; sudo timedatectl set-ntp true"
+        return Finding("clock", "not synchronised", "synchronised", "advice", advice)
+    return Finding("clock", "synchronised", "synchronised", "ok")
+
+
+def _disk(folder: Path) -> Finding:
+    place = folder.resolve()
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free / 1e6
+    if free < LEAST_DISK_MB:
+        return Finding(
+            "disk", f"{free:.0f} MB free at {place}", f"{LEAST_DISK_MB:.0f} MB", "fail", "make room"
+        )
+    return Finding("disk", f"{free / 1000:.0f} GB free at {place}", f"{LEAST_DISK_MB / 1000:.0f} GB", "ok")
+
+
+def _versions() -> Finding:
+    found = versions()
+    names = ("python", "numpy", "pin")
+    text = ", ".join([found["software"], *(f"{name} {found[name]}" for name in names)])
+    return Finding("versions", text, "", "ok")

@@ -1,0 +1,351 @@
+"""The doctor: is this computer ready, and the link, and the controller? Each item with limit and advice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fri.errors import LwrError, NetworkError, RobotError
+from fri.handshake import IdentificationHandshake, find_handshake
+from fri.packets import MSR_ID, MSR_SIZE
+from fri.states import ALL_DRIVES
+from lwr_driver.arm import Arm
+from lwr_driver.driver import Driver, LinkSettings, LinkState
+from lwr_driver.link import advise_quality
+from runner.computer import Finding, Verdict, examine_computer, find_interface
+from runner.link_test import Heard, LinkTest, exercise, listen
+
+__all__ = ["Examination", "Patient", "examine", "judge_heard", "judge_link"]
+
+GOOD_SHARE = 0.99
+POOR_SHARE = 0.95
+WARM = 60.0
+# Upper edges of the printed histogram [us].
+_STEPS = (20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
+_BAR = 40
+_QUANTILES = (0.5, 0.99, 0.999)
+_RANKS = ("UNACCEPTABLE", "BAD", "OK", "PERFECT")
+
+
+@dataclass(frozen=True)
+class Patient:
+    """What is examined: this computer's end of the link, and what is expected at the other.
+
+    counter_int : number of `$FRI_TO_INT` that counts fresh motor torques, None where none are expected
+    realtime : whether real-time rights are needed
+    """
+
+    arm: Arm
+    address: str
+    port: int
+    controller: str | None = None
+    handshake: str = "lwr_identification"
+    counter_int: int | None = None
+    folder: Path = Path("experiments")
+    realtime: bool = True
+
+
+@dataclass(frozen=True)
+class Examination:
+    """All findings, and the link test if there was one."""
+
+    findings: tuple[Finding, ...]
+    link: LinkTest | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0 if nothing failed, else that of the first failure."""
+        return next((f.who.exit_code for f in self.findings if f.verdict == "fail"), 0)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        failed = [f.subject for f in self.findings if f.verdict == "fail"]
+        noted = [f.subject for f in self.findings if f.verdict == "advice"]
+        if failed:
+            return f"Not ready: {', '.join(failed)}."
+        return "Ready." if not noted else f"Ready. Better with: {', '.join(noted)}."
+
+    def __str__(self) -> str:
+        lines = [str(finding) for finding in self.findings]
+        if self.link is not None and self.link.counts.sum():
+            lines += ["", "time from packet to answer", *_histogram(self.link)]
+        return "\n".join([*lines, "", self.verdict])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        content: dict[str, Any] = {
+            "ready": self.exit_code == 0,
+            "exit_code": self.exit_code,
+            "verdict": self.verdict,
+            "findings": [finding.to_dict() for finding in self.findings],
+        }
+        if self.link is not None:
+            content["link"] = {
+                "seconds": self.link.seconds,
+                "packets": self.link.packets,
+                "rate_hz": self.link.rate_hz,
+                "period_s": self.link.end.period_s,
+                "answered_in_time": self.link.in_time,
+                "latency_s": {
+                    f"p{100 * q:g}": value if np.isfinite(value) else None
+                    for q, value in _quantiles(self.link).items()
+                },
+                "histogram": {
+                    "upper_edges_s": self.link.edges[self.link.counts > 0].tolist(),
+                    "counts": self.link.counts[self.link.counts > 0].tolist(),
+                },
+            }
+        return content
+
+
+def examine(
+    patient: Patient,
+    *,
+    link_s: float | None = None,
+    wait_s: float = 20.0,
+    report: Callable[[str, float, str], None] | None = None,
+) -> Examination:
+    """Examine the computer, and with `link_s` the link for so long.
+
+    wait_s : longest wait for the first packet. report : told what goes on: heading, share done, detail
+    """
+    findings = examine_computer(patient.address, patient.port, patient.folder, realtime=patient.realtime)
+    if link_s is None or any(f.verdict == "fail" and f.subject in ("interface", "port") for f in findings):
+        return Examination(tuple(findings))
+    tell = report or (lambda heading, share, detail: None)
+    interface = find_interface(patient.address)
+    before = interface.received if interface else 0
+
+    def waiting(seconds: float, heard: Heard) -> None:
+        advice = "Start the KRL program at the pendant"
+        tell("waiting for the controller", seconds / wait_s, f"{seconds:.0f} s; heard: {heard}. {advice}")
+
+    heard = listen(patient.address, patient.port, patient.controller, wait_s, waiting)
+    traffic = (interface.received if interface else 0) - before
+    findings += judge_heard(patient, heard, traffic)
+    if findings[-1].verdict == "fail":
+        return Examination(tuple(findings))
+
+    def testing(seconds: float, state: LinkState) -> None:
+        tell("testing the link", seconds / link_s, f"{state.state} {state.quality}, {state.late} late")
+
+    settings = LinkSettings(
+        address=patient.address,
+        port=patient.port,
+        controller=patient.controller,
+        handshake=patient.handshake,
+        realtime="allow",
+    )
+    with Driver(patient.arm, settings) as driver:
+        try:
+            driver.connect(timeout_s=wait_s)
+        except LwrError as error:
+            findings.append(Finding("packets", "stopped", "go on", "fail", str(error), type(error)))
+            return Examination(tuple(findings))
+        link = exercise(driver, link_s, counter_int=patient.counter_int, report=testing)
+    return Examination((*findings, *judge_link(patient, link)), link)
+
+
+def judge_heard(patient: Patient, heard: Heard, traffic: int) -> list[Finding]:
+    """What came to the port. traffic : packets that the interface received meanwhile, for whatever port."""
+    place = f"UDP {patient.address}:{patient.port}"
+    wanted = f"{MSR_SIZE} bytes, id 0x{MSR_ID:04x}"
+    if not heard.kinds:
+        seen = f"none on {place} in {heard.waited_s:.1f} s"
+        return [Finding("packets", seen, wanted, "fail", _start_advice(patient, traffic), NetworkError)]
+    if not heard.fri:
+        advice = (
+            "what sends there is not FRI 1.0 of a KR C2 lr (an LBR iiwa speaks another protocol); check "
+            "which software runs on the controller, and that nothing else uses the port"
+        )
+        return [Finding("packets", str(heard), wanted, "fail", advice, NetworkError)]
+    if patient.controller is not None and patient.controller not in heard.fri:
+        advice = f"set `link.controller` to {heard.fri[0]}, or find out who that is"
+        value = f"FRI from {', '.join(heard.fri)}"
+        return [Finding("packets", value, f"from {patient.controller}", "fail", advice, NetworkError)]
+    if patient.controller is None and len(heard.fri) > 1:
+        advice = "name the one that is meant in `link.controller`"
+        return [Finding("packets", f"FRI from {', '.join(heard.fri)}", "one", "fail", advice, NetworkError)]
+    return [Finding("packets", f"{MSR_SIZE} bytes, id 0x{MSR_ID:04x} from {heard.fri[0]}", wanted, "ok")]
+
+
+def _start_advice(patient: Patient, traffic: int) -> str:
+    steps = (
+        f"At the pendant: select and start the KRL program (`{patient.handshake}`); in T1 hold an "
+        "enabling switch and the start key until friOpen is passed. In it, or in dlrrc.ini, the host must be "
+        f"{patient.address} and the port {patient.port}."
+    )
+    if traffic == 0:
+        return (
+            f"{steps} The interface has received nothing at all meanwhile: check cable and FRI network card"
+        )
+    return (
+        f"{steps} The interface has received {traffic} other packets meanwhile: check host and port on the "
+        f"controller, and the firewall (sudo ufw allow {patient.port}/udp)"
+    )
+
+
+def judge_link(patient: Patient, link: LinkTest) -> list[Finding]:
+    """The test of the link, item by item."""
+    if link.trouble is not None and not link.packets:
+        return [Finding("packets", "stopped", "go on", "fail", str(link.trouble), NetworkError)]
+    return [
+        _rate(link),
+        _losses(link),
+        _replies(link),
+        _in_time(link),
+        _quality(link),
+        *_robot(link.end),
+        *_program(patient, link),
+    ]
+
+
+def _rate(link: LinkTest) -> Finding:
+    expected = 1.0 / link.end.period_s
+    value = f"{link.rate_hz:.1f} packets/s at a cycle of {1000 * link.end.period_s:g} ms"
+    if abs(link.rate_hz - expected) > 0.05 * expected:
+        advice = "packets are lost, or the controller does not keep its cycle; check cable and network card"
+        return Finding("rate", value, f"{expected:.1f} ± 5 %", "fail", advice, NetworkError)
+    return Finding("rate", value, f"{expected:.1f} ± 5 %", "ok")
+
+
+def _losses(link: LinkTest) -> Finding:
+    names = ("lost", "repeated", "reordered", "malformed", "foreign")
+    counts = {name: link.between(name) for name in names}
+    value = ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "none"
+    limit = "none lost or damaged"
+    if counts["lost"] > (1.0 - GOOD_SHARE) * link.packets or counts["malformed"]:
+        advice = "change the cable, use a network card of its own and no switch in between"
+        return Finding("losses", value, limit, "fail", advice, NetworkError)
+    if any(counts.values()):
+        return Finding("losses", value, limit, "advice", "one cable, no switch, nothing else on the card")
+    return Finding("losses", value, limit, "ok")
+
+
+def _quantiles(link: LinkTest) -> dict[float, float]:
+    """Quantiles of the reply latency and its maximum (key 1.0) [s], infinite beyond the histogram; empty
+    without answers.
+    """
+    total = int(link.counts.sum())
+    if total == 0:
+        return {}
+    cumulated = np.cumsum(link.counts)
+    places = [int(np.searchsorted(cumulated, max(1.0, np.ceil(q * total)))) for q in (*_QUANTILES, 1.0)]
+    ends = np.append(link.edges[:-1], np.inf)
+    return {q: float(ends[place]) for q, place in zip((*_QUANTILES, 1.0), places, strict=True)}
+
+
+def _replies(link: LinkTest) -> Finding:
+    found = _quantiles(link)
+    half = 0.5 * link.end.period_s
+    if not found:
+        return Finding("reply", "no answer left", "each packet", "fail", "see the losses", NetworkError)
+    words = {q: "over 2000" if np.isinf(value) else f"{1e6 * value:.0f}" for q, value in found.items()}
+    shown = ", ".join(f"p{100 * q:g} {words[q]}" for q in _QUANTILES) + f", longest {words[1.0]} µs"
+    limit = f"p99 below {1e6 * half:.0f} µs"
+    advice = "close other programs, see the real-time rights and the kernel, or choose a longer cycle"
+    if np.isinf(found[0.99]) and half > float(link.edges[-1]):
+        return Finding("reply", shown, limit, "advice", advice)
+    if found[0.99] > half:
+        return Finding("reply", shown, limit, "fail", advice, NetworkError)
+    return Finding("reply", shown, limit, "ok")
+
+
+def _in_time(link: LinkTest) -> Finding:
+    value = f"{100 * link.in_time:.3f} % of {link.packets} cycles"
+    limit = f"{100 * GOOD_SHARE:g} %"
+    if link.in_time < POOR_SHARE:
+        advice = "this set-up is not sufficient for command mode; see reply and losses"
+        return Finding("answered in time", value, limit, "fail", advice, NetworkError)
+    if link.in_time < GOOD_SHARE:
+        advice = "command mode would be lost now and then; take a longer cycle or a real-time kernel"
+        return Finding("answered in time", value, limit, "advice", advice)
+    return Finding("answered in time", value, limit, "ok")
+
+
+def _quality(link: LinkTest) -> Finding:
+    end = link.end
+    value = (
+        f"{end.quality}, worst {link.worst_quality}, answer rate {end.answer_rate:.3f}, latency "
+        f"{1000 * end.controller_latency_s:.2f} ms, jitter {1000 * end.jitter_s:.2f} ms"
+    )
+    if _RANKS.index(end.quality) < _RANKS.index("OK"):
+        return Finding("quality", value, "OK", "fail", advise_quality(end), NetworkError)
+    if _RANKS.index(link.worst_quality) < _RANKS.index("OK"):
+        advice = "command mode needs it without interruption; see reply and losses"
+        return Finding("quality", value, "OK throughout", "advice", advice)
+    return Finding("quality", value, "OK", "ok")
+
+
+def _robot(state: LinkState) -> list[Finding]:
+    found = [Finding("state", f"{state.state}, control {state.control}", "MON", "ok")]
+    if state.control != "POSITION":
+        advice = "$STIFFNESS.STRATEGY=10; the KRL programs do so when command mode is asked for"
+        found[0] = Finding("state", f"{state.state}, control {state.control}", "POSITION", "advice", advice)
+    bits = f"power 0x{state.power:02x}, error 0x{state.error:02x}, warning 0x{state.warning:02x}"
+    if state.error:
+        advice = "acknowledge the messages at the pendant"
+        found.append(Finding("drives", bits, "no error", "fail", advice, RobotError))
+    elif state.power != ALL_DRIVES:
+        found.append(
+            Finding("drives", bits, "0x7f to move", "advice", "switch the drives on before a motion")
+        )
+    else:
+        found.append(Finding("drives", bits, "0x7f to move", "ok"))
+    hottest = float(np.max(state.temperature))
+    verdict: Verdict = "advice" if hottest > WARM else "ok"
+    advice = "friction changes with temperature; let the arm rest, or warm it up to the same point each time"
+    found.append(Finding("temperature", f"at most {hottest:.0f} °C", f"{WARM:.0f} °C", verdict, advice))
+    return found
+
+
+def _program(patient: Patient, link: LinkTest) -> list[Finding]:
+    """Whether the KRL program that is expected runs, what load it compensates, what it publishes."""
+    handshake = find_handshake(patient.handshake)
+    found = [Finding("KRL program", f"{handshake.name} takes requests", handshake.name, "ok")]
+    if not handshake.opened(link.msr):
+        advice = (
+            "another program runs, or it waits at a message: look at the pendant, and set `link.handshake` "
+            "to the program"
+        )
+        value = f"$FRI_TO_INT = {np.trim_zeros(link.msr['krl_int'], 'b').tolist()}"
+        found[0] = Finding("KRL program", value, handshake.name, "fail", advice, RobotError)
+    elif isinstance(handshake, IdentificationHandshake):
+        mass, *centre = handshake.load(link.msr).tolist()
+        text = f"{mass:.3f} kg at ({', '.join(f'{value:.0f}' for value in centre)}) mm from the flange"
+        found.append(Finding("load data", text, "as mounted", "ok"))
+    if link.fresh is None:
+        return found
+    rate = link.fresh / link.seconds if link.seconds > 0.0 else 0.0
+    value = f"{rate:.1f} new values/s"
+    if link.fresh <= 0:
+        advice = (
+            "the KRL program does not count them; check `motor_torque.krl.counter_int`, or set "
+            "`motor_torque.source` to none (Model 1)"
+        )
+        found.append(Finding("motor torques", value, "above 20/s", "fail", advice, RobotError))
+    elif rate < 20.0:
+        advice = "they will bound the bandwidth of Models 2 and 3; shorten the loop of the KRL program"
+        found.append(Finding("motor torques", value, "above 20/s", "advice", advice))
+    else:
+        found.append(Finding("motor torques", value, "above 20/s", "ok"))
+    return found
+
+
+def _histogram(link: LinkTest) -> list[str]:
+    edges = np.array([*_STEPS, np.inf])
+    places = np.searchsorted(edges, 1e6 * link.edges - 1e-6)
+    places[-1] = len(edges) - 1
+    sums = np.bincount(places, weights=link.counts, minlength=len(edges))
+    total = sums.sum()
+    lines = []
+    for place, count in enumerate(sums.tolist()):
+        name = f"to {edges[place]:.0f} µs" if np.isfinite(edges[place]) else f"over {_STEPS[-1]:.0f} µs"
+        bar = "█" * round(_BAR * count / total)
+        lines.append(f"  {name:>13} {int(count):>8} {100 * count / total:7.3f} %  {bar}".rstrip())
+    return lines
