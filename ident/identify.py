@@ -235,7 +235,7 @@ class Identification:
             f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base",
         ]
         for session, payload in zip(self.prepared, self.payloads, strict=True):
-            delay = f", motor channel late by {session.delay}" if session.delay is not None else ""
+            delay = f", motor channel {session.delay}" if session.delay is not None else ""
             lines.append(
                 f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
                 f"{session.counts['lost']} samples lost{delay}"
@@ -414,6 +414,7 @@ def _payload_warnings(
     estimate: Estimate,
     structure: ModelStructure,
 ) -> list[str]:
+    """What the estimated mass of each payload says. DataError where it contradicts the announcement."""
     found = []
     if structure.payloads and None not in payloads:
         found.append(
@@ -428,24 +429,42 @@ def _payload_warnings(
             continue
         place = base.names.index(name)
         mass, std = float(estimate.values[place]), float(estimate.std[place])
-        masses = {
-            s.metadata.get("payload_mass", "")
-            for s, p in zip(sessions, payloads, strict=True)
-            if p == payload
-        }
-        stated = [float(m) for m in masses if m]
-        if mass < 3.0 * std:
-            found.append(
-                f"payload {payload!r}: the estimated mass {mass:.3f} ± {std:.3f} kg is not above zero; it "
-                "was announced but not mounted, or mounted in the unloaded session too: correct the "
-                "metadata or repeat the session"
+        carriers = [s for s, p in zip(sessions, payloads, strict=True) if p == payload]
+        stated = next((m for m in map(_stated_mass, carriers) if m is not None), None)
+        estimated = f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg"
+        absent = mass < 3.0 * std if stated is None else mass + 3.0 * std < 0.5 * stated
+        if absent:
+            names = ", ".join(s.path.name for s in carriers)
+            bare = ", ".join(s.path.name for s, p in zip(sessions, payloads, strict=True) if p is None)
+            doubt = (
+                f"the payloads of {names} and {bare} are interchanged"
+                if bare and mass < -3.0 * std
+                else f"it was not mounted in {names}, or it was mounted in {bare or 'all sessions'} as well"
             )
-        elif stated and abs(mass - stated[0]) > max(0.1 * stated[0], 3.0 * std):
+            raise DataError(
+                f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; say "
+                "what was mounted (`--payload FILE=NAME`, `none` for the bare arm) or record the session again"
+            )
+        if stated is not None and abs(mass - stated) > max(0.1 * stated, 3.0 * std):
             found.append(
-                f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg against {stated[0]:.3f} kg "
-                "stated; check what was mounted, and the torque sensors' gain"
+                f"{estimated} against {stated:.3f} kg stated; check what was mounted, and the torque "
+                "sensors' gain"
+            )
+        elif mass < 3.0 * std:
+            found.append(
+                f"{estimated} is not above zero; the motion says too little about so light a payload"
             )
     return found
+
+
+def _stated_mass(session: Session) -> float | None:
+    stated = session.metadata.get("payload_mass", "")
+    try:
+        return float(stated) if stated else None
+    except ValueError as error:
+        raise DataError(
+            f"{session.path.name}: `payload_mass` {stated!r} in the metadata is no number"
+        ) from error
 
 
 def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:

@@ -56,9 +56,8 @@ class Delay:
     disagreement: float = 1.0
 
     def __str__(self) -> str:
-        if self.std > 0:
-            return f"{1e3 * self.seconds:.2f} ms ± {1e3 * self.std:.2f} ms ({self.how})"
-        return f"{1e3 * self.seconds:.2f} ms ({self.how})"
+        size = f"{'late' if self.seconds >= 0 else 'early'} by {1e3 * abs(self.seconds):.2f} ms"
+        return f"{size} ± {1e3 * self.std:.2f} ms ({self.how})" if self.std > 0 else f"{size} ({self.how})"
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def estimate_delay(
         quiet = [part for part in quiet if part.moving.sum() >= 16]
         if quiet:
             delay = _refined(quiet, joint_names, delay.seconds, search_s, "rows between reversals")
-    logger.info("motor channel: delay %s", delay)
+    logger.info("motor channel %s", delay)
     return delay
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -13,7 +14,7 @@ from ident.kinematics import Chain
 from ident.model_file import write_model
 from ident.mounting import find_mounting
 from ident.signals.settings import SignalSettings
-from lwr_driver.session import read_session
+from lwr_driver.session import Session, read_session
 from runner.results import identified_model
 
 
@@ -30,6 +31,13 @@ from runner.results import identified_model
 @click.option(
     "--without", multiple=True, metavar="NAME", help="Leave out a parameter (offm3) or a kind (Fvl)."
 )
+@click.option(
+    "--payload",
+    "mounted",
+    multiple=True,
+    metavar="FILE=NAME",
+    help="What hung on the arm (`none`: nothing) in a session whose metadata are wrong; repeatable.",
+)
 @click.option("--cutoff-hz", default=10.0, show_default=True, help="Low-pass on the positions.")
 @click.option("--decimate-hz", default=2.0, show_default=True, help="Low-pass of the parallel decimation.")
 @click.option("--choose-cutoff", is_flag=True, help="Take the cut-off from the spectrum of the positions.")
@@ -45,6 +53,7 @@ def command(
     model: int,
     estimator: str,
     without: tuple[str, ...],
+    mounted: tuple[str, ...],
     cutoff_hz: float,
     decimate_hz: float,
     choose_cutoff: bool,
@@ -63,8 +72,9 @@ def command(
     lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
     lwr-run identify unloaded.mcap --model 1 --estimator huber
     lwr-run identify short.mcap --model 1 --estimator physical --tilt
+    lwr-run identify a.mcap b.mcap --payload b.mcap=gripper
     """
-    logs = [read_session(path) for path in sessions]
+    logs = _with_payloads([read_session(path) for path in sessions], mounted)
     if urdf is None and logs[0].robot_description is None:
         raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
     chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
@@ -89,3 +99,18 @@ def command(
     if out is not None:
         write_model(identified_model(found, logs[0].metadata.get("robot", "arm")), out)
         click.echo(str(out), err=as_json)
+
+
+def _with_payloads(logs: list[Session], mounted: tuple[str, ...]) -> list[Session]:
+    """The sessions with the payloads that the user names in place of those of the metadata."""
+    corrected = list(logs)
+    for entry in mounted:
+        file, equals, name = entry.rpartition("=")
+        places = [k for k, log in enumerate(logs) if file in (str(log.path), log.path.name)]
+        if not equals or not name or len(places) != 1:
+            names = ", ".join(log.path.name for log in logs)
+            raise ConfigurationError(f"--payload {entry!r}: write FILE=NAME with one of the files {names}")
+        log = logs[places[0]]
+        metadata = {key: value for key, value in log.metadata.items() if key != "payload_mass"}
+        corrected[places[0]] = replace(log, metadata=metadata | {"payload": name})
+    return corrected

@@ -210,14 +210,40 @@ def test_a_joint_that_never_moves_is_named():
         identify(still, arm.chain(), IdentificationSettings(model=1))
 
 
-def test_a_payload_that_was_announced_but_not_mounted_is_noticed():
-    bare = sessions()[0]
-    claimed = dataclasses.replace(
-        arm.session(seed=9, sensors=NOISY),
-        metadata={**bare.metadata, "payload": "payload", "payload_mass": "3.28"},
+def named(session, payload, mass=""):
+    return dataclasses.replace(
+        session, metadata={**session.metadata, "payload": payload, "payload_mass": mass}
     )
-    found = identify([bare, claimed], arm.chain(), IdentificationSettings(essential=None))
-    assert any("announced but not mounted" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("mass", ["", "3.28"])
+def test_a_payload_that_was_announced_but_not_mounted_is_refused(mass):
+    bare = sessions()[0]
+    claimed = named(arm.session(seed=9, sensors=NOISY), "payload", mass)
+    with pytest.raises(DataError, match=r"not mounted in unloaded.mcap, or it was mounted in .*`--payload"):
+        identify([bare, claimed], arm.chain(), IdentificationSettings(essential=None))
+
+
+@pytest.mark.parametrize("mass", ["", "3.28"])
+def test_a_payload_that_hung_in_the_session_of_the_bare_arm_is_refused(mass):
+    bare, loaded = sessions()
+    with pytest.raises(DataError, match=r"mass -3.* are interchanged"):
+        identify(
+            [named(loaded, "none"), named(bare, "payload", mass)],
+            arm.chain(),
+            IdentificationSettings(essential=None),
+        )
+    both = [named(loaded, "none"), named(arm.session(seed=9, sensors=NOISY, loaded=True), "payload", mass)]
+    with pytest.raises(DataError, match=r"mounted in loaded.mcap as well"):
+        identify(both, arm.chain(), IdentificationSettings(essential=None))
+
+
+def test_a_stated_mass_must_be_a_number():
+    bare, loaded = sessions()
+    with pytest.raises(DataError, match="`payload_mass` 'heavy' in the metadata is no number"):
+        identify(
+            [bare, named(loaded, "payload", "heavy")], arm.chain(), IdentificationSettings(essential=None)
+        )
 
 
 def test_a_payload_of_another_mass_than_stated_is_noticed():
