@@ -184,6 +184,17 @@ class Ring:
         """Free the `count` oldest rows for the writer."""
         self._tail[0] += count
 
+    def peek(self, count: int) -> NDArray[Any]:
+        """Copy of the newest rows, oldest first, at most `count`, for onlookers: nothing is freed.
+
+        Rows that the writer overtook meanwhile are left out.
+        """
+        head = int(self._head[0])
+        first = max(head - min(count, self.capacity // 2), 0)
+        rows = self._rows[np.arange(first, head) % self.capacity]
+        overtaken = int(self._head[0]) - self.capacity - first
+        return rows[max(overtaken, 0) :]
+
     # -- both sides ------------------------------------------------------------------------------------------
 
     @property

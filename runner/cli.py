@@ -20,7 +20,10 @@ __all__ = ["main"]
 VERBS = {
     "doctor": "is this computer ready, and the link, and the controller?",
     "experiment": "plan, drive, log, swap the payload, estimate: the whole chain",
+    "plan": "an optimal exciting motion inside all limits",
     "check": "dry run of an experiment file: every check, no motion",
+    "preview": "the planned motion in 3D in the browser, before anything moves",
+    "report": "report.html of a finished experiment, figures as SVG",
     "emulator": "run the emulated controller and arm until interrupted",
     "identify": "estimate a model from session logs",
     "validate": "hold a model against sessions that it has not seen",

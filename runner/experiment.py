@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -83,15 +83,23 @@ class Record:
     error: LwrError | None = None
 
 
+class Onlooker(Protocol):
+    """Somebody who watches the motions, such as the live view."""
+
+    def begin(self, session: str, payload: Payload | None, motion: Motion) -> None:
+        """A motion begins."""
+
+
 @dataclass(frozen=True)
 class Bench:
-    """What the sequence needs from outside: the arm's description, a connected driver, a person."""
+    """What the sequence needs from outside: the arm's description, a driver, a person, who watches."""
 
     arm: Arm
     cell: Cell
     driver: Driver
     operator: Operator
     status: StatusLine = field(default_factory=StatusLine)
+    onlooker: Onlooker | None = None
 
 
 class Run:
@@ -221,6 +229,8 @@ class Run:
                 f"tracking {error:.1f} mrad  missed {now.state.miss_counter}",
             )
 
+        if self.bench.onlooker is not None:
+            self.bench.onlooker.begin(plan.name, plan.payload, motion)
         return self.bench.driver.execute(motion, progress)
 
     def _import_trace(self, path: Path) -> None:

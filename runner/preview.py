@@ -1,4 +1,4 @@
-"""The planned motion to look at before anything moves: in 3D, with limits, clearance and the tightest moment."""
+"""The planned motion to look at before anything moves: in 3D, with limits and the tightest moment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from runner.preparation import session_motion
 from runner.report.markup import table
 from runner.report.plot import Line, Panel, Points
 from runner.report.svg import panel_svg
-from runner.scene import ALARM, BODY, ArmShape, Colour, add_cell, start_server
+from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
 
 __all__ = ["Planned", "planned_motion", "preview_html", "serve"]
 
@@ -64,8 +64,8 @@ class Planned:
 def planned_motion(file: str, *, session: str | None = None, period_s: float = 0.005) -> Planned:
     """The motion of an experiment file or of a plan file.
 
-    session : of the experiment; by default the one with the heaviest payload. A plan is shown with the default
-    arm and cell. Raises ConfigurationError for a file that is neither.
+    session : of the experiment; by default the one with the heaviest payload. A plan is shown with the
+    default arm and cell. Raises ConfigurationError for a file that is neither.
     """
     path = find(file)
     if read_mapping(path).get("kind") == "excitation plan":
@@ -91,8 +91,9 @@ def _of_plan(path: Path, period_s: float) -> Planned:
     plan = ExcitationPlan.load(path)
     if plan.joint_names != arm.joint_names:
         raise ConfigurationError(
-            f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}; preview an experiment file "
-            "that names the arm"
+            f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}; preview an "
+            "experiment "
+            "file that names the arm"
         )
     motion = excitation_rows(plan, 1)(period_s)
     items = [
@@ -117,12 +118,21 @@ def _planned(
     distance = np.array([watch.clearance(motion.q[row]).distance for row in rows])
     tightest = watch.check_path(motion.q, period_s=motion.period_s)
     return Planned(
-        title, arm, cell, payload, motion, preflight, tightest, margin, rows * motion.period_s, distance
+        title,
+        arm,
+        cell,
+        payload,
+        motion,
+        preflight,
+        tightest,
+        margin,
+        np.asarray(rows * motion.period_s, dtype=np.float64),
+        distance,
     )
 
 
 def build_scene(server: Any, planned: Planned) -> ArmShape:
-    """Cell, path of the flange coloured by clearance, tightest moment, and the arm at the start of the motion."""
+    """Cell, path of the flange coloured by clearance, tightest moment, and the arm at the start."""
     scene = server.scene
     add_cell(scene, planned.cell)
     arm = ArmShape(scene, planned.arm, "/arm", payload=planned.payload)
@@ -130,18 +140,19 @@ def build_scene(server: Any, planned: Planned) -> ArmShape:
     rows = np.round(planned.time / motion.period_s).astype(np.int64)
     path = np.array([arm.tip(motion.q[row]) for row in rows])
     near = np.minimum(planned.distance[1:], planned.distance[:-1])
-    colours = np.array([_colour(float(value), planned.margin) for value in near], dtype=np.uint8)
+    shown = [line_colour(_colour(float(value), planned.margin)) for value in near]
+    colours = np.array(shown, dtype=np.uint8)
     if len(path) > 1:
         segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
         doubled = np.repeat(colours[:, None, :], 2, axis=1)
         scene.add_line_segments("/path", segments, doubled, thickness=2.5, thickness_units="screen")
     tight = planned.tightest
-    ghost = ArmShape(
-        scene, planned.arm, "/tightest/arm", payload=planned.payload, colour=ALARM, opacity=0.28
-    )
+    ghost = ArmShape(scene, planned.arm, "/tightest/arm", payload=planned.payload, colour=ALARM, opacity=0.28)
     ghost.pose(tight.q)
     points = tight.points.astype(np.float32)[None]
-    scene.add_line_segments("/tightest/gap", points, ALARM, thickness=5.0, thickness_units="screen")
+    scene.add_line_segments(
+        "/tightest/gap", points, line_colour(ALARM), thickness=5.0, thickness_units="screen"
+    )
     scene.add_label(
         "/tightest/label",
         f"tightest: {1000 * tight.distance:.0f} mm, {' to '.join(tight.pair)}, t = {tight.time_s:.2f} s",
@@ -163,26 +174,29 @@ def preview_html(planned: Planned) -> str:
             recording.insert_sleep(step)
         scene = recording.as_html()
     finally:
-        server.stop()
+        stop_server(server)
     style = resources.files("runner").joinpath("preview.css").read_text(encoding="utf-8")
     ok = planned.preflight.ok
     verdict = "every condition holds" if ok else "refused: not every condition holds"
     mark = "\N{CHECK MARK}" if ok else "\N{MULTIPLICATION X}"
     tight = planned.tightest
+    joints = "".join(map(panel_svg, _joint_panels(planned)))
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
-        f"<title>Preview of {escape(planned.title)}</title><link rel=icon href='data:,'><style>{style}</style></head>"
-        "<body><main>"
-        f"<section class=view><iframe title='The planned motion in 3D, with time slider' srcdoc='{_quoted(scene)}'>"
-        "</iframe><p class=key><span class=free></span>path of the flange, free <span class=near></span>near "
+        f"<title>Preview of {escape(planned.title)}</title><link rel=icon href='data:,'>"
+        f"<style>{style}</style></head><body><main>"
+        "<section class=view><iframe title='The planned motion in 3D, with time slider' "
+        f"srcdoc='{_quoted(scene)}'></iframe><p class=key><span class=free></span>path of the flange, free "
+        "<span class=near></span>near "
         "<span class=alarm></span>tightest moment</p></section>"
         f"<section class=facts><h1>Preview of {escape(planned.title)}</h1>"
         f"<p class='verdict {'good' if ok else 'bad'}'>{mark} {verdict}</p>"
         f"<p>{planned.motion.duration_s:.1f} s. Tightest moment: <b>{1000 * tight.distance:.0f} mm</b>, "
-        f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; {1000 * planned.margin:.0f} mm must be kept."
-        f"</p>{_conditions(planned)}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
-        f"<h2>Joints within their limits</h2><div class=joints>{''.join(map(panel_svg, _joint_panels(planned)))}</div>"
+        f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; "
+        f"{1000 * planned.margin:.0f} mm must be "
+        f"kept.</p>{_conditions(planned)}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
+        f"<h2>Joints within their limits</h2><div class=joints>{joints}</div>"
         "</section></main></body></html>\n"
     )
 
@@ -213,7 +227,7 @@ def serve(planned: Planned, port: int = 8080) -> None:
             tightest.visible = show.value
             time.sleep(1.0 / _FRAMES_PER_S)
     finally:
-        server.stop()
+        stop_server(server)
 
 
 def _frames(motion: Motion) -> tuple[list[int], float]:
@@ -265,7 +279,7 @@ def _clearance_panel(planned: Planned) -> Panel:
 def _joint_panels(planned: Planned) -> Sequence[Panel]:
     motion, limits = planned.motion, planned.arm.limits
     rows = np.unique(np.linspace(0, len(motion) - 1, _POINTS).astype(np.int64))
-    time_s, span = rows * motion.period_s, np.array([0.0, motion.duration_s])
+    time_s, span = np.asarray(rows * motion.period_s, dtype=np.float64), np.array([0.0, motion.duration_s])
     panels = []
     for k, joint in enumerate(planned.arm.joint_names):
         q = np.degrees(motion.q[:, k])
@@ -281,7 +295,8 @@ def _joint_panels(planned: Planned) -> Sequence[Panel]:
                     Line("limit", "", span, np.full(2, high)),
                     Line("measured", "planned", time_s, q[rows]),
                 ),
-                f"Planned position of {joint}: {q.min():.0f} to {q.max():.0f} degrees, limits {low:.0f} to {high:.0f}.",
+                f"Planned position of {joint}: {q.min():.0f} to {q.max():.0f} degrees, limits {low:.0f} to "
+                f"{high:.0f}.",
                 f"{room:.0f}° to the limit",
             )
         )

@@ -129,7 +129,9 @@ def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
         estimate.rsd_percent.tolist(),
         strict=True,
     )
-    return [dict(zip(("name", "unit", "estimate", "std", "rsd_percent"), row, strict=True)) for row in columns]
+    return [
+        dict(zip(("name", "unit", "estimate", "std", "rsd_percent"), row, strict=True)) for row in columns
+    ]
 
 
 def _link(link: LinkReport) -> dict[str, Any]:

@@ -20,17 +20,27 @@ from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell, PayloadShape
 from runner.experiment_file import Payload
 
-__all__ = ["ALARM", "BODY", "GHOST", "ArmShape", "Colour", "add_cell", "start_server"]
+__all__ = [
+    "ALARM",
+    "BODY",
+    "GHOST",
+    "ArmShape",
+    "Colour",
+    "add_cell",
+    "line_colour",
+    "start_server",
+    "stop_server",
+]
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
-BODY: Colour = (222, 226, 230)
+BODY: Colour = (190, 196, 202)
 JOINT: Colour = (0, 114, 178)
 GHOST: Colour = (0, 158, 115)
 ALARM: Colour = (213, 94, 0)
 CARRIED: Colour = (86, 86, 86)
-_UNKNOWN_RADIUS = 0.04
+_DENSITY = 2700.0  # of a payload whose shape is not given, drawn as an aluminium ball [kg/m³]
 
 
 def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
@@ -49,9 +59,22 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port or _free_port(host), verbose=False)
     server.scene.set_up_direction("+z")
-    server.initial_camera.position = (1.7, -1.5, 1.15)
-    server.initial_camera.look_at = (0.0, 0.0, 0.5)
+    server.scene.configure_default_lights(True, cast_shadow=False)
+    server.initial_camera.position = (1.45, -1.35, 1.05)
+    server.initial_camera.look_at = (0.0, 0.0, 0.45)
     return server
+
+
+def stop_server(server: Any) -> None:
+    """End a server without its message on standard output."""
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def line_colour(colour: Colour) -> Colour:
+    """The value that viser shows as this colour on lines, which it takes as linear light."""
+    red, green, blue = (round(255 * (value / 255) ** 2.2) for value in colour)
+    return red, green, blue
 
 
 def _free_port(host: str) -> int:
@@ -139,7 +162,8 @@ def add_cell(scene: Any, cell: Cell) -> None:
 def _payload_shape(payload: Payload) -> tuple[Any, pin.SE3]:
     shape = payload.shape
     if shape is None:
-        return coal.Sphere(_UNKNOWN_RADIUS), pin.SE3(np.eye(3), np.asarray(payload.com, dtype=np.float64))
+        radius = float((payload.mass / (_DENSITY * 4.0 / 3.0 * np.pi)) ** (1.0 / 3.0))
+        return coal.Sphere(radius), pin.SE3(np.eye(3), np.asarray(payload.com, dtype=np.float64))
     turn = pin.rpy.rpyToMatrix(np.radians(np.array(shape.rpy_deg)))
     return _solid(shape), pin.SE3(turn, np.array(shape.centre_m))
 
@@ -165,7 +189,8 @@ def _add_shape(
         scene.add_box(name, dimensions=tuple(2.0 * np.asarray(geometry.halfSide)), **look, **where)
     else:
         raise ConfigurationError(
-            f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the URDF"
+            f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the "
+            "URDF"
         )
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
@@ -12,7 +15,7 @@ from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
-from runner.experiment import Record, Run
+from runner.experiment import Bench, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import Laboratory
 from runner.planning import excitation_rows, plan_excitation
@@ -39,8 +42,18 @@ PLAN = "plan.yaml"
 @click.option(
     "--allow-non-realtime", is_flag=True, help="Command the real arm without real-time rights; may stutter."
 )
+@click.option("--live", is_flag=True, help="A page in the browser with the arm, torques, link and time left.")
+@click.option(
+    "--live-port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --live."
+)
 def command(
-    file: str | None, out: Path | None, yes: bool, resume: Path | None, allow_non_realtime: bool
+    file: str | None,
+    out: Path | None,
+    yes: bool,
+    resume: Path | None,
+    allow_non_realtime: bool,
+    live: bool,
+    live_port: int,
 ) -> None:
     """Run the experiment FILE; without one the default, against the built-in emulator.
 
@@ -60,17 +73,31 @@ def command(
     status = StatusLine()
     plan = _plan(experiment, arm, cell, folder, status)
     laboratory = Laboratory(experiment, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
-    with laboratory as bench:
+    with laboratory as bench, _watched(bench, experiment, live_port if live else None) as watched:
         records = Run(
-            experiment, folder, bench, excitation_rows(plan, experiment.excitation.periods)
+            experiment, folder, watched, excitation_rows(plan, experiment.excitation.periods)
         ).sessions()
     done = all(record.status == "success" for record in records)
     found = estimate(experiment, arm, records) if done else None
     summary = summarise(experiment, records, found)
     click.echo(write_results(folder, experiment, arm, summary, found))
+    _report(folder)
     click.echo(str(folder))
     if not done:
         raise _failure(records[-1], folder)
+
+
+@contextmanager
+def _watched(bench: Bench, experiment: Experiment, port: int | None) -> Iterator[Bench]:
+    """The bench with the live view on `port` as onlooker, or as it is."""
+    if port is None:
+        yield bench
+        return
+    from runner.live import LiveView
+
+    with LiveView(experiment, bench.driver.ring_name, port=port) as view:
+        bench.status.say(f"live view: {view.url}")
+        yield dataclasses.replace(bench, onlooker=view)
 
 
 def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Experiment, Path]:
@@ -111,6 +138,16 @@ def _plan(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status: St
     status.clear()
     plan.save(path)
     return plan
+
+
+def _report(folder: Path) -> None:
+    """report.html beside the results; a run is not lost because its page cannot be written."""
+    from runner.report.page import write_report
+
+    try:
+        click.echo(str(write_report(folder)))
+    except LwrError as error:
+        click.echo(f"no report.html: {error}", err=True)
 
 
 def _failure(record: Record, folder: Path) -> LwrError:

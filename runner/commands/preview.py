@@ -21,13 +21,15 @@ __all__ = ["command"]
     show_default=True,
     help="The page to write.",
 )
-@click.option("--serve", "serving", is_flag=True, help="Serve the page with time slider until Ctrl-C instead.")
+@click.option(
+    "--serve", "serving", is_flag=True, help="Serve the page with time slider until Ctrl-C instead."
+)
 @click.option("--port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --serve.")
 def command(file: str, session: str | None, out: Path, serving: bool, port: int) -> None:
     """Show the motion of an experiment FILE or of a plan file in 3D. Nothing moves.
 
-    The page is one file that needs no network. It shows the arm along the motion, the path of its flange coloured by
-    clearance, the tightest moment, and every limit with what the motion uses of it.
+    The page is one file that needs no network. It shows the arm along the motion, the path of its flange
+    coloured by clearance, the tightest moment, and every limit with what the motion uses of it.
 
     \b
     lwr-run preview my_lab.yaml

@@ -26,8 +26,8 @@ __all__ = ["command"]
 def command(folder: Path, svg: Path | None, columns: int, width: int) -> None:
     """Write report.html into the FOLDER of an experiment; its first screen says whether the run was good.
 
-    The page is one file that needs no network: plots to zoom into, tables to copy from, and a print style, so that
-    a browser makes a PDF of it. What lies in the folder is read again each time, a diagnosis.json too.
+    The page is one file that needs no network: plots to zoom into, tables to copy from, and a print style, so
+    that a browser makes a PDF of it. What lies in the folder is read again each time, a diagnosis.json too.
 
     \b
     lwr-run report experiments/lwr4plus-20260101-120000

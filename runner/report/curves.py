@@ -1,4 +1,4 @@
-"""What the figures show of a session: torque and velocity as logged and filtered, computed torque, residual."""
+"""What the figures show of a session: torque and velocity, logged and filtered, computed torque, residual."""
 
 from __future__ import annotations
 

@@ -49,8 +49,9 @@ def diagnosis_section(results: ResultFolder) -> str:
         return section(
             "diagnosis",
             "Diagnosis",
-            "<p>This folder holds no diagnosis. <code>lwr-run diagnose SESSION... --out FOLDER</code> looks for what "
-            "the model lacks, and the next <code>lwr-run report</code> shows it here.</p>",
+            "<p>This folder holds no diagnosis. <code>lwr-run diagnose SESSION... --out FOLDER</code> looks "
+            "for "
+            "what the model lacks, and the next <code>lwr-run report</code> shows it here.</p>",
         )
     findings: Sequence[Mapping[str, Any]] = diagnosis.get("findings", [])
     parts = [_finding(one, results.joint_names) for one in findings]
@@ -127,7 +128,8 @@ def _gain(diagnosis: Mapping[str, Any], names: Sequence[str]) -> str:
     whole = extension_gain(diagnosis)
     text = "" if whole is None else paragraph(f"Mean over joints and sides: {100 * whole:.0f} % less error.")
     head = ("joint", "base model [Nm]", "extended [Nm]", "change %", "noise floor [Nm]")
-    return f"<h3>Gain of the extended model on unseen motions</h3>{text}{table(head, rows, 'Gain of the extended model')}"
+    lines = table(head, rows, "Gain of the extended model")
+    return f"<h3>Gain of the extended model on unseen motions</h3>{text}{lines}"
 
 
 def _joints(joints: Sequence[int], names: Sequence[str]) -> str:

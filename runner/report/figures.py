@@ -87,7 +87,8 @@ def motion_figure(results: Results, session: str | None = None, side: str = "joi
                         *thin(one.grid, one.measured[:, k], _POINTS),
                     ),
                 ),
-                f"{side.capitalize()} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm.",
+                f"{side.capitalize()} torque of {joint} over time, session {one.session}: mean magnitude "
+                f"{mean:.2f} Nm.",
                 f"mean |τ| {mean:.2f} Nm",
             )
         )
@@ -102,8 +103,8 @@ def torque_figure(results: Results, session: str | None = None, side: str | None
     """Figure 3 of the paper: measured and computed torque with the relative error, by joint.
 
     session : name; by default the loaded one. side : "joint" (default where there is one) or "motor".
-    The relative error is the residual over the largest measured torque of the joint in the session. Measured and
-    computed torque passed the same low-pass; the samples as logged stand behind them.
+    The relative error is the residual over the largest measured torque of the joint in the session. Measured
+    and computed torque passed the same low-pass; the samples as logged stand behind them.
     """
     one = _choose(results, session, side)
     panels = []
@@ -137,8 +138,8 @@ def residual_figure(
 ) -> Figure:
     """Residual torque against `time`, `position` or `velocity`, by joint.
 
-    Over time: every extreme as logged, and the residual in the pass band. Against position and velocity: mean and
-    spread (5 to 95 %) of the latter in bins, against position for each direction of motion on its own.
+    Over time: every extreme as logged, and the residual in the pass band. Against position and velocity: mean
+    and spread (5 to 95 %) of the latter in bins, against position for each direction of motion on its own.
     """
     if against not in ("time", "position", "velocity"):
         raise ConfigurationError(f"residuals against {against!r}: choose time, position or velocity")
@@ -163,7 +164,9 @@ def residual_figure(
                 label,
                 "residual [Nm]",
                 marks,
-                f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {rms:.3g} Nm rms.",
+                f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {rms:.3g} "
+                "Nm "
+                "rms.",
                 f"{rms:.3g} Nm rms",
             )
         )

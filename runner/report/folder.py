@@ -30,7 +30,7 @@ class ResultFolder:
 
     @classmethod
     def load(cls, path: str | Path) -> ResultFolder:
-        """Read `summary.json` of a folder. ConfigurationError where there is none, DataError if it is broken."""
+        """Read `summary.json` of a folder. ConfigurationError if there is none, DataError if it is broken."""
         folder = Path(path)
         file = folder / "summary.json"
         if not file.is_file():

@@ -124,15 +124,11 @@ def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:
     split = any(panel.split for panel in figure.panels)
     for _ in range(rows):
         heights += [0.7, 0.3] if split else [1.0]
-    titles = [
-        figure.panels[row * columns + column].title if row * columns + column < len(figure.panels) else ""
-        for row in range(rows)
-        for part in range(2 if split else 1)
-        for column in range(columns)
-        if part == 0 or True
-    ]
-    if split:
-        titles = [title if (index // columns) % 2 == 0 else "" for index, title in enumerate(titles)]
+    titles: list[str] = []
+    for row in range(rows):
+        names = [panel.title for panel in figure.panels[row * columns : (row + 1) * columns]]
+        titles += names + [""] * (columns - len(names))
+        titles += [""] * columns if split else []
     whole = make_subplots(
         rows=len(heights),
         cols=columns,

@@ -18,7 +18,7 @@ __all__ = ["Number", "figure_html", "fold", "paragraph", "section", "table"]
 
 @dataclass(frozen=True)
 class Number:
-    """A number in a table: shown short, with all its digits in the markup, and named by its key in summary.json."""
+    """A number in a table: shown short, all its digits in the markup, named by its key in summary.json."""
 
     value: float | None
     form: str = ".4g"
@@ -77,7 +77,7 @@ def table(
 
 
 def figure_html(figure: Figure, *, tall: bool = False) -> str:
-    """Small multiples: legend, then one chart a panel that the page's script draws when it comes into view."""
+    """Small multiples: legend, then one chart a panel, drawn by the page's script when it comes into view."""
     keys = "".join(
         f"<li><svg width=24 height=12 viewBox='0 -6 24 12' aria-hidden=true>{legend_key(role, kind)}</svg>"
         f"{escape(label)}</li>"

@@ -21,7 +21,7 @@ from runner.report.sections import (
     table_2_section,
     torque_section,
 )
-from runner.report.verdicts import Verdict, headline, verdicts
+from runner.report.verdicts import Level, Verdict, headline, verdicts
 
 __all__ = ["REPORT", "report_html", "write_report"]
 
@@ -79,16 +79,17 @@ def report_html(results: ResultFolder) -> str:
     level, sentence = headline(lines)
     name = escape(str(results.summary["experiment"]))
     style = _asset("page.css")
+    software = escape(str(results.summary.get("versions", {}).get("software", "")))
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
-        f"<title>{name}: {escape(sentence)}</title><link rel=icon href='data:,'><style>{style}</style></head><body>"
-        f"<header><h1>{_subtitle(results)}</h1>"
-        f"<p class=verdict><span class='badge {level}'>{_MARKS[level]}</span><span>{escape(sentence)}</span></p>"
+        f"<title>{name}: {escape(sentence)}</title><link rel=icon href='data:,'><style>{style}</style></head>"
+        f"<body><header><h1>{_subtitle(results)}</h1><p class=verdict>{_badge(level)}"
+        f"<span>{escape(sentence)}</span></p>"
         f"{_verdict_table(lines)}<nav aria-label='Parts of the report'>{links}</nav></header>"
         f"<main>{content}</main>"
-        f"<footer>Written by {escape(str(results.summary.get('versions', {}).get('software', '')))}. This file needs no "
-        "network; print it or keep it beside the logs.</footer>"
+        f"<footer>Written by {software}. This file needs no network; print it or keep it beside the logs."
+        "</footer>"
         f"<script>{script}</script><script>{_asset('page.js')}</script></body></html>\n"
     )
 
@@ -116,14 +117,19 @@ def _verdict_table(lines: Sequence[Verdict]) -> str:
         subject = escape(line.subject)
         linked = f"<a href='#{line.section}'>{subject}</a>" if line.section else subject
         rows.append(
-            f"<tr><th scope=row>{linked}</th><td>{escape(line.found)}</td><td class=wanted>{escape(line.wanted)}</td>"
-            f"<td class=mark><span class='badge {line.level}'>{_MARKS[line.level]}</span></td></tr>"
+            f"<tr><th scope=row>{linked}</th><td>{escape(line.found)}</td>"
+            f"<td class=wanted>{escape(line.wanted)}</td><td class=mark>{_badge(line.level)}</td></tr>"
         )
     return (
-        "<table class=verdicts><caption class=hidden>Was the run good?</caption><thead><tr><th scope=col>question</th>"
-        "<th scope=col>found</th><th scope=col>wanted</th><th scope=col>verdict</th></tr></thead>"
+        "<table class=verdicts><caption class=hidden>Was the run good?</caption><thead><tr>"
+        "<th scope=col>question</th><th scope=col>found</th><th scope=col>wanted</th><th "
+        "scope=col>verdict</th></tr></thead>"
         f"<tbody>{''.join(rows)}</tbody></table>"
     )
+
+
+def _badge(level: Level) -> str:
+    return f"<span class='badge {level}'>{_MARKS[level]}</span>"
 
 
 def _asset(name: str) -> str:

@@ -18,8 +18,8 @@ __all__ = ["STYLES", "Band", "Figure", "Line", "Mark", "Panel", "Points", "Role"
 
 Floats = NDArray[np.float64]
 Role = Literal[
-    "logged", "measured", "computed", "error", "commanded", "limit", "forward", "backward", "estimate", "truth",
-    "published", "spread", "alarm",
+    "logged", "measured", "computed", "error", "limit", "forward", "backward", "estimate", "truth",
+    "published", "spread",
 ]  # fmt: skip
 Symbol = Literal["circle", "cross", "diamond"]
 
@@ -39,7 +39,6 @@ STYLES: dict[Role, Style] = {
     "measured": Style("#0072b2", 1.8),
     "computed": Style("#d55e00", 1.8, "3 4"),
     "error": Style("#000000", 0.8, "5 3"),
-    "commanded": Style("#009e73", 1.4, "6 3"),
     "limit": Style("#767676", 1.2, "4 4"),
     "forward": Style("#0072b2", 1.8),
     "backward": Style("#d55e00", 1.8, "4 3"),
@@ -47,7 +46,6 @@ STYLES: dict[Role, Style] = {
     "truth": Style("#000000", 1.6, symbol="cross"),
     "published": Style("#d55e00", 1.6, symbol="diamond"),
     "spread": Style("#9ecae9", 0.0),
-    "alarm": Style("#d55e00", 2.2),
 }
 
 

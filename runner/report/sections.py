@@ -1,4 +1,4 @@
-"""The parts of the report below its first table: what ran, the paper's tables, figures, parameters, provenance."""
+"""The parts of the report below its first table: sessions, the paper's tables, figures, parameters."""
 
 from __future__ import annotations
 
@@ -122,8 +122,9 @@ def table_1_section(results: ResultFolder) -> str:
     )
     strong = range(len(TABLE_1), len(rows))
     note = (
-        "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number is that of the unscaled observation matrix of all "
-        "sessions over the 49 parameters of Table 2, the definition with which the published numbers agree; "
+        "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number is "
+        "that of the unscaled observation matrix of all sessions over the 49 parameters of Table 2, the "
+        "definition with which the published numbers agree; "
     )
     others = [
         f"over all base parameters it is {condition['base']:.1f}" if condition.get("base") else "",
@@ -234,11 +235,15 @@ def torque_section(results: ResultFolder) -> str:
     )
     parts = [
         paragraph(
-            "Computed torque from the filtered measured motion, against the torque measured. Both lines passed the "
-            "same low-pass; what was logged stands behind them, every spike included. These are the sessions that the "
-            "estimate was made from: `lwr-run validate` holds a model against others. The relative error is that of "
-            "the largest torque of the joint. In the band: in the pass band of the estimation; floor: scatter between "
-            "the periods of the motion, which no model can explain."
+            "Computed torque from the filtered measured motion, against the torque measured. Both lines "
+            "passed "
+            "the same low-pass; what was logged stands behind them, every spike included. These are the "
+            "sessions "
+            "that the estimate was made from: `lwr-run validate` holds a model against others. The relative "
+            "error "
+            "is in percent of the largest torque of the joint. In the band: in the pass band of the "
+            "estimation; "
+            "floor: scatter between the periods of the motion, which no model can explain."
         )
     ]
     for index, one in enumerate(results.curves):
@@ -293,8 +298,9 @@ def assumption_section(results: ResultFolder) -> str:
     parts = [
         table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
         paragraph(
-            f"Standard deviations: {results.summary['covariance']}. They do not rest on uncorrelated residuals of "
-            "equal variance; a lack of fit or of exogeneity they cannot cover.",
+            f"Standard deviations: {results.summary['covariance']}. They do not rest on uncorrelated "
+            "residuals "
+            "of equal variance; a lack of fit or of exogeneity they cannot cover.",
             "soft",
         ),
     ]
@@ -329,9 +335,9 @@ def parameter_section(results: ResultFolder) -> str:
     head = ["parameter", "unit", "estimate", "std", "95 % from", "to", "RSD %", *(["truth"] if truth else [])]
     counts = results.summary["counts"]
     intro = (
-        f"Model {results.summary['model']}: {counts['standard']} parameters, {counts['not_identifiable']} not "
-        f"identifiable, {counts['regrouped']} regrouped, {counts['base']} base. R marks regrouped parameters, link 8 "
-        "is the payload."
+        f"Model {results.summary['model']}: {counts['standard']} parameters, {counts['not_identifiable']} "
+        f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base. R marks regrouped "
+        "parameters, link 8 is the payload."
     )
     parts = [
         paragraph(intro),
@@ -365,8 +371,8 @@ def _correlation(results: ResultFolder) -> str:
         "correlation",
         "Correlation of the parameters",
         paragraph(
-            f"{strong} pairs are correlated by more than {_STRONG_CORRELATION} either way: their sum or difference is "
-            "known better than each of them."
+            f"{strong} pairs are correlated by more than {_STRONG_CORRELATION} either way: their sum or "
+            "difference is known better than each of them."
         ),
         chart_html(heatmap_chart(model.names, matrix), alt, "square"),
         fold(
@@ -406,8 +412,8 @@ def provenance_section(results: ResultFolder) -> str:
         if text is not None:
             parts.append(fold(f"{title}, {name}", f"<pre tabindex=0>{escape(text)}</pre>"))
     parts.append(
-        "<p>The logs are ordinary MCAP files: <code>rerun session.mcap</code>, PlotJuggler, Foxglove and Lichtblick open "
-        "them as they are.</p>"
+        "<p>The logs are ordinary MCAP files: <code>rerun session.mcap</code>, PlotJuggler, Foxglove and "
+        "Lichtblick open them as they are.</p>"
     )
     return section("provenance", "Provenance", *parts)
 

@@ -101,9 +101,11 @@ def _axes(
 
     parts = []
     for value in ticks(low, high, 4 if height > 70 else 3):
+        heavy = 1.4 if value == 0 else 0.8
         y = y0 + height - (value - low) / (high - low) * height
         parts.append(
-            f"<path d='M{x0:g} {y:.1f}h{width:g}' stroke='#e3e3e3' stroke-width='{1.4 if value == 0 else 0.8}'/>"
+            f"<path d='M{x0:g} {y:.1f}h{width:g}' stroke='#e3e3e3' "
+            f"stroke-width='{heavy}'/>"
             f"<text x='{x0 - 5:g}' y='{y + 3.5:.1f}' {_FONT} font-size='10' fill='{_GREY}' text-anchor='end'>"
             f"{_number(value)}</text>"
         )
@@ -150,10 +152,11 @@ def _mark(mark: Mark, at: object) -> str:
 
 
 def _symbol(symbol: Symbol, x: float, y: float, colour: str) -> str:
+    stroke = f"stroke='{colour}' stroke-width='1.4' fill='none'"
     if symbol == "cross":
-        return f"<path d='M{x - 4:.1f} {y - 4:.1f}l8 8m0-8l-8 8' stroke='{colour}' stroke-width='1.4' fill='none'/>"
+        return f"<path d='M{x - 4:.1f} {y - 4:.1f}l8 8m0-8l-8 8' {stroke}/>"
     if symbol == "diamond":
-        return f"<path d='M{x:.1f} {y - 5:.1f}l5 5l-5 5l-5-5Z' stroke='{colour}' stroke-width='1.4' fill='none'/>"
+        return f"<path d='M{x:.1f} {y - 5:.1f}l5 5l-5 5l-5-5Z' {stroke}/>"
     return f"<circle cx='{x:.1f}' cy='{y:.1f}' r='3' fill='{colour}'/>"
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,7 @@ def thin(x: Floats, y: Floats, points: int = 1000) -> tuple[Floats, Floats]:
     edges = np.linspace(0, len(x), stretches + 1).astype(np.int64)
     lowest = np.empty(stretches, dtype=np.int64)
     highest = np.empty(stretches, dtype=np.int64)
-    for k, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (low, high) in enumerate(pairwise(edges)):
         lowest[k] = low + int(np.argmin(y[low:high]))
         highest[k] = low + int(np.argmax(y[low:high]))
     kept = np.union1d(np.concatenate([lowest, highest]), np.array([0, len(x) - 1]))

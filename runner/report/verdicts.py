@@ -69,7 +69,10 @@ def _link(results: ResultFolder) -> Verdict | None:
         sum(int(link[key]) for link in links) for key in ("cycles", "missed", "lost", "late")
     )
     reply = max((link["latency_s"].get("p99", 0.0) for link in links), default=0.0)
-    text = f"{missed} missed, {lost} lost, {late} late of {cycles} cycles; 99 % of replies within {1e6 * reply:.0f} µs"
+    text = (
+        f"{missed} missed, {lost} lost, {late} late of {cycles} cycles; 99 % of replies within "
+        f"{1e6 * reply:.0f} µs"
+    )
     level: Level = "good" if missed + lost == 0 and late <= _LATE_LOOK * cycles else "look"
     return Verdict("link quality", text, "none missed or lost", level, "sessions")
 
@@ -197,7 +200,7 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
 
 
 def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
-    """Share of the error on unseen motions that the extended model removes; both sides, mean over the joints."""
+    """Share of the error on unseen motions that the extended model removes, mean over joints and sides."""
     gain = diagnosis.get("gain") or {}
     base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
     ratios = [
