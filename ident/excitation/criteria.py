@@ -62,11 +62,17 @@ def _log_condition_powers(information: Array, power: int) -> tuple[float, Array]
 def _log_norm(matrix: Array, power: int) -> tuple[float, Array]:
     """log of the Schatten norm of even order `power` of a positive definite matrix, and its derivative."""
     below, square = matrix, matrix
+    log_square = log_below = 0.0  # what `square` and `below` have been divided by, against underflow
     for _ in range(power.bit_length() - 2):
         square = square @ square
+        size = float(np.trace(square))
+        square = square / size
+        log_square = 2.0 * log_square + float(np.log(size))
         below = below @ square
+        log_below += log_square
     total = float(np.sum(square * square))
-    return float(np.log(total)) / power, below / total
+    value = (float(np.log(total)) + 2.0 * log_square) / power
+    return value, below * (np.exp(log_below - 2.0 * log_square) / total)
 
 
 def _positive_inverse(matrix: Array) -> Array | None:

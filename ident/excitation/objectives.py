@@ -9,7 +9,7 @@ people.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -36,6 +36,7 @@ __all__ = [
     "MeanTorque",
     "Pullback",
     "RelativeDeviation",
+    "TorqueLevel",
     "View",
 ]
 
@@ -232,6 +233,45 @@ class MeanTorque:
         return value
 
 
+@dataclass(frozen=True)
+class TorqueLevel:
+    """-sum of weighted logs of the mean |joint torque| of some joints: raises all of them, the low ones
+    first.
+    """
+
+    joints: tuple[int, ...]
+    weights: tuple[float, ...]
+    joint_names: tuple[str, ...]
+    softness: float = 0.02
+
+    @property
+    def name(self) -> str:
+        """Which joints, with which weights."""
+        parts = ", ".join(f"{w:g} log {name}" for w, name in zip(self.weights, self.joint_names, strict=True))
+        return f"- level of mean |joint torque| ({parts})"
+
+    def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
+        """The weighted sum; magnitudes are rounded off near zero unless exact."""
+        soft = 0.0 if np.isinf(sharpness) else self.softness
+        value, slopes = 0.0, []
+        for joint, weight in zip(self.joints, self.weights, strict=True):
+            torque = view.torque[:, joint]
+            magnitude = np.sqrt(torque**2 + soft**2)
+            level = float(magnitude.mean())
+            value -= weight * float(np.log(level))
+            slopes.append((joint, -weight / level * torque / np.maximum(magnitude, 1e-300) / torque.size))
+
+        def pull(scale: float) -> None:
+            for joint, slope in slopes:
+                view.torque_bar[:, joint] += scale * slope
+
+        return value, pull
+
+    def report(self, value: float) -> float:
+        """The value as it is."""
+        return value
+
+
 @dataclass(frozen=True, eq=False)
 class GoalAttainment:
     """gamma of equation (10): the largest (F_i - goal_i) / |goal_i|, with F_i in reported units."""
@@ -264,7 +304,9 @@ class GoalAttainment:
         criterion, goal = self.criteria[k], self.goals[k]
         value, pull = criterion.evaluate(view, sharpness)
         size = criterion.report(value)
-        slope = (size if not isinstance(criterion, (MeanTorque, DOptimality)) else 1.0) / abs(goal)
+        slope = (size if not isinstance(criterion, (MeanTorque, TorqueLevel, DOptimality)) else 1.0) / abs(
+            goal
+        )
         return (size - goal) / abs(goal), lambda weight: pull(weight * slope)
 
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
@@ -292,15 +334,3 @@ class GoalAttainment:
     def report(self, value: float) -> float:
         """Gamma as it is."""
         return value
-
-
-def names_of(criteria: Sequence[Criterion]) -> tuple[str, ...]:
-    """All parameters that some criteria need columns for."""
-    names: dict[str, None] = {}
-    for criterion in criteria:
-        if isinstance(criterion, GoalAttainment):
-            names.update(dict.fromkeys(names_of(criterion.criteria)))
-        elif not isinstance(criterion, MeanTorque):
-            assembly: Assembly = criterion.assembly  # type: ignore[attr-defined]
-            names.update(dict.fromkeys(assembly.names))
-    return tuple(names)

@@ -47,7 +47,7 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
     with threadpool_limits(1):
         program = setup.program()
         x = candidate.x
-        program.sharpness, program.constraints.rate = 64.0, 1000.0
+        program.sharpness, program.constraints.rate = 256.0, 1000.0
         best: Outcome | None = None
         for round_ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))

@@ -1,0 +1,405 @@
+"""Excitation: what planning reaches, in how much time, and how safely. One command:
+
+    python benchmarks/excitation/run.py                  # everything, about an hour on one core
+    python benchmarks/excitation/run.py --section table1 --section gradient
+    python benchmarks/excitation/run.py --seeds 3 --budget 10
+
+Budgets are CPU seconds of this process (one BLAS thread, one job). Limits are those of the arm file, with position
+margin; every motion is checked at exact extrema, on a 1 ms grid, and proven in between, self-collision and ground
+included. `urdf speeds` is the same arm with the higher wrist velocities of the published URDF files.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from front_plot import scatter
+from threadpoolctl import threadpool_limits
+
+from fri.errors import LwrError
+from ident.excitation import (
+    Assembled,
+    ExcitationPlan,
+    Objective,
+    PlanProblem,
+    Progress,
+    Search,
+    assemble,
+    check_motion,
+    hypervolume,
+    not_dominated,
+    plan,
+    random_points,
+    table,
+    table_row,
+    trade_off,
+)
+from ident.excitation.check import Limits
+from ident.excitation.objectives import TorqueLevel
+from ident.excitation.search import begin, random_start
+
+HERE = Path(__file__).resolve().parent
+FAST_ARM = str(HERE / "lwr4plus_urdf_speeds.yaml")
+CONDITION = "condition number, essential 49, unscaled"
+MANY = 100_000
+
+
+class Budget:
+    """Ends a search after some CPU seconds, the way Ctrl-C does, and keeps the course of the best value."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self.begun = seconds, time.process_time()
+        self.course: list[tuple[float, float]] = []
+
+    def __call__(self, progress: Progress) -> None:
+        spent = time.process_time() - self.begun
+        if progress.best is not None:
+            self.course.append((spent, progress.best))
+        if spent > self.seconds and progress.stage != "polish" and progress.feasible:
+            raise KeyboardInterrupt
+
+
+def base_problem(period_s: float = 20.0, arm: str = "lwr4plus.yaml", **changes: Any) -> PlanProblem:
+    """The default problem at full speed, condition number of the essential columns as objective."""
+    default = PlanProblem.load("plans/default.yaml")
+    settings: dict[str, Any] = {
+        "arm": arm,
+        "speed_scale": 1.0,
+        "motion": replace(default.motion, period_s=period_s, periods=1),
+        "objective": Objective(criterion="condition_number"),
+        "search": Search(starts=8, hops=MANY),
+    }
+    return replace(default, **(settings | changes))
+
+
+def solve(problem: PlanProblem, seed: int, seconds: float) -> tuple[ExcitationPlan, float]:
+    """A plan within a CPU budget (the polish at the end comes on top), and the CPU seconds really spent."""
+    begun = time.process_time()
+    found = plan(replace(problem, search=replace(problem.search, seed=seed)), Budget(seconds))
+    assert found.check.ok
+    return found, time.process_time() - begun
+
+
+def condition(seeds: int, budget: float) -> dict[str, Any]:
+    """Condition number of the essential columns: median of several seeds, and of all 102 base columns."""
+    results = {}
+    few = max(1, seeds // 3)
+    cases = [
+        ("T0 = 20 s, 49 columns", base_problem(20.0), 27.0, seeds),
+        ("T0 = 25 s, 49 columns", base_problem(25.0), 30.0, seeds),
+        ("T0 = 20 s, 49 columns, urdf speeds", base_problem(20.0, FAST_ARM), 27.0, few),
+        ("T0 = 25 s, 49 columns, urdf speeds", base_problem(25.0, FAST_ARM), 30.0, few),
+        ("T0 = 20 s, 102 columns", base_problem(20.0, parameters="base"), 64.0, few),
+        ("T0 = 20 s, 102 columns, urdf speeds", base_problem(20.0, FAST_ARM, parameters="base"), 64.0, few),
+    ]
+    click.echo(f"{'condition number, unscaled, stacked':40s}  best  median  worst   aim  CPU s")
+    for label, problem, aim, count in cases:
+        found, spent = [], []
+        for seed in range(1, count + 1):
+            result, seconds = solve(problem, seed, budget - 2.0)
+            found.append(next(v for k, v in result.objectives.items() if k.endswith("unscaled")))
+            spent.append(seconds)
+        results[label] = {"values": found, "cpu_s": spent}
+        middle, cost = np.median(found), np.median(spent)
+        click.echo(f"{label:40s} {min(found):5.1f} {middle:7.1f} {max(found):6.1f} {aim:5.0f} {cost:6.1f}")
+    return results
+
+
+def table1(seeds: int, budget: float) -> dict[str, Any]:
+    """The paper's Table 1 rebuilt, and ours beside it; T0 = 25 s."""
+    problem = base_problem(25.0)
+    assembled = assemble(problem)
+    rows = [
+        table_row(f"random points, {name}", assembled, _random(assembled, speed, seed=4))
+        for name, speed in (("full speed", 1.0), ("0.55 of it", 0.55))
+    ]
+    wanted = [
+        ("Alg. 1: condition number", Objective(criterion="condition_number")),
+        ("Alg. 2: equation (10)", Objective(criterion="goal_attainment")),
+        ("mean RSD, condition <= 35", Objective(criterion="mean_rsd", condition_at_most=35.0)),
+        ("mean RSD alone", Objective(criterion="mean_rsd")),
+        ("D-optimal", Objective(criterion="d_optimality")),
+    ]
+    for label, objective in wanted:
+        found, _ = solve(replace(problem, objective=objective), 1, budget - 2.0)
+        rows.append(table_row(label, assembled, found.motion, found.check))
+    click.echo(table(rows, "Table 1 rebuilt (T0 = 25 s; paper: 84.21, 34.01, 37.23)"))
+    click.echo("paper, mean torques: random  3.05 45.09  6.78 18.58  2.17  2.28  1.04")
+    click.echo("                     Alg. 1  3.12 41.71  9.30 13.24  2.12  1.56  0.92")
+    click.echo("                     Alg. 2  4.63 42.26 10.23 14.05  1.56  1.64  1.64")
+    return {row.label: {"condition": row.condition, "torque": row.torque.tolist()} for row in rows}
+
+
+def goal(seeds: int, budget: float) -> dict[str, Any]:
+    """Equation (10) with g = 35 and k_tau = 0.9."""
+    results = {}
+    click.echo(f"{'gamma of equation (10), g = 35, k = 0.9':40s}  best  median  (paper 0.0637)")
+    for label, period, arm in (
+        ("T0 = 20 s", 20.0, "lwr4plus.yaml"),
+        ("T0 = 25 s", 25.0, "lwr4plus.yaml"),
+        ("T0 = 25 s, urdf speeds", 25.0, FAST_ARM),
+    ):
+        problem = base_problem(period, arm, objective=Objective(criterion="goal_attainment"))
+        values = []
+        for seed in range(1, max(2, seeds // 3 + 1)):
+            found, _ = solve(problem, seed, budget - 2.0)
+            values.append(next(v for k, v in found.objectives.items() if k.startswith("goal attainment")))
+        results[label] = values
+        click.echo(f"{label:40s} {min(values):.4f} {np.median(values):.4f}")
+    return results
+
+
+def deviation(seeds: int, budget: float) -> dict[str, Any]:
+    """Predicted relative deviations at equal data (100 samples a session) and noise."""
+    results: dict[str, Any] = {}
+    for arm, name in (("lwr4plus.yaml", "arm file"), (FAST_ARM, "urdf speeds")):
+        problem = base_problem(20.0, arm)
+        assembled = assemble(problem)
+        floor = _floor(assembled)
+        lines = []
+        for label, speed, ramp in (("fast", 1.0, 0.3), ("medium", 1.0, 1.0), ("slow", 0.6, 1.3)):
+            draws = [_random(assembled, speed, seed, ramp) for seed in range(1, 2 + seeds)]
+            found = np.array([_deviations(assembled, motion) for motion in draws])
+            lines.append((f"random points, {label} (median of {len(draws)})", found))
+        for label, objective in (
+            ("A: condition number", Objective(criterion="condition_number")),
+            ("B: equation (10)", Objective(criterion="goal_attainment")),
+            ("mean RSD, condition <= 35", Objective(criterion="mean_rsd", condition_at_most=35.0)),
+            ("mean RSD", Objective(criterion="mean_rsd")),
+            ("worst RSD", Objective(criterion="worst_rsd")),
+        ):
+            motion = solve(replace(problem, objective=objective), 1, budget - 2.0)[0].motion
+            lines.append((label, _deviations(assembled, motion)[None]))
+        click.echo(
+            f"predicted RSD [%], T0 = 20 s, {name}      mean  worst | over the {np.sum(~floor)} without a floor: mean  worst"
+        )
+        for label, found in lines:
+            free = found[:, ~floor]
+            parts = (found.mean(axis=1), found.max(axis=1), free.mean(axis=1), free.max(axis=1))
+            figures = [float(np.median(part)) for part in parts]
+            results[f"{name}: {label}"] = figures
+            click.echo(
+                f"  {label:40s} {figures[0]:6.2f} {figures[1]:6.2f} | {figures[2]:6.2f} {figures[3]:6.2f}"
+            )
+    return results
+
+
+def front(seeds: int, budget: float) -> dict[str, Any]:
+    """Fronts: condition number against wrist torques (hypervolume) and mean predicted deviation (plot)."""
+    results: dict[str, Any] = {}
+    for label, period, aim in (("T0 = 20 s", 20.0, 375.0), ("T0 = 25 s", 25.0, 357.0)):
+        assembled = assemble(base_problem(period))
+        condition_number = assembled.criteria.condition
+        points = []
+        limits = np.log([28.0, 30.0, 32.0, 35.0, 40.0, 46.0, 54.0, 64.0, 75.0])
+        for weights in ((1.0, 1.0), (1.0, 0.3), (0.3, 1.0)):
+            level = TorqueLevel((5, 6), weights, ("A5", "A6"))
+            for point in trade_off(assembled, level, condition_number, limits, starts=2, hops=8):
+                torque = np.mean(np.abs(assembled.view(point.motion).torque), axis=0)
+                points.append((point.bounded, -torque[5], -torque[6]))
+        values = np.array(points)
+        values = values[not_dominated(values)]
+        volume = hypervolume(values, np.array([84.21, 0.0, 0.0]))
+        paper = np.array([37.23, -1.64, -1.64])
+        dominating = values[np.all(values <= paper, axis=1)]
+        best = dominating[np.argmin(dominating[:, 0])] if len(dominating) else None
+        results[label] = {"hypervolume": volume, "points": values.tolist()}
+        click.echo(f"{label}: hypervolume to (84.21; 0; 0) {volume:.0f} (aim {aim:.0f}, paper's A and B 131)")
+        if best is not None:
+            click.echo(
+                f"  dominates the paper's (37.23; 1.64; 1.64): ({best[0]:.2f}; {-best[1]:.2f}; {-best[2]:.2f})"
+            )
+    assembled = assemble(base_problem(20.0))
+    criteria = assembled.criteria
+    limits = np.log([28.0, 30.0, 32.0, 35.0, 40.0, 48.0, 60.0, 80.0])
+    trade = trade_off(assembled, criteria.rsd_mean, criteria.condition, limits, starts=3, hops=10)
+    pairs = [(point.bounded, point.minimised) for point in trade]
+    results["condition against mean RSD"] = pairs
+    scatter(
+        HERE / "front.svg",
+        pairs,
+        "condition number, 49 columns",
+        "mean predicted RSD [%]",
+        "Condition number against predicted deviation, T0 = 20 s",
+    )
+    click.echo("condition number; mean RSD [%]: " + "  ".join(f"({a:.1f}; {b:.2f})" for a, b in pairs))
+    click.echo(f"plot: {HERE / 'front.svg'}")
+    return results
+
+
+def robustness(seeds: int, budget: float) -> dict[str, Any]:
+    """Random starts that end feasible, and plans under random limits checked on a 1 ms grid by other means."""
+    assembled = assemble(base_problem(20.0))
+    starts = [begin(assembled.setup, (77, index)) for index in range(20)]
+    feasible = sum(start.feasible for start in starts)
+    click.echo(f"random starts feasible at the end: {feasible} of 20")
+    rng = np.random.default_rng(5)
+    violated, planned, refused = 0, 0, 0
+    count = 10 * seeds
+    for index in range(count):
+        problem = base_problem(
+            float(rng.uniform(8.0, 30.0)),
+            speed_scale=float(rng.uniform(0.3, 1.0)),
+            clearance_m=float(rng.uniform(0.01, 0.06)),
+            workspace=replace(
+                PlanProblem("x").workspace,
+                radius_m=float(rng.uniform(0.1, 0.45)),
+                height_m=float(rng.uniform(-0.3, 0.1)),
+            ),
+            objective=Objective(criterion=str(rng.choice(["condition_number", "mean_rsd"]))),  # type: ignore[arg-type]
+            search=Search(seed=index, starts=1, hops=0),
+        )
+        try:
+            found = plan(problem)
+        except LwrError as error:
+            refused += 1
+            click.echo(f"  plan {index}: {error}")
+            continue
+        planned += 1
+        violated += not _clean(assemble(problem), found)
+    click.echo(
+        f"plans under random limits: {planned} of {count} found, {refused} refused, {violated} violate anything"
+    )
+    return {"feasible_starts": feasible, "planned": planned, "violations": violated, "refused": refused}
+
+
+def gradient(seeds: int, budget: float) -> dict[str, Any]:
+    """CPU time of one value and gradient at 200 samples, against central differences."""
+    results = {}
+    with threadpool_limits(1):
+        for label, parameters in (("49 columns", None), ("102 columns", "base")):
+            problem = base_problem(20.0)
+            if parameters is not None:
+                problem = replace(problem, parameters=parameters)
+            setup = replace(assemble(problem).setup, samples=200, refine=1)
+            program = setup.program()
+            evaluator, target = program.evaluator, setup.target
+            assert target is not None
+            x = random_start(setup, np.random.default_rng(1))
+
+            def value_and_gradient(
+                at: np.ndarray = x, evaluator: Any = evaluator, target: Any = target
+            ) -> float:
+                view = evaluator.view(evaluator.signals(at.reshape(7, -1)))
+                value, pull = target.evaluate(view, 16.0)
+                pull(1.0)
+                evaluator.gradient(view)
+                return float(value)
+
+            def value_only(at: np.ndarray, evaluator: Any = evaluator, target: Any = target) -> float:
+                return float(target.evaluate(evaluator.view(evaluator.signals(at.reshape(7, -1))), 16.0)[0])
+
+            def differences(x: np.ndarray = x, value_only: Any = value_only) -> None:
+                for k in range(x.size):
+                    step = np.zeros(x.size)
+                    step[k] = 1e-6
+                    value_only(x + step)
+                    value_only(x - step)
+
+            exact, slow = _cpu(value_and_gradient, 300), _cpu(differences, 5)
+            results[label] = (exact, slow)
+            click.echo(
+                f"value and gradient, {label}, 200 samples: {1e3 * exact:.2f} ms; central differences {1e3 * slow:.0f} ms"
+            )
+    return results
+
+
+def _random(assembled: Assembled, speed: float, seed: int, ramp_s: float | None = None) -> Any:
+    """Random points; `ramp_s` is the time to reach full velocity, None: acceleration 4 rad/s²."""
+    limits = assembled.setup.limits
+    ramp = np.full(7, 4.0) if ramp_s is None else limits.v_max * speed / ramp_s
+    return random_points(
+        assembled.setup.mechanism,
+        limits,
+        seed=seed,
+        speed_scale=speed,
+        a_max=ramp,
+        workspace=assembled.problem.workspace,
+        checker=assembled.checker,
+        clearance_m=assembled.clearance_m,
+    )
+
+
+def _deviations(assembled: Assembled, motion: Any) -> np.ndarray:
+    return assembled.criteria.rsd_mean.deviations(assembled.view(motion))
+
+
+def _floor(assembled: Assembled) -> np.ndarray:
+    """Offsets and Coulomb terms: their signals are constants of magnitude one, whatever the motion."""
+    names = assembled.criteria.rsd_mean.assembly.names
+    return np.array([name.startswith(("off", "Fc")) for name in names])
+
+
+def _clean(assembled: Assembled, found: ExcitationPlan) -> bool:
+    """Every limit on the 1 ms grid by plain samples, with nothing of the exact extrema."""
+    times = np.arange(0.0, found.period_s, 1e-3)
+    samples = found.motion.sample(times)
+    limits: Limits = assembled.setup.limits
+    kinematic = (
+        np.all(samples.q >= limits.q_low)
+        and np.all(samples.q <= limits.q_high)
+        and np.all(np.abs(samples.qd) <= limits.v_max)
+        and np.all(np.abs(samples.qdd) <= limits.a_max)
+        and np.all(np.abs(samples.qddd) <= limits.j_max)
+    )
+    rest = check_motion(
+        found.motion,
+        assembled.setup.mechanism,
+        limits,
+        workspace=assembled.problem.workspace,
+        estimate=assembled.setup.estimate,
+        checker=assembled.checker,
+        clearance_m=assembled.clearance_m,
+    )
+    return bool(kinematic) and rest.ok
+
+
+def _cpu(work: Callable[[], Any], repeats: int) -> float:
+    work()
+    begun = time.process_time()
+    for _ in range(repeats):
+        work()
+    return (time.process_time() - begun) / repeats
+
+
+SECTIONS: dict[str, Callable[[int, float], dict[str, Any]]] = {
+    "gradient": gradient,
+    "table1": table1,
+    "condition": condition,
+    "goal": goal,
+    "deviation": deviation,
+    "front": front,
+    "robustness": robustness,
+}
+
+
+@click.command(help=__doc__.splitlines()[0] if __doc__ else "")
+@click.option(
+    "--section", "sections", multiple=True, type=click.Choice(list(SECTIONS)), help="Default: all of them."
+)
+@click.option("--seeds", default=10, show_default=True, help="Searches per case.")
+@click.option("--budget", default=30.0, show_default=True, help="CPU seconds of a search.")
+@click.option(
+    "--json", "output", type=click.Path(path_type=Path), help="Write the figures to a file as well."
+)
+def main(sections: tuple[str, ...], seeds: int, budget: float, output: Path | None) -> None:
+    """Run the sections and print their figures."""
+    results = {}
+    for name in sections or tuple(SECTIONS):
+        begun = time.process_time()
+        click.echo(f"\n== {name} ==")
+        results[name] = SECTIONS[name](seeds, budget)
+        click.echo(f"({time.process_time() - begun:.0f} CPU s)")
+    if output is not None:
+        output.write_text(json.dumps(results, indent=1, default=float), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
