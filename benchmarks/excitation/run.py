@@ -4,9 +4,10 @@
     python benchmarks/excitation/run.py --section table1 --section gradient
     python benchmarks/excitation/run.py --seeds 3 --budget 10
 
-Budgets are CPU seconds of this process (one BLAS thread, one job). Limits are those of the arm file, with position
-margin; every motion is checked at exact extrema, on a 1 ms grid, and proven in between, self-collision and ground
-included. `urdf speeds` is the same arm with the higher wrist velocities of the published URDF files.
+Budgets are CPU seconds of this process (one BLAS thread, one job). Limits are those of the arm file, with its
+position margin. Every motion is checked at exact extrema, on a 1 ms grid, and proven in between,
+self-collision and ground included. `urdf speeds`: the same arm with the higher wrist velocities of the
+published URDF files.
 """
 
 from __future__ import annotations
@@ -178,7 +179,7 @@ def deviation(seeds: int, budget: float) -> dict[str, Any]:
             motion = solve(replace(problem, objective=objective), 1, budget - 2.0)[0].motion
             lines.append((label, _deviations(assembled, motion)[None]))
         click.echo(
-            f"predicted RSD [%], T0 = 20 s, {name}      mean  worst | over the {np.sum(~floor)} without a floor: mean  worst"
+            f"RSD [%], T0 = 20 s, {name}: mean, worst | the {np.sum(~floor)} without a floor: mean, worst"
         )
         for label, found in lines:
             free = found[:, ~floor]
@@ -213,9 +214,7 @@ def front(seeds: int, budget: float) -> dict[str, Any]:
         results[label] = {"hypervolume": volume, "points": values.tolist()}
         click.echo(f"{label}: hypervolume to (84.21; 0; 0) {volume:.0f} (aim {aim:.0f}, paper's A and B 131)")
         if best is not None:
-            click.echo(
-                f"  dominates the paper's (37.23; 1.64; 1.64): ({best[0]:.2f}; {-best[1]:.2f}; {-best[2]:.2f})"
-            )
+            click.echo(f"  beats (37.23; 1.64; 1.64): ({best[0]:.2f}; {-best[1]:.2f}; {-best[2]:.2f})")
     assembled = assemble(base_problem(20.0))
     criteria = assembled.criteria
     limits = np.log([28.0, 30.0, 32.0, 35.0, 40.0, 48.0, 60.0, 80.0])
@@ -235,7 +234,7 @@ def front(seeds: int, budget: float) -> dict[str, Any]:
 
 
 def robustness(seeds: int, budget: float) -> dict[str, Any]:
-    """Random starts that end feasible, and plans under random limits checked on a 1 ms grid by other means."""
+    """Random starts that end feasible, and plans under random limits checked on a 1 ms grid."""
     assembled = assemble(base_problem(20.0))
     starts = [begin(assembled.setup, (77, index)) for index in range(20)]
     feasible = sum(start.feasible for start in starts)
@@ -265,7 +264,7 @@ def robustness(seeds: int, budget: float) -> dict[str, Any]:
         planned += 1
         violated += not _clean(assemble(problem), found)
     click.echo(
-        f"plans under random limits: {planned} of {count} found, {refused} refused, {violated} violate anything"
+        f"plans under random limits: {planned} of {count} found, {refused} refused, {violated} violate"
     )
     return {"feasible_starts": feasible, "planned": planned, "violations": violated, "refused": refused}
 
@@ -306,7 +305,7 @@ def gradient(seeds: int, budget: float) -> dict[str, Any]:
             exact, slow = _cpu(value_and_gradient, 300), _cpu(differences, 5)
             results[label] = (exact, slow)
             click.echo(
-                f"value and gradient, {label}, 200 samples: {1e3 * exact:.2f} ms; central differences {1e3 * slow:.0f} ms"
+                f"{label}, 200 samples: value, gradient {1e3 * exact:.2f} ms; differences {1e3 * slow:.0f} ms"
             )
     return results
 
