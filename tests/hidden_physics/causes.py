@@ -22,6 +22,8 @@ COULOMB = (15.04, 16.48, 8.77, 9.96, 5.58, 4.41, 4.16)
 VISCOUS = (16.68, 19.09, 7.87, 11.63, 5.39, 3.64, 2.03)
 FULL_SCALE = (176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0)
 MOTOR_NOISE = (0.4, 0.42, 0.26, 0.25, 0.18, 0.085, 0.1)
+PLAY = (1.5e-4, 3e-4, 4e-4, 5e-4, 1e-3, 1.2e-3, 2e-3)
+ZERO_DEG = (0.2, 0.2, 0.3, 0.3, 0.8, 1.0, 1.5)
 JOINT_NOISE = (0.155, 0.16, 0.096, 0.105, 0.098, 0.037, 0.045)
 
 Random = np.random.Generator
@@ -110,10 +112,10 @@ def _fault(joint: int, **values: float) -> Setting:
 
 
 def _stribeck(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    speed, shape = _log(random, 0.03, 0.2), random.uniform(0.8, 2.0)
+    speed, shape = _log(random, 0.04, 0.25), random.uniform(0.8, 2.0)
 
     def sized(size: float) -> Hidden:
-        rise = size * 2.5 * MOTOR_NOISE[joint - 1]
+        rise = size * 7.0 * MOTOR_NOISE[joint - 1]
         setting = _trait(
             joint, stribeck=rise / COULOMB[joint - 1], stribeck_speed=speed, stribeck_shape=shape
         )
@@ -139,8 +141,8 @@ def _asymmetry(random: Random, joint: int, scene: Scene) -> Callable[[float], Hi
     sign = _sign(random)
 
     def sized(size: float) -> Hidden:
-        coulomb = sign * min(0.4, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
-        viscous = sign * min(0.6, size * 4.0 * MOTOR_NOISE[joint - 1] / VISCOUS[joint - 1])
+        coulomb = sign * min(0.4, size * 0.9 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        viscous = sign * min(0.6, size * 1.8 * MOTOR_NOISE[joint - 1] / VISCOUS[joint - 1])
         setting = _trait(joint, forward_coulomb=coulomb, forward_viscous=viscous)
         return Hidden("friction_asymmetry", "motor", (joint,), size, _everywhere(setting))
 
@@ -149,7 +151,7 @@ def _asymmetry(random: Random, joint: int, scene: Scene) -> Callable[[float], Hi
 
 def _load(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        share = size * 4.0 * MOTOR_NOISE[joint - 1] / scene.peaks[joint - 1]
+        share = size * 2.4 * MOTOR_NOISE[joint - 1] / scene.peaks[joint - 1]
         setting = _trait(joint, load_share=share)
         return Hidden("friction_load", "motor", (joint,), size, _everywhere(setting), {"share": share})
 
@@ -163,13 +165,13 @@ def _temperature(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     def sized(size: float) -> Hidden:
         share = size * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1]
         if between:
-            settings = tuple(_trait(joint, warmth=0.1 * share, start_warm=start) for start in warm)
+            settings = tuple(_trait(joint, warmth=0.03 * share, start_warm=start) for start in warm)
             return Hidden(
                 "friction_temperature", "motor", (joint,), size, settings, variant="between sessions"
             )
         # A thin film that warms up within the session by 5 to 15 K.
         power = COULOMB[joint - 1] * 0.35
-        setting = _trait(joint, warmth=0.4 * share, film_capacity=power / 0.9, film_conductance=power / 12.0)
+        setting = _trait(joint, warmth=0.08 * share, film_capacity=power / 0.9, film_conductance=power / 12.0)
         return Hidden(
             "friction_temperature", "motor", (joint,), size, _everywhere(setting), variant="within a session"
         )
@@ -186,7 +188,7 @@ def _position(random: Random, joint: int, scene: Scene) -> Callable[[float], Hid
     )
 
     def sized(size: float) -> Hidden:
-        share = min(0.6, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        share = min(0.6, size * 1.4 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         if wave:
             setting = _trait(joint, wave=share, wave_count=count, wave_phase=phase)
         else:
@@ -201,7 +203,7 @@ def _presliding(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     reach = _log(random, 5e-3, 4e-2)
 
     def sized(size: float) -> Hidden:
-        share = min(0.9, size * 4.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        share = min(0.9, size * 3.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         setting = _trait(joint, long_share=share, long_reach=reach)
         return Hidden("presliding_hysteresis", "motor", (joint,), size, _everywhere(setting))
 
@@ -229,7 +231,7 @@ def _motor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     sign = _sign(random)
 
     def sized(size: float) -> Hidden:
-        error = sign * min(0.3, size * 0.05)
+        error = sign * min(0.3, size * 0.03)
         setting = _trait(joint, motor_gain=1.0 + error)
         return Hidden(
             "motor_torque_gain", "motor", (joint,), size, _everywhere(setting), {"gain": 1.0 / (1.0 + error)}
@@ -239,11 +241,12 @@ def _motor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 
 def _backlash(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    softness = random.uniform(0.0, 0.06)
+    softness = random.uniform(1e-3, 0.06)
 
     def sized(size: float) -> Hidden:
-        setting = _trait(joint, play=size * 1.0e-3, play_softness=max(softness, 1e-3))
-        return Hidden("backlash", "joint", (joint,), size, _everywhere(setting), {"width": 2e-3 * size})
+        play = size * PLAY[joint - 1]
+        setting = _trait(joint, play=play, play_softness=softness)
+        return Hidden("backlash", "joint", (joint,), size, _everywhere(setting), {"width": 2.0 * play})
 
     return sized
 
@@ -266,7 +269,7 @@ def _cable(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
     centre, slack = random.uniform(-0.5, 0.5), random.uniform(0.2, 0.8)
 
     def sized(size: float) -> Hidden:
-        torque = size * 3.0 * JOINT_NOISE[joint - 1]
+        torque = size * 0.7 * JOINT_NOISE[joint - 1]
         if kind == "hardening":
             setting = _trait(joint, cable=torque, cable_cubic=0.7 * torque, cable_centre=centre)
         elif kind == "slack":
@@ -289,7 +292,7 @@ def _tilt(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     direction = random.uniform(-math.pi, math.pi)
 
     def sized(size: float) -> Hidden:
-        angle = math.radians(0.5 * size)
+        angle = math.radians(0.12 * size)
         rx, ry = angle * math.cos(direction), angle * math.sin(direction)
         truth = {"tilt_x": rx, "tilt_y": ry}
         return Hidden("base_tilt", "joint", (), size, _everywhere(Setting(tilt=(rx, ry))), truth)
@@ -317,11 +320,11 @@ def _payload_change(random: Random, joint: int, scene: Scene) -> Callable[[float
     def sized(size: float) -> Hidden:
         load: dict[str, object]
         if kind == "drop":
-            load = {"mass": -min(1.5, 0.08 * size), "moment": [0.0, 0.0, -min(0.2, 0.011 * size)]}
+            load = {"mass": -0.02 * size, "moment": [0.0, 0.0, -0.003 * size]}
         elif kind == "shift":
-            load = {"moment": [float(v) for v in 0.015 * size * direction]}
+            load = {"moment": [float(v) for v in 0.004 * size * direction]}
         else:
-            load = {"rattle": 0.006 * size}
+            load = {"rattle": 0.0025 * size}
         loaded = Setting(load={**load, "from_s": time_s})
         after = Setting(load=load)
         truth = {"time": time_s - scene.begin_s}
@@ -334,7 +337,7 @@ def _zero(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     sign = _sign(random)
 
     def sized(size: float) -> Hidden:
-        angle = sign * math.radians(0.4 * size)
+        angle = sign * math.radians(ZERO_DEG[joint - 1] * size)
         setting = _trait(joint, zero=angle)
         return Hidden("joint_zero_offset", "joint", (joint,), size, _everywhere(setting), {"offset": angle})
 
@@ -356,8 +359,8 @@ def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidd
                 "start_s": time_s,
                 "length_s": length,
                 "link": link,
-                "force": [float(v) for v in (0.0 if drag else 12.0 * size) * direction],
-                "stiffness": 60.0 * size if drag else 0.0,
+                "force": [float(v) for v in (0.0 if drag else 2.5 * size) * direction],
+                "stiffness": 8.0 * size if drag else 0.0,
             }
             settings[session] = Setting(contacts=(episode,))
         truth = {"time": times[train] - scene.begin_s + 0.5 * length}
@@ -375,7 +378,7 @@ def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     sign = _sign(random)
 
     def sized(size: float) -> Hidden:
-        gain = 1.0 + sign * min(0.3, 0.03 * size)
+        gain = 1.0 + sign * min(0.3, 0.025 * size)
         return Hidden(
             "sensor_gain", "sensor", (joint,), size, _everywhere(_fault(joint, gain=gain)), {"gain": gain}
         )
@@ -388,7 +391,7 @@ def _crosstalk(random: Random, joint: int, scene: Scene) -> Callable[[float], Hi
     source, sign = int(random.choice(others)), _sign(random)
 
     def sized(size: float) -> Hidden:
-        share = sign * size * 3.0 * JOINT_NOISE[joint - 1] / scene.peaks[source - 1]
+        share = sign * size * 1.8 * JOINT_NOISE[joint - 1] / scene.peaks[source - 1]
         setting = Setting(leak={joint: {source: share}})
         truth = {"source": float(source), "share": share}
         return Hidden("sensor_crosstalk", "sensor", (joint,), size, _everywhere(setting), truth)
@@ -400,7 +403,7 @@ def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     share = random.uniform(0.5, 1.0)
 
     def sized(size: float) -> Hidden:
-        width = min(0.4 * scene.peaks[joint - 1], size * 1.2 * JOINT_NOISE[joint - 1])
+        width = min(0.4 * scene.peaks[joint - 1], size * 2.0 * JOINT_NOISE[joint - 1])
         setting = _fault(joint, play=width / share, play_share=share)
         return Hidden("sensor_hysteresis", "sensor", (joint,), size, _everywhere(setting))
 
@@ -409,7 +412,7 @@ def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 def _saturation(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        clip = scene.peaks[joint - 1] * (1.0 - min(0.7, 0.12 * size))
+        clip = scene.peaks[joint - 1] * (1.0 - min(0.7, 0.04 * size))
         return Hidden(
             "sensor_saturation",
             "sensor",
@@ -428,7 +431,7 @@ def _drift(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
     time_constant = random.uniform(4.0, 12.0)
 
     def sized(size: float) -> Hidden:
-        torque = sign * size * 1.5 * JOINT_NOISE[joint - 1]
+        torque = sign * size * 0.8 * JOINT_NOISE[joint - 1]
         settings = _everywhere(_fault(joint, drift=2.0 * torque / (PERIODS * PERIOD_S)))
         if kind == "creep":
             settings = _everywhere(_fault(joint, creep=2.0 * torque, creep_time=time_constant))

@@ -69,6 +69,7 @@ def _late(values: np.ndarray, rows: np.ndarray, place: int, late: np.ndarray) ->
 def _chain(
     time_s: float,
     torque: np.ndarray,
+    true: np.ndarray,
     angle: np.ndarray,
     f: np.ndarray,
     leak: np.ndarray,
@@ -76,13 +77,16 @@ def _chain(
     rows: np.ndarray,
     place: int,
 ) -> None:
-    """The chain of the joint torque sensors on `torque` (n,), in place."""
+    """The chain of the joint torque sensors, from the `true` torque (n,) to the reading `torque` (n,), in place.
+
+    What the reading holds beyond the truth is the electronics' noise, which comes after the strain gauges.
+    """
     n = torque.shape[0]
     felt = np.empty(n)
     for i in range(n):
-        felt[i] = torque[i]
+        felt[i] = true[i]
         for j in range(n):
-            felt[i] += leak[i, j] * torque[j]
+            felt[i] += leak[i, j] * true[j]
     for i in range(n):
         value = f[GAIN, i] * felt[i]
         if f[OTHER_SCALE, i] != 0.0:
@@ -91,7 +95,7 @@ def _chain(
             slack[i] = min(value + f[PLAY, i], max(value - f[PLAY, i], slack[i]))
             value += f[PLAY_SHARE, i] * (slack[i] - value)
         value += f[RIPPLE, i] * math.sin(f[COUNT, i] * angle[i] + f[PHASE, i])
-        value += f[ZERO, i] + f[DRIFT, i] * time_s
+        value += f[ZERO, i] + f[DRIFT, i] * time_s + torque[i] - true[i]
         if f[CREEP, i] != 0.0:
             value += f[CREEP, i] * (1.0 - math.exp(-time_s / f[CREEP_TIME, i]))
         torque[i] = min(f[CLIP, i], max(-f[CLIP, i], value))
@@ -146,12 +150,13 @@ class SensorChain(Effect):
         torque = reading.joint_torque
         if not self._begun:
             self._begun = True
-            self._slack[:] = torque
+            self._slack[:] = plant.joint_torque
             self._rows[0] = torque
         self._place = (self._place + 1) % _MEMORY
         _chain(
             time_s,
             torque,
+            plant.joint_torque,
             plant.position,
             self.faults,
             self.leak,
