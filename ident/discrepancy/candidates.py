@@ -1,0 +1,264 @@
+"""Candidates: every cause on every joint, with its shapes, as columns in rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from ident.discrepancy.events import find_bursts
+from ident.discrepancy.evidence import Evidence, Floats, Key, Products, Rows, Score
+from ident.discrepancy.nominal import Nominal
+from ident.effects import EFFECTS, Effect, Setting, Shape
+from ident.effects.motion import Motion
+
+__all__ = ["Candidate", "Dictionary", "Trial"]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A cause on a joint (counted from 0, -1 for the whole arm)."""
+
+    effect: Effect
+    joint: int
+
+    @property
+    def cause(self) -> str:
+        """Name of the cause."""
+        return self.effect.cause
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Joints counted from 1, empty for the whole arm."""
+        return () if self.joint < 0 else (self.joint + 1,)
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Identifies it."""
+        return self.effect.cause, self.joint
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A candidate with the shape that suits the data best, and its score."""
+
+    candidate: Candidate
+    shape: Shape
+    score: Score
+    rows: Rows = field(repr=False)
+
+
+class Dictionary:
+    """Columns of all candidates for the rows of a nominal arm, made once and kept.
+
+    causes : names to consider; None for all.
+    """
+
+    def __init__(self, nominal: Nominal, evidence: Evidence, causes: Sequence[str] | None = None) -> None:
+        self.nominal = nominal
+        self.evidence = evidence
+        self.setting = _setting(nominal)
+        wanted = list(EFFECTS) if causes is None else list(causes)
+        n = nominal.arm.chain.n
+        motor = "motor" in nominal.rows
+        self.candidates = tuple(
+            Candidate(EFFECTS[cause], joint)
+            for cause in wanted
+            if motor or EFFECTS[cause].side != "motor"
+            for joint in ([-1] if EFFECTS[cause].whole_arm else range(n))
+        )
+        self._kept: dict[tuple[str, int], list[tuple[Shape, Rows, dict[Key, Floats], Products]]] = {}
+
+    def rows(self, candidate: Candidate, shape: Shape) -> Rows:
+        """Columns of a candidate in rows: (m, k) by side and joint."""
+        nominal = self.nominal
+        by_motion = [
+            candidate.effect.columns(motion, max(candidate.joint, 0), shape) for motion in nominal.motions
+        ]
+        found: dict[Key, Floats] = {}
+        for side in nominal.rows:
+            per_column = [
+                [getattr(columns[k], side) for columns in by_motion] for k in range(len(by_motion[0]))
+            ]
+            per_column = [c for c in per_column if c[0] is not None]
+            if not per_column:
+                continue
+            reduced = [nominal.reduce(side, column) for column in per_column]
+            if reduced[0].ndim == 1:
+                found[side, candidate.joint] = np.stack(reduced, axis=1)
+                continue
+            for j in range(nominal.arm.chain.n):
+                column = np.stack([r[:, j] for r in reduced], axis=1)
+                if np.any(column):
+                    found[side, j] = column
+        return found
+
+    def _prepared(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
+        if candidate.key not in self._kept:
+            entries = self._steps(candidate) if candidate.effect.step else []
+            keep_rows = not candidate.effect.event
+            shapes = [] if entries else candidate.effect.shapes(self.setting, max(candidate.joint, 0))
+            for shape in shapes:
+                rows = self.rows(candidate, shape)
+                if not rows or not any(np.any(values) for values in rows.values()):
+                    continue
+                padded = self.evidence.padded(rows)
+                base = self.evidence.alone(padded)
+                entries.append((shape, rows if keep_rows else {}, padded if keep_rows else {}, base))
+            self._kept[candidate.key] = entries
+        return self._kept[candidate.key]
+
+    def _steps(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
+        """Entries of an effect that sets in at a time: one for each edge of a block, from the same products."""
+        evidence, entries = self.evidence, []
+        for session in sorted(set(evidence.block_session.tolist())):
+            mine = np.flatnonzero(evidence.block_session == session)
+            starts = evidence.block_start[mine]
+            shape = {"time": float(starts.min()), "session": float(session + 1)}
+            padded = evidence.padded(self.rows(candidate, shape))
+            whole = evidence.alone(padded)
+            for edge in np.sort(starts)[1:]:
+                on = np.zeros(evidence.blocks)
+                on[mine[starts >= edge]] = 1.0
+                part = Products(
+                    whole.base * on[:, None, None],
+                    whole.own * on[:, None, None],
+                    whole.target * on[:, None],
+                )
+                entries.append(({**shape, "time": float(edge)}, {}, {}, part))
+        return entries
+
+    def _contacts(self, candidate: Candidate) -> Trial | None:
+        """The best contact in a burst of the residual, on any link from the third on."""
+        best: Trial | None = None
+        n = self.nominal.arm.chain.n
+        for burst in find_bursts(self.evidence):
+            for link in range(min(3, n), n + 1):
+                shape = {
+                    "time": burst.start_s - 0.05,
+                    "duration": burst.duration_s + 0.1,
+                    "session": float(burst.session + 1),
+                    "link": float(link),
+                }
+                trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
+                if trial is not None and (best is None or trial.score.gain > best.score.gain):
+                    best = trial
+        return best
+
+    def best(self, candidate: Candidate) -> Trial | None:
+        """The candidate with the best shape of its grid, None where no shape is plausible."""
+        if candidate.cause == "contact":
+            return self._contacts(candidate)
+        best: Trial | None = None
+        entries = self._prepared(candidate)
+        for shape, kept, ready, known in entries:
+            rows, padded = kept, ready
+            if not rows:
+                if self.evidence.extra:
+                    rows = self.rows(candidate, shape)
+                    padded = self.evidence.padded(rows)
+                else:
+                    padded = dict.fromkeys(self.evidence.mask, _EMPTY[:, :, : known.own.shape[1]])
+            score = self.measure(candidate, padded, len(entries), known)
+            if not candidate.effect.plausible(score.coefficients, shape):
+                continue
+            if best is None or score.gain > best.score.gain:
+                best = Trial(candidate, shape, score, rows)
+        if best is not None and not best.rows:
+            best = Trial(candidate, best.shape, best.score, self.rows(candidate, best.shape))
+        return best
+
+    def measure(
+        self,
+        candidate: Candidate,
+        padded: Mapping[Key, Floats],
+        choices: int = 1,
+        known: Products | None = None,
+    ) -> Score:
+        """Score of padded columns in the way that suits the candidate."""
+        if candidate.effect.event:
+            return self.evidence.event_score(padded, choices, known)
+        return self.evidence.score(padded, known=known)
+
+    def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
+        """The candidate with a given shape, None where it has no rows or makes no sense."""
+        rows = self.rows(candidate, shape)
+        if not rows or not any(np.any(values) for values in rows.values()):
+            return None
+        score = self.measure(candidate, self.evidence.padded(rows), choices)
+        if not candidate.effect.plausible(score.coefficients, shape):
+            return None
+        return Trial(candidate, shape, score, rows)
+
+    def refine(self, trial: Trial, choices: int = 1, evaluations: int = 12) -> Trial:
+        """The same with its continuous shape parameters at the best fit, one after the other."""
+        effect, best = trial.candidate.effect, trial
+        grid = effect.shapes(self.setting, max(trial.candidate.joint, 0))
+        for name in effect.continuous(trial.shape):
+            values = sorted({s[name] for s in grid if name in s and _alike(s, trial.shape, name)})
+            low, high = _neighbours(values, float(trial.shape[name]))
+            if effect.step:
+                low, high = float(trial.shape[name]) - 2.5, float(trial.shape[name]) + 2.5
+            elif effect.event:
+                here = float(trial.shape[name])
+                low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
+            logarithmic = low > 0.0 and not effect.event
+
+            def value(x: float, logarithmic: bool = logarithmic) -> float:
+                return float(np.exp(x)) if logarithmic else float(x)
+
+            def loss(x: float, name: str = name) -> float:
+                nonlocal best
+                tried = self.trial(trial.candidate, {**best.shape, name: value(x)}, choices)
+                if tried is None:
+                    return 0.0
+                if tried.score.fitted > best.score.fitted:
+                    best = tried
+                return -tried.score.fitted
+
+            bounds = (np.log(low), np.log(high)) if logarithmic else (low, high)
+            minimize_scalar(loss, bounds=bounds, method="bounded", options={"maxiter": evaluations})
+        return best
+
+    def trials(self) -> Iterator[Trial]:
+        """The best shape of every candidate."""
+        for candidate in self.candidates:
+            found = self.best(candidate)
+            if found is not None:
+                yield found
+
+
+_EMPTY = np.zeros((1, 1, 16))
+
+
+def _alike(a: Shape, b: Shape, besides: str) -> bool:
+    return all(a[k] == b[k] for k in a if k != besides and k in b)
+
+
+def _neighbours(values: Sequence[float], here: float) -> tuple[float, float]:
+    below = [v for v in values if v < here * (1 - 1e-9) - 1e-12]
+    above = [v for v in values if v > here * (1 + 1e-9) + 1e-12]
+    low = below[-1] if below else (0.4 * here if here > 0 else here - 0.5)
+    high = above[0] if above else (2.5 * here if here > 0 else here + 0.5)
+    if here > 0.0 and low <= 0.0:
+        low = 0.3 * here
+    if here < 0.0 and high >= 0.0:
+        high = 0.3 * here
+    return low, high
+
+
+def _setting(nominal: Nominal) -> Setting:
+    motions: list[Motion] = nominal.motions
+    q = np.concatenate([m.q for m in motions])
+    return Setting(
+        sessions=len({m.session for m in motions}),
+        durations_s=tuple(
+            max(m.time[-1] for m in motions if m.session == k) for k in sorted({m.session for m in motions})
+        ),
+        gear_ratio=nominal.arm.gear_ratio,
+        torque_range=np.max([np.abs(m.joint_torque).max(axis=0) for m in motions], axis=0),
+        speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
+        position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
+    )

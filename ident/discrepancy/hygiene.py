@@ -1,0 +1,59 @@
+"""Samples that were lost, repeated or held, seen in the channels themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from lwr_driver.session import JointColumns, Session
+
+__all__ = ["SampleLoss", "sample_loss"]
+
+_LEAST = 10
+_SHARE = 0.001
+
+
+@dataclass(frozen=True)
+class SampleLoss:
+    """Share of the samples of a channel of a session that are missing or repeat the one before."""
+
+    session: str
+    channel: str
+    lost: int
+    repeated: int
+    samples: int
+
+    @property
+    def share(self) -> float:
+        """Lost and repeated over all."""
+        return (self.lost + self.repeated) / max(self.samples + self.lost, 1)
+
+    @property
+    def matters(self) -> bool:
+        """More than a handful, and more than one in a thousand."""
+        return self.lost + self.repeated >= _LEAST and self.share > _SHARE
+
+
+def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
+    """The channels with the losses that matter, worst first."""
+    found = []
+    for session in sessions:
+        found.append(_channel(session.path.name, "joint", session.joint))
+        if session.motor is not None:
+            found.append(_channel(session.path.name, "motor", session.motor))
+    return tuple(sorted((loss for loss in found if loss.matters), key=lambda loss: -loss.share))
+
+
+def _channel(name: str, channel: str, columns: JointColumns) -> SampleLoss:
+    effort = columns.effort
+    repeated = 0
+    if effort.shape[1] >= 2 and len(effort) > 2:
+        same = np.all(np.diff(effort, axis=0) == 0.0, axis=1)
+        # Smooth or coarse channels repeat by themselves; then equality of all joints at once means nothing.
+        each = np.mean(np.diff(effort, axis=0) == 0.0, axis=0)
+        expected = float(np.prod(np.maximum(each - same.mean(), 0.0))) * len(same)
+        repeated = max(0, int(same.sum() - np.ceil(expected + 3.0 * np.sqrt(expected))))
+    return SampleLoss(name, channel, columns.lost, repeated, len(columns))

@@ -1,0 +1,338 @@
+"""The nominal arm: rows of the base model at the full bandwidth of the channels, and its predictions.
+
+Each side keeps its own sample times. Joint torque is averaged over short bins, the regressor with it; motor
+torque that comes slower than that gives one row a sample, with the regressor at that very instant. Both are
+linear operations on torque and regressor alike, so neither biases anything, and a row depends on a few
+milliseconds only: standstill and reversals spoil few rows.
+
+The drive's own columns (Ia, Fvm, Fcm) belong to the motor, which stands elsewhere than the link by the twist
+of the joint; the twist is that of the torque which the model predicts, so no sensor's noise or error leaks
+from one side to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident import regressor
+from ident.base import BaseSet, numeric_base
+from ident.discrepancy.recording import Recording, Stretch
+from ident.discrepancy.settings import DiagnosisSettings
+from ident.effects.motion import Motion
+from ident.kinematics import Chain
+from ident.model import DynamicModel
+from ident.parameters import split_name
+from ident.signals.filters import differentiate, low_pass
+from ident.structure import Condition, ModelStructure, Side
+
+__all__ = ["Arm", "Nominal", "SideRows", "structure_of"]
+
+Floats = NDArray[np.float64]
+
+_CHUNK = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """What is known of the arm beforehand.
+
+    compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio : (n,), one where
+    unknown. motor_delay_s, joint_delay_s : of the healthy channels.
+    """
+
+    chain: Chain
+    compliance: Floats
+    gear_ratio: Floats
+    motor_delay_s: float = 0.0
+    joint_delay_s: float = 0.0
+
+
+def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStructure, BaseSet]:
+    """Columns for the sessions' payloads and sides."""
+    payloads = tuple(dict.fromkeys(r.payload for r in recordings if r.payload is not None))
+    motor = any(r.has_motor for r in recordings)
+    structure = ModelStructure(arm.chain, 2 if motor else 1, payloads)
+    conditions: dict[Condition, None] = {}
+    for r in recordings:
+        sides: tuple[Side, ...] = ("motor", "joint") if r.has_motor else ("joint",)
+        conditions[Condition(r.payload, sides)] = None
+    return structure, numeric_base(structure, tuple(conditions))
+
+
+@dataclass(frozen=True, eq=False)
+class SideRows:
+    """Rows of one side, all sessions, in the order of time.
+
+    matrix : (n, m, p) base regressor by joint; target : (m, n) [Nm]; valid : (m, n).
+    session : (m,) number; time : (m,) [s]; test : (m,) rows that are never fitted.
+    """
+
+    matrix: Floats
+    target: Floats
+    valid: NDArray[np.bool_]
+    session: NDArray[np.int64]
+    time: Floats
+    test: NDArray[np.bool_]
+
+
+@dataclass(eq=False)
+class Nominal:
+    """Rows and predictions of the nominal arm for recordings; `refine` repeats them with better predictions.
+
+    motions : one for each stretch, with the predicted torques.
+    """
+
+    arm: Arm
+    recordings: tuple[Recording, ...]
+    settings: DiagnosisSettings
+    structure: ModelStructure
+    base: BaseSet
+    motions: list[Motion] = field(default_factory=list)
+    rows: dict[str, SideRows] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        arm: Arm,
+        recordings: Sequence[Recording],
+        settings: DiagnosisSettings,
+        structure: ModelStructure,
+        base: BaseSet,
+    ) -> Nominal:
+        """Rows with the twist of the measured joint torque, to begin with."""
+        nominal = cls(arm, tuple(recordings), settings, structure, base)
+        nominal.motions = [
+            nominal._motion(r, s, _measured(s)) for r in nominal.recordings for s in r.stretches
+        ]
+        nominal.rows = nominal._rows()
+        return nominal
+
+    @property
+    def stretches(self) -> list[tuple[Recording, Stretch]]:
+        """Recording and stretch of each motion."""
+        return [(r, s) for r in self.recordings for s in r.stretches]
+
+    @cached_property
+    def sides(self) -> tuple[str, ...]:
+        """Sides that have rows."""
+        return ("motor", "joint") if any(r.has_motor for r in self.recordings) else ("joint",)
+
+    def refine(self, values: Floats) -> None:
+        """Predict the torques with the base parameters (b,) and make the rows anew."""
+        model = DynamicModel("arm", self.structure, self.base.names, values, None, self.base)
+        drive = model.drive()
+        bodies = {payload: model.inertial(payload) for payload in {r.payload for r in self.recordings}}
+        motions = []
+        for recording, stretch in self.stretches:
+            body = bodies[recording.payload]
+            rigid = regressor.torque(self.arm.chain, stretch.q, stretch.qd, stretch.qdd, body)
+            link = rigid + drive["Fvl"] * stretch.qd + drive["Fcl"] * np.sign(stretch.qd) + drive["offl"]
+            motions.append(self._motion(recording, stretch, link, body, drive))
+        self.motions = motions
+        self.rows = self._rows()
+
+    def _motion(
+        self,
+        recording: Recording,
+        stretch: Stretch,
+        link_torque: Floats,
+        bodies: Floats | None = None,
+        drive: dict[str, Floats] | None = None,
+    ) -> Motion:
+        n = self.arm.chain.n
+        dt = float(stretch.time[1] - stretch.time[0])
+        speed, thrust = stretch.qd, stretch.qdd
+        if np.any(self.arm.compliance > 0.0):
+            # A measured torque is noisy, and its second derivative more so; a predicted one is not.
+            wanted = self.settings.deflection_hz if bodies is not None else 20.0
+            cutoff = min(wanted, 0.2 / dt)
+            twist = low_pass(link_torque, dt, cutoff) * self.arm.compliance
+            first, second = differentiate(twist, dt)
+            speed, thrust = speed + first, thrust + second
+        zero = np.zeros(n)
+        values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), zero)
+
+        def friction(v: Floats) -> Floats:
+            return values["Fvm"] * v + values["Fcm"] * np.sign(v)
+
+        motor = link_torque + values["Ia"] * thrust + friction(speed) + values["offm"]
+        return Motion(
+            chain=self.arm.chain,
+            bodies=np.zeros((n, 10)) if bodies is None else bodies,
+            session=recording.number,
+            time=stretch.time,
+            duration_s=recording.duration_s,
+            q=stretch.q,
+            qd=stretch.qd,
+            qdd=stretch.qdd,
+            motor_speed=speed,
+            motor_acceleration=thrust,
+            joint_torque=link_torque,
+            motor_torque=motor,
+            gear_ratio=self.arm.gear_ratio,
+            inertia=values["Ia"],
+            link_coulomb=values["Fcl"],
+            motor_coulomb=values["Fcm"],
+            friction=friction,
+        )
+
+    # ---- rows ----
+
+    def _bin(self, stretch: Stretch) -> int:
+        """Samples in a bin of the joint torque."""
+        dt = float(stretch.time[1] - stretch.time[0])
+        return max(1, round(self.settings.bin_s / dt))
+
+    def motor_bin(self, stretch: Stretch) -> int:
+        """Samples in a bin of the motor torque."""
+        if len(stretch.motor_time) < 2:
+            return 1
+        step = float(np.median(np.diff(stretch.motor_time)))
+        return max(1, round(self.settings.bin_s / step)) if step < 0.6 * self.settings.bin_s else 1
+
+    def reduce(self, side: str, values: Sequence[Floats]) -> Floats:
+        """Rows (m,) or (m, k) of signals given on the grid of each motion, (N,) or (N, k)."""
+        parts = []
+        for (_, stretch), signal in zip(self.stretches, values, strict=True):
+            flat = signal.reshape(len(signal), -1)
+            if side == "joint":
+                at = stretch.time if self.arm.joint_delay_s == 0.0 else stretch.time - self.arm.joint_delay_s
+                width = self._bin(stretch)
+                shifted = flat if self.arm.joint_delay_s == 0.0 else _at(stretch.time, flat, at)
+                parts.append(_binned(shifted, width))
+            else:
+                at = stretch.motor_time - self.arm.motor_delay_s
+                parts.append(_binned(_at(stretch.time, flat, at), self.motor_bin(stretch)))
+        whole = np.concatenate(parts)
+        return whole[:, 0] if values[0].ndim == 1 else whole
+
+    def _rows(self) -> dict[str, SideRows]:
+        return {side: self._side_rows(side) for side in self.sides}
+
+    def _side_rows(self, side: str) -> SideRows:
+        still = self.settings.standstill_rad_s
+        matrices, targets, valid, session, time, test = [], [], [], [], [], []
+        for motion, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
+            if side == "motor":
+                width = self.motor_bin(stretch)
+                at = stretch.motor_time - self.arm.motor_delay_s
+                target, usable, stamp = stretch.motor, stretch.motor_usable, stretch.motor_time
+                if not len(at):
+                    continue
+            else:
+                width = self._bin(stretch)
+                at = stretch.time - self.arm.joint_delay_s
+                target, usable, stamp = stretch.effort, stretch.usable, stretch.time
+            speed = motion.motor_speed if side == "motor" else motion.qd
+            moves = np.abs(_at(stretch.time, speed, at)) > still
+            matrices.append(self._matrix(side, motion, recording, stretch.time, at, width))
+            targets.append(_binned(target, width))
+            moves = _binned(moves.astype(float), width) > 1.0 - 1e-9
+            if side == "joint":
+                # The positions' low-pass rounds the corner that the link's Coulomb friction makes.
+                moves = _guarded(moves, round(self.settings.guard_s * len(moves) / max(at[-1] - at[0], 1e-9)))
+            valid.append((_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves)
+            stamps = _binned(stamp[:, None], width)[:, 0]
+            time.append(stamps)
+            session.append(np.full(len(stamps), recording.number))
+            test.append(np.full(len(stamps), recording.test))
+        return SideRows(
+            np.concatenate(matrices, axis=1),
+            np.concatenate(targets),
+            np.concatenate(valid),
+            np.concatenate(session),
+            np.concatenate(time),
+            np.concatenate(test),
+        )
+
+    def _matrix(
+        self, side: str, motion: Motion, recording: Recording, grid: Floats, at: Floats, width: int
+    ) -> Floats:
+        """(n, m, p) regressor of one stretch and side in rows."""
+        n, columns = motion.n, self.base.columns
+        chosen: Side = "motor" if side == "motor" else "joint"
+        parts = []
+        size = max(width, _CHUNK // width * width)
+        count = len(at) // width * width
+        exact = _on_grid(grid, at)
+        drive = self._drive_columns() if side == "motor" else {}
+        for first in range(0, count, size):
+            some = at[first : min(first + size, count)]
+            if exact is not None:
+                pick = exact[first : first + len(some)]
+                state = [
+                    x[pick]
+                    for x in (motion.q, motion.qd, motion.qdd, motion.motor_speed, motion.motor_acceleration)
+                ]
+            else:
+                state = [
+                    _at(grid, x, some)
+                    for x in (motion.q, motion.qd, motion.qdd, motion.motor_speed, motion.motor_acceleration)
+                ]
+            q, qd, qdd, speed, thrust = state
+            wide = self.structure.regressor(
+                q, qd, qdd, payload=recording.payload, sides=(chosen,), columns=columns
+            )
+            table = wide.T.reshape(len(columns), n, len(some))
+            if drive:
+                table = table.copy()
+                signals = {"Ia": thrust, "Fvm": speed, "Fcm": np.sign(speed)}
+                for place, (symbol, joint) in drive.items():
+                    table[place, joint] = signals[symbol][:, joint]
+            parts.append(table.reshape(len(columns), n, -1, width).mean(axis=3).transpose(1, 2, 0))
+        return np.concatenate(parts, axis=1)
+
+    def _drive_columns(self) -> dict[int, tuple[str, int]]:
+        """Places of the base columns that belong to the motor, with symbol and joint."""
+        found = {}
+        for place, column in enumerate(self.base.columns):
+            symbol, link = split_name(self.structure.names[column])[:2]
+            if symbol in ("Ia", "Fvm", "Fcm") and link <= self.arm.chain.n:
+                found[place] = (symbol, link - 1)
+        return found
+
+
+def _measured(stretch: Stretch) -> Floats:
+    return stretch.effort
+
+
+def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
+    """The same (m, n) without the rows next to those that are not set."""
+    out = moves.copy()
+    for k in range(1, rows + 1):
+        out[k:] &= moves[:-k]
+        out[:-k] &= moves[k:]
+    return out
+
+
+def _on_grid(grid: Floats, at: Floats) -> NDArray[np.int64] | None:
+    """Indices of the grid at the times, where these all fall on it."""
+    dt = float(grid[1] - grid[0])
+    place = (at - grid[0]) / dt
+    nearest = np.rint(place).astype(np.int64)
+    inside = nearest.min() >= 0 and nearest.max() < len(grid)
+    return nearest if inside and np.max(np.abs(place - nearest)) < 1e-4 else None
+
+
+def _at(grid: Floats, values: Floats, at: Floats) -> Floats:
+    """Values (N, k) of the grid at other times, linearly; ends are held."""
+    exact = _on_grid(grid, at) if len(at) else None
+    if exact is not None:
+        return values[exact]
+    place = np.clip((at - grid[0]) / (grid[1] - grid[0]), 0.0, len(grid) - 1.000001)
+    low = place.astype(np.int64)
+    share = (place - low)[:, None]
+    return (1.0 - share) * values[low] + share * values[low + 1]
+
+
+def _binned(values: Floats, width: int) -> Floats:
+    """Means (m, k) over `width` samples of (N, k)."""
+    if width == 1:
+        return values
+    count = len(values) // width
+    return values[: count * width].reshape(count, width, -1).mean(axis=1)

@@ -1,0 +1,136 @@
+"""The commissioned arm: what its healthy sessions taught, kept in the provenance of its model.
+
+A reference ties the base parameters to their healthy values, within their uncertainty and a tolerance for
+what changes from day to day, so that causes show which the parameters would otherwise absorb. It also holds
+the noise, the delays and the stiffness of the healthy arm, and the largest gain that each candidate reached
+where nothing was wrong: what a claim must exceed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from ident.base import BaseSet
+from ident.discrepancy.evidence import Floats
+from ident.model import DynamicModel
+
+__all__ = ["Reference"]
+
+_KEY = "commissioning"
+_WIDER = 1.5
+_DAY_TO_DAY = {"Fvl": 0.02, "Fcl": 0.02, "Fvm": 0.02, "Fcm": 0.02, "Ia": 0.005}
+_ELSE = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A healthy arm.
+
+    model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
+    noise : of a row [Nm] by side, (n,). null : largest gain of each candidate by (cause, joint from 0).
+    sets : number of healthy sets of sessions behind the null.
+    """
+
+    model: DynamicModel
+    compliance: Floats
+    motor_delay_s: float
+    joint_delay_s: float
+    noise: Mapping[str, Floats]
+    null: Mapping[tuple[str, int], float]
+    sets: int
+
+    @classmethod
+    def of(cls, model: DynamicModel) -> Reference:
+        """From a model file that `lwr-run commission` wrote; other models give their parameters alone."""
+        n = model.structure.chain.n
+        stored = model.provenance.get(_KEY)
+        if not isinstance(stored, Mapping):
+            return cls(model, np.zeros(0), 0.0, 0.0, {}, {}, 0)
+        try:
+            null = {_split(key): float(value) for key, value in stored["null"].items()}
+            compliance = np.array(stored["compliance"], dtype=np.float64)
+            noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
+            delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
+            sets = int(stored["sets"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigurationError(
+                f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
+            ) from error
+        if compliance.shape != (n,):
+            raise ConfigurationError(
+                f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
+            )
+        return cls(model, compliance, *delays, noise, null, sets)
+
+    def stored(self) -> dict[str, Any]:
+        """Content for the provenance of the model."""
+        return {
+            _KEY: {
+                "compliance": [float(v) for v in self.compliance],
+                "motor_delay_s": self.motor_delay_s,
+                "joint_delay_s": self.joint_delay_s,
+                "noise": {side: [float(v) for v in values] for side, values in self.noise.items()},
+                "null": {
+                    f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
+                },
+                "sets": self.sets,
+            }
+        }
+
+    def prior(self, base: BaseSet) -> tuple[Floats, Floats] | None:
+        """Precision (p, p) and values (p,) of base parameters that mean the same in the reference.
+
+        None where the reference has no covariance or none of them.
+        """
+        own = self.model
+        if own.covariance is None or own.base is None:
+            return None
+        pairs = _same(own.base, base)
+        mine = {int(p): k for k, p in enumerate(own.positions)}
+        pairs = [(mine[a], b) for a, b in pairs if a in mine]
+        if not pairs:
+            return None
+        here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
+        covariance = own.covariance[np.ix_(there, there)] * _WIDER**2
+        values = own.values[there]
+        tolerance = np.array([_tolerance(base.names[b]) for b in here]) * np.abs(values)
+        std = np.sqrt(np.diag(covariance))
+        covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
+        precision = np.zeros((len(base), len(base)))
+        precision[np.ix_(here, here)] = np.linalg.inv(covariance)
+        mean = np.zeros(len(base))
+        mean[here] = values
+        return precision, mean
+
+
+def _tolerance(name: str) -> float:
+    symbol = name.rstrip("R").rstrip("0123456789")
+    return _DAY_TO_DAY.get(symbol, _ELSE)
+
+
+def _split(key: str) -> tuple[str, int]:
+    cause, _, joint = key.rpartition(" ")
+    return cause, int(joint) - 1
+
+
+def _same(a: BaseSet, b: BaseSet) -> list[tuple[int, int]]:
+    """Pairs of base parameters that stand for the same sum of standard parameters in two sets."""
+    rows_a = [_combination(a, k) for k in range(len(a))]
+    rows_b = {_combination(b, k): k for k in range(len(b))}
+    return [(k, rows_b[row]) for k, row in enumerate(rows_a) if row in rows_b]
+
+
+def _combination(base: BaseSet, k: int) -> tuple[tuple[str, float], ...]:
+    names, row = base.structure.names, base.matrix[k]
+    return tuple((names[c], round(float(row[c]), 6)) for c in np.flatnonzero(np.abs(row) > 1e-9))
+
+
+def merged_null(parts: Sequence[Mapping[tuple[str, int], float]]) -> dict[tuple[str, int], float]:
+    """Largest gain of each candidate over several healthy sets."""
+    keys = {key for part in parts for key in part}
+    return {key: max(part.get(key, 0.0) for part in parts) for key in sorted(keys)}

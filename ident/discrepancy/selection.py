@@ -1,0 +1,246 @@
+"""Which causes the data carry: greedy acceptance, second thoughts, look-alikes, and what they leave.
+
+A round scores every candidate against the base with what was accepted before, takes the best if the data
+carry it, and asks each earlier one again: whether it is still needed, and whether another cause or joint now
+does better in its place. Small deviations of the nominal arm (sub-millisecond delays, joint stiffness) are
+columns of the base as long as they stay within their tolerance, so they neither hide nor feign a cause.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import norm
+
+from ident.discrepancy.candidates import Candidate, Dictionary, Trial
+from ident.discrepancy.evidence import Evidence, Floats, Rows, Score
+from ident.discrepancy.settings import DiagnosisSettings
+from ident.effects import EFFECTS
+
+__all__ = ["Claim", "Null", "Selection", "confidence", "select"]
+
+log = logging.getLogger(__name__)
+
+Null = Mapping[tuple[str, int], float]
+"""Largest gain of each candidate in healthy sessions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """An accepted trial: its score beside all other claims, and the candidates that do almost as well."""
+
+    trial: Trial
+    score: Score
+    alternatives: tuple[tuple[Candidate, float], ...] = ()
+    confidence: float = 1.0
+
+    @property
+    def gain(self) -> float:
+        """Fall of the held-back chi-square when it is added to all others."""
+        return self.score.gain
+
+
+@dataclass(eq=False)
+class Selection:
+    """Result of `select`. `nuisance` : tolerated deviations by name, value and standard deviation."""
+
+    claims: list[Claim]
+    nuisance: dict[str, tuple[float, float]]
+    scores: dict[tuple[str, int], float]
+    nuisance_rows: list[Rows] = field(default_factory=list)
+
+
+def select(
+    dictionary: Dictionary,
+    evidence: Evidence,
+    settings: DiagnosisSettings,
+    null: Null | None = None,
+) -> Selection:
+    """Accept causes one after the other until the data carry no more."""
+    state = _State(dictionary, evidence, settings, null or {})
+    state.tolerate([])
+    first: dict[tuple[str, int], float] = {}
+    accepted: list[Trial] = []
+    for _ in range(settings.rounds):
+        found = state.contenders(accepted)
+        first = first or {t.candidate.key: max(t.score.gain, 0.0) for t in found}
+        carried = [t for t in found if state.carried(t)]
+        if not carried:
+            break
+        best = max((state.dictionary.refine(t, state.choices(t)) for t in carried[:4]), key=_gain)
+        log.info("%s: gain %.0f", best.candidate.key, best.score.gain)
+        accepted = state.reconsider([*accepted, best])
+        if best.candidate.key not in [t.candidate.key for t in accepted]:
+            break
+    claims = [state.claim(accepted, k) for k in range(len(accepted))]
+    state.tolerate(accepted)
+    claims.sort(key=lambda c: -c.gain)
+    return Selection(claims, state.nuisance, first, state.nuisance_rows)
+
+
+def _gain(trial: Trial) -> float:
+    return trial.score.gain
+
+
+@dataclass(eq=False)
+class _State:
+    dictionary: Dictionary
+    evidence: Evidence
+    settings: DiagnosisSettings
+    null: Null
+    nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
+    nuisance_rows: list[Rows] = field(default_factory=list)
+    _tolerances: list[tuple[str, Rows, float, float]] | None = None
+
+    # ---- tolerated deviations ----
+
+    def tolerances(self) -> list[tuple[str, Rows, float, float]]:
+        """Name, rows, unit of the coefficient and tolerance of each deviation that is no finding."""
+        if self._tolerances is not None:
+            return self._tolerances
+        nominal, found = self.dictionary.nominal, []
+        limit = self.settings.delay_tolerance_s
+        for side in nominal.rows:
+            candidate = Candidate(EFFECTS[f"{side}_torque_delay"], -1)
+            rows = self.dictionary.rows(candidate, {"delay": 1e-3})
+            found.append((f"{side} delay", rows, 1e-3, limit))
+        if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
+            for joint in range(nominal.arm.chain.n):
+                candidate = Candidate(EFFECTS["joint_elasticity"], joint)
+                rows = self.dictionary.rows(candidate, {"encoder": 0.0})
+                if rows:
+                    size = self.settings.compliance_tolerance * float(nominal.arm.compliance[joint])
+                    found.append((f"compliance {joint + 1}", rows, 1.0, size))
+        self._tolerances = found
+        return found
+
+    def tolerate(self, accepted: Sequence[Trial]) -> None:
+        """Base with the accepted columns and with the deviations that stay within their tolerance."""
+        entries = self.tolerances()
+        fixed = [t.rows for t in accepted]
+        self.evidence.replace([*fixed, *(rows for _, rows, _, _ in entries)])
+        place = self.evidence.base_count + sum(_width(rows) for rows in fixed)
+        values = self.evidence.full.values[place:]
+        inside = [
+            entry for entry, value in zip(entries, values, strict=True) if abs(value) * entry[2] <= entry[3]
+        ]
+        if len(inside) < len(entries):
+            self.evidence.replace([*fixed, *(rows for _, rows, _, _ in inside)])
+        values = self.evidence.full.values[place:]
+        std = np.sqrt(np.diag(self.evidence.full.inverse))[place:]
+        self.nuisance = {
+            name: (float(v) * unit, float(s) * unit)
+            for (name, _, unit, _), v, s in zip(inside, values, std, strict=True)
+        }
+        self.nuisance_rows = [rows for _, rows, _, _ in inside]
+
+    # ---- rounds ----
+
+    def contenders(self, accepted: Sequence[Trial]) -> list[Trial]:
+        """Best shapes of all candidates beside the accepted ones, best first."""
+        self.tolerate(accepted)
+        taken = {t.candidate.key for t in accepted if not t.candidate.effect.event}
+        found = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
+        return sorted(found, key=_gain, reverse=True)
+
+    def choices(self, trial: Trial) -> int:
+        """Number of shapes that an event was chosen from."""
+        return self.evidence.blocks if trial.candidate.effect.event else 1
+
+    def carried(self, trial: Trial, score: Score | None = None) -> bool:
+        """Whether the data carry the trial: gain, significance, and size."""
+        score = trial.score if score is None else score
+        settings = self.settings
+        least = settings.least_gain + 6.0 * (len(score.coefficients) - 1)
+        known = (1.0 + settings.margin) * max(self.null.get(trial.candidate.key, 0.0), 0.0)
+        return (
+            score.gain > max(least, known)
+            and score.p_value < settings.alpha
+            and score.inflation > settings.least_inflation
+        )
+
+    def beside(self, accepted: Sequence[Trial], without: int) -> list[Trial]:
+        """All but one of the accepted, in the base."""
+        rest = [t for k, t in enumerate(accepted) if k != without]
+        self.tolerate(rest)
+        return rest
+
+    def reconsider(self, accepted: list[Trial]) -> list[Trial]:
+        """Each of the accepted beside the others: drop it, refine it, or let another take its place."""
+        if len(accepted) == 1:
+            return accepted
+        for _ in range(2):
+            changed = False
+            k = 0
+            while k < len(accepted) and len(accepted) > 1:
+                here = accepted[k]
+                rest = self.beside(accepted, k)
+                taken = {t.candidate.key for t in rest if not t.candidate.effect.event}
+                again = self.dictionary.trial(here.candidate, here.shape, self.choices(here))
+                rivals = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
+                rivals.sort(key=_gain, reverse=True)
+                contest = [t for t in rivals[:3] if again is None or _gain(t) > 0.9 * _gain(again)]
+                contest = [self.dictionary.refine(t, self.choices(t)) for t in contest]
+                if again is not None:
+                    contest.append(again)
+                best = max(contest, key=_gain) if contest else None
+                if best is None or not self.carried(best):
+                    accepted = rest
+                    changed = True
+                    continue
+                if best.candidate.key != here.candidate.key or best is not again:
+                    changed = changed or best.candidate.key != here.candidate.key
+                    accepted = [*accepted[:k], best, *accepted[k + 1 :]]
+                k += 1
+            if not changed:
+                break
+        return accepted
+
+    # ---- claims ----
+
+    def claim(self, accepted: Sequence[Trial], k: int) -> Claim:
+        """The accepted trial number k with its look-alikes, given all others."""
+        here = accepted[k]
+        rest = self.beside(accepted, k)
+        taken = {t.candidate.key for t in rest if not t.candidate.effect.event}
+        again = self.dictionary.trial(here.candidate, here.shape, self.choices(here)) or here
+        rivals = sorted(
+            (t for t in self.dictionary.trials() if t.candidate.key not in {*taken, here.candidate.key}),
+            key=_gain,
+            reverse=True,
+        )
+        close = [t for t in rivals[:6] if _gain(t) > 0.6 * _gain(again)]
+        close = [self.dictionary.refine(t, self.choices(t)) for t in close]
+        scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
+        sure = confidence(_gain(again), [g for _, g in scores])
+        alike = tuple((c, g) for c, g in scores if _gain(again) - g < _reach(_gain(again)))
+        return Claim(again, again.score, alike, sure)
+
+
+def _reach(gain: float) -> float:
+    """Difference of gains within which two causes are not told apart."""
+    return 12.0 + 0.12 * gain
+
+
+def confidence(gain: float, rivals: Sequence[float]) -> float:
+    """Probability that the best is the right one, among itself, its rivals and chance.
+
+    Gains are differences of chi-square, and count as such up to the misfit that any form of an effect has,
+    taken as 4 % of the gain.
+    """
+    scale = 2.0 * (1.0 + 0.04 * gain)
+    others = sum(float(np.exp(-max(gain - g, 0.0) / scale)) for g in rivals)
+    chance = float(2.0 * norm.sf(np.sqrt(max(gain, 0.0)))) * 500.0
+    return 1.0 / (1.0 + others + chance)
+
+
+def _width(rows: Rows) -> int:
+    return next(iter(rows.values())).shape[1]
+
+
+def excess(values: Floats) -> float:
+    """Mean square of values that are finite."""
+    return float(np.nanmean(values**2))

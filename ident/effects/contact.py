@@ -1,0 +1,78 @@
+"""An outside force during an interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ident.effects.body import force_torque, plant_jacobian
+from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
+from ident.effects.motion import Motion
+
+
+class Contact(Effect):
+    """A force [N] on the flange, in axes of the base, from `time` for `duration`, shaped as half a sine."""
+
+    cause = "contact"
+    side = "joint"
+    physics = "something or somebody outside pushes the arm for a while"
+    source = "Haddadin, De Luca and Albu-Schaeffer, IEEE Trans. Robotics 33 (2017)"
+    parameters = (
+        Parameter("force_x", "N", "largest force along x of the base"),
+        Parameter("force_y", "N", "largest force along y of the base"),
+        Parameter("force_z", "N", "largest force along z of the base"),
+        Parameter("time", "s", "beginning, from the start of the session", shape=True),
+        Parameter("duration", "s", "of the contact", shape=True, low=0.02),
+        Parameter("session", "1", "number of the session", shape=True),
+        Parameter("link", "1", "link that is pushed, at the origin of the frame after it", shape=True),
+    )
+    whole_arm = True
+    event = True
+    tell_apart = "repeat the motion: a contact is tied to the moment, a snagging cable to the posture"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """None: times and durations come from the residual's bursts."""
+        return []
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """Beginning and duration."""
+        return ("time", "duration")
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Less the Jacobian's transpose times the force's course, in all rows."""
+        inside = (
+            (motion.time >= shape["time"])
+            & (motion.time <= shape["time"] + shape["duration"])
+            & (motion.session == round(shape["session"]) - 1)
+        )
+        course = np.where(inside, np.sin(np.pi * (motion.time - shape["time"]) / shape["duration"]), 0.0)
+        columns = []
+        for axis in range(3):
+            torque = np.zeros_like(motion.q)
+            if inside.any():
+                torque[inside] = -course[inside, None] * force_torque(
+                    motion.chain, motion.q[inside], axis, round(shape["link"])
+                )
+            columns.append(Column(motor=torque, joint=torque))
+        return tuple(columns)
+
+    def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
+        """A torque on the links."""
+        return _Push({p.name: float(parameters[p.name]) for p in self.parameters})
+
+
+class _Push(Simulated):
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self.values = values
+        self.chain: Any = None
+
+    def load(self, time_s: float, plant: Any, loads: Any) -> None:
+        since = time_s - self.values["time"]
+        if not 0.0 <= since <= self.values["duration"]:
+            return
+        course = np.sin(np.pi * since / self.values["duration"])
+        force = np.array([self.values[f"force_{axis}"] for axis in "xyz"])
+        jacobian = plant_jacobian(plant, int(self.values["link"]))
+        loads.link_torque += course * (jacobian.T @ force)

@@ -1,0 +1,71 @@
+"""Friction that changes as the drive warms up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
+from ident.effects.motion import Motion
+
+
+class FrictionTemperature(Effect):
+    """Drive friction times `1 + change w`, with w running from 0 to 1 as the drive warms up.
+
+    Within a session w = 1 - exp(-t / time_constant) and starts anew in each; between sessions w is 1 in all
+    sessions after the first; against a reference it is 1 in all sessions.
+    """
+
+    cause = "friction_temperature"
+    side = "motor"
+    physics = "the lubricant thins as it warms up, so friction drifts with the time in use"
+    source = "Bittencourt, Wernholt, Sander-Tavallaey and Brogardh, IROS 2010; Simoni et al., Robotica 2017"
+    parameters = (
+        Parameter("change", "1", "relative change of the friction, cold to warm", low=-0.9, high=2.0),
+        Parameter(
+            "time_constant",
+            "s",
+            "of the warming up within a session; 0: between the sessions, -1: since the reference",
+            shape=True,
+        ),
+    )
+    tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """From a fifth of the session to a steady drift, and between sessions where there are several."""
+        longest = max(setting.durations_s)
+        within = [{"time_constant": share * longest} for share in (0.15, 0.4, 1.0, 5.0)]
+        between = [{"time_constant": 0.0}] if setting.sessions > 1 else []
+        return [*within, *between, {"time_constant": -1.0}]
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """The time constant, where it is one."""
+        return ("time_constant",) if shape["time_constant"] > 0.0 else ()
+
+    def mode(self, shape: Shape) -> str | None:
+        """Within a session or between sessions."""
+        return "within" if shape["time_constant"] > 0.0 else "between"
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """The model's friction times w in the motor torque."""
+        friction = motion.friction(motion.motor_speed)[:, joint]
+        constant = shape["time_constant"]
+        if constant > 0.0:
+            return (Column(motor=friction * (1.0 - np.exp(-motion.time / constant))),)
+        return (Column(motor=friction * float(constant < 0.0 or motion.session > 0)),)
+
+    def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
+        """Scales the friction of the drive."""
+        return _Warm(joint, float(parameters["change"]), float(parameters.get("time_constant", 0.0)))
+
+
+class _Warm(Simulated):
+    def __init__(self, joint: int, change: float, constant: float) -> None:
+        self.joint, self.change, self.constant = joint, change, constant
+
+    def load(self, time_s: float, plant: Any, loads: Any) -> None:
+        warm = 1.0 - np.exp(-time_s / self.constant) if self.constant > 0.0 else 1.0
+        loads.Fcm[self.joint] *= 1.0 + self.change * warm
+        loads.Fvm[self.joint] *= 1.0 + self.change * warm

@@ -1,0 +1,90 @@
+"""The motion of an arm as effects see it: one uninterrupted stretch of samples on an even grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident import regressor
+from ident.kinematics import Chain
+
+__all__ = ["Floats", "Motion"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Motion of n joints at N samples and the torques that the present model predicts for it.
+
+    chain : the arm. bodies : (n, 10) inertial parameters of the links, the payload in the last one.
+    session : number of the session in the order in which the sessions were run.
+    time : (N,) [s] from the start of the session, evenly spaced. duration_s : length of the session [s].
+    q, qd, qdd : (N, n), positions as published [rad], and their derivatives.
+    motor_speed, motor_acceleration : (N, n) of the motors referred to the joints; equal to qd and qdd where
+        the joints are taken for stiff.
+    joint_torque, motor_torque : (N, n) predicted torque through the joint and at the motor [Nm], free of any
+        sensor's noise.
+    gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
+    link_coulomb, motor_coulomb : (n,) Coulomb friction of link and drive [Nm].
+    friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
+    """
+
+    chain: Chain
+    bodies: Floats
+    session: int
+    time: Floats
+    duration_s: float
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    motor_speed: Floats
+    motor_acceleration: Floats
+    joint_torque: Floats
+    motor_torque: Floats
+    gear_ratio: Floats
+    inertia: Floats
+    link_coulomb: Floats
+    motor_coulomb: Floats
+    friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.chain.n
+
+    @property
+    def dt(self) -> float:
+        """Time between samples [s]."""
+        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else 1e-3
+
+    def rigid_torque(self, q: Floats, qd: Floats, qdd: Floats, bodies: Floats | None = None) -> Floats:
+        """Rigid inverse dynamics (N, n) [Nm] of the links with the payload, or of other `bodies` (n, 10)."""
+        return regressor.torque(self.chain, q, qd, qdd, self.bodies if bodies is None else bodies)
+
+    def smooth_torque(self, side: str) -> Floats:
+        """Predicted torque (N, n) of a side without the Coulomb friction, which jumps at reversals."""
+        link = self.link_coulomb * np.sign(self.qd)
+        if side == "joint":
+            return self.joint_torque - link
+        return self.motor_torque - link - self.motor_coulomb * np.sign(self.motor_speed)
+
+    def gravity_along(self, direction: Floats) -> Floats:
+        """Gravity torque (N, n) [Nm] in a field of 9.81 m/s^2 along `direction` (3,), in frame 0."""
+        from dataclasses import replace
+
+        tilted = replace(self.chain, gravity=9.81 * np.asarray(direction, dtype=np.float64))
+        return regressor.gravity_torque(tilted, self.q, self.bodies)
+
+    def displaced(self, shift: Floats) -> Floats:
+        """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift, shift (N, n) [rad].
+
+        Derivatives of the shift are central differences, low-passed by the grid alone.
+        """
+        first = np.gradient(shift, self.dt, axis=0)
+        second = np.gradient(first, self.dt, axis=0)
+        moved = self.rigid_torque(self.q + shift, self.qd + first, self.qdd + second)
+        return moved - self.rigid_torque(self.q, self.qd, self.qdd)

@@ -1,0 +1,59 @@
+"""A payload that changes or comes loose during a session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ident.effects.body import Body, body_columns
+from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
+from ident.effects.motion import Motion
+
+
+class PayloadChange(Effect):
+    """Mass and first moments of the last link jump at `time`, in the session number `session` from 1."""
+
+    cause = "payload_change"
+    side = "joint"
+    physics = "the payload slips, loosens, or a part of it falls off during the motion"
+    source = "Khalil, Gautier and Lemoine, ICRA 2007"
+    parameters = (
+        Parameter("mass", "kg", "jump of the mass", low=-50.0, high=50.0),
+        Parameter("moment_x", "kg m", "jump of the first moment in x of the last link's frame"),
+        Parameter("moment_y", "kg m", "jump of the first moment in y"),
+        Parameter("moment_z", "kg m", "jump of the first moment in z"),
+        Parameter("time", "s", "from the start of the session", shape=True),
+        Parameter("session", "1", "number of the session", shape=True),
+    )
+    whole_arm = True
+    event = True
+    step = True
+    tell_apart = "hold one static pose for a minute at the start, in the middle and at the end of the session"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """A time each half second of each session, not closer than a second to its ends."""
+        return [
+            {"time": float(time), "session": float(number + 1)}
+            for number, duration in enumerate(setting.durations_s)
+            for time in np.arange(1.0, duration - 1.0, 0.5)
+        ]
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """The time."""
+        return ("time",)
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Torque of a unit mass and unit first moments in the last link after the time, in all rows."""
+        after = (motion.time >= shape["time"]) & (motion.session == round(shape["session"]) - 1)
+        return tuple(
+            Column(motor=c.motor * after[:, None], joint=c.joint * after[:, None])
+            for c in body_columns(motion, 4)
+            if c.motor is not None and c.joint is not None
+        )
+
+    def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
+        """Gravity and inertia of the lost part, from the time on."""
+        return Body(
+            np.array([float(parameters.get(p.name, 0.0)) for p in self.linear]), float(parameters["time"])
+        )
