@@ -61,7 +61,7 @@ _ESTIMATORS: dict[str, EstimatorFactory] = {
         cad_prior(base), covariance=covariance
     ),
 }
-ESTIMATORS = tuple(_ESTIMATORS)
+ESTIMATORS = (*_ESTIMATORS, "iv")
 _WIDE_CONDITION = 100.0
 
 
@@ -71,10 +71,11 @@ class IdentificationSettings:
 
     model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
     estimator : one of `ESTIMATORS`, or a factory that gets the base set, the problem and the covariance
-        settings and returns an estimator. "wls" (default) takes nothing but the data; "physical" (consistent
-        bodies near the URDF's, within 20 % of themselves) is the one to predict motions that were not
-        recorded, above all after a short or weakly exciting one: on three runs of a real LWR4+ it errs by 3
-        to 4 % where least squares errs by 9 to 14 % (`benchmarks/real_data.py`).
+        settings and returns an estimator. "iv" takes the commanded motion as instruments. "wls" (default)
+        takes nothing but the data; "physical" (consistent bodies near the URDF's, within 20 % of themselves)
+        is the one to predict motions that were not recorded, above all after a short or weakly exciting one:
+        on three runs of a real LWR4+ it errs by 3 to 4 % where least squares errs by 9 to 14 %
+        (`benchmarks/real_data.py`).
     without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
     resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
     essential : how essential parameters are found; None leaves that out.
@@ -93,8 +94,8 @@ class IdentificationSettings:
     robot: str = ""
 
     def __post_init__(self) -> None:
-        if isinstance(self.estimator, str) and self.estimator not in _ESTIMATORS:
-            known = ", ".join(_ESTIMATORS)
+        if isinstance(self.estimator, str) and self.estimator not in ESTIMATORS:
+            known = ", ".join(ESTIMATORS)
             raise ConfigurationError(f"estimator {self.estimator!r} is unknown; choose one of {known}")
 
 
@@ -312,11 +313,19 @@ def identify(
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
     normalised = problem.require_rank()
-    estimate = _estimator(settings, base, problem).fit(problem)
+    instrumental = _instrumental(problem, problems, instruments, settings)
+    estimate = plain = _estimator(settings, base, problem).fit(problem)
+    if settings.estimator == "iv":
+        if instrumental is None:
+            raise DataError(
+                "estimator `iv` takes its instruments from the commanded motion, and not every session has "
+                "it: record /joint_command and do not average periods, or choose `wls`"
+            )
+        estimate = instrumental
     assumptions = check_assumptions(
         problem,
-        estimate,
-        instrumental=_instrumental(problem, problems, instruments, settings),
+        plain,
+        instrumental=instrumental,
         period_rows=_common_period(prepared),
     )
     essential = None
@@ -342,7 +351,9 @@ def identify(
 
 
 def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
-    factory = _ESTIMATORS[settings.estimator] if isinstance(settings.estimator, str) else settings.estimator
+    """The estimator; for instrumental variables, which need more than this, the WLS to compare them with."""
+    name = settings.estimator
+    factory = _ESTIMATORS["wls" if name == "iv" else name] if isinstance(name, str) else name
     return factory(base, problem, settings.covariance)
 
 
@@ -443,7 +454,7 @@ def _payload_warnings(
             )
             raise DataError(
                 f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; say "
-                "what was mounted (`--payload FILE=NAME`, `none` for the bare arm) or record the session again"
+                "what was mounted (`--payload FILE=NAME`, `none`: the bare arm) or record the session again"
             )
         if stated is not None and abs(mass - stated) > max(0.1 * stated, 3.0 * std):
             found.append(

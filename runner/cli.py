@@ -34,6 +34,7 @@ VERBS = {
     "recover": "make a session log whole whose recorder was killed",
     "attach": "add a controller's trace file to a session log",
     "import": "turn other people's CSV and NPZ files into a session log",
+    "completion": "what bash, zsh or fish need to complete commands and options",
 }
 MODULES = {"import": "import_log"}
 

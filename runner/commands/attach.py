@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 from lwr_driver.trace import import_trace
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 
 @click.command("attach")
@@ -18,7 +20,8 @@ from lwr_driver.trace import import_trace
 @click.option(
     "--tolerance-ms", type=click.FloatRange(min=0.0, min_open=True), help="Largest timing error accepted."
 )
-def command(session: Path, trace: Path, out: Path | None, tolerance_ms: float | None) -> None:
+@json_option
+def command(session: Path, trace: Path, out: Path | None, tolerance_ms: float | None, as_json: bool) -> None:
     """Add the motor torques of a controller's TRACE file to a SESSION log.
 
     The trace has a clock of its own; it is aligned by the joint positions that both hold. Delay, clock rate
@@ -31,4 +34,5 @@ def command(session: Path, trace: Path, out: Path | None, tolerance_ms: float | 
     lwr-run attach loaded.mcap loaded.trace.csv
     """
     tolerance = None if tolerance_ms is None else tolerance_ms / 1000.0
-    click.echo(str(import_trace(session, trace, out, tolerance_s=tolerance)))
+    done = import_trace(session, trace, out, tolerance_s=tolerance)
+    click.echo(to_json(done) if as_json else str(done))

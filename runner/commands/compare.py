@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
+
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 __all__ = ["command"]
 
@@ -13,7 +15,7 @@ __all__ = ["command"]
 @click.command("compare")
 @click.argument("first", type=click.Path(path_type=Path))
 @click.argument("second", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option
 @click.option(
     "--level",
     type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
@@ -34,4 +36,4 @@ def command(first: Path, second: Path, as_json: bool, level: float) -> None:
 
     labels = (f"{first}", f"{second}")
     result = compare(read_model(first), read_model(second), level=level, labels=labels)
-    click.echo(json.dumps(result.to_dict(), indent=1) if as_json else str(result))
+    click.echo(to_json(result.to_dict()) if as_json else str(result))

@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 __all__ = ["command"]
 
@@ -19,7 +21,10 @@ _FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
 @click.option("--payload", help="Mount this payload of the model (default: the bare arm).")
 @click.option("--name", default="arm", show_default=True, help="Name in the file; begins the C functions.")
 @click.option("--force", is_flag=True, help="Replace files that exist.")
-def command(model: Path, outputs: tuple[Path, ...], payload: str | None, name: str, force: bool) -> None:
+@json_option
+def command(
+    model: Path, outputs: tuple[Path, ...], payload: str | None, name: str, force: bool, as_json: bool
+) -> None:
     """Write a model in the formats that the OUTPUTS' endings say.
 
     \b
@@ -59,6 +64,11 @@ def command(model: Path, outputs: tuple[Path, ...], payload: str | None, name: s
             output.write_text(text, encoding="utf-8")
         except OSError as error:
             raise ConfigurationError(f"output {output} cannot be written: {error.strerror}") from error
+    if as_json:
+        files = [{"file": output, "format": _FORMATS[output.suffix]} for output in outputs]
+        click.echo(to_json({"files": files, "title": plain.title, "notes": bodies.notes}))
+        return
+    for output in outputs:
         click.echo(f"{output}: {_FORMATS[output.suffix]}, {plain.title}")
     for note in bodies.notes:
         click.echo(f"  {note}")

@@ -2,23 +2,79 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import click
 
 from fri.errors import ConfigurationError
+from ident.essential import EssentialSettings
+from ident.estimators import CovarianceSettings
 from ident.identify import ESTIMATORS, IdentificationSettings, identify
 from ident.kinematics import Chain
 from ident.model_file import write_model
 from ident.mounting import find_mounting
 from ident.signals.settings import SignalSettings
-from lwr_driver.session import Session, read_session
-from runner.results import identified_model
+from lwr_driver.session import read_session
+from runner.estimation import EstimatorChoice, announced, coulomb, couplings
+from runner.options import GroupedCommand, json_option, number_or
+from runner.plain import as_json as to_json
+from runner.versions import software
+
+_SIGNALS = {field.name: field.default for field in dataclasses.fields(SignalSettings)}
+_GROUPS = {
+    "Model": ("model", "without", "coupling", "coulomb_text", "tilt", "urdf", "payload"),
+    "Estimator": (
+        "estimator",
+        "covariance",
+        "bandwidth_s",
+        "block_s",
+        "tuning",
+        "memory_s",
+        "relative_noise",
+        "prior_strength",
+        "prior_metric",
+        "prior_std",
+    ),
+    "Signals": (
+        "cutoff_hz",
+        "order",
+        "decimate_hz",
+        "rate_hz",
+        "attenuation_db",
+        "choose_cutoff",
+        "average_periods",
+        "edge_s",
+        "longest_bridge_s",
+        "bridged_share",
+        "standstill_rad_s",
+        "standstill_share",
+        "outlier_scale",
+        "motor_delay_s",
+        "delay_search_s",
+        "resonance_hz",
+    ),
+    "Essential parameters": ("essential", "significance", "largest_loss", "keep", "drop"),
+}
 
 
-@click.command("identify")
+def _signal(name: str, text: str, **named: Any) -> Any:
+    """Option of the signal setting `name`, with its default."""
+    kind = named.pop("type", float)
+    default = _SIGNALS[name]
+    return click.option(
+        f"--{name.replace('_', '-')}",
+        name,
+        default=default,
+        type=kind,
+        show_default=default is not None,
+        help=text,
+        **named,
+    )
+
+
+@click.command("identify", cls=GroupedCommand, groups=_GROUPS)
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--model",
@@ -27,90 +83,156 @@ from runner.results import identified_model
     show_default=True,
     help="1: joint torques; 2: motor and joint torques; 3: their difference.",
 )
-@click.option("--estimator", type=click.Choice(ESTIMATORS), default="wls", show_default=True)
 @click.option(
     "--without", multiple=True, metavar="NAME", help="Leave out a parameter (offm3) or a kind (Fvl)."
 )
 @click.option(
-    "--payload",
-    "mounted",
-    multiple=True,
-    metavar="FILE=NAME",
-    help="What hung on the arm (`none`: nothing) in a session whose metadata are wrong; repeatable.",
+    "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
 )
-@click.option("--cutoff-hz", default=10.0, show_default=True, help="Low-pass on the positions.")
-@click.option("--decimate-hz", default=2.0, show_default=True, help="Low-pass of the parallel decimation.")
-@click.option("--choose-cutoff", is_flag=True, help="Take the cut-off from the spectrum of the positions.")
-@click.option("--average-periods", is_flag=True, help="Average the periods of a periodic motion first.")
+@click.option(
+    "--coulomb",
+    "coulomb_text",
+    default="sign",
+    show_default=True,
+    metavar="KIND",
+    help="What stands for sign(qd): sign, deadband:WIDTH or tanh:WIDTH [rad/s].",
+)
 @click.option("--tilt", is_flag=True, help="Find how the base leans, too, and identify under it.")
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
 )
+@click.option(
+    "--payload",
+    multiple=True,
+    metavar="FILE=NAME[:KG]",
+    help="What a session carried, against its metadata; NAME `none`: the bare arm.",
+)
+@click.option("--estimator", type=click.Choice(ESTIMATORS), default="wls", show_default=True)
+@click.option(
+    "--covariance",
+    type=click.Choice(("jackknife", "hac", "bootstrap", "textbook")),
+    default="jackknife",
+    show_default=True,
+    help="Where the standard deviations come from; all but textbook hold for correlated residuals.",
+)
+@click.option("--bandwidth-s", type=float, help="Longest lag of the HAC weights; default: from the data.")
+@click.option("--block-s", type=float, help="Block of jackknife and bootstrap; default: from the data.")
+@click.option("--tuning", type=float, help="huber, tukey: where the loss bends, in standard deviations.")
+@click.option("--memory-s", type=float, help="recursive, mixing: time over which the past is forgotten.")
+@click.option("--relative-noise", type=float, help="tls: error of a column as a share of its rms.")
+@click.option(
+    "--prior-strength",
+    type=number_or("evidence", "cross_validation"),
+    help="map, physical: weight of the URDF's inertials.",
+)
+@click.option(
+    "--prior-metric",
+    type=click.Choice(("pullback", "entropic", "euclidean")),
+    help="map, physical: how distance from the URDF's inertials is measured.",
+)
+@click.option("--prior-std", type=float, help="map, physical: their standard deviation as a share.")
+@_signal("cutoff_hz", "Low-pass on the positions.")
+@_signal("order", "Its order, run forward and back.", type=int)
+@_signal("decimate_hz", "Low-pass of the parallel decimation.")
+@_signal("rate_hz", "Rate of the rows; default: 2.5 times --decimate-hz.")
+@_signal("attenuation_db", "Stop band of the parallel low-pass.")
+@click.option("--choose-cutoff", is_flag=True, help="Take the cut-off from the spectrum of the positions.")
+@click.option("--average-periods", is_flag=True, help="Average the periods of a periodic motion first.")
+@_signal("edge_s", "Time lost at each end of a stretch; default: 2 / --cutoff-hz.")
+@_signal("longest_bridge_s", "Longest gap that is bridged by interpolation.")
+@_signal("bridged_share", "Largest share of bridged samples in a row.")
+@_signal("standstill_rad_s", "Speed below which the sign of the friction is unknown.")
+@_signal("standstill_share", "Largest share of such samples in a row; 1 keeps all.")
+@_signal("outlier_scale", "Distance from the running median that makes an outlier, in deviations.")
+@_signal("motor_delay_s", "How late the motor torques are.", type=number_or("estimate"))
+@_signal("delay_search_s", "Largest delay that is looked for.")
+@click.option("--resonance-hz", type=float, help="Lowest resonance of the arm, for advice on the cut-offs.")
+@click.option(
+    "--essential/--no-essential",
+    default=None,
+    help="Keep the essential parameters only in the model; or do not look for them. Default: listed.",
+)
+@click.option(
+    "--significance", default=0.01, show_default=True, type=float, help="Level of the test against zero."
+)
+@click.option(
+    "--largest-loss",
+    default=1.0,
+    show_default=True,
+    type=float,
+    metavar="PERCENT",
+    help="Growth of the residual that all eliminations together may cost.",
+)
+@click.option("--keep", multiple=True, metavar="NAME", help="A parameter, or a kind, that stays.")
+@click.option("--drop", multiple=True, metavar="NAME", help="A parameter, or a kind, that goes untested.")
 @click.option("--out", type=click.Path(path_type=Path), help="Write the model to this file, e.g. model.yaml.")
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+@json_option
 def command(
     sessions: tuple[Path, ...],
     model: int,
-    estimator: str,
     without: tuple[str, ...],
-    mounted: tuple[str, ...],
-    cutoff_hz: float,
-    decimate_hz: float,
-    choose_cutoff: bool,
-    average_periods: bool,
+    coupling: tuple[str, ...],
+    coulomb_text: str,
     tilt: bool,
     urdf: Path | None,
+    payload: tuple[str, ...],
+    estimator: str,
+    covariance: Any,
+    bandwidth_s: float | None,
+    block_s: float | None,
+    resonance_hz: float | None,
+    essential: bool | None,
+    significance: float,
+    largest_loss: float,
+    keep: tuple[str, ...],
+    drop: tuple[str, ...],
     out: Path | None,
     as_json: bool,
+    **others: Any,
 ) -> None:
     """Estimate the base parameters of an arm from its SESSIONS, stacked.
 
     Each session's payload is the one that its metadata names; sessions without and with a payload together
-    identify the payload apart from the last link.
+    identify the payload apart from the last link, and there may be several payloads.
 
     \b
     lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
-    lwr-run identify unloaded.mcap --model 1 --estimator huber
+    lwr-run identify unloaded.mcap --model 1 --estimator huber --tuning 2
     lwr-run identify short.mcap --model 1 --estimator physical --tilt
-    lwr-run identify a.mcap b.mcap --payload b.mcap=gripper
+    lwr-run identify unloaded.mcap loaded.mcap --essential --keep Fcm --drop offl7 --out small.yaml
     """
-    logs = _with_payloads([read_session(path) for path in sessions], mounted)
+    if essential is False and (keep or drop):
+        raise ConfigurationError("--keep and --drop say which parameters are essential; leave --no-essential")
+    logs = announced([read_session(path) for path in sessions], payload)
     if urdf is None and logs[0].robot_description is None:
         raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
     chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
+    choice = {name: others.pop(name) for name in _CHOICE}
     settings = IdentificationSettings(
         model=model,
-        signals=SignalSettings(
-            cutoff_hz=cutoff_hz,
-            decimate_hz=decimate_hz,
-            choose_cutoff=choose_cutoff,
-            average_periods=average_periods,
-        ),
-        estimator=estimator,
+        signals=SignalSettings(**others),
+        estimator=EstimatorChoice(estimator, **choice).build(),
+        covariance=CovarianceSettings(kind=covariance, bandwidth_s=bandwidth_s, block_s=block_s),
         without=without,
+        couplings=couplings(coupling),
+        coulomb=coulomb(coulomb_text),
+        resonance_hz=resonance_hz,
+        essential=None
+        if essential is False
+        else EssentialSettings(significance, largest_loss, keep=keep, drop=drop),
     )
     mounting = find_mounting(logs, chain, settings) if tilt else None
     found = identify(logs, chain, settings) if mounting is None else mounting.identification
     if as_json:
-        content = found.to_dict() | ({} if mounting is None else {"mounting": mounting.to_dict()})
-        click.echo(json.dumps(content, indent=1))
+        click.echo(to_json(found.to_dict() | ({} if mounting is None else {"mounting": mounting.to_dict()})))
     else:
         click.echo(found.summary() if mounting is None else f"{found.summary()}\n\n{mounting}")
     if out is not None:
-        write_model(identified_model(found, logs[0].metadata.get("robot", "arm")), out)
+        result = found.essential_model if essential else found.model
+        robot = logs[0].metadata.get("robot", "arm")
+        provenance = {**result.provenance, "software": software()}
+        write_model(dataclasses.replace(result, robot=robot, provenance=provenance), out)
         click.echo(str(out), err=as_json)
 
 
-def _with_payloads(logs: list[Session], mounted: tuple[str, ...]) -> list[Session]:
-    """The sessions with the payloads that the user names in place of those of the metadata."""
-    corrected = list(logs)
-    for entry in mounted:
-        file, equals, name = entry.rpartition("=")
-        places = [k for k, log in enumerate(logs) if file in (str(log.path), log.path.name)]
-        if not equals or not name or len(places) != 1:
-            names = ", ".join(log.path.name for log in logs)
-            raise ConfigurationError(f"--payload {entry!r}: write FILE=NAME with one of the files {names}")
-        log = logs[places[0]]
-        metadata = {key: value for key, value in log.metadata.items() if key != "payload_mass"}
-        corrected[places[0]] = replace(log, metadata=metadata | {"payload": name})
-    return corrected
+_CHOICE = ("tuning", "memory_s", "relative_noise", "prior_strength", "prior_metric", "prior_std")

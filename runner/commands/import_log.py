@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 __all__ = ["command"]
 
@@ -28,6 +30,7 @@ def _rows(context: click.Context, parameter: click.Parameter, value: str | None)
 @click.option("--payload", help="Name of the payload; `none` if there is none.")
 @click.option("--payload-mass", type=float, metavar="KG", help="Mass of the payload as weighed.")
 @click.option("--serial", help="Serial number of the arm.")
+@json_option
 def command(
     mapping: str,
     source: Path,
@@ -36,6 +39,7 @@ def command(
     payload: str | None,
     payload_mass: float | None,
     serial: str | None,
+    as_json: bool,
 ) -> None:
     """Turn a CSV or NPZ recording into a session log.
 
@@ -61,4 +65,4 @@ def command(
         serial=serial,
         beside=mapping_path(mapping).parent,
     )
-    click.echo(str(report))
+    click.echo(to_json(report) if as_json else str(report))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from fri.errors import ConfigurationError
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 __all__ = ["command"]
 
@@ -19,11 +20,14 @@ __all__ = ["command"]
     "--free-offsets", is_flag=True, help="Let the torque offsets move since the arm's identification."
 )
 @click.option(
-    "--write", type=click.Path(path_type=Path), metavar="FILE", help="Write a model with the payload."
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a model with the payload to this file.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@json_option
 def command(
-    model: Path, sessions: tuple[Path, ...], free_offsets: bool, write: Path | None, as_json: bool
+    model: Path, sessions: tuple[Path, ...], free_offsets: bool, out: Path | None, as_json: bool
 ) -> None:
     """Estimate mass, centre of mass and inertia of what the arm carries in SESSIONS, with MODEL as the arm.
 
@@ -32,16 +36,17 @@ def command(
 
     \b
     lwr-run payload model.yaml loaded.mcap
+    lwr-run payload model.yaml loaded.mcap --out with_payload.yaml
     """
     from ident.model_file import read_model, write_model
     from ident.payload import identify_payload, with_payload
     from lwr_driver.session import read_session
 
-    if write is not None and write.exists():
-        raise ConfigurationError(f"file {write} exists; choose another name")
+    if out is not None and out.exists():
+        raise ConfigurationError(f"file {out} exists; choose another name")
     arm = read_model(model)
     found = identify_payload(arm, [read_session(path) for path in sessions], free_offsets=free_offsets)
-    click.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
-    if write is not None:
-        write_model(with_payload(arm, found), write)
-        click.echo(f"written {write}", err=True)
+    click.echo(to_json(found.to_dict()) if as_json else str(found))
+    if out is not None:
+        write_model(with_payload(arm, found), out)
+        click.echo(str(out), err=as_json)

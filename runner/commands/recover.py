@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 from lwr_driver.session import recover
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 
 @click.command("recover")
@@ -14,7 +16,8 @@ from lwr_driver.session import recover
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Recovered file; default: SESSION.recovered.mcap."
 )
-def command(session: Path, out: Path | None) -> None:
+@json_option
+def command(session: Path, out: Path | None, as_json: bool) -> None:
     """Make the SESSION log of a killed recorder whole. The broken file stays as it is.
 
     Everything up to the last whole chunk is kept; the result is read back before it is called good.
@@ -23,4 +26,5 @@ def command(session: Path, out: Path | None) -> None:
     lwr-run recover experiments/lwr4plus-20260101-120000/loaded.mcap
     """
     target = out if out is not None else session.with_suffix(".recovered.mcap")
-    click.echo(str(recover(session, target)))
+    done = recover(session, target)
+    click.echo(to_json(done) if as_json else str(done))

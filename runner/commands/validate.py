@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
+
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 __all__ = ["command"]
 
@@ -15,7 +17,7 @@ __all__ = ["command"]
 @click.command("validate")
 @click.argument("model", type=click.Path(path_type=Path))
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option
 @click.option("--allow-seen", is_flag=True, help="Score sessions that the estimate was made from, labelled.")
 @click.option(
     "--against",
@@ -80,4 +82,4 @@ def command(
         folds = cross_validate(logs, structure.chain, wanted)
         content["cross_validation"] = folds.to_dict()
         texts.append(str(folds))
-    click.echo(json.dumps(content, indent=1) if as_json else "\n\n".join(texts))
+    click.echo(to_json(content) if as_json else "\n\n".join(texts))

@@ -219,7 +219,7 @@ def test_commands_work_on_files(
     assert len(content["sessions"][0]["scores"]) == 14
     assert "differ by more than chance" in run(compare_command.command, whole, arm)
     assert json.loads(run(compare_command.command, whole, arm, "--json"))["p"] > 0
-    text = run(payload_command.command, arm, loaded.path, "--write", tmp_path / "with_load.yaml")
+    text = run(payload_command.command, arm, loaded.path, "--out", tmp_path / "with_load.yaml")
     mass = re.search(r"mass (\S+) ± (\S+) kg", text)
     assert mass is not None
     assert float(mass[1]) == pytest.approx(3.3, abs=5 * float(mass[2]))
