@@ -74,6 +74,7 @@ def observe(
         tuple(units),
         tuple(session.name for session in sessions),
         tuple(nuisances),
+        tuple(session.period_rows if session.periods > 1 else None for session in sessions),
     )
 
 
@@ -84,6 +85,7 @@ def stack(problems: Sequence[Problem]) -> Problem:
     groups: list[RowGroup] = []
     nuisances: list[Nuisance] = []
     names: list[str] = []
+    periods: list[int | None] = []
     for problem in problems:
         if problem.names != problems[0].names:
             raise DataError("problems of different parameters cannot be stacked; observe the same columns")
@@ -94,8 +96,14 @@ def stack(problems: Sequence[Problem]) -> Problem:
             for nuisance in problem.nuisances
         ]
         names += problem.record_names
-    one = problems[0]
-    return Problem(one.names, tuple(groups), one.sample_time_s, one.units, tuple(names), tuple(nuisances))
+        periods += problem.periods
+    return replace(
+        problems[0],
+        groups=tuple(groups),
+        record_names=tuple(names),
+        nuisances=tuple(nuisances),
+        periods=tuple(periods),
+    )
 
 
 @dataclass(frozen=True)

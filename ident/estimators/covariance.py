@@ -11,7 +11,9 @@ correlation between joints and sides is covered too, and then
   away;
 * `jackknife` (the default): blocks of time, twice the bandwidth long, are left out one after the other. It
   undoes that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard
-  deviations are the jackknife's, correlations the HAC's, which have full rank;
+  deviations are the jackknife's, correlations the HAC's, which have full rank. Where the motion is periodic a
+  block is a part of the period, left out of all periods together: what the model lacks repeats with the
+  motion, so the periods are no independent witnesses of it;
 * `bootstrap`: blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
 """
 
@@ -23,11 +25,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from ident.estimators.estimate import Covariance
-from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.problem import FloatArray, Problem, RowGroup
 
 __all__ = [
     "CovarianceSettings",
@@ -193,10 +194,10 @@ def jackknife(
     information = np.linalg.inv(bread)
     normals: dict[tuple[int, int], FloatArray] = {}
     sums: dict[tuple[int, int], FloatArray] = {}
-    length = _block_length(problem, block_s)
+    cut = _Blocks.of(problem, block_s)
     for number, group in enumerate(problem.groups):
         left = group.matrix if matrices is None else matrices[number]
-        for block, rows in _blocks(group.time_index, length):
+        for block, rows in cut.runs(group):
             key = (group.record, block)
             weighted = left[rows] * row_weights[number][rows, None]
             normals[key] = normals.get(key, np.zeros((p, p))) + weighted.T @ group.matrix[rows]
@@ -216,38 +217,70 @@ def jackknife(
         ratio = own / np.where(other > 0, other, 1.0)
         matrix = correlation * np.outer(ratio, ratio)
     kind = (
-        f"block jackknife ({count} blocks of {length * problem.sample_time_s:.2f} s left out): robust to "
-        "serial correlation"
+        f"block jackknife ({count} blocks of {cut.length * problem.sample_time_s:.2f} s{cut.note} left out): "
+        "robust to serial correlation"
     )
     return Covariance(matrix, kind, degrees_of_freedom=max(1.0, count - 1.0))
 
 
-def _block_length(problem: Problem, block_s: float) -> int:
-    """Length of a block in samples; at least eight blocks in all, at most eighty."""
-    samples = sum(_span(problem, record) for record in {group.record for group in problem.groups})
-    length = max(1, round(block_s / problem.sample_time_s))
-    return int(np.clip(length, -(-samples // 80), max(1, samples // 8)))
+@dataclass(frozen=True)
+class _Blocks:
+    """Blocks of time of all records.
 
+    length : of a block in samples. spans : (first sample, number of samples that do not repeat, number of
+        blocks) by record.
+    """
 
-def _span(problem: Problem, record: int) -> int:
-    indices = [g.time_index for g in problem.groups if g.record == record and len(g.time_index)]
-    return max(int(i[-1]) for i in indices) - min(int(i[0]) for i in indices) + 1 if indices else 0
+    length: int
+    spans: dict[int, tuple[int, int, int]]
+    periodic: bool
 
+    @classmethod
+    def of(cls, problem: Problem, block_s: float) -> _Blocks:
+        """At least eight blocks in all, at most eighty."""
+        spans: dict[int, tuple[int, int]] = {}
+        periodic = False
+        for record in {group.record for group in problem.groups}:
+            times = [g.time_index for g in problem.groups if g.record == record and len(g.time_index)]
+            if not times:
+                continue
+            first = min(int(t[0]) for t in times)
+            samples = max(int(t[-1]) for t in times) - first + 1
+            period = problem.periods[record] if record < len(problem.periods) else None
+            if period is not None and period < samples:
+                first, samples, periodic = 0, period, True
+            spans[record] = (first, samples)
+        total = sum(samples for _, samples in spans.values())
+        length = max(1, round(block_s / problem.sample_time_s))
+        length = int(np.clip(length, -(-total // 80), max(1, total // 8)))
+        counts = {
+            record: (first, samples, max(1, round(samples / length)))
+            for record, (first, samples) in spans.items()
+        }
+        return cls(length, counts, periodic)
 
-def _blocks(time_index: NDArray[np.int64], length: int) -> list[tuple[int, slice]]:
-    """Number and rows of each block of `length` samples; the index increases."""
-    block = time_index // length
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(block)) + 1, [len(block)]])
-    return [(int(block[a]), slice(int(a), int(b))) for a, b in itertools.pairwise(edges) if b > a]
+    @property
+    def note(self) -> str:
+        """For the name of the covariance."""
+        return " of the period" if self.periodic else ""
+
+    def runs(self, group: RowGroup) -> list[tuple[int, slice]]:
+        """Number of the block and rows of each run of neighbouring rows in one block."""
+        if not len(group.time_index):
+            return []
+        first, samples, count = self.spans[group.record]
+        block = (group.time_index - first) % samples * count // samples
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(block)) + 1, [len(block)]])
+        return [(int(block[a]), slice(int(a), int(b))) for a, b in itertools.pairwise(edges)]
 
 
 def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int) -> Covariance:
     """Covariance of `draws` weighted least-squares solutions over blocks of time drawn with replacement."""
-    length = _block_length(problem, block_s)
+    cut = _Blocks.of(problem, block_s)
     p = len(problem.names)
     grams: dict[tuple[int, int], FloatArray] = {}
     for group, number in zip(problem.groups, problem.class_of_group, strict=True):
-        for block, rows in _blocks(group.time_index, length):
+        for block, rows in cut.runs(group):
             augmented = np.column_stack([group.matrix[rows], group.target[rows]])
             key = (group.record, block)
             product = weights[number] * (augmented.T @ augmented)
@@ -268,8 +301,8 @@ def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int,
     matrix = np.atleast_2d(np.cov(np.array(solutions).T))
     return Covariance(
         matrix,
-        f"block bootstrap ({len(stack)} blocks of {length * problem.sample_time_s:.2f} s, {draws} draws): "
-        "robust to serial correlation",
+        f"block bootstrap ({len(stack)} blocks of {cut.length * problem.sample_time_s:.2f} s{cut.note}, "
+        f"{draws} draws): robust to serial correlation",
         degrees_of_freedom=max(1.0, len(stack) - 1.0),
     )
 

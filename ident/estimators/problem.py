@@ -159,6 +159,8 @@ class Problem:
     names : p parameter names. groups : the rows. sample_time_s : time between neighbouring time indices [s].
     units : p units, for tables; may be empty. record_names : one name a record, for messages.
     nuisances : quantities known with an uncertainty that the covariance must carry.
+    periods : for each record the number of time indices after which its motion repeats, None where it does
+        not; may be empty. What the model lacks repeats with the motion, so rows of equal phase err alike.
     """
 
     names: tuple[str, ...]
@@ -167,6 +169,7 @@ class Problem:
     units: tuple[str, ...] = ()
     record_names: tuple[str, ...] = ()
     nuisances: tuple[Nuisance, ...] = ()
+    periods: tuple[int | None, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.groups:
@@ -232,6 +235,7 @@ class Problem:
             tuple(self.units[c] for c in chosen) if self.units else (),
             self.record_names,
             self.nuisances,
+            self.periods,
         )
 
     def require_rank(self) -> float:
