@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError
 from ident import regressor
 from ident.base import BaseSet
+from ident.effects.model_torque import check_entry, effects_torque
 from ident.parameters import INERTIAL, PER_LINK
 from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Samples, Side
 
@@ -51,7 +52,8 @@ class DynamicModel:
     values : (p,). covariance : (p, p) or None.
     base : the base set when the parameters are base parameters, None for standard parameters.
     provenance : where the values come from (sessions, estimator, date, software), plain content for YAML.
-    effects : descriptions of further effects, plain content; `torque` is the linear model without them.
+    effects : entries of further effects (`ident.effects`): cause, side, joints, parameters. `torque` has them,
+        the regressor does not.
 
     Raises ConfigurationError when names are unknown or repeat and when shapes do not fit.
     """
@@ -89,6 +91,8 @@ class DynamicModel:
         if self.base is not None and self.base.structure is not self.structure:
             raise ConfigurationError("the base set belongs to another structure than the model")
         _ = self.positions
+        for entry in self.effects:
+            check_entry(entry, self.structure.chain.n)
 
     @cached_property
     def positions(self) -> NDArray[np.int64]:
@@ -185,11 +189,50 @@ class DynamicModel:
         *,
         payload: str | None = None,
         side: Side | None = None,
+        time: ArrayLike | None = None,
+        measured: bool = False,
     ) -> Floats:
-        """Inverse dynamics (N, n) [Nm, N] of one side (default the structure's first), equations (1) to (4).
+        """Inverse dynamics (N, n) [Nm, N] of one side (default the structure's first), equations (1) to (4),
+        with the physics of the model's effects.
 
-        q, qd, qdd : (N, n). payload : the payload mounted, one of the structure's. Effects are not included.
+        q, qd, qdd : (N, n). payload : the payload mounted, one of the structure's. time : (N,) [s], evenly
+        spaced, for effects with a memory; default 1 ms steps. measured : add what the sensors do to the torque.
         """
+        position, speed, thrust = regressor.check_states(self.structure.chain, q, qd, qdd)
+        chosen = self.structure.sides[0] if side is None else side
+        torque = self.linear_torque(position, speed, thrust, payload=payload, side=chosen)
+        if self.effects:
+            linear = {
+                of: torque
+                if of == chosen
+                else self.linear_torque(position, speed, thrust, payload=payload, side=of)
+                for of in self.structure.sides
+                if of != "difference"
+            }
+            stamps = None if time is None else np.asarray(time, dtype=np.float64)
+            torque = torque + effects_torque(
+                self,
+                position,
+                speed,
+                thrust,
+                linear,
+                side=chosen,
+                payload=payload,
+                time=stamps,
+                measured=measured,
+            )
+        return torque
+
+    def linear_torque(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        *,
+        payload: str | None = None,
+        side: Side | None = None,
+    ) -> Floats:
+        """Inverse dynamics (N, n) of the linear model alone, without its effects; arguments as in `torque`."""
         chosen = self.structure.sides[0] if side is None else side
         chosen = self.structure.condition_sides(Condition(payload, (chosen,)))[0]
         position, speed, thrust = regressor.check_states(self.structure.chain, q, qd, qdd)

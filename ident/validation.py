@@ -202,8 +202,8 @@ def validate(
         )
     notes: tuple[str, ...] = ()
     if model.effects:
-        named = ", ".join(str(effect.get("name", "?")) for effect in model.effects)
-        notes = (f"The torque is that of the linear model; its effects are not in it: {named}.",)
+        named = ", ".join(str(effect["cause"]) for effect in model.effects)
+        notes = (f"The torque has the effects of the model: {named}.",)
     return Validation(model.robot, tuple(scores), notes=notes)
 
 
@@ -211,7 +211,15 @@ def predictor(model: DynamicModel, payload: str | None) -> Predictor:
     """The computed torque of a model with a payload mounted."""
 
     def predict(channel: TorqueChannel, side: Side) -> Floats:
-        return model.torque(channel.q, channel.qd, channel.qdd, payload=payload, side=side)
+        return model.torque(
+            channel.q,
+            channel.qd,
+            channel.qdd,
+            payload=payload,
+            side=side,
+            time=channel.times,
+            measured=True,
+        )
 
     return predict
 

@@ -86,7 +86,7 @@ def standard_model(
     if link is not None:
         inertial[-1] += vector[_LINK * link : _LINK * link + _BODY]
     if model.effects:
-        named = ", ".join(str(effect.get("name", "?")) for effect in model.effects)
+        named = ", ".join(str(effect["cause"]) for effect in model.effects)
         notes = (*notes, f"Effects of the model that are not in this file: {named}.")
     title = f"{model.robot}, {'bare arm' if payload is None else f'payload {payload}'}"
     return StandardModel(

@@ -16,6 +16,17 @@ STRUCTURES = {
     "scara": lambda: ModelStructure(scara(), 1, without=("offl",)),
 }
 
+CABLE = {
+    "cause": "cable_spring",
+    "side": "joint",
+    "joints": [1],
+    "parameters": {
+        "stiffness": {"value": 0.3, "std": 0.01, "unit": "Nm/rad"},
+        "kind": {"value": 0.0, "std": 0.0, "unit": "1"},
+        "slack": {"value": 0.0, "std": 0.0, "unit": "rad"},
+    },
+}
+
 
 def base_model(kind: str = "lwr", *, covariance: bool = True) -> DynamicModel:
     structure = STRUCTURES[kind]()
@@ -118,13 +129,11 @@ def test_a_model_survives_its_file(kind, tmp_path):
 
 def test_standard_parameters_survive_their_file(tmp_path):
     structure = STRUCTURES["lwr"]()
-    model = DynamicModel(
-        "cad", structure, ("M2", "MY2", "Ia1"), [4.0, 0.3, 3.1], effects=({"name": "cable", "joint": "A5"},)
-    )
+    model = DynamicModel("cad", structure, ("M2", "MY2", "Ia1"), [4.0, 0.3, 3.1], effects=(CABLE,))
     write_model(model, tmp_path / "cad.yaml")
     again = read_model(tmp_path / "cad.yaml")
     assert again.kind == "standard"
-    assert again.effects == ({"name": "cable", "joint": "A5"},)
+    assert again.effects == (CABLE,)
     assert np.array_equal(again.standard, model.standard)
 
 

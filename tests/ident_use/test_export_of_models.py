@@ -123,5 +123,18 @@ def test_unsuitable_models_and_payloads_are_refused(truth_model: DynamicModel) -
 
 
 def test_effects_that_are_left_out_are_named(truth_model: DynamicModel) -> None:
-    extended = replace(truth_model, effects=({"name": "stribeck"},))
+    extended = replace(
+        truth_model,
+        effects=(
+            {
+                "cause": "stribeck",
+                "side": "motor",
+                "joints": [2],
+                "parameters": {
+                    "amplitude": {"value": 1.0, "std": 0.1, "unit": "Nm"},
+                    "velocity": {"value": 0.05, "std": 0.01, "unit": "rad/s"},
+                },
+            },
+        ),
+    )
     assert "Effects of the model that are not in this file: stribeck." in to_numpy(standard_model(extended))

@@ -108,9 +108,22 @@ def test_a_session_without_the_sides_of_the_model_says_so(truth_model: Any, benc
         validate(difference, [session], settings=PLAIN)
 
 
-def test_effects_that_are_not_computed_are_named(truth_model: Any, loaded: Any) -> None:
-    extended = replace(truth_model, effects=({"name": "stribeck"},))
-    assert "its effects are not in it: stribeck" in str(validate(extended, [loaded], settings=PLAIN))
+def test_effects_in_the_torque_are_named(truth_model: Any, loaded: Any) -> None:
+    extended = replace(
+        truth_model,
+        effects=(
+            {
+                "cause": "stribeck",
+                "side": "motor",
+                "joints": [2],
+                "parameters": {
+                    "amplitude": {"value": 1.0, "std": 0.1, "unit": "Nm"},
+                    "velocity": {"value": 0.05, "std": 0.01, "unit": "rad/s"},
+                },
+            },
+        ),
+    )
+    assert "the effects of the model: stribeck" in str(validate(extended, [loaded], settings=PLAIN))
 
 
 def test_results_print_and_serialise(truth_model: Any, unloaded: Any) -> None:
