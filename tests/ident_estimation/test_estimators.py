@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -184,6 +186,24 @@ def test_jackknife_is_the_scatter_of_estimates_without_a_block():
         shifts.append(np.linalg.lstsq(rows[rest], target[rest], rcond=None)[0] - estimate.values)
     expected = np.sqrt(7 / 8 * np.sum(np.square(shifts), axis=0))
     np.testing.assert_allclose(estimate.std, expected, rtol=1e-6)
+
+
+def test_periods_are_no_independent_witnesses_of_what_the_model_lacks():
+    matrices = [np.tile(matrix, (4, 1)) for matrix in design(samples=150, seed=3)]
+    inside, alone = [], []
+    for seed in range(30):
+        random = np.random.default_rng(seed)
+        noise = [np.tile(ar1(random, 150, 0.5), 4) + 0.3 * random.normal(size=600) for _ in matrices]
+        case = problem(matrices, CHI, noise)
+        for found, periods in ((inside, (150, 150)), (alone, ())):
+            estimate = WeightedLeastSquares().fit(dataclasses.replace(case, periods=periods))
+            low, high = estimate.interval(0.95).T
+            found.append((low < CHI) & (high > CHI))
+    assert (
+        "of the period" in WeightedLeastSquares().fit(dataclasses.replace(case, periods=(150, 150))).summary()
+    )
+    assert 0.90 < np.mean(inside) < 0.98
+    assert np.mean(alone) < 0.80
 
 
 def test_intervals_cover_on_correlated_residuals_where_the_textbook_fails():
