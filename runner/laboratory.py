@@ -56,6 +56,9 @@ class Laboratory:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.status.clear()
+        if error is not None and self.emulator is not None and not self.emulator.running:
+            said = self.emulator.messages().strip().splitlines()
+            self.status.say(f"the emulator ended by itself: {said[-1] if said else 'it said nothing'}")
         self._stack.close()
 
     def _set_up(self, stack: ExitStack) -> Bench:
@@ -93,6 +96,8 @@ class Laboratory:
             lock_step=emulated and self.experiment.lock_step,
             handshake=link.handshake,
             realtime="allow" if emulated or self._allow_non_realtime else "require",
+            # On a busy computer the emulator may be held up for long, and in lock step that harms nothing.
+            lock_step_patience_s=60.0,
         )
 
     def _krl(self) -> KrlMotorTorque | None:
