@@ -1,0 +1,64 @@
+"""Take the pictures of the README: run the default experiment, open report and preview in Chromium.
+
+::
+
+    make screenshot
+    python docs/images/take.py FOLDER      # of an experiment that is there already
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+from runner.preview import planned_motion, preview_html
+from runner.report.page import write_report
+
+HERE = Path(__file__).resolve().parent
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SIZE = {"width": 1280, "height": 800}
+# What a browser without a graphics card says of itself has no place in a picture.
+CLEAN = ".mantine-Notification-root, .mantine-Notifications-root { display: none !important; }"
+
+
+def main(arguments: list[str]) -> None:
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        sys.exit("no chromium on this computer; install the system's package `chromium`")
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(arguments[0]) if arguments else Path(place) / "lwr4plus"
+        if not arguments:
+            command = [sys.executable, "-m", "runner.cli", "experiment", "--yes", "--out", str(folder)]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        preview = Path(place) / "preview.html"
+        preview.write_text(preview_html(planned_motion(str(folder / "experiment.yaml"))), encoding="utf-8")
+        take(browser, write_report(folder), preview)
+
+
+def take(browser: str, report: Path, preview: Path) -> None:
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=browser, args=FLAGS)
+        page = opened.new_page(viewport=SIZE)
+        page.goto(report.resolve().as_uri())
+        page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=120_000)
+        page.screenshot(path=HERE / "report.png")
+        page.locator("#torque").scroll_into_view_if_needed()
+        page.evaluate("document.querySelector('#torque details').scrollIntoView()")
+        page.screenshot(path=HERE / "report_torque.png")
+        page.goto(preview.resolve().as_uri())
+        frame = page.frames[-1]
+        frame.wait_for_selector("canvas", timeout=120_000)
+        frame.add_style_tag(content=CLEAN)
+        page.wait_for_timeout(15_000)
+        page.screenshot(path=HERE / "preview.png", timeout=240_000)
+        opened.close()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

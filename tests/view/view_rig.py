@@ -1,0 +1,93 @@
+"""A browser without a network, and what it saw of a page."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+WIDE, NARROW = (1280, 800), (400, 800)
+FLAGS = [
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+]
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+
+
+def chromium() -> str | None:
+    """Path of the browser, None where this computer has none."""
+    return next((path for name in CHROMIUM if (path := shutil.which(name))), None)
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=chromium(), args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@dataclass
+class Seen:
+    """A page with every error of its console and every request that left the computer."""
+
+    page: Page
+    errors: list[str] = field(default_factory=list)
+    external: list[str] = field(default_factory=list)
+
+    def wait_drawn(self) -> None:
+        """Until every chart that is not folded away is drawn."""
+        self.page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=120_000)
+
+
+@contextmanager
+def opened(browser: Browser, address: str | Path, size: tuple[int, int] = WIDE) -> Iterator[Seen]:
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    seen = Seen(page)
+
+    def console(message: Any) -> None:
+        if message.type == "error":
+            seen.errors.append(message.text)
+
+    def request(sent: Any) -> None:
+        if not sent.url.startswith(
+            ("file:", "data:", "blob:", "about:", "http://127.0.0.1", "ws://127.0.0.1")
+        ):
+            seen.external.append(sent.url)
+
+    page.on("console", console)
+    page.on("pageerror", lambda error: seen.errors.append(str(error)))
+    page.on("request", request)
+    page.goto(address.as_uri() if isinstance(address, Path) else address, wait_until="load", timeout=120_000)
+    yield seen
+    page.close()
+
+
+CONTRAST = """() => {
+  const light = (c) => { const v = c / 255; return v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4; };
+  const luminance = ([r, g, b]) => 0.2126 * light(r) + 0.7152 * light(g) + 0.0722 * light(b);
+  const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+  const ground = (node) => {
+    for (; node; node = node.parentElement) {
+      const c = parts(getComputedStyle(node).backgroundColor);
+      if (c.length < 4 || c[3] > 0) return c;
+    }
+    return [255, 255, 255];
+  };
+  const worst = [];
+  for (const node of document.querySelectorAll('h1,h2,h3,p,th,td,a,summary,span,figcaption,li,footer,pre')) {
+    if (node.offsetParent === null || !node.textContent.trim()) continue;
+    const a = luminance(parts(getComputedStyle(node).color)), b = luminance(ground(node));
+    worst.push((Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05));
+  }
+  return Math.min(...worst);
+}"""
+"""Lowest contrast of any text to what is behind it, as WCAG 2 counts."""
