@@ -1,4 +1,4 @@
-"""The hidden arm: a plant for the emulated cabinet, with its own joints and what happens to it from outside."""
+"""The hidden arm: a plant for the emulated cabinet, with joints of its own and what befalls it."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ class Load:
 class HiddenArm:
     """Plant of the emulated cabinet (`sim_backend.plant.Plant`).
 
-    traits : see `traits`. tilt : (2,) rotations of the base about its x and y axes [rad]. contacts, load : see
-    there. The public arrays are what the sensors see: the encoders' zeros are in the positions.
+    traits : see `traits`. tilt : (2,) rotations of the base about its x and y axes [rad]. contacts, load :
+    see there. The public arrays are what the sensors see: the encoders' zeros are in the positions.
     """
 
     def __init__(

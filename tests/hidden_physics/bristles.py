@@ -199,8 +199,8 @@ def advance(
     """Advance everything by `period` [s] in place.
 
     body : (4, n) motor angle and speed, link angle and speed. inner : (STATES, n), see there
-    mass : (n, n) upper triangle; bias : (n,) what the links need besides [Nm]; reported : (n,) motor torque as
-    the cabinet has it; drive : (10, n) Ia, K, D, Fvm, Fcm, offm, Fvl, Fcl, offl, and 0 or 1 for braked motors
+    mass : (n, n) upper triangle; bias : (n,) what the links need besides [Nm]; reported : (n,) motor torque
+    as the cabinet has it; drive : (9, n) Ia, K, D, Fvm, Fcm, offm, Fvl, Fcl, offl
     p : (traits, n). joint_torque : (n,) out
     """
     n = mass.shape[0]

@@ -191,7 +191,7 @@ def draw(
         joint = int(random.choice(free))
         taken |= {joint} - {0}
         sized = cause.draw(random, joint, scene)
-        drawn = float(np.exp(random.uniform(*map(math.log, _SIZES))))
+        drawn = math.exp(random.uniform(math.log(_SIZES[0]), math.log(_SIZES[1])))
         hidden.append(sized(drawn if size is None else size))
     name = _name("case", seed, kind, [h.cause for h in hidden], [h.size for h in hidden])
     return Case(name, seed, kind, schedule, day, tuple(hidden))

@@ -108,7 +108,7 @@ def _fault(joint: int, **values: float) -> Setting:
     return Setting(faults={name: {joint: value} for name, value in values.items()})
 
 
-# -- friction --------------------------------------------------------------------------------------------------
+# ---- friction ----
 
 
 def _stribeck(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
@@ -210,7 +210,7 @@ def _presliding(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     return sized
 
 
-# -- drive -----------------------------------------------------------------------------------------------------
+# ---- drive ----
 
 
 def _gear_ripple(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
@@ -261,7 +261,7 @@ def _elasticity(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     return sized
 
 
-# -- links -----------------------------------------------------------------------------------------------------
+# ---- links ----
 
 
 def _cable(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
@@ -371,7 +371,7 @@ def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidd
     return sized
 
 
-# -- sensors and timing ----------------------------------------------------------------------------------------
+# ---- sensors and timing ----
 
 
 def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
@@ -484,16 +484,17 @@ def _joint_late(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 
 def _held(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    what, every_s = str(random.choice(("packet", "torque"))), random.uniform(0.4, 1.5)
+    what, every_s = str(random.choice(("packet", "torque"))), random.uniform(0.8, 3.0)
 
     def sized(size: float) -> Hidden:
-        held = {"every_s": every_s, "length_s": min(0.2, 0.05 * size), "what": what}
+        length_s = min(0.2, (0.008 if what == "packet" else 0.02) * size)
+        held = {"every_s": every_s, "length_s": length_s, "what": what}
         return Hidden("lost_samples", "timing", (), size, _everywhere(Setting(held=held)), variant=what)
 
     return sized
 
 
-# -- outside the catalogue -------------------------------------------------------------------------------------
+# ---- outside the catalogue ----
 
 
 def _other(random: Random, joint: int) -> int:

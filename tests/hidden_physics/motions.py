@@ -1,8 +1,8 @@
 """Exciting motions of all hidden sessions.
 
-Each schedule is three motions: without payload, with payload, and one held out, with payload. They were chosen
-among thirty random feasible Fourier motions so that the parameters found on the first two predict the third
-within a third of the noise: what is then wrong in a prediction is what was hidden.
+Each schedule is three motions: without payload, with payload, and one held out, with payload. They were
+chosen among thirty random feasible Fourier motions so that the parameters found on the first two predict the
+third within a third of the noise: what is then wrong in a prediction is what was hidden.
 """
 
 from __future__ import annotations

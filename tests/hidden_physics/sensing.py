@@ -1,4 +1,4 @@
-"""The hidden sensor chain: what joint torque sensors, encoders' packets and motor currents do to the truth."""
+"""The hidden sensor chain: from true torques and positions to readings."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = ["FAULTS", "SensorChain"]
 
 _HEALTHY: dict[str, float] = {
     # joint torque sensor: scale; play [Nm], half the width, and share of the torque that passes through it;
-    # clipping [Nm]; zero at the beginning [Nm], drift [Nm/s], creep towards [Nm] with time constant [s]; ripple
-    # [Nm], count per turn of the joint, phase [rad]; lateness [s]
+    # clipping [Nm]; zero at the beginning [Nm], drift [Nm/s], creep towards [Nm] with time constant [s];
+    # ripple [Nm], count per turn of the joint, phase [rad]; lateness [s]
     "gain": 1.0,
     "play": 0.0,
     "play_share": 1.0,
@@ -77,7 +77,7 @@ def _chain(
     rows: np.ndarray,
     place: int,
 ) -> None:
-    """The chain of the joint torque sensors, from the `true` torque (n,) to the reading `torque` (n,), in place.
+    """The chain of the joint torque sensors, from the `true` torque (n,) to the reading `torque` (n,).
 
     What the reading holds beyond the truth is the electronics' noise, which comes after the strain gauges.
     """

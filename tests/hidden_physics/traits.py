@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ Traits = Mapping[str, Mapping[int, float]]
 """Values by trait and joint number (1 to 7); what is not named is healthy."""
 
 _HEALTHY: dict[str, float] = {
-    # elastic joint: scales of stiffness and damping; lost motion, half its width [rad], and the stiffness that
-    # is left inside it; relative hardening [1/rad^2]
+    # elastic joint: scales of stiffness and damping; lost motion, half its width [rad], and the stiffness
+    # that is left inside it; relative hardening [1/rad^2]
     "stiffness": 1.0,
     "damping": 1.0,
     "play": 0.0,
@@ -56,8 +56,8 @@ _HEALTHY: dict[str, float] = {
     "housing_capacity": 900.0,
     "housing_conductance": 0.6,
     "start_warm": 0.0,
-    # drive: true torque over reported torque; ripple once and twice per turn of the wave generator [Nm], phases
-    # [rad], turns of the wave generator per joint turn
+    # drive: true torque over reported torque; ripple once and twice per turn of the wave generator [Nm],
+    # phases [rad], turns of the wave generator per joint turn
     "motor_gain": 1.0,
     "ripple_once": 0.0,
     "ripple_twice": 0.0,
@@ -75,8 +75,8 @@ _HEALTHY: dict[str, float] = {
     # encoder zero [rad]
     "zero": 0.0,
     # what no catalogue lists. The other joint (1 to 7): its angle modulates our friction (share, phase), its
-    # speed drags us [Nm s/rad]; drag by our own speed of a while ago [Nm s/rad], how long a while [s]; friction
-    # that grows with acceleration [s^2/rad]; a shaking foundation [Nm], [Hz]
+    # speed drags us [Nm s/rad]; drag by our own speed of a while ago [Nm s/rad], how long a while [s];
+    # friction that grows with acceleration [s^2/rad]; a shaking foundation [Nm], [Hz]
     "other": 0.0,
     "other_friction": 0.0,
     "other_phase": 0.0,
@@ -118,6 +118,6 @@ def merged(*parts: Traits) -> dict[str, dict[int, float]]:
     return whole
 
 
-def every(values: Sequence[float]) -> dict[int, float]:
+def every(values: Iterable[float]) -> dict[int, float]:
     """Seven values as a mapping by joint number."""
     return {joint: float(value) for joint, value in enumerate(values, start=1)}

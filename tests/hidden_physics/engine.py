@@ -1,0 +1,73 @@
+"""The diagnosis under test, called as a program would call it: sessions and a healthy reference in, its own
+file's content out. Nothing of a case but its logs goes in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hidden_physics.cases import Case, Sessions, Store, twin
+from hidden_physics.motions import SCHEDULES
+from hidden_physics.robots import Day, Encoder
+from ident.discrepancy.diagnose import ArmData, commission, diagnose
+from ident.discrepancy.reference import Reference
+from ident.kinematics import Chain
+from ident.model_file import read_model, write_model
+from lwr_driver.arm import Arm
+from lwr_driver.session import read_session
+
+__all__ = ["COMMISSIONING_DAYS", "commissioned", "diagnosed", "healthy_sets"]
+
+COMMISSIONING_DAYS = 12
+_FIRST_DAY = 5000
+
+
+@cache
+def _arm() -> tuple[Chain, ArmData]:
+    arm = Arm.load()
+    return Chain.from_urdf(arm.urdf), ArmData(arm.stiffness, arm.gear_ratio)
+
+
+def healthy_sets(encoder: Encoder, days: int, schedules: Sequence[str] = SCHEDULES) -> list[Case]:
+    """Healthy days to commission the arm on, each with the motions of one schedule."""
+    return [
+        twin(schedules[number % len(schedules)], Day(_FIRST_DAY + number, encoder)) for number in range(days)
+    ]
+
+
+def commissioned(
+    store: Store, encoder: Encoder, days: int = COMMISSIONING_DAYS, schedules: Sequence[str] = SCHEDULES
+) -> Path:
+    """Reference of the healthy arm as a model file, made once a store."""
+    path = store.folder / f"reference_{encoder}_{''.join(schedules)}_{days}.yaml"
+    if path.is_file():
+        return path
+    chain, data = _arm()
+    sets = []
+    for case in healthy_sets(encoder, days, schedules):
+        sessions = store.sessions(case)
+        sets.append([read_session(session) for session in sessions.train])
+    reference = commission(sets, chain, arm=data)
+    model = reference.model
+    model = dataclasses.replace(model, provenance={**model.provenance, **reference.stored()})
+    write_model(model, path)
+    return path
+
+
+def diagnosed(sessions: Sessions, reference: Path | None) -> tuple[dict[str, Any], float]:
+    """Content of `diagnosis.json`, and the processor time that it took [s], reading the logs included."""
+    chain, data = _arm()
+    began = time.process_time()
+    result = diagnose(
+        [read_session(path) for path in sessions.train],
+        chain,
+        test=[read_session(path) for path in sessions.test],
+        arm=data,
+        reference=None if reference is None else Reference.of(read_model(reference)),
+    )
+    return result.to_dict(), time.process_time() - began
