@@ -1,30 +1,35 @@
-"""A simple feasible excitation: no optimisation, in well under a second, for first runs and as a start for
-planning.
+"""A simple feasible excitation: no optimisation of any criterion, in a second, for first runs and as a
+fallback.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from fri.errors import RefusedError
+from ident.excitation.capsules import space_of
 from ident.excitation.check import Check, Limits, PathChecker, Workspace, check_motion
 from ident.excitation.estimate import ArmEstimate
-from ident.excitation.fourier import FourierBasis, FourierSeries
-from ident.excitation.mechanism import Mechanism, tip_path
-from ident.excitation.motion import Array, ParametricMotion
+from ident.excitation.fourier import FourierBasis
+from ident.excitation.information import Columns
+from ident.excitation.mechanism import Mechanism
+from ident.excitation.motion import ParametricMotion
 from ident.excitation.plan import ExcitationPlan
+from ident.excitation.polish import tighten
+from ident.excitation.search import Setup, random_start
+from ident.excitation.sqp import minimise
 from lwr_driver.arm import Arm
 
 __all__ = ["arm_limits", "feasible_fourier"]
 
 _log = logging.getLogger(__name__)
 
-_CENTRES = 200
-_DIRECTIONS = 24
-_BISECTIONS = 8
+_STARTS = 12
+_ROUNDS = 4
+_RESERVE = 3e-3
 
 
 def arm_limits(arm: Arm, speed_scale: float = 1.0) -> Limits:
@@ -45,121 +50,75 @@ def feasible_fourier(
     estimate: ArmEstimate | None = None,
     clearance_m: float = 0.02,
 ) -> ExcitationPlan:
-    """Random Fourier motion, as large as the limits allow, that passes every check.
+    """Random Fourier motion of moderate size, moved as little as the limits ask for, that passes every check.
 
-    Around random postures with room on all sides, random series are grown until a limit stops them; the
-    largest is taken. `estimate` defaults to the URDF's inertias without friction. Raises RefusedError where
-    no posture or no motion passes, naming the limit that stands in the way most often.
+    `estimate` defaults to the URDF's inertias without friction. Raises RefusedError where none of a dozen
+    random starts leads to a motion that passes, naming the limit that stands in the way most often.
     """
     mechanism = Mechanism.from_urdf(arm.urdf)
-    limits = arm_limits(arm, speed_scale)
-    space = workspace if workspace is not None else Workspace()
-    known = estimate if estimate is not None else ArmEstimate.nominal(mechanism)
-    basis = FourierBasis(period_s, harmonics)
-    rng = np.random.default_rng(seed)
-
-    def coarse(motion: ParametricMotion) -> Check:
-        return check_motion(
-            motion,
-            mechanism,
-            limits,
-            workspace=space,
-            estimate=known,
-            checker=checker,
-            clearance_m=clearance_m,
-            step_s=period_s / 200,
-            collision_step_s=period_s / 100,
-        )
-
-    def fine(motion: ParametricMotion) -> Check:
-        return check_motion(
-            motion,
-            mechanism,
-            limits,
-            workspace=space,
-            estimate=known,
-            checker=checker,
-            clearance_m=clearance_m,
-        )
-
-    centres = _roomy_postures(rng, mechanism, limits, space)
-    best: tuple[float, FourierSeries] | None = None
+    space, _ = space_of(mechanism, getattr(checker, "geometry", None))
+    work = workspace if workspace is not None else Workspace()
+    floor = np.full(space.rows, clearance_m + _RESERVE)
+    floor[0] = -np.inf if work.radius_m is None else work.radius_m + _RESERVE
+    floor[1] = -np.inf if work.height_m is None else work.height_m + _RESERVE
+    setup = Setup(
+        mechanism=mechanism,
+        basis=FourierBasis(period_s, harmonics),
+        limits=arm_limits(arm, speed_scale),
+        space=space,
+        floor=floor,
+        estimate=estimate if estimate is not None else ArmEstimate.nominal(mechanism),
+        columns=Columns.of(mechanism.joints, ()),
+        target=None,
+        samples=max(64, 10 * harmonics),
+        refine=max(3, int(np.ceil(period_s / 0.0625 / max(64, 10 * harmonics)))),
+    )
     blocked: dict[str, int] = {}
-    for trial in range(_DIRECTIONS):
-        direction = _random_direction(rng, basis, limits)
-        centre = centres[trial % len(centres)]
-        size, reason = _grow(centre, direction, basis, coarse)
-        if reason:
-            blocked[reason] = blocked.get(reason, 0) + 1
-        if size > 0.0 and (best is None or size > best[0]):
-            candidate = basis.motion(_coefficients(centre, direction, 0.97 * size))
-            if fine(candidate).ok:
-                best = (size, candidate)
-    if best is None:
-        culprit = max(blocked, key=lambda key: blocked[key]) if blocked else "every limit at once"
-        raise RefusedError(
-            f"no feasible exciting motion found in {_DIRECTIONS} tries; {culprit} stands in the way most "
-            "often; widen that limit or choose another seed"
-        )
-    _log.info("feasible excitation: size %.2f of the largest drawn", best[0])
-    return ExcitationPlan(
-        motion=best[1],
-        joint_names=arm.joint_names,
-        periods=periods,
-        check=fine(best[1]),
-        provenance={"method": "feasible_fourier", "seed": seed, "speed_scale": speed_scale, "arm": arm.name},
+    for start in range(_STARTS):
+        plan, check = _from_start(setup, seed, start, work, checker, clearance_m)
+        if check.ok:
+            _log.info("feasible excitation found from start %d of %d", start + 1, _STARTS)
+            provenance = {
+                "method": "feasible_fourier",
+                "seed": seed,
+                "speed_scale": speed_scale,
+                "arm": arm.name,
+            }
+            return ExcitationPlan(plan, arm.joint_names, periods, check=check, provenance=provenance)
+        worst = check.violations[0]
+        blame = f"{worst.subject} {worst.constraint}"
+        blocked[blame] = blocked.get(blame, 0) + 1
+    culprit = max(blocked, key=lambda key: blocked[key])
+    raise RefusedError(
+        f"no feasible exciting motion found from {_STARTS} random starts; {culprit} stands in the way most "
+        "often; widen that limit or choose another seed"
     )
 
 
-def _roomy_postures(
-    rng: np.random.Generator, mechanism: Mechanism, limits: Limits, space: Workspace
-) -> Array:
-    """Random postures, those with most room in the workspace first, (k, joints)."""
-    middle = 0.5 * (limits.q_low + limits.q_high)
-    half = 0.5 * (limits.q_high - limits.q_low)
-    postures = middle + half * rng.uniform(-0.6, 0.6, size=(_CENTRES, mechanism.joints))
-    points = tip_path(mechanism, postures)
-    room = np.hypot(points[:, 0], points[:, 1]) - (space.radius_m or 0.0)
-    if space.height_m is not None:
-        room = np.minimum(room, points[:, 2] - space.height_m)
-    return postures[np.argsort(-room)[:_DIRECTIONS]]
-
-
-def _random_direction(rng: np.random.Generator, basis: FourierBasis, limits: Limits) -> Array:
-    """Random series around zero that reaches some limit of range, velocity, acceleration or jerk in each
-    joint.
-    """
-    x = rng.normal(size=(limits.q_low.size, basis.free))
-    x[:, 0] = 0.0
-    motion = basis.motion(x)
-    half = 0.5 * (limits.q_high - limits.q_low)
-    scale = np.full(half.shape, np.inf)
-    for order, bound in enumerate((half, limits.v_max, limits.a_max, limits.j_max)):
-        extrema = motion.extrema(order)
-        scale = np.minimum(scale, bound / np.maximum(np.abs(extrema.low), np.abs(extrema.high)))
-    return x * scale[:, None]
-
-
-def _coefficients(centre: Array, direction: Array, size: float) -> Array:
-    x = size * direction
-    x[:, 0] += centre
-    return x
-
-
-def _grow(
-    centre: Array, direction: Array, basis: FourierBasis, check: Callable[[ParametricMotion], Check]
-) -> tuple[float, str]:
-    """Largest share of `direction` around `centre` that passes, by bisection, and what stopped it."""
-    passed, failed, reason = 0.0, 1.0, ""
-    for _ in range(_BISECTIONS):
-        size = 0.5 * (passed + failed) if failed - passed < 1.0 else 1.0
-        result = check(basis.motion(_coefficients(centre, direction, size)))
-        if result.ok:
-            passed = size
-            if size == 1.0:
+def _from_start(
+    setup: Setup, seed: int, start: int, work: Workspace, checker: PathChecker | None, clearance_m: float
+) -> tuple[ParametricMotion, Check]:
+    """The motion nearest to one random start, tightened until it passes or the rounds are over."""
+    with threadpool_limits(1):
+        program = setup.program()
+        program.constraints.rate = 200.0
+        x = random_start(setup, np.random.default_rng([seed, start]))
+        program.anchor = x.copy()
+        for _ in range(_ROUNDS):
+            program.constraints.refresh_deviation(program.signals(x))
+            x = minimise(program, x, iterations=40, tolerance=1e-6).x
+            motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
+            check = check_motion(
+                motion,
+                setup.mechanism,
+                setup.limits,
+                workspace=work,
+                estimate=setup.estimate,
+                checker=checker,
+                clearance_m=clearance_m,
+                continuous=True,
+            )
+            if check.ok:
                 break
-        else:
-            failed = size if size < 1.0 else 0.999
-            worst = result.violations[0]
-            reason = f"{worst.subject} {worst.constraint}"
-    return passed, reason
+            tighten(program.constraints, check, setup.mechanism.joint_names)
+        return motion, check
