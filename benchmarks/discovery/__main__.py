@@ -1,0 +1,67 @@
+"""How well the diagnosis finds what it was not told: hidden cases from seeds, judged against their truth.
+
+    python benchmarks/discovery --cases 100 --jobs 2 --out campaign
+    python benchmarks/discovery --cases 500 --out campaign        goes on where it was left
+    python benchmarks/discovery --report --out campaign           tables of what is there
+    python benchmarks/discovery --again --out campaign            diagnoses once more, on the same logs
+
+The hidden arms, their sensors and the drawing of cases are in `tests/hidden_physics`. Sessions, the
+references of the healthy arm, one line a case in `results.jsonl` and the figures in `summary.json` are in the
+folder; the truth stands in the results only, and no diagnosis gets to see it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+_HERE = Path(__file__).resolve().parent
+_TESTS = str(_HERE.parents[1] / "tests")
+for folder in (str(_HERE), _TESTS):
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+# Worker processes start from nothing.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(_HERE), _TESTS, os.environ.get("PYTHONPATH"))))
+
+import click  # noqa: E402
+from campaign import Plan, run  # noqa: E402
+from tally import read_results, summary, tables  # noqa: E402
+
+
+@click.command()
+@click.option("--cases", default=60, show_default=True, help="Number of cases altogether.")
+@click.option("--seed", default=1, show_default=True, help="Of the first case; case i has seed + i.")
+@click.option("--jobs", default=1, show_default=True, help="Processes at a time.")
+@click.option("--days", default=12, show_default=True, help="Healthy days that the reference rests on.")
+@click.option("--without-reference", is_flag=True, help="Diagnose as if the arm had never been commissioned.")
+@click.option("--cause", "causes", multiple=True, help="Hide only these, one at a time.")
+@click.option("--again", is_flag=True, help="Diagnose cases once more that have a result.")
+@click.option("--discard", is_flag=True, help="Delete the logs of a case once it is judged.")
+@click.option("--report", is_flag=True, help="Run nothing.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("discovery"), show_default=True)
+def main(
+    cases: int,
+    seed: int,
+    jobs: int,
+    days: int,
+    without_reference: bool,
+    causes: tuple[str, ...],
+    again: bool,
+    discard: bool,
+    report: bool,
+    out: Path,
+) -> None:
+    """Hide physics in simulated sessions, have them diagnosed, and count what is found."""
+    plan = Plan(out, cases, seed, days, not without_reference, causes, discard)
+    if not report:
+        run(plan, jobs, again, click.echo)
+    results = read_results(plan.results)
+    if not results:
+        raise click.ClickException(f"{plan.results} has no result yet")
+    click.echo(tables(results))
+    (out / "summary.json").write_text(summary(results), encoding="utf-8")
+
+
+main()

@@ -1,0 +1,169 @@
+"""Running a campaign: which cases, each once, in as many processes as wanted."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from hidden_physics.cases import Case, Store, draw, twin
+from hidden_physics.causes import CAUSES, OUTSIDE
+from hidden_physics.engine import commissioned, diagnosed
+from hidden_physics.inflation import inflation
+from hidden_physics.robots import Encoder
+from hidden_physics.verdict import error_rows, judge
+from joblib import Parallel, delayed
+
+__all__ = ["Plan", "run"]
+
+# Out of twenty cases; the order spreads the kinds evenly.
+_KINDS = (
+    *("single", "single", "none", "single", "pair", "single", "single", "outside", "single", "none"),
+    *("single", "single", "pair", "single", "single", "none", "single", "outside", "single", "triple"),
+)
+_SINGLES = _KINDS.count("single")
+_MOTOR_SIDE = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run, see the command's help. out : folder of everything."""
+
+    out: Path
+    cases: int
+    seed: int
+    days: int
+    reference: bool = True
+    causes: tuple[str, ...] = ()
+    discard: bool = False
+
+    @property
+    def results(self) -> Path:
+        """One line of JSON a case."""
+        return self.out / ("results.jsonl" if self.reference else "results_without_reference.jsonl")
+
+    @property
+    def store(self) -> Store:
+        """Where the sessions are."""
+        return Store(self.out / "sessions")
+
+    def wanted(self) -> Iterator[tuple[int, str, str | None, Encoder]]:
+        """Seed, kind, cause (None: drawn) and encoder of each case."""
+        names, singles, healthy = list(CAUSES), 0, 0
+        for number in range(self.cases):
+            seed = self.seed + number
+            if self.causes:
+                name = self.causes[number % len(self.causes)]
+                yield seed, "outside" if name in OUTSIDE else "single", name, "link"
+                continue
+            kind = _KINDS[number % len(_KINDS)]
+            cause, encoder = None, cast(Encoder, "link")
+            if kind == "single":
+                # Every cause in turn.
+                cause = names[singles % len(names)]
+                singles += 1
+            elif kind == "none":
+                healthy += 1
+                encoder = "motor" if healthy % _MOTOR_SIDE == 0 else "link"
+            yield seed, kind, cause, encoder
+
+
+def run(plan: Plan, jobs: int, again: bool, say: Callable[[str], Any]) -> None:
+    """Run what has no result yet (`again`: everything), printing a line a case."""
+    plan.out.mkdir(parents=True, exist_ok=True)
+    if again and plan.results.is_file():
+        plan.results.replace(plan.results.with_suffix(".old.jsonl"))
+    done = set()
+    if plan.results.is_file():
+        done = {json.loads(line)["id"] for line in plan.results.read_text().splitlines()}
+    wanted = [entry for entry in plan.wanted() if _identity(*entry) not in done]
+    if plan.reference and wanted:
+        for encoder in sorted({_encoder(entry) for entry in wanted}):
+            began = time.monotonic()
+            path = commissioned(plan.store, encoder, plan.days)
+            say(f"reference with the {encoder} encoder: {path.name}, {time.monotonic() - began:.0f} s")
+    work = Parallel(n_jobs=jobs, return_as="generator_unordered")
+    count = len(done)
+    with plan.results.open("a", encoding="utf-8") as stream:
+        for result in work(delayed(_one)(plan, *entry) for entry in wanted):
+            stream.write(json.dumps(result) + "\n")
+            stream.flush()
+            count += 1
+            say(f"{count:4d} of {plan.cases}  {_line(result)}")
+
+
+def _encoder(entry: tuple[int, str, str | None, Encoder]) -> Encoder:
+    """Side of the joints that a case publishes, as far as it is known before the draw."""
+    _, _, cause, encoder = entry
+    return (CAUSES[cause].encoder if cause in CAUSES else None) or encoder
+
+
+def _identity(seed: int, kind: str, cause: str | None, encoder: str) -> str:
+    return f"{seed} {kind} {cause or 'any'} {encoder}"
+
+
+def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) -> dict[str, Any]:
+    """Draw, record, diagnose, judge; a crash of the diagnosis is a result like any other."""
+    logging.getLogger("ident").setLevel(logging.ERROR)
+    store = plan.store
+    case = draw(seed, kind, store, causes=None if cause is None else [cause], encoder=encoder)
+    identity = _identity(seed, kind, cause, encoder)
+    result: dict[str, Any] = {"id": identity, "truth": case.truth()}
+    healthy = twin(case.schedule, case.day)
+    twin_error = store.error(healthy)
+    result["rho"] = inflation(store.error(case), twin_error) if case.hidden else 1.0
+    if len(case.hidden) > 1:
+        result["rho_alone"] = [
+            inflation(store.error(case.alone(index)), twin_error) for index in range(len(case.hidden))
+        ]
+    sessions = store.sessions(case)
+    reference = commissioned(store, case.day.encoder, plan.days) if plan.reference else None
+    try:
+        diagnosis, seconds = diagnosed(sessions, reference)
+        clean = _twin_errors(plan, healthy, reference) if case.hidden else None
+    except Exception:
+        return {**result, "crash": traceback.format_exc()}
+    result["seconds"] = seconds
+    result["verdict"] = judge(diagnosis, case.hidden, clean).to_dict()
+    result["diagnosis"] = {key: diagnosis[key] for key in ("findings", "unexplained", "gain")}
+    if plan.discard and case.hidden:
+        _discard(store, case)
+    return result
+
+
+def _twin_errors(plan: Plan, healthy: Case, reference: Path | None) -> np.ndarray:
+    """Held-out errors of the base model in the diagnosis of the healthy twin, made once."""
+    folder = plan.store.folder / healthy.name
+    kept = folder / f"clean_error_{'with' if reference else 'without'}.json"
+    if kept.is_file():
+        return np.array(json.loads(kept.read_text()))
+    diagnosis, _ = diagnosed(plan.store.sessions(healthy), reference)
+    errors = error_rows(diagnosis["baseline"]["test_rms"])
+    kept.write_text(json.dumps(errors.tolist()))
+    return errors
+
+
+def _discard(store: Store, case: Case) -> None:
+    for name in (case.name, *(case.alone(index).name for index in range(len(case.hidden)))):
+        shutil.rmtree(store.folder / name, ignore_errors=True)
+
+
+def _line(result: dict[str, Any]) -> str:
+    """A case in a line."""
+    hidden = result["truth"]["hidden"]
+    what = " + ".join(f"{h['cause']}({','.join(map(str, h['joints']))})" for h in hidden) or "nothing"
+    if "crash" in result:
+        return f"rho {result['rho']:5.2f}  {what:<44}  CRASH {result['crash'].splitlines()[-1]}"
+    verdict = result["verdict"]
+    found = "; ".join(verdict["findings"]) or "silent"
+    if verdict["unexplained"]:
+        found += f"; {verdict['unexplained']} unexplained"
+    good = verdict["silent"] if not hidden else verdict["exact"] or verdict["flagged"]
+    return f"rho {result['rho']:5.2f}  {'ok ' if good else '-- '} {what:<44}  {found}"
