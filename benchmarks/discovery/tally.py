@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -175,10 +175,8 @@ def summary(results: Sequence[Result]) -> str:
 def tables(results: Sequence[Result]) -> str:
     """The figures as text."""
     f = figures(results)
-    lines = [
-        f"cases: {', '.join(f'{n} {kind}' for kind, n in f['cases'].items())}; {f['crashes']} crashes",
-        "",
-    ]
+    kinds = ", ".join(f"{n} {kind}" for kind, n in f["cases"].items())
+    lines = [f"cases: {kinds}; {f['crashes']} crashes", ""]
     for name, (right, count) in f["rates"].items():
         goal = f"goal {100 * GOALS[name]:.0f} %" if name in GOALS else ""
         lines.append(f"{name:<52}{_share(right, count):>18}  {goal}")
@@ -218,19 +216,16 @@ def _share(part: int, whole: int) -> str:
 
 
 def _cause_table(by_cause: dict[str, list[list[int]]], confusion: dict[str, dict[str, int]]) -> str:
-    heads = ["< 1.03", "1.03-1.1", "1.1-1.3", ">= 1.3"]
-    lines = [
-        f"{'first finding right, by rho':<26}"
-        + "".join(f"{head:>10}" for head in heads)
-        + "   else (rho >= 1.03)"
-    ]
-    show: Callable[[list[int]], str] = lambda cell: f"{cell[0]}/{cell[1]}" if cell[1] else "."  # noqa: E731
+    heads = "".join(f"{head:>10}" for head in ("< 1.03", "1.03-1.1", "1.1-1.3", ">= 1.3"))
+    lines = [f"{'first finding right, by rho':<28}{heads}   else (rho >= 1.03)"]
     for cause in sorted(by_cause):
         said = {name: n for name, n in confusion.get(cause, {}).items() if name != "right"}
         others = ", ".join(f"{name} {n}" for name, n in sorted(said.items(), key=lambda item: -item[1]))
-        lines.append(
-            f"{cause:<26}" + "".join(f"{show(cell):>10}" for cell in by_cause[cause]) + f"   {others}"
-        )
+        lines.append(f"{cause:<28}{_cells(by_cause[cause])}   {others}")
     total = [[sum(row[k][i] for row in by_cause.values()) for i in (0, 1)] for k in range(len(BINS))]
-    lines.append(f"{'all':<26}" + "".join(f"{show(cell):>10}" for cell in total))
+    lines.append(f"{'all':<28}{_cells(total)}")
     return "\n".join(lines)
+
+
+def _cells(row: Sequence[Sequence[int]]) -> str:
+    return "".join(f"{f'{right}/{count}' if count else '.':>10}" for right, count in row)
