@@ -1,0 +1,74 @@
+"""A folder with everything that the documents speak of: an experiment file, logs, models, a broken log."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from click.testing import CliRunner
+
+import runner.experiment
+from lwr_driver.trace import TraceImport, import_trace
+from runner.cli import main
+
+SHORT: dict[str, Any] = {
+    "name": "my_lab",
+    "emulator_settings": {"fri.period_ms": 10},
+    "excitation": {"period_s": 6.0, "harmonics": 3, "periods": 1, "seed": 3},
+    "moves": {"home": [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], "speed_scale": 0.5, "settle_s": 0.5},
+    "sessions": [
+        {"name": "unloaded"},
+        {"name": "loaded", "payload": {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}},
+    ],
+}
+
+
+def keep_and_import(session: Path, trace: Path) -> TraceImport:
+    shutil.copy(session, session.with_suffix(".plain.mcap"))
+    return import_trace(session, trace)
+
+
+def lwr_run(*arguments: str) -> None:
+    result = CliRunner().invoke(main, list(arguments), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.fixture(scope="session")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Made once; tests work in copies of it (`workplace`)."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    (folder / "my_lab.yaml").write_text(yaml.safe_dump(SHORT))
+    lwr_run("experiment", str(folder / "my_lab.yaml"), "--yes", "--out", str(folder / "results"))
+    trace = {"name": "other", "motor_torque": {"source": "trace_file"}, "sessions": SHORT["sessions"][1:]}
+    (folder / "other.yaml").write_text(yaml.safe_dump({**SHORT, **trace}))
+    other = folder / "other"
+    seed = {"excitation": {**SHORT["excitation"], "seed": 4}}
+    (folder / "other.yaml").write_text(yaml.safe_dump({**SHORT, **trace, **seed}))
+    with pytest.MonkeyPatch.context() as patch:
+        # The log as it is before its trace is added.
+        patch.setattr(runner.experiment, "import_trace", keep_and_import)
+        lwr_run("experiment", str(folder / "other.yaml"), "--yes", "--out", str(other))
+    for name in ("unloaded.mcap", "loaded.mcap", "model.yaml"):
+        shutil.copy(folder / "results" / name, folder / name)
+    shutil.copy(other / "loaded.mcap", folder / "another.mcap")
+    shutil.copy(other / "model.yaml", folder / "another_model.yaml")
+    content = (folder / "loaded.mcap").read_bytes()
+    (folder / "broken.mcap").write_bytes(content[: len(content) * 2 // 3])
+    return folder
+
+
+@pytest.fixture
+def workplace(laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Path]:
+    """Makes a copy of the laboratory and goes there."""
+
+    def go() -> Path:
+        place = tmp_path / "work"
+        shutil.copytree(laboratory, place)
+        monkeypatch.chdir(place)
+        return place
+
+    return go

@@ -1,0 +1,167 @@
+"""Every command and every example of the documents is run; every link leads somewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+import yaml
+from click.testing import CliRunner
+from markdown import DOCUMENTS, ROOT, Command, blocks, commands
+
+from fri.errors import LwrError
+from ident.effects import EFFECTS
+from runner.cli import VERBS, main
+from runner.experiment_file import Experiment
+
+WITH_COMMANDS = [document for document in DOCUMENTS if any(not c.slow for c in commands(document))]
+WITH_PYTHON = [d for d in DOCUMENTS if any(not block.slow for block in blocks(d, "python"))]
+SLOW = [(document, command) for document in DOCUMENTS for command in commands(document) if command.slow]
+
+
+def run(command: Command) -> None:
+    where = f"line {command.line}: {command.text}"
+    assert command.words[0] == "lwr-run", f"{where} is no command of this project"
+    result = CliRunner().invoke(main, list(command.words[1:]))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise AssertionError(where) from result.exception
+    assert result.exit_code == command.code, f"{where} ended with {result.exit_code}\n{result.output}"
+    if command.output is not None:
+        Path(command.output).write_text(result.stdout)
+
+
+@pytest.mark.parametrize("document", WITH_COMMANDS, ids=str)
+def test_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]) -> None:
+    place = workplace()
+    if document.name == "quick_start.md":
+        (place / "my_lab.yaml").write_text(blocks(document, "yaml")[0].text)
+        for path in (place / "results").iterdir():
+            path.unlink()
+    elif document.name == "session_log.md":
+        # A log that has no motor torques yet, and the controller's recording of the same motion.
+        (place / "other" / "loaded.trace.csv").rename(place / "loaded.trace.csv")
+        (place / "other" / "loaded.plain.mcap").replace(place / "loaded.mcap")
+    for command in commands(document):
+        if not command.slow:
+            run(command)
+
+
+@pytest.mark.parametrize(("document", "command"), SLOW, ids=lambda value: str(getattr(value, "text", value)))
+def test_slow_commands_exist_with_these_options(document: Path, command: Command) -> None:
+    head, *rest = command.words
+    if head == "make":
+        assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    elif head == "python":
+        assert (ROOT / rest[0]).is_file()
+    else:
+        assert head == "lwr-run"
+        with click.Context(main) as context:
+            verb = main.get_command(context, rest[0])
+            assert verb is not None
+            verb.make_context(rest[0], rest[1:], parent=context, resilient_parsing=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("document", "command"), SLOW, ids=lambda value: str(getattr(value, "text", value)))
+def test_slow_commands_do_what_they_say(
+    document: Path, command: Command, workplace: Callable[[], Path]
+) -> None:
+    place = workplace()
+    words = list(command.words)
+    if words == ["make", "test"]:
+        # That is what is running.
+        return
+    if words[0] == "make":
+        words = ["lwr-run", "experiment", "--yes"]
+    if words[0] == "python":
+        words = [sys.executable, str(ROOT / words[1]), *words[2:]]
+    if words[:2] == ["lwr-run", "experiment"] and "--yes" not in words:
+        words.append("--yes")
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(words, cwd=place, env=environment, capture_output=True, text=True)
+    assert done.returncode == command.code, done.stderr
+
+
+@pytest.mark.parametrize("document", WITH_PYTHON, ids=str)
+def test_python_examples_work_one_after_the_other(document: Path, workplace: Callable[[], Path]) -> None:
+    workplace()
+    names: dict[str, object] = {}
+    for block in blocks(document, "python"):
+        if not block.slow:
+            code = compile("\n" * (block.line - 1) + block.text, str(document), "exec")
+            exec(code, names)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=str)
+def test_experiment_files_in_documents_are_valid(document: Path, tmp_path: Path) -> None:
+    for block in blocks(document, "yaml"):
+        content = {"name": "example", **yaml.safe_load(block.text)}
+        path = tmp_path / "example.yaml"
+        path.write_text(yaml.safe_dump(content))
+        Experiment.load(path)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=str)
+def test_links_and_files_that_are_named_exist(document: Path) -> None:
+    text = (ROOT / document).read_text()
+    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", text):
+        if "://" not in target:
+            assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
+    for name in re.findall(
+        r"`((?:configs|benchmarks|fri|ident|runner|lwr_driver|sim_backend|docs)/[\w./]+)`", text
+    ):
+        assert (ROOT / name).exists(), f"{document}: {name}"
+
+
+def test_every_option_that_a_document_names_exists() -> None:
+    known = set()
+    with click.Context(main) as context:
+        for name in VERBS:
+            command = main.get_command(context, name)
+            assert command is not None
+            for parameter in command.params:
+                known.update((*parameter.opts, *parameter.secondary_opts))
+    known.update(("--help", "--version", "-h", "-v", "-vv"))
+    for document in DOCUMENTS:
+        text = re.sub(r"^```.*?^```", "", (ROOT / document).read_text(), flags=re.MULTILINE | re.DOTALL)
+        for option in re.findall(r"`(--[a-z][a-z-]*)", text):
+            assert option in known, f"{document}: {option}"
+
+
+def test_every_command_is_documented_in_order() -> None:
+    rows = re.findall(r"^\| `([a-z]+)` \|", (ROOT / "docs/terminal.md").read_text(), re.MULTILINE)
+    assert rows == list(VERBS)
+
+
+def test_documented_exit_codes_are_those_of_the_errors() -> None:
+    text = (ROOT / "docs/terminal.md").read_text()
+    documented = {int(code) for code in re.findall(r"^\| (\d) \|", text, re.MULTILINE)}
+    raised = {kind.exit_code for kind in (LwrError, *LwrError.__subclasses__())}
+    assert documented == raised | {0}
+
+
+def test_every_cause_is_documented_with_its_parameters() -> None:
+    text = (ROOT / "docs/effects.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", text, re.MULTILINE))
+    assert set(rows) == set(EFFECTS)
+    for cause, effect in EFFECTS.items():
+        for parameter in effect.parameters:
+            assert parameter.name in effect.hidden or parameter.name in rows[cause], (
+                f"{cause}: {parameter.name}"
+            )
+
+
+def test_the_krl_program_is_explained_line_by_line() -> None:
+    def lines(text: str) -> list[str]:
+        return [s for line in text.splitlines() if (s := line.strip()) and s[0] not in "&;"]
+
+    folder = ROOT / "configs/krl"
+    data, *program = (block.text for block in blocks(Path("configs/krl/README.md"), "krl"))
+    assert lines("\n".join(program)) == lines((folder / "lwr_identification.src").read_text())
+    assert lines(data) == lines((folder / "lwr_identification.dat").read_text())
