@@ -14,25 +14,20 @@ from ident.base import BaseSet, closed_form_base
 from ident.excitation.bspline import SplineBasis
 from ident.excitation.capsules import space_of
 from ident.excitation.check import Check, Limits, PathChecker, check_motion
-from ident.excitation.constraints import Bound
 from ident.excitation.estimate import ArmEstimate, Noise, split_name
-from ident.excitation.evaluation import Evaluator
 from ident.excitation.fourier import FourierBasis
-from ident.excitation.information import Assembly, Columns, Rows
+from ident.excitation.information import Columns
 from ident.excitation.mechanism import Mechanism
 from ident.excitation.motion import Array, Basis, ParametricMotion
 from ident.excitation.objectives import (
-    ConditionNumber,
     Criterion,
-    DOptimality,
     GoalAttainment,
-    MeanTorque,
-    RelativeDeviation,
     View,
 )
-from ident.excitation.plan import ExcitationPlan
 from ident.excitation.problem import PlanProblem
 from ident.excitation.search import Setup
+from ident.excitation.views import motion_view
+from ident.excitation.wanted import Criteria, reported_criteria, wanted_target
 from ident.model_file import read_model
 from ident.structure import Condition, ModelStructure
 from lwr_driver.arm import Arm
@@ -40,27 +35,11 @@ from lwr_driver.cell import Cell
 from lwr_driver.collision import CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 
-__all__ = ["Assembled", "Criteria", "assemble", "motion_view"]
+__all__ = ["Assembled", "assemble"]
 
 _FLANGE_RESERVE = 2e-3
 _CLEARANCE_RESERVE = 3e-3
 _PAYLOAD_NAME = "load"
-_NEGLIGIBLE = 1e-9  # parameters this small are zero up to arithmetic
-
-
-@dataclass(frozen=True, eq=False)
-class Criteria:
-    """Every criterion that is reported, whatever is optimised."""
-
-    condition: ConditionNumber
-    condition_columns: ConditionNumber
-    d_optimality: DOptimality
-    rsd_mean: RelativeDeviation
-    rsd_worst: RelativeDeviation
-
-    def all(self) -> tuple[Criterion, ...]:
-        """In the order of the report."""
-        return (self.condition, self.condition_columns, self.d_optimality, self.rsd_mean, self.rsd_worst)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,43 +102,6 @@ class Assembled:
         }
 
 
-def motion_view(
-    motion: ParametricMotion,
-    mechanism: Mechanism,
-    estimate: ArmEstimate,
-    columns: Columns,
-    step_s: float = 0.01,
-) -> View:
-    """Any motion, of any parametrisation, as the criteria see it, sampled every `step_s`."""
-    samples = max(200, round(motion.duration / step_s))
-    evaluator = Evaluator(mechanism, _Fixed(motion), estimate, columns, samples=samples, refine=1)
-    return evaluator.view(list(motion.sample(evaluator.times)), exact_sign=True)
-
-
-class _Fixed:
-    """A basis of no coefficients: lets an evaluator look at a motion that is given."""
-
-    def __init__(self, motion: ParametricMotion) -> None:
-        self._motion = motion
-        self.duration, self.free = motion.duration, 0
-
-    def matrix(self, t: np.typing.ArrayLike, derivative: int = 0) -> Array:
-        """No basis functions."""
-        return np.zeros((np.size(t), 0))
-
-    def motion(self, x: Array) -> ParametricMotion:
-        """The given motion."""
-        return self._motion
-
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """None."""
-        return np.zeros((motion.joints, 0))
-
-    def grid_factor(self, n: int, derivative: int) -> float:
-        """No bound is claimed."""
-        return np.inf
-
-
 def assemble(problem: PlanProblem) -> Assembled:
     """Read every file that the problem names and build the criteria; ConfigurationError where they do not
     fit.
@@ -180,8 +122,8 @@ def assemble(problem: PlanProblem) -> Assembled:
         kept = [k for k, name in enumerate(names) if split_name(name)[1] <= mechanism.joints]
         names, values = tuple(names[k] for k in kept), values[kept]
     columns = Columns.of(mechanism.joints, names)
-    criteria = _criteria(problem, mechanism, estimate, columns, names, values, sessions, beside)
-    target, bounds = _target(problem, criteria, limits, mechanism)
+    criteria = reported_criteria(problem, mechanism, estimate, columns, names, values, sessions)
+    target, bounds = wanted_target(problem, criteria, limits, mechanism)
     space, row_names = space_of(mechanism, checker.geometry)
     floor = np.full(space.rows, clearance + _CLEARANCE_RESERVE)
     work = problem.workspace
@@ -223,7 +165,7 @@ def _estimate(
     path = find(knowledge.file, beside=beside)
     names: tuple[str, ...] = ()
     content = read_mapping(path)
-    if "structure" in content or content.get("kind") == "dynamic model":
+    if "chain" in content:
         model = read_model(path)
         estimate = ArmEstimate.from_model(model, knowledge.payload)
         names = model.names
@@ -292,136 +234,3 @@ def _parameters(
         wanted = tuple(problem.parameters)
     index = [base.index(name) for name in wanted]
     return tuple(base.names[k] for k in index), all_values[index]
-
-
-def _criteria(
-    problem: PlanProblem,
-    mechanism: Mechanism,
-    estimate: ArmEstimate,
-    columns: Columns,
-    names: tuple[str, ...],
-    values: Array,
-    sessions: tuple[bool, ...],
-    beside: Path | None,
-) -> Criteria:
-    noise = estimate.noise
-    assert noise is not None
-    label = {"base": "base"}.get(str(problem.parameters), "essential")
-    plain = Assembly(columns, names, Rows.unweighted(mechanism.joints, problem.model, sessions))
-    weighted = Assembly(columns, names, Rows(problem.model, sessions, noise.joint**-2.0, noise.motor**-2.0))
-    prior_plain = _prior(problem, mechanism, estimate, columns, names, None, beside)
-    prior_weighted = _prior(problem, mechanism, estimate, columns, names, noise, beside)
-    # a parameter near zero has no meaningful relative deviation; its own noise floor would rule the mean
-    known = np.where(np.abs(values) > _NEGLIGIBLE, np.abs(values), np.inf)
-    usable = np.isfinite(known)
-    judged, judged_prior = weighted, prior_weighted
-    if not usable.all():
-        kept = tuple(name for name, use in zip(names, usable, strict=True) if use)
-        judged = Assembly(columns, kept, weighted.rows)
-        if prior_weighted is not None:
-            judged_prior = prior_weighted[np.ix_(usable, usable)]
-        known = known[usable]
-    condition = ConditionNumber(plain, label, "none", None, prior_plain)
-    return Criteria(
-        condition=condition,
-        condition_columns=ConditionNumber(plain, label, "columns", None, prior_plain),
-        d_optimality=DOptimality(weighted, label, noise.samples, prior_weighted),
-        rsd_mean=RelativeDeviation(judged, known, label, "mean", noise.samples, judged_prior),
-        rsd_worst=RelativeDeviation(judged, known, label, "worst", noise.samples, judged_prior),
-    )
-
-
-def _prior(
-    problem: PlanProblem,
-    mechanism: Mechanism,
-    estimate: ArmEstimate,
-    columns: Columns,
-    names: tuple[str, ...],
-    noise: Noise | None,
-    beside: Path | None,
-) -> Array | None:
-    """Information of the motions that have been run already; per sample of the new one where unweighted."""
-    if not problem.prior:
-        return None
-    n = mechanism.joints
-    total = np.zeros((len(names), len(names)))
-    for entry in problem.prior:
-        done = ExcitationPlan.load(find(entry.plan, beside=beside))
-        if done.joint_names != mechanism.joint_names:
-            raise ConfigurationError(f"prior plan {entry.plan} is for joints {' '.join(done.joint_names)}")
-        loads = tuple(session == "loaded" for session in entry.sessions)
-        rows = (
-            Rows.unweighted(n, problem.model, loads)
-            if noise is None
-            else Rows(problem.model, loads, noise.joint**-2.0, noise.motor**-2.0)
-        )
-        view = motion_view(done.motion, mechanism, estimate, columns)
-        share = done.duration_s / (problem.motion.periods * problem.motion.period_s)
-        count = share if noise is None else share * noise.samples
-        total += count * Assembly(columns, names, rows).information(view.gram)
-    return total
-
-
-def _target(
-    problem: PlanProblem, criteria: Criteria, limits: Limits, mechanism: Mechanism
-) -> tuple[Criterion, tuple[Bound, ...]]:
-    wanted = problem.objective
-    condition: ConditionNumber = criteria.condition
-    if wanted.scaling == "columns":
-        condition = criteria.condition_columns
-    elif wanted.scaling == "parameters":
-        condition = ConditionNumber(
-            condition.assembly, condition.label, "parameters", _scale(criteria), condition.prior
-        )
-    single: dict[str, Criterion] = {
-        "condition_number": condition,
-        "d_optimality": criteria.d_optimality,
-        "mean_rsd": criteria.rsd_mean,
-        "worst_rsd": criteria.rsd_worst,
-    }
-    target: Criterion
-    if wanted.criterion == "goal_attainment":
-        target = goal_attainment(
-            condition, limits, mechanism, wanted.goal_condition, wanted.goal_wrist, wanted.wrist
-        )
-    else:
-        target = single[wanted.criterion]
-    bounds = []
-    for criterion, limit in (
-        (condition, wanted.condition_at_most),
-        (criteria.rsd_mean, wanted.mean_rsd_at_most),
-        (criteria.rsd_worst, wanted.worst_rsd_at_most),
-    ):
-        if limit is not None:
-            if limit <= 0.0 or (criterion is condition and limit < 1.0):
-                raise ConfigurationError(f"objective: bound {limit} on the {criterion.name} can never be met")
-            bounds.append(Bound(criterion, float(np.log(limit))))
-    return target, tuple(bounds)
-
-
-def goal_attainment(
-    condition: ConditionNumber,
-    limits: Limits,
-    mechanism: Mechanism,
-    goal: float,
-    share: float,
-    joints: tuple[int, ...],
-) -> GoalAttainment:
-    """Equation (10): goals `goal` for the condition number and `share` * tau_max for each listed joint (from
-    1).
-    """
-    criteria: list[Criterion] = [condition]
-    goals = [goal]
-    for number in joints:
-        if not 1 <= number <= mechanism.joints:
-            raise ConfigurationError(f"objective: wrist joint {number} does not exist")
-        peak = float(limits.tau_max[number - 1])
-        criteria.append(MeanTorque(number - 1, peak, mechanism.joint_names[number - 1]))
-        goals.append(share * peak)
-    return GoalAttainment(tuple(criteria), tuple(goals))
-
-
-def _scale(criteria: Criteria) -> Array:
-    if criteria.rsd_mean.values.size != len(criteria.condition.assembly.names):
-        raise ConfigurationError("scaling by parameters needs a value for each parameter; some are zero")
-    return criteria.rsd_mean.values

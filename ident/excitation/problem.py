@@ -82,13 +82,20 @@ class Objective:
 
 @dataclass(frozen=True)
 class Prior:
-    """A motion that has been run already; the new one adds what it lacks.
+    """A motion that has been run already; the new one adds what it lacks. Either a plan or a recorded
+    session.
 
     plan : its plan file; sessions : the sessions recorded with it
+    session : a session log; what was loaded is in the log
     """
 
-    plan: str
+    plan: str | None = None
+    session: str | None = None
     sessions: tuple[Literal["unloaded", "loaded"], ...] = ("unloaded", "loaded")
+
+    def __post_init__(self) -> None:
+        if (self.plan is None) == (self.session is None):
+            raise ConfigurationError("a prior is either a `plan` or a `session`; give one of them")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError, OperatorError, RefusedError
+from ident.base import closed_form_base
 from ident.excitation import (
     ExcitationPlan,
     Knowledge,
@@ -29,10 +30,18 @@ from ident.excitation import (
     table_row,
     trade_off,
 )
+from ident.excitation.estimate import ArmEstimate
+from ident.excitation.mechanism import Mechanism
+from ident.excitation.motion import Samples
 from ident.excitation.point_to_point import random_points
+from ident.excitation.torque import rigid_torque, torque_bounds
+from ident.model import DynamicModel
+from ident.model_file import write_model
+from ident.structure import ModelStructure
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Box, Cell
 from lwr_driver.configuration import CONFIGS
+from lwr_driver.session import SessionWriter, session_metadata
 
 CONDITION = "condition number, essential 49, unscaled"
 
@@ -158,15 +167,66 @@ def test_a_spline_plan_keeps_every_limit(problem: PlanProblem) -> None:
 def test_a_motion_run_before_makes_the_next_one_complement_it(
     problem: PlanProblem, solved: ExcitationPlan, tmp_path: Path
 ) -> None:
-    path = tmp_path / "before.plan.yaml"
-    solved.save(path)
-    follow = assemble(replace(problem, prior=(Prior(str(path)),)))
+    follow = assemble(replace(problem, prior=(Prior(plan=str(_saved(solved, tmp_path))),)))
     alone = assemble(problem)
     view = alone.view(solved.motion)
     single = alone.criteria.rsd_mean.deviations(view)
     double = follow.criteria.rsd_mean.deviations(follow.view(solved.motion))
     # the prior ran the same motion for the same time: the same information once more
     np.testing.assert_allclose(double, single / np.sqrt(2.0), rtol=1e-6)
+
+
+def test_a_recorded_session_counts_as_much_as_the_motion_it_recorded(
+    problem: PlanProblem, solved: ExcitationPlan, tmp_path: Path
+) -> None:
+    path, times = tmp_path / "unloaded.mcap", np.arange(0.0, 40.0, 0.004)
+    metadata = session_metadata(robot="KUKA LWR4+")
+    with SessionWriter(path, solved.joint_names, metadata) as writer:
+        position = solved.sample(times).q
+        stamps = np.rint(times * 1e9).astype(np.int64) + 10**18
+        writer.write_joint_states(stamps, position, np.ones_like(position))
+    recorded = assemble(replace(problem, prior=(Prior(session=str(path)),)))
+    whole = replace(problem, prior=(Prior(plan=str(_saved(solved, tmp_path)), sessions=("unloaded",)),))
+    planned = assemble(whole)
+    for criteria in ("condition", "rsd_mean"):
+        found, expected = (getattr(a.criteria, criteria).prior for a in (recorded, planned))
+        # two periods less the ends that filtering drops
+        np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.12, atol=0.05 * np.max(expected))
+
+
+def _saved(plan_: ExcitationPlan, folder: Path) -> Path:
+    path = folder / "before.plan.yaml"
+    plan_.save(path)
+    return path
+
+
+def test_an_identified_model_is_the_knowledge_of_the_next_plan(
+    problem: PlanProblem, mechanism: Mechanism, estimate: ArmEstimate, tmp_path: Path
+) -> None:
+    structure = ModelStructure(mechanism.chain, 2, payloads=("weight",))
+    base = closed_form_base(structure)
+    standard = np.zeros(structure.n_columns)
+    for column, name in enumerate(structure.names):
+        if not (name.endswith("8") and name[0] in "IFo"):
+            standard[column] = estimate.value(name)
+    values = base.reduce(standard)
+    covariance = np.diag((0.01 + 0.05 * np.abs(values)) ** 2)
+    model = DynamicModel("KUKA LWR4+", structure, base.names, values, covariance, base)
+    write_model(model, tmp_path / "model.yaml")
+    knowledge = Knowledge(file=str(tmp_path / "model.yaml"), payload="weight")
+    assembled = assemble(replace(problem, knowledge=knowledge, parameters="model"))
+    np.testing.assert_allclose(dict(zip(base.names, values, strict=True))["MY2R"], 3.46, atol=0.005)
+    assert {"ZZ1", "XX2", "Ia3", "M8"} <= set(assembled.setup.estimate.covariance_names)
+    samples = Samples(*(0.5 * np.random.default_rng(1).normal(size=(20, 7)) for _ in range(4)))
+    for found, true in zip(
+        rigid_torque(mechanism, samples, assembled.setup.estimate.loads),
+        rigid_torque(mechanism, samples, estimate.loads),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, true, atol=1e-9)
+    wide = torque_bounds(mechanism, samples, assembled.setup.estimate)
+    narrow = torque_bounds(mechanism, samples, estimate)
+    assert np.all(wide.motor > narrow.motor)
 
 
 @pytest.mark.parametrize(
