@@ -22,6 +22,8 @@ __all__ = ["ControllerEnd"]
 _BUFFER_SIZE = 2048
 _SLICE_S = 0.05
 _RESEND_S = 0.2
+# Even with a timeout of zero, datagrams of strangers are passed over for so long.
+_SHORTEST_FLOOD_S = 0.005
 
 
 class ControllerEnd:
@@ -69,7 +71,8 @@ class ControllerEnd:
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Next datagram of the PC, or None after `timeout_s` [s]; 0 takes what is there."""
-        deadline = monotonic() + timeout_s
+        began = monotonic()
+        deadline, flooded = began + timeout_s, began + max(timeout_s, _SHORTEST_FLOOD_S)
         while True:
             try:
                 datagram, source = self._socket.recvfrom(_BUFFER_SIZE)
@@ -82,7 +85,7 @@ class ControllerEnd:
             if source == self.remote:
                 return datagram
             self.foreign += 1
-            if monotonic() >= deadline:
+            if monotonic() >= flooded:
                 return None
 
     def lock_step(

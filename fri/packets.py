@@ -250,7 +250,7 @@ class MsrBuffer:
             return Fault.ID
         if size != MSR_SIZE:
             return Fault.SIZE
-        timestamp, state, quality, _, sample_time = self._intf(buffer, 140)
+        timestamp, state, quality, measuring, sample_time = self._intf(buffer, 140)
         power, control, error = self._robot(buffer, 180)
         # 1 to 100 ms with room for float32; the comparisons are also false for NaN.
         if (
@@ -258,6 +258,7 @@ class MsrBuffer:
             or quality > 3
             or control > 3
             or not 0.0009 < sample_time < 0.1001
+            or not 0.0009 < measuring < 0.1001
             or not -1e9 < timestamp < 1e9
         ):
             return Fault.FIELD

@@ -268,7 +268,13 @@ class RemoteEnd:
         """Whether another datagram is waiting, which makes the one in hand a stale one."""
         return bool(self._poll.poll(0))
 
-    def answer(self, jnt_pos: ArrayLike | None = None, add_jnt_trq: ArrayLike | None = None) -> bool:
+    def answer(
+        self,
+        jnt_pos: ArrayLike | None = None,
+        add_jnt_trq: ArrayLike | None = None,
+        *,
+        insist: bool = False,
+    ) -> bool:
         """Answer the packet that ``receive`` returned; once.
 
         Parameters
@@ -278,6 +284,9 @@ class RemoteEnd:
             out.
         add_jnt_trq : array_like or None
             (7,) additional torque [Nm], likewise; None is zero.
+        insist : bool
+            Send the setpoint although the packet says that the arm does not follow: it may be damaged. A
+            controller that does not follow ignores it.
 
         Returns
         -------
@@ -296,7 +305,7 @@ class RemoteEnd:
                 "no packet to answer: answer() needs a receive() that returned a packet, once each"
             )
         msr = self._msr
-        commanding = self.commanding
+        commanding = self.commanding or insist
         used = commanding and jnt_pos is not None
         if used:
             self._jnt_pos[:] = jnt_pos
@@ -310,7 +319,11 @@ class RemoteEnd:
         elif self._torque_set:
             self._add_jnt_trq[:] = 0.0
             self._torque_set = False
-        if self._flags_control != msr.control and (msr.state != _CMD or self._flags_control < 0):
+        if (
+            self._flags_control != msr.control
+            and (msr.state != _CMD or self._flags_control < 0)
+            and not insist
+        ):
             self._flags_control = msr.control
             self.command["cmd_flags"] = int(FLAGS[Control(msr.control)])
         if msr.control == Control.CART_IMP:

@@ -21,7 +21,7 @@ _LATEST_S = 1.0
 # A clock that is wrong at a jump of the counter by no more than this is damage, not a restart.
 _SHORT_JUMP = 64
 # So many old packets in a row, in order, are a controller that counts from an earlier number.
-_OLD_RUN = 8
+_OLD_RUN = 40
 _FLOAT32_EPS = 1.2e-7
 
 

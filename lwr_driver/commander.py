@@ -67,19 +67,35 @@ class Commander:
         """Whether a motion or a stop is under way."""
         return self.mode in (Mode.MOTION, Mode.STOP)
 
-    def enter(self, setpoint: NDArray[np.float32], safety_limits: float) -> NDArray[np.float32]:
-        """Begin to command, at rest, with the controller's own set point; returns it."""
+    def enter(
+        self,
+        setpoint: NDArray[np.float32],
+        safety_limits: float,
+        step: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float32] | None:
+        """Begin to command with the controller's own set point; the value to send.
+
+        step : of the set point per cycle (7,) [rad], None at rest. Command mode begins at rest; a set point
+        that moves is one that was lost in command mode and is brought to rest within the limits.
+        """
+        moves = step is not None and bool(step.any())
         self.target = setpoint.copy()
         self._hold = setpoint.astype(np.float64)
         self._past[:] = self._hold
-        self._guard.reset(setpoint)
+        if step is not None and moves:
+            self._past -= np.arange(3)[:, np.newaxis] * step
+        self._guard.reset(setpoint, step / self._period if step is not None and moves else None)
         self._guard.scale_velocity(safety_limits)
         self._since_sent = 0
         self.index, self.phase = -1, HOLD
         self._control.tracking[:] = 0.0
         self._control.write_text(Text.LEFT, "")
         self.mode = Mode.HOLD
-        return self.target
+        if not moves:
+            return self.target
+        self._since_sent = 1
+        self.stop(*self.ended)
+        return self.command(0)
 
     def watch(self, elapsed: int, setpoint: NDArray[np.float32], q: NDArray[np.float32]) -> None:
         """Count `elapsed` cycles, and stop if arm or set point are not where they were sent."""

@@ -47,6 +47,7 @@ from lwr_driver.link import (
     advise_connect,
     advise_leave,
     advise_quality,
+    silence_in_lock_step,
 )
 from lwr_driver.loop import LoopSettings
 from lwr_driver.loop_process import LoopProcess, Scheduling
@@ -581,7 +582,5 @@ class _Watch:
         if cycles != self._cycles:
             self._cycles, self._moved = cycles, now
         elif now - self._moved > patience_s:
-            self.error = NetworkError(
-                f"no packet for {now - self._moved:.1f} s in lock step; the emulator is gone"
-            )
+            self.error = NetworkError(silence_in_lock_step(driver.state(), now - self._moved))
             raise self.error

@@ -68,11 +68,12 @@ class Guard:
         self._excess = np.zeros((4, JOINTS))
         self.reset(np.zeros(JOINTS, dtype=np.float32))
 
-    def reset(self, q: NDArray[np.float32]) -> None:
-        """Begin at rest at the value q that was sent in this cycle."""
+    def reset(self, q: NDArray[np.float32], v: NDArray[np.float64] | None = None) -> None:
+        """Begin at the value q that was sent in this cycle, at rest or with the velocity v [rad/s]."""
         self._q = q.astype(np.float64)
-        self._v, self._a = np.zeros(JOINTS), np.zeros(JOINTS)
-        self._v_error = self._a_error = 0.0
+        self._v, self._a = np.zeros(JOINTS) if v is None else v, np.zeros(JOINTS)
+        self._v_error = 0.0 if v is None else 2.0 * ROUNDING / self._period
+        self._a_error = 0.0 if v is None else 2.0 * self._v_error / self._period
         self._h1 = self._h2 = self._period
         np.maximum(self._half, np.abs(self._q - self._middle), out=self._bounds[0])
         self._outside = bool(np.any(self._bounds[0] > self._half))

@@ -10,8 +10,16 @@ from fri.handshake import find_handshake
 from fri.states import ALL_DRIVES
 from lwr_driver.state import LinkState
 
-__all__ = ["LinkSettings", "advise_command", "advise_connect", "advise_leave", "advise_quality"]
+__all__ = [
+    "LinkSettings",
+    "advise_command",
+    "advise_connect",
+    "advise_leave",
+    "advise_quality",
+    "silence_in_lock_step",
+]
 
+_SILENCE_S = 1.0  # without packets for so long, that is the trouble and nothing else
 _POSITION_PROGRAMS = ("lwr_identification", "stanford", "ros_control")
 
 
@@ -65,7 +73,7 @@ def advise_connect(state: LinkState) -> str:
     if state.malformed:
         return "The packets are not FRI 1.0: check which software runs on the controller"
     if state.foreign:
-        return "Packets come from another address: check `controller`"
+        return "Packets come from another address than the controller's: check `controller`"
     return (
         "Start the KRL program; check FRIHOST and FRISOCK on the controller, the cable, the address of this "
         "computer and its firewall"
@@ -74,6 +82,10 @@ def advise_connect(state: LinkState) -> str:
 
 def advise_quality(state: LinkState) -> str:
     """What to do while the controller rates the link as bad."""
+    if state.age_s > _SILENCE_S:
+        return advise_connect(state)
+    if state.foreign:
+        return "Another address sends too: set `controller` to the controller's, and find the other"
     if state.late > state.received // 100:
         return "Answers come too late: close other programs, see the real-time rights, or use a longer cycle"
     return "Check cable and network card, and that only one client answers"
@@ -81,6 +93,8 @@ def advise_quality(state: LinkState) -> str:
 
 def advise_command(state: LinkState) -> str:
     """What to do while command mode does not come."""
+    if state.age_s > _SILENCE_S:
+        return advise_connect(state)
     if state.state == "CMD" and (state.power != ALL_DRIVES or state.error):
         return "Switch the drives on and acknowledge messages at the pendant"
     if state.quality in ("UNACCEPTABLE", "BAD"):
@@ -93,3 +107,9 @@ def advise_command(state: LinkState) -> str:
 def advise_leave(state: LinkState) -> str:
     """What to do while command mode does not end."""
     return "The KRL program does not react: stop it at the pendant"
+
+
+def silence_in_lock_step(state: LinkState, silence_s: float) -> str:
+    """What to say when nothing has come for so long [s] in lock step, where the other side waits for us."""
+    cause = f"{state.malformed} malformed packets came" if state.malformed else "the emulator is gone"
+    return f"no packet for {silence_s:.1f} s in lock step; {cause}"

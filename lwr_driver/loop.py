@@ -33,6 +33,15 @@ _IDLE_S = 0.0005  # pause of a loop in lock step that has nothing to do
 _SLICE_S = 0.02  # longest wait for a packet before requests and silence are looked at
 _FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated
 _RING_PATIENCE_S = 5.0
+_STILL_RAD = 1e-5  # a set point that moves by no more in a cycle rests
+# What a reason tells of the link: counter and word for it.
+_TOLD = (
+    ("lost", "lost"),
+    ("reordered", "late"),
+    ("suspect", "held back"),
+    ("malformed", "malformed"),
+    ("foreign", "foreign"),
+)
 _COUNTERS = (
     (Word.LOST, "lost"),
     (Word.REPEATED, "repeated"),
@@ -83,7 +92,12 @@ class Loop:
         self._sample_time = self._period = 0.0
         self._silence_s, self._silence_cycles = settings.link_timeout_s, 0
         self._sequence = -1
+        unknown = np.full(JOINTS, np.nan, dtype=np.float32)
+        self._past_setpoints = [(unknown, 1)] * 3  # newest first, and the cycles to the one before
+        self._limits, self._fastest = limits, limits.v_max
+        self._doubted = self._held_back = False
         self._misses, self._misses_before, self._missed_at = 0, 0, -_FEWEST_CYCLES
+        self._counted_before = self.remote.counters()
         self._heard_s = time.monotonic()
         self._restarts = 0
         self._last_event: LinkEvent | None = None
@@ -134,9 +148,9 @@ class Loop:
         elapsed = remote.sequence - self._sequence if self._sequence >= 0 else 1
         target = self._decide(remote.sequence, elapsed)
         self._sequence = remote.sequence
-        answered = self._commander.mode is not Mode.SILENT
+        answered = self._commander.mode is not Mode.SILENT and not self._held_back
         if answered:
-            remote.answer(target)
+            remote.answer(target, insist=self._doubted)
         self._write_row(answered)
         self._advance_job(elapsed)
         return True
@@ -165,11 +179,23 @@ class Loop:
     # -- what to answer --------------------------------------------------------------------------------------
 
     def _decide(self, sequence: int, elapsed: int) -> NDArray[np.float32] | None:
-        """The position to send, or None for the mirror."""
+        """The position to send, or None for the mirror, or for nothing where the answer is held back.
+
+        In command mode the mirror of a set point in motion would stop the arm at once. Without an answer the
+        controller brakes it.
+        """
         remote, commander = self.remote, self._commander
+        self._held_back = False
         self._heard_s = remote.received_ns * 1e-9
-        if remote.sample_time_s != self._sample_time:
-            self._set_period(remote.sample_time_s)
+        ready = (
+            remote.state == State.CMD
+            and remote.power == ALL_DRIVES
+            and remote.error == 0
+            and remote.control == ControlMode.POSITION
+        )
+        setpoint = self._krl + self._offset
+        past = self._past_setpoints
+        past[2], past[1], past[0] = past[1], past[0], (setpoint, elapsed)
         if remote.restarts != self._restarts:
             self._restarts = remote.restarts
             # The request to start was made to the program before and is cleared; it is made anew.
@@ -177,25 +203,30 @@ class Loop:
             self._lose("the controller was started again")
         elif elapsed > self._silence_cycles:
             self._lose(f"{elapsed - 1} packets in a row were lost")
+        other_cycle = remote.sample_time_s != self._sample_time
+        self._doubted = (other_cycle or not ready) and self._doubtful()
+        if self._doubted:
+            other_cycle, ready = False, True
+        if other_cycle:
+            self._set_period(remote.sample_time_s)
         self._take_request()
         misses = int(remote.msr["miss_counter"])
         if misses != self._misses:
             self._misses, self._missed_at = misses, sequence
         if commander.mode is Mode.SILENT:
             return None
-        ready = (
-            remote.state == State.CMD
-            and remote.power == ALL_DRIVES
-            and remote.error == 0
-            and remote.control == ControlMode.POSITION
-        )
         if not ready:
             self._leave()
+            self._held_back = remote.commanding and self._step() is None
             return None
-        setpoint = self._krl + self._offset
         if commander.mode is Mode.MIRROR:
+            step = self._step()
+            self._held_back = step is None
+            if step is None:
+                return None
             self._misses_before = misses
-            return commander.enter(setpoint, float(remote.msr["safety_limits"]))
+            self._counted_before = remote.counters()
+            return commander.enter(setpoint, float(remote.msr["safety_limits"]), step)
         commander.watch(elapsed, setpoint, self._q)
         if self._job is Job.MOTION and not self._begun:
             self._begun = True
@@ -207,6 +238,30 @@ class Loop:
                 commander.stop(Result.ABORTED, f"stopped by the driver {commander.place()}")
         return commander.command(sequence)
 
+    def _step(self) -> NDArray[np.float64] | None:
+        """Step of the controller's set point per cycle (7,) [rad], zero at rest; None where it cannot be
+        told.
+
+        It cannot where the packet or the one before is the first, or one of them may be damaged: the steps
+        must agree as far as the acceleration limits go.
+        """
+        (now, cycles), (before, cycles_before), (first, _) = self._past_setpoints
+        step = (now - before).astype(np.float64) / cycles
+        if float(np.abs(step).max()) <= _STILL_RAD:
+            return np.zeros(JOINTS)
+        change = np.abs(step - (before - first) / cycles_before)
+        room = self._limits.a_max * self._period**2 * (cycles + cycles_before) / 2.0 + _STILL_RAD
+        # Also false for what is no number.
+        return step if np.all(change <= room) and np.all(np.abs(step) <= self._fastest) else None
+
+    def _doubtful(self) -> bool:
+        """Whether a packet that would end command mode is the first of its kind and was not asked for.
+
+        One packet alone may be damaged: what is commanded goes on, the next packet tells.
+        """
+        in_command = self._commander.mode not in (Mode.MIRROR, Mode.SILENT)
+        return in_command and not self._doubted and self._job is not Job.LEAVE
+
     def _set_period(self, sample_time_s: float) -> None:
         """Take the controller's sample time: float32 on the wire, a whole number of milliseconds in truth."""
         if self._sample_time:
@@ -215,6 +270,7 @@ class Loop:
         self._period = round(sample_time_s * 1e6) * 1e-6
         self._silence_s = max(self._settings.link_timeout_s, _FEWEST_CYCLES * self._period)
         self._silence_cycles = round(self._silence_s / self._period)
+        self._fastest = self._limits.v_max * self._period
         self._commander.set_period(self._period)
 
     def _leave(self) -> None:
@@ -241,15 +297,25 @@ class Loop:
     def _lose(self, reason: str, result: Result = Result.NETWORK) -> None:
         if self._commander.mode in (Mode.MIRROR, Mode.SILENT):
             return
-        self._commander.lose(result, reason)
+        self._commander.lose(result, reason + self._meanwhile())
         # The KRL program must not start command mode again before it is asked to.
         self._handshake.request_stop(self.remote.command, self.remote.msr)
+
+    def _meanwhile(self) -> str:
+        """What else the link has seen in command mode, for a reason."""
+        now, before = self.remote.counters(), self._counted_before
+        seen = [f"{now[name] - before[name]} {word}" for name, word in _TOLD if now[name] > before[name]]
+        if now["malformed"] > before["malformed"]:
+            by = self.remote.malformed_by
+            seen.append(f"most for its {max(by, key=lambda fault: by[fault]).value}")
+        return f" (packets in command mode: {', '.join(seen)})" if seen else ""
 
     def _no_packet(self) -> None:
         now = time.monotonic()
         if self._ring is not None:
             self._ring.beat(round(now * 1e9))
         self._take_request()
+        self._tell()
         self._words[Word.MODE] = int(self._commander.mode)
         if self._commander.mode is Mode.SILENT and self._job in (Job.MOTION, Job.HALT):
             self._finish(
@@ -260,6 +326,7 @@ class Loop:
             return
         reason = f"no packet for {silence:.3f} s"
         self._lose(reason)
+        reason += self._meanwhile()
         self._words[Word.MODE] = int(self._commander.mode)
         if self._job is Job.CYCLES or (self._job is Job.MOTION and not self._begun):
             self._finish(Result.NETWORK, reason)
@@ -360,11 +427,16 @@ class Loop:
         words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), index
         if index >= 0:
             words[Word.ROW] = index
+        self._tell()
+
+    def _tell(self) -> None:
+        """Counters and the last note of the link into the shared memory."""
+        remote, words = self.remote, self._words
         for word, name in _COUNTERS:
             words[word] = getattr(remote, name)
         if remote.events and remote.events[-1] is not self._last_event:
             self._last_event = remote.events[-1]
-            control.write_text(Text.NOTE, f"{self._last_event.kind.value}: {self._last_event.text}")
+            self._control.write_text(Text.NOTE, f"{self._last_event.kind.value}: {self._last_event.text}")
             words[Word.NOTES] += 1
 
 

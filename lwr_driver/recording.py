@@ -97,6 +97,7 @@ class Recording:
         self._utc_offset = utc_offset
         self._sequence: int | None = None
         self._log_time = 0
+        self._counted: tuple[int, int] | None = None  # last packet count and its controller time [ns]
         self._phase = NO_PHASE
         self._phase_names = list(request.phase_names)
         self._decoder = None if request.motor_torque is None else KrlTorqueDecoder(request.motor_torque)
@@ -125,7 +126,7 @@ class Recording:
         sequence = np.ascontiguousarray(rows["sequence"])
         # float32 seconds, exact to the microsecond
         sample_time = np.rint(msr["msr_sample_time"].astype(np.float64) * 1e6).astype(np.int64) * 1000
-        publish_time = sequence * sample_time
+        publish_time = self._controller_times(sequence, sample_time)
         log_time = self._log_times(rows, publish_time)
         writer = self._writer
         position = msr["msr_jnt_pos"]
@@ -205,6 +206,15 @@ class Recording:
         if good.any():
             self._sequence = int(sequence[good][-1])
         return rows if good.all() else rows[good]
+
+    def _controller_times(
+        self, sequence: NDArray[np.int64], sample_time: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """The controller's clock: packet count times sample time, going on where the sample time changes."""
+        count, time_ns = self._counted or (int(sequence[0]), int(sequence[0] * sample_time[0]))
+        times: NDArray[np.int64] = time_ns + np.cumsum(np.diff(sequence, prepend=count) * sample_time)
+        self._counted = int(sequence[-1]), int(times[-1])
+        return times
 
     def _log_times(self, rows: NDArray[Any], publish_time: NDArray[np.int64]) -> NDArray[np.int64]:
         """Strictly increasing log times: packets read in the same nanosecond come out one apart."""

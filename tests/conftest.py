@@ -2,5 +2,11 @@
 
 import os
 
+from hypothesis import settings
+
 # Before numpy is imported: the matrices are small, and test processes run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# No test asserts a wall-clock time: a busy computer is not a failure.
+settings.register_profile("project", deadline=None)
+settings.load_profile("project")
