@@ -27,6 +27,8 @@ VERBS = {
     "emulator": "run the emulated controller and arm until interrupted",
     "identify": "estimate a model from session logs",
     "validate": "hold a model against sessions that it has not seen",
+    "commission": "learn the healthy arm, for later diagnoses to be held against",
+    "diagnose": "what the simulation gets wrong, by cause and joint; extends the model",
     "compare": "two models, parameter by parameter, with significance",
     "payload": "the payload's ten parameters from a known arm and one session",
     "export": "a model as URDF, MJCF, or stand-alone C and numpy code",

@@ -98,7 +98,6 @@ class Dictionary:
     def _prepared(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
         if candidate.key not in self._kept:
             entries = self._steps(candidate) if candidate.effect.step else []
-            keep_rows = not candidate.effect.event
             shapes = [] if entries else candidate.effect.shapes(self.setting, max(candidate.joint, 0))
             for shape in shapes:
                 rows = self.rows(candidate, shape)
@@ -106,29 +105,43 @@ class Dictionary:
                     continue
                 padded = self.evidence.padded(rows)
                 base = self.evidence.alone(padded)
-                entries.append((shape, rows if keep_rows else {}, padded if keep_rows else {}, base))
+                entries.append((shape, rows, padded, base))
             self._kept[candidate.key] = entries
         return self._kept[candidate.key]
 
-    def _steps(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
-        """Entries of an effect that sets in at a time: one for each edge of a block, from the same products."""
-        evidence, entries = self.evidence, []
+    def _step(self, candidate: Candidate) -> Trial | None:
+        """The best edge of a block for an effect that sets in at a time and stays.
+
+        The products of the whole session are made once; those after an edge are a part of their blocks.
+        """
+        evidence = self.evidence
+        best: tuple[Shape, Score] | None = None
         for session in sorted(set(evidence.block_session.tolist())):
             mine = np.flatnonzero(evidence.block_session == session)
             starts = evidence.block_start[mine]
-            shape = {"time": float(starts.min()), "session": float(session + 1)}
-            padded = evidence.padded(self.rows(candidate, shape))
-            whole = evidence.alone(padded)
+            shape = {"time": float(starts.min()) - 1.0, "session": float(session + 1)}
+            key = (candidate.cause, -2 - session)
+            if key not in self._kept:
+                rows = self.rows(candidate, shape)
+                padded = evidence.padded(rows)
+                self._kept[key] = [(shape, rows, padded, evidence.alone(padded))]
+            _, _, padded, known = self._kept[key][0]
+            whole = evidence.products(padded, known)
             for edge in np.sort(starts)[1:]:
                 on = np.zeros(evidence.blocks)
                 on[mine[starts >= edge]] = 1.0
                 part = Products(
-                    whole.base * on[:, None, None],
-                    whole.own * on[:, None, None],
-                    whole.target * on[:, None],
+                    whole.base * on[:, None, None], whole.own * on[:, None, None], whole.target * on[:, None]
                 )
-                entries.append(({**shape, "time": float(edge)}, {}, {}, part))
-        return entries
+                score = evidence.event_score(evidence.score_products(part, list(padded)), evidence.blocks)
+                if best is None or score.gain > best[1].gain:
+                    best = ({**shape, "time": float(edge)}, score)
+        if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
+            return None
+        # The rows themselves are made only where the step may matter.
+        if best[1].gain < 10.0:
+            return Trial(candidate, best[0], best[1], self._kept[candidate.cause, -2][0][1])
+        return Trial(candidate, best[0], best[1], self.rows(candidate, best[0]))
 
     def _contacts(self, candidate: Candidate) -> Trial | None:
         """The best contact in a burst of the residual, on any link from the third on."""
@@ -151,23 +164,16 @@ class Dictionary:
         """The candidate with the best shape of its grid, None where no shape is plausible."""
         if candidate.cause == "contact":
             return self._contacts(candidate)
+        if candidate.effect.step:
+            return self._step(candidate)
         best: Trial | None = None
         entries = self._prepared(candidate)
-        for shape, kept, ready, known in entries:
-            rows, padded = kept, ready
-            if not rows:
-                if self.evidence.extra:
-                    rows = self.rows(candidate, shape)
-                    padded = self.evidence.padded(rows)
-                else:
-                    padded = dict.fromkeys(self.evidence.mask, _EMPTY[:, :, : known.own.shape[1]])
+        for shape, rows, padded, known in entries:
             score = self.measure(candidate, padded, len(entries), known)
             if not candidate.effect.plausible(score.coefficients, shape):
                 continue
             if best is None or score.gain > best.score.gain:
                 best = Trial(candidate, shape, score, rows)
-        if best is not None and not best.rows:
-            best = Trial(candidate, best.shape, best.score, self.rows(candidate, best.shape))
         return best
 
     def measure(
@@ -178,9 +184,8 @@ class Dictionary:
         known: Products | None = None,
     ) -> Score:
         """Score of padded columns in the way that suits the candidate."""
-        if candidate.effect.event:
-            return self.evidence.event_score(padded, choices, known)
-        return self.evidence.score(padded, known=known)
+        score = self.evidence.score(padded, known=known)
+        return self.evidence.event_score(score, choices) if candidate.effect.event else score
 
     def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
         """The candidate with a given shape, None where it has no rows or makes no sense."""
@@ -228,9 +233,6 @@ class Dictionary:
             found = self.best(candidate)
             if found is not None:
                 yield found
-
-
-_EMPTY = np.zeros((1, 1, 16))
 
 
 def _alike(a: Shape, b: Shape, besides: str) -> bool:

@@ -270,7 +270,10 @@ class Evidence:
         ridge : pull towards zero, in units of the columns' mean square, for groups of many columns.
         known : their products with the base alone, to save time.
         """
-        products = self.products(columns, known)
+        return self.score_products(self.products(columns, known), list(columns), ridge=ridge)
+
+    def score_products(self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0) -> Score:
+        """Score of columns in the rows of `keys` from their products with all present columns."""
         gain = 0.0
         for part, fit in self._held:
             train = ~part
@@ -283,7 +286,7 @@ class Evidence:
         coefficients = inner @ reach
         fitted = float(reach @ coefficients)
         covariance, active = self._robust(products, lever, inner, coefficients)
-        rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in columns)
+        rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
         if self.prior is not None:
             gain += self._strain(self.full.values) - self._strain(self.full.values - lever @ coefficients)
         # Held-back error can also fall because a base fitted without the part was poor: never more than that.
@@ -297,18 +300,15 @@ class Evidence:
             gain / max(rows, 1.0),
         )
 
-    def event_score(
-        self, columns: Mapping[Key, Floats], choices: int, known: Products | None = None
-    ) -> Score:
-        """Score of columns that are active in a few blocks only, the best of `choices`: the fall on the rows
-        fitted, less what the best of so many would fall by chance."""
-        score = self.score(columns, known=known)
+    def event_score(self, score: Score, choices: int) -> Score:
+        """A score of columns that are active in a few blocks only, the best of `choices`: the fall on the rows
+        fitted, less what the best of so many would fall by chance.
+        """
         k = len(score.coefficients)
         penalty = 2.0 * np.log(max(choices, 1)) + 4.0 * k
         p = float(min(1.0, choices * chi2.sf(score.fitted, k)))
-        return Score(
-            score.fitted - penalty, score.fitted, score.coefficients, score.covariance, p, score.inflation
-        )
+        gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
+        return Score(gain, score.fitted, score.coefficients, score.covariance, p, score.inflation)
 
     def _schur(
         self, products: Products, fit: Fit, chosen: NDArray[np.bool_], ridge: float

@@ -18,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from ident import regressor
 from ident.base import BaseSet, numeric_base
@@ -229,7 +230,9 @@ class Nominal:
                 at = stretch.time - self.arm.joint_delay_s
                 target, usable, stamp = stretch.effort, stretch.usable, stretch.time
             speed = motion.motor_speed if side == "motor" else motion.qd
-            moves = np.abs(_at(stretch.time, speed, at)) > still
+            moves = (np.abs(_at(stretch.time, speed, at)) > still) & (
+                _at(stretch.time, self._steady(speed, stretch), at) > 0.999
+            )
             matrices.append(self._matrix(side, motion, recording, stretch.time, at, width))
             targets.append(_binned(target, width))
             moves = _binned(moves.astype(float), width) > 1.0 - 1e-9
@@ -249,6 +252,13 @@ class Nominal:
             np.concatenate(time),
             np.concatenate(test),
         )
+
+    def _steady(self, speed: Floats, stretch: Stretch) -> Floats:
+        """1 where a joint keeps its direction for a while before and after, 0 elsewhere, (N, n)."""
+        dt = float(stretch.time[1] - stretch.time[0])
+        size = 2 * round(self.settings.reversal_s / dt) + 1
+        same = (minimum_filter1d(speed, size, axis=0) > 0.0) | (maximum_filter1d(speed, size, axis=0) < 0.0)
+        return same.astype(float)
 
     def _matrix(
         self, side: str, motion: Motion, recording: Recording, grid: Floats, at: Floats, width: int

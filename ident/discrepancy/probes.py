@@ -19,7 +19,7 @@ from ident.effects.motion import Motion
 
 __all__ = ["Remainder", "find_remainders"]
 
-_HATS = 8
+_HATS = 7
 _RIDGE = 1e-3
 
 
@@ -99,7 +99,7 @@ def _groups(dictionary: Dictionary, side: str, joint: int) -> dict[str, dict[Key
             continue
         hats = [_hats(v, low, high) for v in values]
         found[name] = {(side, joint): dictionary.nominal.reduce(side, hats)}
-        if name != f"qd{joint + 1}":
+        if not name.startswith("qd"):
             signed = [
                 h * np.sign(m.motor_speed[:, joint : joint + 1])
                 for h, m in zip(hats, dictionary.nominal.motions, strict=True)
@@ -109,6 +109,6 @@ def _groups(dictionary: Dictionary, side: str, joint: int) -> dict[str, dict[Key
 
 
 def _hats(values: Floats, low: float, high: float) -> Floats:
-    """Piecewise linear functions (N, 8) with knots evenly over the range."""
+    """Piecewise linear functions (N, 7) with knots evenly over the range."""
     place = (values - low) / (high - low) * (_HATS - 1)
     return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(_HATS)))

@@ -222,16 +222,16 @@ class _State:
 
 def _reach(gain: float) -> float:
     """Difference of gains within which two causes are not told apart."""
-    return 12.0 + 0.12 * gain
+    return 12.0 + 0.1 * gain
 
 
 def confidence(gain: float, rivals: Sequence[float]) -> float:
     """Probability that the best is the right one, among itself, its rivals and chance.
 
     Gains are differences of chi-square, and count as such up to the misfit that any form of an effect has,
-    taken as 4 % of the gain.
+    taken as 3 % of the gain.
     """
-    scale = 2.0 * (1.0 + 0.04 * gain)
+    scale = 2.0 * (1.0 + 0.03 * gain)
     others = sum(float(np.exp(-max(gain - g, 0.0) / scale)) for g in rivals)
     chance = float(2.0 * norm.sf(np.sqrt(max(gain, 0.0)))) * 500.0
     return 1.0 / (1.0 + others + chance)

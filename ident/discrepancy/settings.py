@@ -18,6 +18,7 @@ class DiagnosisSettings:
     cutoff_hz : zero-phase low-pass on the positions; lowered to a fifth of the sampling rate.
     deflection_hz : low-pass on the torque from which the joints' twist is computed.
     standstill_rad_s : below that speed the friction of a joint is unknown, and its row is left out.
+    reversal_s : rows this close to a reversal are left out: the motor may not have turned yet.
     guard_s : joint rows this close to a joint's standstill are left out too.
     block_s : length of the blocks that errors are taken to be independent between, and that are held back.
     folds : number of parts of the motion that are held back in turn.
@@ -34,6 +35,7 @@ class DiagnosisSettings:
     cutoff_hz: float = 40.0
     deflection_hz: float = 30.0
     standstill_rad_s: float = 0.01
+    reversal_s: float = 0.015
     guard_s: float = 0.04
     block_s: float = 2.0
     folds: int = 5

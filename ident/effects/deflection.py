@@ -26,7 +26,10 @@ def deflected(
         return (Column(motor=change, joint=change),)
     first = np.gradient(twist, motion.dt)
     second = np.gradient(first, motion.dt)
-    speed = motion.motor_speed.copy()
-    speed[:, joint] += scale * first
-    friction = (motion.friction(speed) - motion.friction(motion.motor_speed))[:, joint] / scale
+    # The jump of Coulomb friction moves by a millisecond or so; a column of spikes would say nothing else.
+    here, there = motion.motor_speed, motion.motor_speed.copy()
+    there[:, joint] += scale * first
+    friction = (motion.friction(there) - motion.friction(here))[:, joint]
+    friction -= motion.motor_coulomb[joint] * (np.sign(there) - np.sign(here))[:, joint]
+    friction /= scale
     return (Column(motor=motion.inertia[joint] * second + friction),)

@@ -12,7 +12,7 @@ from ident.effects.motion import Motion
 
 
 class Stribeck(Effect):
-    """Coulomb friction gains `amplitude exp(-|v| / velocity)` near standstill."""
+    """Coulomb friction gains `amplitude exp(-(|v| / velocity)^exponent)` near standstill."""
 
     cause = "stribeck"
     side = "motor"
@@ -21,29 +21,35 @@ class Stribeck(Effect):
     parameters = (
         Parameter("amplitude", "Nm", "friction at standstill above the Coulomb level", low=0.0),
         Parameter("velocity", "rad/s", "speed at which 1/e of it is left", shape=True, low=1e-3, high=1.0),
+        Parameter("exponent", "1", "1: Tustin, 2: Gauss", shape=True),
     )
     tell_apart = "a slow constant-velocity sweep of joint {joint} through 0.01 to 0.2 rad/s"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """Speeds from 0.01 rad/s to half the largest one."""
-        return [
-            {"velocity": v} for v in (0.01, 0.02, 0.04, 0.08, 0.16, 0.3) if v < setting.speed_range[joint]
-        ]
+        speeds = [v for v in (0.01, 0.02, 0.04, 0.08, 0.16, 0.3) if v < setting.speed_range[joint]]
+        return [{"velocity": v, "exponent": e} for e in (1.0, 2.0) for v in speeds]
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """The speed."""
+        return ("velocity",)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """sign(v) exp(-|v| / velocity) in the motor torque."""
+        """sign(v) exp(-(|v| / velocity)^exponent) in the motor torque."""
         speed = motion.motor_speed[:, joint]
-        return (Column(motor=np.sign(speed) * np.exp(-np.abs(speed) / shape["velocity"])),)
+        fall = np.exp(-((np.abs(speed) / shape["velocity"]) ** shape.get("exponent", 1.0)))
+        return (Column(motor=np.sign(speed) * fall),)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Raises the Coulomb friction of the drive."""
-        return _Stribeck(joint, float(parameters["amplitude"]), float(parameters["velocity"]))
+        values = (float(parameters[name]) for name in ("amplitude", "velocity"))
+        return _Stribeck(joint, *values, float(parameters.get("exponent", 1.0)))
 
 
 class _Stribeck(Simulated):
-    def __init__(self, joint: int, amplitude: float, velocity: float) -> None:
-        self.joint, self.amplitude, self.velocity = joint, amplitude, velocity
+    def __init__(self, joint: int, amplitude: float, velocity: float, exponent: float) -> None:
+        self.joint, self.amplitude, self.velocity, self.exponent = joint, amplitude, velocity, exponent
 
     def load(self, time_s: float, plant: Any, loads: Any) -> None:
         speed = abs(plant.motor_velocity[self.joint])
-        loads.Fcm[self.joint] += self.amplitude * np.exp(-speed / self.velocity)
+        loads.Fcm[self.joint] += self.amplitude * np.exp(-((speed / self.velocity) ** self.exponent))
