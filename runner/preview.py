@@ -24,6 +24,7 @@ from runner.experiment_file import Experiment, Payload
 from runner.planning import checker, excitation_rows, plan_excitation
 from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
 from runner.preparation import session_motion
+from runner.progress import Progress
 from runner.report.markup import table
 from runner.report.plot import Line, Panel, Points
 from runner.report.svg import panel_svg
@@ -62,15 +63,23 @@ class Planned:
 
 
 def planned_motion(file: str, *, session: str | None = None, period_s: float = 0.005) -> Planned:
-    """The motion of an experiment file or of a plan file.
+    """The motion of an experiment file, of the folder of an experiment with its plan, or of a plan file.
 
-    session : of the experiment; by default the one with the heaviest payload. A plan is shown with the
+    session : of the experiment; by default the one with the heaviest payload. A plan alone is shown with the
     default arm and cell. Raises ConfigurationError for a file that is neither.
     """
-    path = find(file)
-    if read_mapping(path).get("kind") == "excitation plan":
-        return _of_plan(path, period_s)
-    experiment = Experiment.load(path)
+    folder = Path(file)
+    stored = None
+    if folder.is_dir():
+        path = folder / "experiment.yaml"
+        experiment = Experiment.load(path.resolve(), beside=Progress.load(folder).origin)
+        if (folder / "plan.yaml").is_file():
+            stored = ExcitationPlan.load(folder / "plan.yaml")
+    else:
+        path = find(file)
+        if read_mapping(path).get("kind") == "excitation plan":
+            return _of_plan(path, period_s)
+        experiment = Experiment.load(path)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     plans = {plan.name: plan for plan in experiment.sessions}
@@ -78,7 +87,8 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
         raise ConfigurationError(f"session {session!r} is not in {path}; it has {', '.join(plans)}")
     heaviest = max(experiment.sessions, key=lambda one: 0.0 if one.payload is None else one.payload.mass)
     plan = plans[session] if session is not None else heaviest
-    excite = excitation_rows(plan_excitation(experiment, arm, cell), experiment.excitation.periods)
+    excitation = stored if stored is not None else plan_excitation(experiment, arm, cell)
+    excite = excitation_rows(excitation, experiment.excitation.periods)
     home = experiment.home(len(arm.joint_names))
     motion, preflight = session_motion(experiment, arm, cell, plan, excite(period_s), home)
     margin = max(experiment.moves.clearance_m, cell.margin_m)
@@ -150,9 +160,7 @@ def build_scene(server: Any, planned: Planned) -> ArmShape:
     ghost = ArmShape(scene, planned.arm, "/tightest/arm", payload=planned.payload, colour=ALARM, opacity=0.28)
     ghost.pose(tight.q)
     points = tight.points.astype(np.float32)[None]
-    scene.add_line_segments(
-        "/tightest/gap", points, line_colour(ALARM), thickness=5.0, thickness_units="screen"
-    )
+    scene.add_line_segments("/tightest/gap", points, ALARM, thickness=5.0, thickness_units="screen")
     scene.add_label(
         "/tightest/label",
         f"tightest: {1000 * tight.distance:.0f} mm, {' to '.join(tight.pair)}, t = {tight.time_s:.2f} s",

@@ -72,7 +72,7 @@ def stop_server(server: Any) -> None:
 
 
 def line_colour(colour: Colour) -> Colour:
-    """The value that viser shows as this colour on lines, which it takes as linear light."""
+    """The value that viser shows as this colour where lines have a colour each, taken as linear light."""
     red, green, blue = (round(255 * (value / 255) ** 2.2) for value in colour)
     return red, green, blue
 

@@ -28,6 +28,7 @@ CLEAN = ".mantine-Notification-root, .mantine-Notifications-root { display: none
 
 
 def main(arguments: list[str]) -> None:
+    """Take all pictures of a run, of one made now unless a folder is named."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         sys.exit("no chromium on this computer; install the system's package `chromium`")
@@ -37,25 +38,24 @@ def main(arguments: list[str]) -> None:
             command = [sys.executable, "-m", "runner.cli", "experiment", "--yes", "--out", str(folder)]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         preview = Path(place) / "preview.html"
-        preview.write_text(preview_html(planned_motion(str(folder / "experiment.yaml"))), encoding="utf-8")
+        preview.write_text(preview_html(planned_motion(str(folder))), encoding="utf-8")
         take(browser, write_report(folder), preview)
 
 
 def take(browser: str, report: Path, preview: Path) -> None:
+    """Open the pages and write the pictures beside this file."""
     with sync_playwright() as playwright:
         opened = playwright.chromium.launch(executable_path=browser, args=FLAGS)
         page = opened.new_page(viewport=SIZE)
         page.goto(report.resolve().as_uri())
         page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=120_000)
         page.screenshot(path=HERE / "report.png")
-        page.locator("#torque").scroll_into_view_if_needed()
-        page.evaluate("document.querySelector('#torque details').scrollIntoView()")
-        page.screenshot(path=HERE / "report_torque.png")
+        page.locator("#torque .panels").first.screenshot(path=HERE / "report_torque.png")
         page.goto(preview.resolve().as_uri())
         frame = page.frames[-1]
         frame.wait_for_selector("canvas", timeout=120_000)
         frame.add_style_tag(content=CLEAN)
-        page.wait_for_timeout(15_000)
+        page.wait_for_timeout(8_000)
         page.screenshot(path=HERE / "preview.png", timeout=240_000)
         opened.close()
 

@@ -26,7 +26,7 @@ __all__ = ["command"]
 )
 @click.option("--port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --serve.")
 def command(file: str, session: str | None, out: Path, serving: bool, port: int) -> None:
-    """Show the motion of an experiment FILE or of a plan file in 3D. Nothing moves.
+    """Show the motion of an experiment FILE, of a folder of results, or of a plan file in 3D. Nothing moves.
 
     The page is one file that needs no network. It shows the arm along the motion, the path of its flange
     coloured by clearance, the tightest moment, and every limit with what the motion uses of it.
@@ -34,7 +34,7 @@ def command(file: str, session: str | None, out: Path, serving: bool, port: int)
     \b
     lwr-run preview my_lab.yaml
     lwr-run preview my_lab.yaml --session unloaded --out unloaded.html
-    lwr-run preview experiments/lwr4plus-20260101-120000/plan.yaml --serve
+    lwr-run preview experiments/lwr4plus-20260101-120000 --serve
     """
     from runner.preview import planned_motion, preview_html, serve
 

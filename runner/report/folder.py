@@ -9,6 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from fri.errors import ConfigurationError, DataError, LwrError
 from ident.model import DynamicModel
 from ident.model_file import read_model
@@ -104,6 +106,15 @@ class ResultFolder:
             if session.end is not None and session.end.get("exit_status") == "success":
                 found += curves(self.model, session, name, cutoff_hz=cutoffs.get(session.path.name))
         return tuple(sorted(found, key=lambda one: (one.payload is None, one.session, one.side)))
+
+    @cached_property
+    def lock_step(self) -> bool:
+        """Whether the emulator waited for each answer, so that reply times say nothing of the link."""
+        text = self.text("experiment.yaml")
+        content = yaml.safe_load(text) if text is not None else None
+        if not isinstance(content, dict):
+            return False
+        return content.get("backend", "emulator") == "emulator" and bool(content.get("lock_step", True))
 
     @property
     def joint_names(self) -> tuple[str, ...]:

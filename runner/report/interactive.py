@@ -75,7 +75,7 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
             "y1": 1,
         }
         layout["shapes"] = [{**frame, "line": {"color": "#8c8c8c", "width": 1}}]
-        layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 4}
+        layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 6}
     return {"data": data, "layout": layout}
 
 

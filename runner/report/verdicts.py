@@ -74,6 +74,8 @@ def _link(results: ResultFolder) -> Verdict | None:
     replies = (
         f"99 % of replies within {1e6 * reply:.0f} µs" if reply < _SLOWEST_S else "replies take over 2 ms"
     )
+    if results.lock_step:
+        replies = "lock step, so the emulator waited for every reply"
     text = f"{missed} missed, {lost} lost, {late} late of {cycles} cycles; {replies}"
     level: Level = "good" if missed + lost == 0 and late <= _LATE_LOOK * cycles else "look"
     return Verdict("link quality", text, "none missed or lost", level, "sessions")

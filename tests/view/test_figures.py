@@ -61,16 +61,7 @@ def panel(**changes: object) -> Panel:
         Points("estimate", "estimate", x[:3], x[:3], np.column_stack([x[:3] - 1, x[:3] + 1])),
         Line("error", "error", x, x, lower=True),
     )
-    return Panel(
-        **{
-            "title": "A1 <b>",
-            "x_label": "time [s]",
-            "y_label": "[Nm]",
-            "marks": marks,
-            "alt": "A & B",
-            **changes,
-        }
-    )  # type: ignore[arg-type]
+    return replace(Panel("A1 <b>", "time [s]", "[Nm]", marks, "A & B"), **changes)  # type: ignore[arg-type]
 
 
 def test_svg_holds_every_mark_and_escapes_texts() -> None:
