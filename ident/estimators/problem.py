@@ -80,11 +80,18 @@ class TriangularFactor:
         """
         if not len(target):
             return cls(np.zeros((matrix.shape[1] + 1,) * 2), 0)
-        if len(target) > _QR_ROWS:
-            r = _gram_factor(matrix, target)
-            if r is not None:
-                return cls(r, len(target))
-        return cls(_blocked_qr(matrix, target), len(target))
+        p = matrix.shape[1]
+        acting = _acting(matrix)
+        part = _columns(matrix, acting)
+        r = _gram_factor(part, target) if len(target) > _QR_ROWS else None
+        if r is None:
+            r = _blocked_qr(part, target)
+        if len(acting) < p:
+            # Upper triangular still, since the order of the columns stays.
+            places, whole = np.append(acting, p), np.zeros((p + 1, p + 1))
+            whole[np.ix_(places, places)] = r
+            r = whole
+        return cls(r, len(target))
 
     @classmethod
     def combine(cls, factors: Iterable[TriangularFactor], weights: Iterable[float]) -> TriangularFactor:
@@ -275,6 +282,23 @@ class Problem:
 def _listed(names: Sequence[str], limit: int = 12) -> str:
     shown = ", ".join(names[:limit])
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+
+
+def _acting(matrix: FloatArray) -> NDArray[np.int64]:
+    """Columns with an entry other than zero: a joint's rows have none for the links before it."""
+    idle = np.flatnonzero(~matrix[:: max(1, len(matrix) // 16)].any(axis=0))
+    acting = np.ones(matrix.shape[1], dtype=bool)
+    for column in idle:
+        acting[column] = bool(np.any(matrix[:, column]))
+    return np.flatnonzero(acting)
+
+
+def _columns(matrix: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
+    """Some columns in rising order, without a copy where they are neighbours."""
+    if not len(chosen) or chosen[-1] - chosen[0] + 1 == len(chosen):
+        return matrix[:, chosen[0] : chosen[-1] + 1] if len(chosen) else matrix[:, :0]
+    by_column = matrix.strides[0] < matrix.strides[1]
+    return matrix.T[chosen].T if by_column else matrix[:, chosen]
 
 
 def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
