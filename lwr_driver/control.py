@@ -53,6 +53,7 @@ class Job(IntEnum):
     LEAVE = 4  # monitor mode
     MOTION = 5  # A: rows, B: count of stop requests that are over
     HALT = 6  # no motion
+    LOAD = 7  # load data in the first row of `plan`: kg, mm from the flange, kg m2
 
 
 class Result(IntEnum):

@@ -37,6 +37,7 @@ from fri.errors import (
     RefusedError,
     RobotError,
 )
+from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
 from lwr_driver.commander import BRAKE, HOLD
@@ -46,6 +47,7 @@ from lwr_driver.link import (
     advise_command,
     advise_connect,
     advise_leave,
+    advise_load,
     advise_quality,
     silence_in_lock_step,
 )
@@ -229,6 +231,41 @@ class Driver:
             awaited=f"quality {least.name} for {cycles} cycles",
             advice=advise_quality,
             failure=NetworkError,
+        )
+        return self.state()
+
+    @property
+    def sets_load(self) -> bool:
+        """Whether the KRL program takes load data over the link, see `set_load`."""
+        return isinstance(find_handshake(self.link.handshake), IdentificationHandshake)
+
+    def set_load(
+        self,
+        mass: float,
+        com: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        inertia: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        *,
+        timeout_s: float = 10.0,
+    ) -> LinkState:
+        """Put load data in force on the controller, which compensates gravity with them; in monitor mode.
+
+        mass : [kg]. com : centre of mass in the flange frame [m]. inertia : JX JY JZ about it, along the axes
+        of the flange frame [kg m2]. Raises ConfigurationError where the KRL program takes none.
+        """
+        if not self.sets_load:
+            raise ConfigurationError(
+                f"KRL program {self.link.handshake!r} takes no load data; enter them at the pendant, or use "
+                f"{IdentificationHandshake.name}"
+            )
+        control, mode = self._need(self._control), self.state().mode
+        if mode != "mirror":
+            raise RobotError(f"load data cannot change in mode {mode}; leave command mode first")
+        control.plan[0] = (mass, *(1000.0 * value for value in com), *inertia)
+        self._wait(
+            Job.LOAD,
+            timeout_s=timeout_s,
+            awaited=f"load data of {mass:g} kg in force",
+            advice=advise_load,
         )
         return self.state()
 

@@ -15,6 +15,7 @@ __all__ = [
     "advise_command",
     "advise_connect",
     "advise_leave",
+    "advise_load",
     "advise_quality",
     "silence_in_lock_step",
 ]
@@ -102,6 +103,13 @@ def advise_command(state: LinkState) -> str:
     if state.control != "POSITION":
         return "Switch the controller to position control (strategy 10)"
     return "Start the KRL program, or let it go on; acknowledge messages at the pendant"
+
+
+def advise_load(state: LinkState) -> str:
+    """What to do while load data are not taken."""
+    if state.age_s > _SILENCE_S:
+        return advise_connect(state)
+    return "The KRL program takes them in monitor mode, up to its LWR_LOAD_MAX: see its data list"
 
 
 def advise_leave(state: LinkState) -> str:

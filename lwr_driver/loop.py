@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.handshake import find_handshake
+from fri.handshake import IdentificationHandshake, find_handshake
 from fri.remote import LinkEvent, RemoteEnd
 from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
@@ -376,6 +376,10 @@ class Loop:
             done = remote.state != State.CMD and handshake.stopped(remote.msr)
         elif job is Job.HALT:
             done = not commander.moving
+        elif job is Job.LOAD:
+            assert isinstance(handshake, IdentificationHandshake)
+            handshake.request_load(remote.command, remote.msr, self._control.plan[0])
+            done = handshake.load_taken(remote.command, remote.msr)
         elif self._begun and commander.ended[0] is not Result.NONE:
             self._finish(*commander.ended)
             return

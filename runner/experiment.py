@@ -25,7 +25,7 @@ from lwr_driver.trace import import_trace
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.interrupt import Interrupts
 from runner.operator import Operator
-from runner.payload import Rest, check_payload
+from runner.payload import Rest, check_payload, load_data
 from runner.preflight import Preflight, check_gravity, check_link, check_rights
 from runner.preparation import session_motion
 from runner.progress import Progress
@@ -204,6 +204,8 @@ class Run:
         if plan.payload != self._mounted or before is None:
             bench.status.say(f"payload for session {plan.name}: {_payload_name(plan.payload)}")
             bench.operator.swap(self._mounted, plan.payload)
+            if bench.driver.sets_load:
+                bench.driver.set_load(*load_data(bench.arm, plan.payload))
             self._mounted = plan.payload
         if before is None:
             return

@@ -7,6 +7,7 @@ import socket
 from contextlib import ExitStack
 from types import TracebackType
 
+from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.driver import Driver, LinkSettings, Waiting
@@ -67,7 +68,8 @@ class Laboratory:
         arm = Arm.load(experiment.arm, beside=beside)
         cell = Cell.load(experiment.cell, beside=beside)
         port = experiment.link.port
-        operator: Operator = Person(self._assume_yes)
+        enters_load = experiment.link.handshake != IdentificationHandshake.name
+        operator: Operator = Person(self._assume_yes, enters_load=enters_load)
         if experiment.backend == "emulator":
             port = free_port(experiment.link.address)
             emulator = EmulatorProcess(
@@ -79,7 +81,7 @@ class Laboratory:
             )
             self.emulator = stack.enter_context(emulator)
             known = robot_file(load_configuration(experiment.emulator_path)).payloads
-            operator = EmulatedOperator(emulator.pendant, frozenset(known))
+            operator = EmulatedOperator(emulator.pendant, frozenset(known), enters_load=enters_load)
         driver = stack.enter_context(
             Driver(arm, self._link(port), notify=self._notify, motor_torque=self._krl())
         )

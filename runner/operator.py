@@ -28,10 +28,15 @@ class Operator(Protocol):
 
 
 class Person:
-    """A person at a terminal. `assume_yes` confirms by itself, for automation around a real arm."""
+    """A person at a terminal.
 
-    def __init__(self, assume_yes: bool) -> None:
+    assume_yes : confirm by itself, for automation around a real arm
+    enters_load : whether load data are entered at the pendant; otherwise they go over the link
+    """
+
+    def __init__(self, assume_yes: bool, *, enters_load: bool = True) -> None:
         self._assume_yes = assume_yes
+        self._enters_load = enters_load
 
     def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
         """Ask for the swap and wait for the confirmation."""
@@ -45,7 +50,9 @@ class Person:
                 f"enter its load data on the controller: {wanted.mass:g} kg, centre of mass "
                 f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the frame of link 7"
             )
-        self._confirm(f"{work}, then {load}. Stay clear of the arm. Ready?")
+        if self._enters_load:
+            work = f"{work}, then {load}"
+        self._confirm(f"{work}. Stay clear of the arm. Ready?")
 
     def start_trace(self) -> None:
         """Ask for the controller's recording to be started."""
@@ -69,23 +76,27 @@ class EmulatedOperator:
     """Does at the emulator's pendant what a person does at the arm.
 
     known : names of the payloads that the emulator has properties of; others are mounted as announced.
+    enters_load : whether load data are entered at the pendant; otherwise they go over the link
     """
 
-    def __init__(self, pendant: Pendant, known: frozenset[str]) -> None:
+    def __init__(self, pendant: Pendant, known: frozenset[str], *, enters_load: bool = True) -> None:
         self._pendant = pendant
         self._known = known
+        self._enters_load = enters_load
 
     def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
         """Mount or unmount, and enter the announced load data."""
         if wanted is None:
             self._pendant.unmount()
-            self._pendant.set_load(0.0)
+            if self._enters_load:
+                self._pendant.set_load(0.0)
             return
         if wanted.name in self._known:
             self._pendant.mount(wanted.name)
         else:
             self._pendant.mount(mass=wanted.mass, com=wanted.com, inertia=wanted.inertia)
-        self._pendant.set_load(wanted.mass, wanted.com, wanted.inertia)
+        if self._enters_load:
+            self._pendant.set_load(wanted.mass, wanted.com, wanted.inertia)
 
     def start_trace(self) -> None:
         """Begin the controller's trace."""

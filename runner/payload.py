@@ -20,9 +20,10 @@ import pinocchio as pin
 from lwr_driver.arm import Arm
 from runner.experiment_file import Payload
 
-__all__ = ["PayloadCheck", "Rest", "check_payload", "gravity_torque"]
+__all__ = ["PayloadCheck", "Rest", "check_payload", "gravity_torque", "load_data"]
 
 Vector = npt.NDArray[np.float64]
+Triple = tuple[float, float, float]
 
 RELATIVE_TOLERANCE = 0.15
 FRICTION_SHARE = 0.02
@@ -113,3 +114,21 @@ def _mass(arm: Arm, before: Rest, after: Rest) -> float:
     carried = gravity_torque(arm, before.q, before.payload)
     change = after.tau - before.tau - gravity_torque(arm, after.q, None) + carried
     return float(per_kg @ change / (per_kg @ per_kg))
+
+
+def load_data(arm: Arm, payload: Payload | None) -> tuple[float, Triple, Triple]:
+    """Mass [kg], centre of mass in the flange frame [m] and inertia about it along its axes [kg m2], as the
+    controller wants them; zeros for the empty flange.
+    """
+    if payload is None:
+        return 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    model = pin.buildModelFromXML(arm.urdf)
+    flange = model.frames[model.getFrameId("flange")].placement
+    com = flange.actInv(np.asarray(payload.com))
+    tensor = flange.rotation.T @ payload.body().inertia @ flange.rotation
+    return payload.mass, _triple(com), _triple(np.diag(tensor))
+
+
+def _triple(values: Vector) -> Triple:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
