@@ -22,7 +22,7 @@ COULOMB = (15.04, 16.48, 8.77, 9.96, 5.58, 4.41, 4.16)
 VISCOUS = (16.68, 19.09, 7.87, 11.63, 5.39, 3.64, 2.03)
 FULL_SCALE = (176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0)
 MOTOR_NOISE = (0.4, 0.42, 0.26, 0.25, 0.18, 0.085, 0.1)
-PLAY = (1.5e-4, 3e-4, 4e-4, 5e-4, 1e-3, 1.2e-3, 2e-3)
+PLAY = (1.5e-4, 8e-4, 8e-4, 8e-4, 1.2e-3, 2e-3, 3e-3)
 ZERO_DEG = (0.2, 0.2, 0.3, 0.3, 0.8, 1.0, 1.5)
 JOINT_NOISE = (0.155, 0.16, 0.096, 0.105, 0.098, 0.037, 0.045)
 
@@ -231,7 +231,7 @@ def _motor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     sign = _sign(random)
 
     def sized(size: float) -> Hidden:
-        error = sign * min(0.3, size * 0.03)
+        error = sign * min(0.3, size * 0.025)
         setting = _trait(joint, motor_gain=1.0 + error)
         return Hidden(
             "motor_torque_gain", "motor", (joint,), size, _everywhere(setting), {"gain": 1.0 / (1.0 + error)}
@@ -269,7 +269,7 @@ def _cable(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
     centre, slack = random.uniform(-0.5, 0.5), random.uniform(0.2, 0.8)
 
     def sized(size: float) -> Hidden:
-        torque = size * 0.7 * JOINT_NOISE[joint - 1]
+        torque = size * 1.4 * JOINT_NOISE[joint - 1]
         if kind == "hardening":
             setting = _trait(joint, cable=torque, cable_cubic=0.7 * torque, cable_centre=centre)
         elif kind == "slack":
@@ -292,7 +292,7 @@ def _tilt(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     direction = random.uniform(-math.pi, math.pi)
 
     def sized(size: float) -> Hidden:
-        angle = math.radians(0.12 * size)
+        angle = math.radians(0.18 * size)
         rx, ry = angle * math.cos(direction), angle * math.sin(direction)
         truth = {"tilt_x": rx, "tilt_y": ry}
         return Hidden("base_tilt", "joint", (), size, _everywhere(Setting(tilt=(rx, ry))), truth)
@@ -359,7 +359,7 @@ def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidd
                 "start_s": time_s,
                 "length_s": length,
                 "link": link,
-                "force": [float(v) for v in (0.0 if drag else 2.5 * size) * direction],
+                "force": [float(v) for v in (0.0 if drag else 5.0 * size) * direction],
                 "stiffness": 8.0 * size if drag else 0.0,
             }
             settings[session] = Setting(contacts=(episode,))
@@ -378,7 +378,7 @@ def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     sign = _sign(random)
 
     def sized(size: float) -> Hidden:
-        gain = 1.0 + sign * min(0.3, 0.025 * size)
+        gain = 1.0 + sign * min(0.3, 4.0 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1] * size)
         return Hidden(
             "sensor_gain", "sensor", (joint,), size, _everywhere(_fault(joint, gain=gain)), {"gain": gain}
         )
@@ -403,7 +403,7 @@ def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     share = random.uniform(0.5, 1.0)
 
     def sized(size: float) -> Hidden:
-        width = min(0.4 * scene.peaks[joint - 1], size * 2.0 * JOINT_NOISE[joint - 1])
+        width = min(0.4 * scene.peaks[joint - 1], size * 1.2 * JOINT_NOISE[joint - 1])
         setting = _fault(joint, play=width / share, play_share=share)
         return Hidden("sensor_hysteresis", "sensor", (joint,), size, _everywhere(setting))
 
@@ -412,7 +412,7 @@ def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 def _saturation(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        clip = scene.peaks[joint - 1] * (1.0 - min(0.7, 0.04 * size))
+        clip = scene.peaks[joint - 1] - min(0.7 * scene.peaks[joint - 1], 6.0 * JOINT_NOISE[joint - 1] * size)
         return Hidden(
             "sensor_saturation",
             "sensor",
