@@ -25,7 +25,7 @@ from fri.errors import DataError
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.problem import Problem, RowGroup
 from ident.estimators.weighted import WeightedLeastSquares
-from ident.signals.filters import ParallelFilter, interpolate_uniform
+from ident.signals.filters import ParallelFilter, half_width, interpolate_uniform
 
 __all__ = ["Delay", "DelayData", "estimate_delay"]
 
@@ -37,6 +37,7 @@ _STEPS = 12
 # Scatter of the joints, in their standard deviations, beyond which reversals are not trusted.
 _TOLERATED = 2.0
 _GRID = 41
+_ATTENUATION_DB = 40.0
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,12 @@ def estimate_delay(
     Raises DataError when the best delay lies at the edge of +- `search_s`, or no joint moves.
     """
     found = [_Filtered.of(data, cutoff_hz, search_s, standstill_rad_s) for data in stretches]
+    if not any(part is not None for part in found):
+        need = 4.0 / cutoff_hz + 2.0 * (half_width(cutoff_hz, _ATTENUATION_DB) + search_s)
+        raise DataError(
+            "the delay of the motor channel cannot be estimated: no stretch without lost samples is longer "
+            f"than the {need:.1f} s that it takes beside the filters' ends; record a longer motion"
+        )
     parts = [part for part in found if part is not None and part.moving.any()]
     if not parts:
         raise DataError(
@@ -156,7 +163,7 @@ class _Filtered:
 
     @classmethod
     def of(cls, data: DelayData, cutoff_hz: float, search_s: float, standstill: float) -> _Filtered | None:
-        low_pass = ParallelFilter(data.times, np.zeros(0), cutoff_hz)
+        low_pass = ParallelFilter(data.times, np.zeros(0), cutoff_hz, _ATTENUATION_DB)
         margin = low_pass.half_width + search_s
         first = max(data.span[0], float(data.motor_times[0])) + margin
         last = min(data.span[1], float(data.motor_times[-1])) - margin

@@ -138,6 +138,9 @@ def _session(
         notes=tuple(notes),
     )
     description = texts["/robot_description"]
+    attachments = {name: data for name, (_, _, data) in scan.attachments.items()}
+    # Imported logs have no transforms, hence no topic with the URDF; the attachment says the same.
+    attached = attachments["robot.urdf"].decode("utf-8") if "robot.urdf" in attachments else None
     session = Session(
         path=scan.path,
         metadata=metadata or {},
@@ -149,8 +152,8 @@ def _session(
         phases=phases,
         status=status,
         controller_model=model,
-        robot_description=description[0][1] if description else None,
-        attachments={name: data for name, (_, _, data) in scan.attachments.items()},
+        robot_description=description[0][1] if description else attached,
+        attachments=attachments,
         missing=missing,
     )
     return session if joint_names is None else session.select(joint_names)

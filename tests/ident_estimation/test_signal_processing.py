@@ -318,6 +318,9 @@ def test_too_short_a_motion_is_refused():
     session = arm.session(motor=False, phases=False, run_in_s=0.5, period_s=1.0, periods=1)
     with pytest.raises(DataError, match="record a longer motion"):
         prepare(session)
+    with_motor = arm.session(phases=False, run_in_s=0.0, period_s=1.0, periods=1)
+    with pytest.raises(DataError, match=r"longer than the 1\.9 s .* record a longer motion"):
+        prepare(with_motor)
 
 
 def test_no_motion_is_refused():
