@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from fri.errors import ConfigurationError, DataError
 from ident.import_log import LogMapping, import_log
+from ident.kinematics import Chain
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
 from runner.commands.import_log import command
@@ -56,6 +57,13 @@ def test_plain_columns_arrive_bit_for_bit(tmp_path: Path) -> None:
     assert session.joint_names == ("a", "b")
     assert session.motor is None
     assert report.rows == {"/joint_states": 50}
+
+
+def test_the_urdf_of_the_mapping_comes_with_the_session(tmp_path: Path) -> None:
+    report = import_log(mapping(urdf="lwr4plus.urdf"), write_csv(tmp_path), tmp_path / "x.mcap")
+    text = read_session(report.path).robot_description
+    assert text is not None
+    assert Chain.from_urdf(text).n == 7
 
 
 @settings(max_examples=25, deadline=None)
