@@ -97,9 +97,8 @@ class Dictionary:
 
     def _prepared(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
         if candidate.key not in self._kept:
-            entries = self._steps(candidate) if candidate.effect.step else []
-            shapes = [] if entries else candidate.effect.shapes(self.setting, max(candidate.joint, 0))
-            for shape in shapes:
+            entries = []
+            for shape in candidate.effect.shapes(self.setting, max(candidate.joint, 0)):
                 rows = self.rows(candidate, shape)
                 if not rows or not any(np.any(values) for values in rows.values()):
                     continue
@@ -209,6 +208,10 @@ class Dictionary:
             elif effect.event:
                 here = float(trial.shape[name])
                 low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
+            limits = next(p for p in effect.shape_parameters if p.name == name)
+            low, high = max(low, limits.low), min(high, limits.high)
+            if not low < high:
+                continue
             logarithmic = low > 0.0 and not effect.event
 
             def value(x: float, logarithmic: bool = logarithmic) -> float:

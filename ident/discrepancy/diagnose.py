@@ -73,7 +73,8 @@ def diagnose(
 
     test : sessions for measuring only. arm : stiffness and gear ratios, from its description. model : the
     present model, whose simulation the extended one is compared with; default the base model fitted here.
-    reference : the healthy arm. simulate : replay, for the error of the simulation. causes : names to consider.
+    reference : the healthy arm. simulate : replay, for the error of the simulation. causes : names
+    to consider.
     Raises DataError, with advice, for sessions that cannot be used.
     """
     settings = settings or DiagnosisSettings()
@@ -165,8 +166,8 @@ def commission(
     )
     known = replace(
         nominal.arm,
-        motor_delay_s=selection.nuisance.get("motor delay", (0.0, 0.0))[0],
-        joint_delay_s=selection.nuisance.get("joint delay", (0.0, 0.0))[0],
+        motor_delay_s=mean_delay(selection.nuisance, "motor")[0],
+        joint_delay_s=mean_delay(selection.nuisance, "joint")[0],
     )
     null: dict[tuple[str, int], float] = {}
     for part in sets:
@@ -463,7 +464,7 @@ def _timing(
         if side == "motor"
         else arm.joint_delay_s - known.joint_delay_s
     )
-    rest, std = after.nuisance.get(f"{side} delay", (0.0, 2e-4))
+    rest, std = mean_delay(after.nuisance, side)
     now = held_out(bench.evidence, [*(c.trial.rows for c in after.claims), *after.nuisance_rows])
     same = all(now.residual[s].shape == before.residual[s].shape for s in now.residual)
     keys = [(side, j) for j in range(bench.nominal.arm.chain.n)]
@@ -479,6 +480,16 @@ def _timing(
         candidate.effect.tell_apart,
         claim.gain,
     )
+
+
+def mean_delay(nuisance: Mapping[str, tuple[float, float]], side: str) -> tuple[float, float]:
+    """Weighted mean of the delays of a side that were tolerated, and its standard deviation [s]."""
+    entries = [value for name, value in nuisance.items() if name.startswith(f"{side} delay")]
+    weights = [1.0 / max(std, 1e-6) ** 2 for _, std in entries]
+    if not entries:
+        return 0.0, 2e-4
+    mean = sum(w * value for w, (value, _) in zip(weights, entries, strict=True)) / sum(weights)
+    return float(mean), float(1.0 / np.sqrt(sum(weights)))
 
 
 def _loss_finding(loss: tuple[SampleLoss, ...]) -> Finding:
@@ -558,7 +569,8 @@ def _notes(bench: _Bench, reference: Reference | None) -> tuple[str, ...]:
     notes = []
     if "motor" not in bench.nominal.rows:
         notes.append(
-            "no motor torque: causes on the motor side cannot be seen, and sensor causes are told from physical "
+            "no motor torque: causes on the motor side cannot be seen, and sensor causes are told "
+            "from physical "
             "ones by their shape alone"
         )
     if reference is None:

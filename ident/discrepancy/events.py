@@ -18,7 +18,9 @@ _MOST = 4
 
 @dataclass(frozen=True)
 class Burst:
-    """session : number. start_s, duration_s : from the start of the session. excess : chi-square above usual."""
+    """session : number. start_s, duration_s : from the start of the session. excess : chi-square
+    above usual.
+    """
 
     session: int
     start_s: float

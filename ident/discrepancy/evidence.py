@@ -210,7 +210,8 @@ class Evidence:
             gram[:p, :p] += self.prior[0]
             target[:p] += self.prior[0] @ self.prior[1]
         gram *= np.outer(s, s)
-        # A motion that leaves a direction open must not blow it up; 1e-9 of the diagonal decides nothing else.
+        # A motion that leaves a direction open must not blow it up; 1e-9 of the diagonal decides
+        # nothing else.
         gram[np.diag_indices_from(gram)] += 1e-9
         inverse = np.linalg.inv(gram) * np.outer(s, s)
         return Fit(inverse @ target, inverse)
@@ -222,7 +223,8 @@ class Evidence:
     def products(self, columns: Mapping[Key, Floats], known: Products | None = None) -> Products:
         """Products in each block of padded columns (blocks, L, k).
 
-        known : the products of the same columns with the base alone; only those with further columns are made.
+        known : the products of the same columns with the base alone; only those with further
+        columns are made.
         """
         known = self.alone(columns) if known is None else known
         parts = [known.base]
@@ -301,7 +303,8 @@ class Evidence:
         )
 
     def event_score(self, score: Score, choices: int) -> Score:
-        """A score of columns that are active in a few blocks only, the best of `choices`: the fall on the rows
+        """A score of columns that are active in a few blocks only, the best of `choices`: the fall
+        on the rows
         fitted, less what the best of so many would fall by chance.
         """
         k = len(score.coefficients)
@@ -360,7 +363,9 @@ class Evidence:
     def _robust(
         self, products: Products, lever: Floats, inner: Floats, coefficients: Floats
     ) -> tuple[Floats, int]:
-        """Covariance from blocks, at least that of independent rows; and the number of blocks that carry it."""
+        """Covariance from blocks, at least that of independent rows; and the number of blocks that
+        carry it.
+        """
         values = self.full.values - lever @ coefficients
         own = products.target - products.base @ values - products.own @ coefficients
         base = self.target - self.gram @ values - np.einsum("bkp,k->bp", products.base, coefficients)

@@ -16,7 +16,9 @@ _DRAWS = 1000
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Residual (m, n) [Nm] by side on rows that were not fitted, NaN elsewhere, and the blocks (m,) of rows."""
+    """Residual (m, n) [Nm] by side on rows that were not fitted, NaN elsewhere, and the blocks
+    (m,) of rows.
+    """
 
     residual: dict[str, Floats]
     block: dict[str, Floats]
@@ -32,7 +34,8 @@ class HeldOut:
 
 
 def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
-    """Residuals with the base and further columns: on the test sessions where there are any, else on each part
+    """Residuals with the base and further columns: on the test sessions where there are any, else
+    on each part
     of the motion as predicted from the others."""
     evidence.replace(extra)
     rows = evidence.nominal.rows

@@ -42,7 +42,8 @@ _CHUNK = 2000
 class Arm:
     """What is known of the arm beforehand.
 
-    compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio : (n,), one where
+    compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio :
+    (n,), one where
     unknown. motor_delay_s, joint_delay_s : of the healthy channels.
     """
 

@@ -128,6 +128,6 @@ def _stretches(prepared: PreparedSession, rate: float) -> list[Stretch]:
                 motor_time,
                 motor,
                 usable,
-            )  # fmt: skip
+            )
         )
     return found

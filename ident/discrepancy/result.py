@@ -39,7 +39,8 @@ class Evident:
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions, where it says so.
+    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions,
+    where it says so.
     alternatives : (cause, joints, delta_bic). gain : fall of the held-back chi-square."""
 
     cause: str

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm
 
 from ident.discrepancy.candidates import Candidate, Dictionary, Trial
-from ident.discrepancy.evidence import Evidence, Floats, Rows, Score
+from ident.discrepancy.evidence import Evidence, Rows, Score
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 
@@ -106,7 +106,12 @@ class _State:
         for side in nominal.rows:
             candidate = Candidate(EFFECTS[f"{side}_torque_delay"], -1)
             rows = self.dictionary.rows(candidate, {"delay": 1e-3})
-            found.append((f"{side} delay", rows, 1e-3, limit))
+            if side == "motor":
+                found.append(("motor delay", rows, 1e-3, limit))
+                continue
+            # Each torque sensor has electronics of its own.
+            for key in sorted(rows):
+                found.append((f"joint delay {key[1] + 1}", {key: rows[key]}, 1e-3, 2.0 * limit))
         if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
             for joint in range(nominal.arm.chain.n):
                 candidate = Candidate(EFFECTS["joint_elasticity"], joint)
@@ -130,7 +135,8 @@ class _State:
         if len(inside) < len(entries):
             self.evidence.replace([*fixed, *(rows for _, rows, _, _ in inside)])
         values = self.evidence.full.values[place:]
-        std = np.sqrt(np.diag(self.evidence.full.inverse))[place:]
+        # A motion that says nothing about a deviation leaves its variance open.
+        std = np.sqrt(np.maximum(np.diag(self.evidence.full.inverse), 0.0))[place:]
         self.nuisance = {
             name: (float(v) * unit, float(s) * unit)
             for (name, _, unit, _), v, s in zip(inside, values, std, strict=True)
@@ -154,12 +160,13 @@ class _State:
         """Whether the data carry the trial: gain, significance, and size."""
         score = trial.score if score is None else score
         settings = self.settings
-        least = settings.least_gain + 6.0 * (len(score.coefficients) - 1)
+        strict = trial.candidate.effect.scrutiny
+        least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
         known = (1.0 + settings.margin) * max(self.null.get(trial.candidate.key, 0.0), 0.0)
         return (
             score.gain > max(least, known)
             and score.p_value < settings.alpha
-            and score.inflation > settings.least_inflation
+            and score.inflation > strict * settings.least_inflation
         )
 
     def beside(self, accepted: Sequence[Trial], without: int) -> list[Trial]:
@@ -239,8 +246,3 @@ def confidence(gain: float, rivals: Sequence[float]) -> float:
 
 def _width(rows: Rows) -> int:
     return next(iter(rows.values())).shape[1]
-
-
-def excess(values: Floats) -> float:
-    """Mean square of values that are finite."""
-    return float(np.nanmean(values**2))

@@ -13,7 +13,8 @@ __all__ = ["DiagnosisSettings"]
 class DiagnosisSettings:
     """How sessions become rows, and what it takes to make a claim.
 
-    bin_s : length of the mean that joint torque and regressor pass alike; motor torque too where it is sampled
+    bin_s : length of the mean that joint torque and regressor pass alike; motor torque too where
+    it is sampled
         faster. Slower channels give a row a sample.
     cutoff_hz : zero-phase low-pass on the positions; lowered to a fifth of the sampling rate.
     deflection_hz : low-pass on the torque from which the joints' twist is computed.

@@ -1,6 +1,7 @@
 """Effects: physics that the linear model leaves out, one cause a class.
 
-`EFFECTS` maps the name of each cause to its effect. An entry of a model's `effects` is a mapping with `cause`,
+`EFFECTS` maps the name of each cause to its effect. An entry of a model's `effects` is a mapping
+with `cause`,
 `side`, `joints` (from 1; empty for the whole arm) and `parameters`, each with `value`, `std` and `unit`.
 """
 

@@ -28,6 +28,7 @@ class Backlash(Effect):
         Parameter("encoder", "1", "1: positions of the motors, 0: of the links", shape=True),
         Parameter("width", "Nm", "torque over which the gap is crossed", shape=True),
     )
+    scrutiny = 2.0
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

@@ -29,7 +29,8 @@ def body_columns(motion: Motion, count: int) -> tuple[Column, ...]:
 
 
 def force_torque(chain: Chain, q: Floats, axis: int, link: int) -> Floats:
-    """Torque (N, n) [Nm] that a unit force along a base axis at the end of `link` (from 1) puts on the joints.
+    """Torque (N, n) [Nm] that a unit force along a base axis at the end of `link` (from 1) puts on
+    the joints.
 
     The end of a link is the origin of the next frame, of the last link a point 0.1 m along its z axis. It is
     the gravity torque of a unit mass there, in a field of one unit along the axis, with its sign turned.

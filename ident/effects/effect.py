@@ -80,7 +80,9 @@ class Setting:
 
 
 class Simulated:
-    """What an effect does to a simulated arm, called each millisecond in the way of `sim_backend.plant.Effect`."""
+    """What an effect does to a simulated arm, called each millisecond in the way of
+    `sim_backend.plant.Effect`.
+    """
 
     def start(self, joints: int, random: np.random.Generator) -> None:
         """Begin a run of an arm with `joints` joints."""
@@ -100,10 +102,13 @@ class Effect(ABC):
 
     cause, side : as in the table of the diagnosis. physics : a sentence. source : where it is described.
     parameters : all of them, the linear ones first in the order of the columns.
-    whole_arm : the effect belongs to no single joint. event : it acts during a part of the time only, found by
+    whole_arm : the effect belongs to no single joint. event : it acts during a part of the time
+    only, found by
         a search over times. step : it sets in at its `time` and stays.
     hidden : linear parameters that are 1 by the physics, left free in the search and not reported.
-    tell_apart : the motion that decides between this cause and those that it is mistaken for; `{joint}` stands
+    scrutiny : how many times the usual evidence it takes, where the nominal arm itself is a little like it.
+    tell_apart : the motion that decides between this cause and those that it is mistaken for;
+    `{joint}` stands
         for the joint's number.
     """
 
@@ -116,6 +121,7 @@ class Effect(ABC):
     event: ClassVar[bool] = False
     step: ClassVar[bool] = False
     hidden: ClassVar[tuple[str, ...]] = ()
+    scrutiny: ClassVar[float] = 1.0
     tell_apart: ClassVar[str] = "repeat the motion at half the speed and with another payload"
 
     @abstractmethod

@@ -24,6 +24,8 @@ class FrictionAsymmetry(Effect):
     source = "Armstrong-Helouvry, Control of Machines with Friction (1991)"
     parameters = (
         Parameter("viscous", "Nm s/rad", "half the difference of the viscous friction of both ways"),
+        Parameter("coulomb", "Nm", "half the difference of the Coulomb friction; 0 without a reference"),
+        Parameter("parts", "1", "1: viscous alone, 2: against a reference, both", shape=True),
     )
     tell_apart = "the same constant-speed sweep of joint {joint} both ways, twice"
 
@@ -43,7 +45,8 @@ class FrictionAsymmetry(Effect):
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """A torque at the motor."""
-        return _Asymmetry(joint, float(parameters.get("viscous", 0.0)), float(parameters.get("coulomb", 0.0)))
+        viscous, coulomb = float(parameters.get("viscous", 0.0)), float(parameters.get("coulomb", 0.0))
+        return _Asymmetry(joint, viscous, coulomb)
 
 
 class _Asymmetry(Simulated):

@@ -27,6 +27,7 @@ class JointElasticity(Effect):
         Parameter("compliance", "rad/Nm", "twist per torque beyond the model's", low=0.0, high=0.02),
         Parameter("encoder", "1", "1: positions of the motors, 0: of the links", shape=True),
     )
+    scrutiny = 2.0
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

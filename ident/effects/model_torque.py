@@ -30,7 +30,8 @@ def check_entry(entry: Mapping[str, Any], joints: int) -> None:
     unknown = set(entry) - _ENTRY
     if unknown or not {"cause", "joints", "parameters"} <= set(entry):
         raise ConfigurationError(
-            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, parameters, each with value, "
+            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, parameters, each "
+            f"with value, "
             "std, unit"
         )
     effect = find_effect(str(entry["cause"]))
@@ -43,8 +44,9 @@ def check_entry(entry: Mapping[str, Any], joints: int) -> None:
     known = {p.name for p in effect.parameters}
     foreign = set(entry["parameters"]) - known
     if foreign:
+        listed = ", ".join(sorted(known))
         raise ConfigurationError(
-            f"effect {effect.cause} has no parameter {sorted(foreign)[0]!r}; it has {', '.join(sorted(known))}"
+            f"effect {effect.cause} has no parameter {sorted(foreign)[0]!r}; it has {listed}"
         )
 
 
@@ -103,7 +105,9 @@ def _motion(
     joint = linear.get("joint")
     if joint is None:
         joint = regressor.torque(chain, q, qd, qdd, bodies)
-    stamps = 1e-3 * np.arange(len(q)) if time is None else np.asarray(time, dtype=np.float64) - time[0]
+    stamps: Floats = np.arange(len(q), dtype=np.float64) * 1e-3
+    if time is not None:
+        stamps = time - time[0]
 
     def friction(speed: Floats) -> Floats:
         return drive["Fvm"] * speed + drive["Fcm"] * np.sign(speed)

@@ -80,7 +80,8 @@ class Motion:
         return regressor.gravity_torque(tilted, self.q, self.bodies)
 
     def displaced(self, shift: Floats) -> Floats:
-        """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift, shift (N, n) [rad].
+        """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift, shift
+        (N, n) [rad].
 
         Derivatives of the shift are central differences, low-passed by the grid alone.
         """

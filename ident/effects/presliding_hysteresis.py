@@ -23,6 +23,7 @@ class PreslidingHysteresis(Effect):
         Parameter("amplitude", "Nm", "Coulomb friction that turns over slowly", low=0.0),
         Parameter("length", "rad", "distance in which it turns by 63 %", shape=True, low=1e-5, high=0.5),
     )
+    scrutiny = 2.0
     tell_apart = "reversals of joint {joint} at three accelerations and amplitudes (0.5, 2 and 10 mrad)"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -44,7 +45,8 @@ class PreslidingHysteresis(Effect):
 class _Dahl(Simulated):
     def __init__(self, joint: int, amplitude: float, length: float) -> None:
         self.joint, self.amplitude, self.length = joint, amplitude, length
-        self.state, self.before = 0.0, None
+        self.state = 0.0
+        self.before: float | None = None
 
     def load(self, time_s: float, plant: Any, loads: Any) -> None:
         here = float(plant.motor_position[self.joint])

@@ -23,6 +23,7 @@ class SensorHysteresis(Effect):
         Parameter("amplitude", "Nm", "half the width of the loop", low=0.0),
         Parameter("width", "Nm", "torque in which the lag turns by 63 %", shape=True, low=0.1),
     )
+    scrutiny = 3.0
     tell_apart = "load joint {joint} quasi-statically up and down over its range, twice"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -44,7 +45,8 @@ class SensorHysteresis(Effect):
 class _Loop(Simulated):
     def __init__(self, joint: int, amplitude: float, width: float) -> None:
         self.joint, self.amplitude, self.width = joint, amplitude, width
-        self.state, self.before = 0.0, None
+        self.state = 0.0
+        self.before: float | None = None
 
     def sense(self, time_s: float, plant: Any, reading: Any) -> None:
         here = float(plant.joint_torque[self.joint])

@@ -12,7 +12,9 @@ from ident.effects.motion import Motion
 
 
 class SensorOffsetDrift(Effect):
-    """The sensor's zero moves by `drift`: as 1 - exp(-t / time_constant) in each session, or between sessions."""
+    """The sensor's zero moves by `drift`: as 1 - exp(-t / time_constant) in each session, or
+    between sessions.
+    """
 
     cause = "sensor_offset_drift"
     side = "sensor"

@@ -12,7 +12,9 @@ from ident.effects.motion import Motion
 
 
 class SensorRipple(Effect):
-    """The sensor adds `cosine cos(k r q) + sine sin(k r q)`: r = 1 for the joint's angle, N for the motor's."""
+    """The sensor adds `cosine cos(k r q) + sine sin(k r q)`: r = 1 for the joint's angle, N for
+    the motor's.
+    """
 
     cause = "sensor_ripple"
     side = "sensor"

@@ -42,8 +42,8 @@ class Stribeck(Effect):
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Raises the Coulomb friction of the drive."""
-        values = (float(parameters[name]) for name in ("amplitude", "velocity"))
-        return _Stribeck(joint, *values, float(parameters.get("exponent", 1.0)))
+        amplitude, velocity = float(parameters["amplitude"]), float(parameters["velocity"])
+        return _Stribeck(joint, amplitude, velocity, float(parameters.get("exponent", 1.0)))
 
 
 class _Stribeck(Simulated):

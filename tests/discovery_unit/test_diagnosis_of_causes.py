@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fri.errors import DataError
+from ident.discrepancy import Diagnosis, commission, diagnose
+from ident.kinematics import Chain
+from ident.model_file import model_text, read_model
+from lwr_driver.session import Session
+
+Make = Callable[..., Session]
+Signals = dict[str, np.ndarray]
+
+
+def stribeck(s: Signals) -> None:
+    v = s["qd"][:, 1]
+    s["motor"][:, 1] += 0.3 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+
+
+def load_friction(s: Signals) -> None:
+    s["motor"][:, 1] += 0.03 * np.abs(s["joint"][:, 1]) * np.sign(s["qd"][:, 1])
+
+
+def cable(s: Signals) -> None:
+    pull = 0.1 * s["q"][:, 2] ** 3
+    s["motor"][:, 2] += pull
+    s["joint"][:, 2] += pull
+
+
+def sensor_gain(s: Signals) -> None:
+    s["joint"][:, 1] *= 1.03
+
+
+def crosstalk(s: Signals) -> None:
+    s["joint"][:, 0] += 0.02 * s["joint"][:, 1]
+
+
+def drift(s: Signals) -> None:
+    s["joint"][:, 2] += 0.1 * (1.0 - np.exp(-s["time"] / 8.0))
+
+
+def clipped(s: Signals) -> None:
+    top = 0.85 * np.abs(s["joint"][:, 1]).max()
+    s["joint"][:, 1] = np.clip(s["joint"][:, 1], -top, top)
+
+
+def late_motor(s: Signals) -> None:
+    old = s["time"] - 0.006
+    s["motor"][:] = np.column_stack([np.interp(old, s["time"], c) for c in s["motor"].T])
+
+
+def pair(make: Make, change: Callable[[Signals], None] | None = None, seed: int = 1) -> list[Session]:
+    return [make("a.mcap", seed, change), make("b.mcap", seed + 1, change, 1)]
+
+
+@pytest.fixture(scope="module")
+def healthy(make: Make, chain: Chain) -> Diagnosis:
+    return diagnose(pair(make), chain)
+
+
+def test_says_nothing_where_nothing_is_wrong(healthy: Diagnosis) -> None:
+    assert healthy.findings == ()
+    assert healthy.unexplained == ()
+    assert "Nothing is wrong" in str(healthy)
+
+
+def test_base_model_alone_leaves_only_noise(healthy: Diagnosis) -> None:
+    for side, values in healthy.rms_base.items():
+        np.testing.assert_allclose(values, healthy.noise_floor[side], rtol=0.12)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause", "joints", "parameter", "value"),
+    [
+        (stribeck, "stribeck", (2,), "amplitude", 0.3),
+        (load_friction, "friction_load", (2,), "factor", 0.03),
+        (cable, "cable_spring", (3,), "stiffness", 0.1),
+        (sensor_gain, "sensor_gain", (2,), "error", 0.03),
+        (crosstalk, "sensor_crosstalk", (1,), "factor", 0.02),
+        (drift, "sensor_offset_drift", (3,), "drift", 0.1),
+        (clipped, "sensor_saturation", (2,), "limit", None),
+        (late_motor, "motor_torque_delay", (), "delay", 0.006),
+    ],
+)
+def test_names_cause_and_joint_first(
+    make: Make,
+    chain: Chain,
+    change: Callable[[Signals], None],
+    cause: str,
+    joints: tuple[int, ...],
+    parameter: str,
+    value: float | None,
+) -> None:
+    found = diagnose(pair(make, change), chain)
+    first = found.findings[0]
+    assert (first.cause, first.joints) == (cause, joints)
+    assert first.evidence.p_value < 1e-5
+    assert first.evidence.gain_interval_95[1] > 0.0
+    if value is not None:
+        estimate = first.parameters[parameter]
+        assert abs(estimate.value - value) < 4.0 * estimate.std + 0.05 * abs(value)
+    content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert content["findings"][0]["cause"] == cause
+
+
+def test_extended_model_is_an_ordinary_model(make: Make, chain: Chain) -> None:
+    sessions = pair(make, stribeck)
+    found = diagnose(sessions, chain)
+    again = read_model(_loaded(model_text(found.extended_model)))
+    assert [e["cause"] for e in again.effects] == ["stribeck"]
+    q = np.array([[0.1, 0.2, 0.3]])
+    slow, fast = np.full((1, 3), 0.01), np.full((1, 3), 1.0)
+    for speed, share in ((slow, np.exp(-0.01 / 0.15)), (fast, np.exp(-1.0 / 0.15))):
+        zero = np.zeros((1, 3))
+        extra = again.torque(q, speed, zero, side="motor") - again.linear_torque(q, speed, zero, side="motor")
+        assert extra[0, 1] == pytest.approx(0.3 * share, abs=0.08)
+        assert extra[0, 0] == 0.0
+
+
+def test_gain_is_measured_on_sessions_never_fitted(make: Make, chain: Chain) -> None:
+    test = [make("c.mcap", 9, load_friction, 2)]
+    found = diagnose(pair(make, load_friction), chain, test=test)
+    assert found.test == ("c.mcap",)
+    assert found.train == ("a.mcap", "b.mcap")
+    assert found.rms_extended["motor"][1] < 0.97 * found.rms_base["motor"][1]
+
+
+def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bodies: np.ndarray) -> None:
+    from ident.regressor import torque
+
+    def heavier(s: Signals) -> None:
+        extra = np.zeros((3, 10))
+        extra[2, 9], extra[2, 6] = 0.2, 0.04
+        qdd = np.gradient(s["qd"], s["time"], axis=0)
+        add = torque(chain, s["q"], s["qd"], qdd, extra)
+        s["joint"] += add
+        s["motor"] += add
+
+    sessions = pair(make, heavier, seed=5)
+    alone = diagnose(sessions, chain)
+    assert alone.findings == ()
+    assert any("no reference" in note for note in alone.notes)
+    reference = commission([pair(make, seed=1)], chain)
+    found = diagnose(sessions, chain, reference=reference)
+    assert found.findings[0].cause == "payload_error"
+
+
+def test_reference_alone_claims_nothing(make: Make, chain: Chain) -> None:
+    reference = commission([pair(make, seed=1), pair(make, seed=3)], chain)
+    assert diagnose(pair(make, seed=5), chain, reference=reference).findings == ()
+
+
+def test_unknown_physics_is_not_named_with_confidence(make: Make, chain: Chain) -> None:
+    def strange(s: Signals) -> None:
+        s["motor"][:, 1] += 0.12 * np.sign(s["qd"][:, 1]) * np.sin(2.0 * s["q"][:, 0])
+
+    found = diagnose(pair(make, strange), chain)
+    assert all(f.confidence < 0.8 for f in found.findings)
+    assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
+
+
+def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
+    sessions = pair(make)
+    effort = sessions[0].joint.effort.copy()
+    rows = np.arange(50, len(effort), 40)
+    effort[rows] = effort[rows - 1]
+    from dataclasses import replace
+
+    sessions[0] = replace(sessions[0], joint=replace(sessions[0].joint, effort=effort))
+    found = diagnose(sessions, chain)
+    lost = [f for f in found.findings if f.cause == "lost_samples"]
+    assert lost
+    assert lost[0].parameters["share"].value == pytest.approx(len(rows) / len(effort), rel=0.05)
+
+
+def test_one_session_without_motor_channel(make: Make, chain: Chain) -> None:
+    from dataclasses import replace
+
+    found = diagnose([replace(make("a.mcap", 1), motor=None)], chain)
+    assert found.findings == ()
+    assert found.model_number == 1
+    assert any("no motor torque" in note for note in found.notes)
+    assert found.to_dict()["baseline"]["test_rms"]["motor"] is None
+
+
+def test_no_session_is_an_error(chain: Chain) -> None:
+    with pytest.raises(DataError, match="no session given"):
+        diagnose([], chain)
+
+
+def _loaded(text: str) -> dict[str, object]:
+    import yaml
+
+    content = yaml.safe_load(text)
+    assert isinstance(content, dict)
+    return content

@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fri.errors import ConfigurationError
+from ident.effects import EFFECTS, Motion, Setting, find_effect
+from ident.effects.model_torque import check_entry
+from ident.effects.operators import dahl, play
+from ident.kinematics import Chain
+
+TABLE = {
+    "motor": {
+        "stribeck",
+        "viscous_nonlinear",
+        "friction_asymmetry",
+        "friction_load",
+        "friction_temperature",
+        "friction_position",
+        "presliding_hysteresis",
+        "gear_ripple",
+        "motor_torque_gain",
+    },
+    "joint": {
+        "backlash",
+        "joint_elasticity",
+        "cable_spring",
+        "base_tilt",
+        "payload_error",
+        "payload_change",
+        "joint_zero_offset",
+        "contact",
+    },
+    "sensor": {
+        "sensor_gain",
+        "sensor_crosstalk",
+        "sensor_hysteresis",
+        "sensor_saturation",
+        "sensor_offset_drift",
+        "sensor_ripple",
+    },
+    "timing": {"motor_torque_delay", "joint_torque_delay", "lost_samples"},
+}
+CONTACT = {"time": 0.5, "duration": 0.5, "session": 1.0, "link": 3.0}
+
+
+@pytest.fixture(scope="module")
+def motion(chain: Chain, bodies: np.ndarray) -> Motion:
+    time = np.arange(0.0, 4.0, 0.002)
+    w = 2.0 * np.pi / 2.0 * np.array([1.0, 1.5, 2.0])
+    phase = np.array([0.3, 1.0, 2.0])
+    q = 0.6 * np.sin(w * time[:, None] + phase)
+    qd = 0.6 * w * np.cos(w * time[:, None] + phase)
+    qdd = -0.6 * w**2 * np.sin(w * time[:, None] + phase)
+    from ident.regressor import torque
+
+    joint = torque(chain, q, qd, qdd, bodies)
+    return Motion(
+        chain=chain,
+        bodies=bodies,
+        session=0,
+        time=time,
+        duration_s=4.0,
+        q=q,
+        qd=qd,
+        qdd=qdd,
+        motor_speed=qd,
+        motor_acceleration=qdd,
+        joint_torque=joint,
+        motor_torque=joint + 2.0 * qd + 1.5 * np.sign(qd),
+        gear_ratio=np.full(3, 100.0),
+        inertia=np.full(3, 0.4),
+        link_coulomb=np.zeros(3),
+        motor_coulomb=np.full(3, 1.5),
+        friction=lambda v: 2.0 * v + 1.5 * np.sign(v),
+    )
+
+
+def setting() -> Setting:
+    spread = np.array([[-0.6, 0.6]] * 3)
+    return Setting(1, (4.0,), np.full(3, 100.0), np.full(3, 20.0), np.full(3, 2.0), spread)
+
+
+def shapes(cause: str) -> list[dict[str, float]]:
+    return [dict(s) for s in EFFECTS[cause].shapes(setting(), 1)] or (
+        [CONTACT] if cause == "contact" else [{}]
+    )
+
+
+def test_causes_and_sides_are_those_of_the_table() -> None:
+    for side, causes in TABLE.items():
+        assert {e.cause for e in EFFECTS.values() if e.side == side} == causes
+
+
+@pytest.mark.parametrize("cause", sorted(EFFECTS))
+def test_effect_describes_itself(cause: str) -> None:
+    effect = EFFECTS[cause]
+    assert effect.physics
+    assert effect.source
+    assert effect.tell_apart.format(joint=2)
+    assert all(p.unit and p.meaning for p in effect.parameters)
+    assert len({p.name for p in effect.parameters}) == len(effect.parameters)
+
+
+@pytest.mark.parametrize("cause", sorted(EFFECTS))
+def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: Motion) -> None:
+    effect = EFFECTS[cause]
+    for shape in shapes(cause)[:3]:
+        columns = effect.columns(motion, 1, shape)
+        assert len(columns) <= len(effect.linear) or not effect.linear
+        for column in columns:
+            for part in (column.motor, column.joint):
+                if part is not None:
+                    assert part.shape in ((len(motion.time),), (len(motion.time), 3))
+                    assert np.all(np.isfinite(part))
+        parameters = {**{p.name: 0.01 * (k + 1) for k, p in enumerate(effect.linear)}, **shape}
+        motor, joint = effect.torque(motion, 1, parameters)
+        assert motor.shape == joint.shape == (len(motion.time), 3)
+        expected = sum(
+            (
+                0.01 * (k + 1) * (c.wide(1, 3)[0] if c.motor is not None else 0.0)
+                for k, c in enumerate(columns)
+            ),
+            np.zeros((len(motion.time), 3)),
+        )
+        np.testing.assert_allclose(motor, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("cause", ["stribeck", "viscous_nonlinear", "presliding_hysteresis", "friction_load"])
+def test_derivative_is_the_slope_of_the_torque(cause: str, motion: Motion) -> None:
+    effect = EFFECTS[cause]
+    parameters = {**{p.name: 0.3 for p in effect.linear}, **shapes(cause)[2 if cause == "stribeck" else 0]}
+    for parameter in effect.parameters:
+        if parameter.name == "exponent" and cause == "stribeck":
+            continue
+        step = 1e-5 * abs(parameters[parameter.name])
+        upper = effect.torque(motion, 1, {**parameters, parameter.name: parameters[parameter.name] + step})
+        lower = effect.torque(motion, 1, {**parameters, parameter.name: parameters[parameter.name] - step})
+        slope = (upper[0] - lower[0]) / (2.0 * step)
+        found, _ = effect.derivative(motion, 1, parameters, parameter.name)
+        np.testing.assert_allclose(found, slope, rtol=1e-3, atol=1e-4 * np.abs(slope).max() + 1e-12)
+
+
+def test_sensor_causes_leave_the_motor_torque_alone(motion: Motion) -> None:
+    for cause in TABLE["sensor"]:
+        assert all(c.motor is None for c in EFFECTS[cause].columns(motion, 1, shapes(cause)[0]))
+
+
+def test_motor_causes_leave_the_joint_torque_alone(motion: Motion) -> None:
+    for cause in TABLE["motor"]:
+        assert all(c.joint is None for c in EFFECTS[cause].columns(motion, 1, shapes(cause)[0]))
+
+
+def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: Motion) -> None:
+    (column,) = EFFECTS["joint_zero_offset"].columns(motion, 1, {})
+    shift = np.array([0.0, 1e-3, 0.0])
+    expected = motion.rigid_torque(motion.q + shift, motion.qd, motion.qdd) - motion.joint_torque
+    assert column.joint is not None
+    np.testing.assert_allclose(1e-3 * column.joint, expected, atol=1e-4)
+
+
+def test_tilt_column_is_gravity_of_a_tilted_base(motion: Motion) -> None:
+    from dataclasses import replace
+
+    from ident.regressor import gravity_torque
+
+    angle = 1e-3
+    tilted = replace(motion.chain, gravity=9.81 * np.array([0.0, -np.sin(angle), -np.cos(angle)]))
+    change = gravity_torque(tilted, motion.q, motion.bodies) - gravity_torque(
+        motion.chain, motion.q, motion.bodies
+    )
+    # A base turned by +angle about x sees (0, 0, -g) turned by -angle: (0, -g sin, -g cos).
+    column, _ = EFFECTS["base_tilt"].columns(motion, 0, {})
+    assert column.joint is not None
+    np.testing.assert_allclose(angle * column.joint, change, atol=2e-5)
+
+
+def test_dahl_turns_over_within_its_length() -> None:
+    path = np.concatenate([np.linspace(0.0, 1.0, 500), np.linspace(1.0, 0.99, 100)])
+    state = dahl(path, 0.01, 0.0)
+    assert state[499] == pytest.approx(1.0, abs=1e-9)
+    assert state[-1] == pytest.approx(-1.0 + 2.0 * np.exp(-1.0), abs=1e-6)
+
+
+def test_play_lags_by_half_its_width() -> None:
+    out = play(np.array([0.0, 1.0, 2.0, 1.5, 0.0]), 0.5)
+    np.testing.assert_allclose(out, [0.0, 0.5, 1.5, 1.5, 0.5])
+
+
+def test_unknown_cause_names_the_nearest() -> None:
+    with pytest.raises(ConfigurationError, match="did you mean 'stribeck'"):
+        find_effect("stribek")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joints": [8]}, "between 1 and 7"),
+        ({"joints": []}, "the joints it acts on"),
+        ({"parameters": {"slope": {"value": 1.0}}}, "no parameter 'slope'"),
+        ({"cause": "gremlins"}, "unknown"),
+    ],
+)
+def test_wrong_entries_are_refused(change: dict[str, object], message: str) -> None:
+    entry = {"cause": "stribeck", "side": "motor", "joints": [2], "parameters": {}, **change}
+    with pytest.raises(ConfigurationError, match=message):
+        check_entry(entry, 7)
