@@ -114,7 +114,7 @@ def figaroh(states: tuple[np.ndarray, ...], tau: np.ndarray, python: Path | None
             python = Path(folder) / "env" / "bin" / "python"
             subprocess.run([python, "-m", "pip", "install", "-q", "figaroh"], check=True)
         path = Path(folder) / "data.npz"
-        np.savez(path, **dict(zip(("q", "qd", "qdd"), states, strict=True)), tau=tau)
+        np.savez(path, q=states[0], qd=states[1], qdd=states[2], tau=tau)
         command = [str(python), "-W", "ignore", "-c", FIGAROH, str(find("lwr4plus.urdf")), str(path)]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
