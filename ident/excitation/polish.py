@@ -26,6 +26,7 @@ _ORDERS = {"position": 0, "velocity": 1, "acceleration": 2, "jerk": 3}
 _SPACE_STEP = 2e-4
 _SHARE_STEP = 2e-4
 _BOUND_TOLERANCE = 1e-9
+_BOUND_RESERVE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,10 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
         x = candidate.x
         program.sharpness, program.constraints.rate = 256.0, 1000.0
         best: Outcome | None = None
+        reserve = _BOUND_RESERVE
         for round_ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))
+            program.calibrate(x, reserve)
             solution = minimise(program, x, iterations=15 if quick else 60, tolerance=1e-5)
             x = solution.x
             if solution.constraints.min(initial=0.0) < -_GRID_TOLERANCE and round_ < _ROUNDS - 1:
@@ -64,7 +67,8 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
             if outcome.bound_excess > _HOPELESS:
                 break
             tighten(program.constraints, outcome.check, setup.mechanism.joint_names)
-            tighten_bounds(program, outcome.bound_excess)
+            if outcome.bound_excess > 0.0:
+                reserve += 1.2 * outcome.bound_excess + 1e-5
         return best if best is not None else _outcome(assembled, program, x)
 
 
@@ -103,12 +107,3 @@ def _raise_floor(constraints: Constraints, margin: Margin, short: float) -> None
     if rows is None:
         rows = list(range(2, constraints.space.rows))
     constraints.floor[rows] += _SPACE_STEP + 1.2 * short
-
-
-def tighten_bounds(program: Program, excess: float) -> None:
-    """Lower the limits of bounded criteria by a little more than they were exceeded."""
-    if excess > 0.0:
-        program.constraints.bounds = tuple(
-            type(bound)(bound.criterion, bound.limit - 1.2 * excess - 1e-5)
-            for bound in program.constraints.bounds
-        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.excitation.constraints import Constraints
+from ident.excitation.constraints import Bound, Constraints
 from ident.excitation.evaluation import Evaluator
 from ident.excitation.motion import Array
 from ident.excitation.objectives import Criterion
@@ -23,6 +23,7 @@ class Program:
         self.sharpness = 8.0
         self.anchor = np.zeros(0)
         self.evaluations = 0
+        self._asked = constraints.bounds
 
     def values(self, x: Array) -> tuple[float, Array]:
         """Objective and constraints."""
@@ -49,6 +50,22 @@ class Program:
     def signals(self, x: Array) -> list[Array]:
         """Signals on the fine grid at flattened coefficients."""
         return self.evaluator.signals(x.reshape(self.evaluator.mechanism.joints, -1))
+
+    def calibrate(self, x: Array, reserve: float = 0.0) -> None:
+        """Shift the bounds by what smoothing adds to the bounded criteria at x, less a reserve.
+
+        The smooth condition number lies a few percent above the exact one; a bound on it would cost as much.
+        """
+        if not self._asked:
+            return
+        signals = self.signals(x)
+        smooth = self.evaluator.view(signals)
+        values = [bound.criterion.evaluate(smooth, self.sharpness)[0] for bound in self._asked]
+        exact = self.evaluator.view(signals, exact_sign=True)
+        self.constraints.bounds = tuple(
+            Bound(bound.criterion, bound.limit + value - bound.criterion.evaluate(exact, np.inf)[0] - reserve)
+            for bound, value in zip(self._asked, values, strict=True)
+        )
 
     def exact(self, x: Array) -> float:
         """The target itself, unsmoothed and with the true sign of the velocities."""

@@ -162,6 +162,7 @@ def _solve(program: Program, x: Array, schedule: Sequence[tuple[int, float, floa
     for iterations, sharpness, rate in schedule:
         program.sharpness, program.constraints.rate = sharpness, rate
         program.constraints.refresh_deviation(program.signals(x))
+        program.calibrate(x)
         solution = minimise(program, x, iterations=iterations, hessian=hessian)
         x, hessian = solution.x, solution.hessian
     return Candidate(x, program.exact(x), _violation(solution.constraints), program.evaluations)
