@@ -476,7 +476,7 @@ def _motor_late(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 def _joint_late(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        late = min(0.04, 4e-3 * size)
+        late = min(0.04, 2.5e-3 * size)
         setting = Setting(faults={"late": every([late] * JOINTS)})
         return Hidden("joint_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
 
@@ -524,7 +524,7 @@ def _other_drag(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     other, sign = _other(random, joint), _sign(random)
 
     def sized(size: float) -> Hidden:
-        drag = sign * size * 3.0 * MOTOR_NOISE[joint - 1]
+        drag = sign * size * 1.2 * MOTOR_NOISE[joint - 1]
         setting = _trait(joint, other_drag=drag, other=float(other))
         return Hidden(
             "drag by a neighbour's speed",
@@ -558,7 +558,7 @@ def _memory(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidde
 
 def _inertial(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        share = min(1.0, size * 2.5 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
+        share = min(1.0, size * 1.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         setting = _trait(joint, inertial_friction=share)
         return Hidden(
             "friction by acceleration",
@@ -589,7 +589,7 @@ def _bent_sensor(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     other, phase = _other(random, joint), random.uniform(-math.pi, math.pi)
 
     def sized(size: float) -> Hidden:
-        scale = size * 4.0 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1]
+        scale = size * 2.5 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1]
         setting = _fault(joint, other=float(other), other_scale=scale, other_phase=phase)
         return Hidden(
             "sensor scale by a neighbour's angle",
@@ -605,7 +605,7 @@ def _bent_sensor(random: Random, joint: int, scene: Scene) -> Callable[[float], 
 
 def _dead_current(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        dead = min(COULOMB[joint - 1], size * 6.0 * MOTOR_NOISE[joint - 1])
+        dead = min(COULOMB[joint - 1], size * 15.0 * MOTOR_NOISE[joint - 1])
         setting = _fault(joint, motor_dead=dead)
         return Hidden(
             "small currents not reported",
