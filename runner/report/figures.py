@@ -37,7 +37,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 Results = ResultFolder | str | Path
 
-_POINTS = 900
+_POINTS = 700
 _BINS = 36
 _MOVING = 0.01
 
