@@ -37,7 +37,7 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
         estimator=wanted.estimator,
         resonance_hz=arm.resonance_hz,
     )
-    sessions = [read_session(record.path) for record in records if record.status == "success"]
+    sessions = [read_session(record.path, status=False) for record in records if record.status == "success"]
     return identify(sessions, Chain.from_urdf(arm.urdf), settings)
 
 
@@ -76,6 +76,7 @@ def summarise(
                 "file": record.path.name,
                 "exit_status": record.status,
                 "reason": record.reason,
+                "warnings": list(record.warnings),
             }
             for record in records
         ],
@@ -152,6 +153,7 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
         lines.append(f"  reason: {summary['reason']}")
     for entry in summary["sessions"]:
         lines.append(f"  {entry['file']:<20} {entry['exit_status']}  {entry['reason']}".rstrip())
+        lines += [f"    warning: {warning}" for warning in entry["warnings"]]
     for name, link in summary["link"].items():
         tracking = 1000 * max(link["worst_tracking_error_rad"])
         latency = ", ".join(f"{key} {1e6 * value:.0f} µs" for key, value in link["latency_s"].items())

@@ -41,10 +41,13 @@ _MANY_LAYOUTS = 8
 """Layouts of one block and size after which messages are decoded one by one."""
 
 
-def read_session(path: str | Path, joint_names: Sequence[str] | None = None) -> Session:
+def read_session(
+    path: str | Path, joint_names: Sequence[str] | None = None, *, status: bool = True
+) -> Session:
     """The session in the MCAP file `path`.
 
     joint_names : joints wanted, in this order; None takes those of `/joint_states` as they are
+    status : read `/fri/status` too, which takes as much memory as all torques and positions
 
     A file that was cut is read up to its last whole chunk and `missing` says what is not there. DataError,
     with file, topic and time, for: no MCAP, no `/joint_states`, a damaged chunk amid others, wrong types,
@@ -66,6 +69,8 @@ def read_session(path: str | Path, joint_names: Sequence[str] | None = None) -> 
                     f"{source}: a message in the chunk at byte {block.offset} belongs to no channel"
                 )
             if channel.topic not in TOPICS or channel.topic == "/tf":
+                continue
+            if channel.topic == "/fri/status" and not status:
                 continue
             if number not in readable:
                 readable[number] = _check_types(

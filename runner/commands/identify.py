@@ -203,7 +203,7 @@ def command(
     """
     if essential is False and (keep or drop):
         raise ConfigurationError("--keep and --drop say which parameters are essential; leave --no-essential")
-    logs = announced([read_session(path) for path in sessions], payload)
+    logs = announced([read_session(path, status=False) for path in sessions], payload)
     if urdf is None and logs[0].robot_description is None:
         raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
     chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
