@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import savgol_filter
 
 from fri.errors import ConfigurationError
 from lwr_driver.session.columns import JointColumns
@@ -25,6 +26,8 @@ _FOLLOWS = 0.9
 _CLEARLY = 4.0
 _LOADED = 0.8
 _GAIN = 3.0
+_SMOOTHING_S = 0.1
+_CREEP = 0.01  # below this speed [rad/s] the sign of the friction is not told
 
 
 @dataclass(frozen=True)
@@ -157,31 +160,34 @@ class KrlTorqueDecoder:
 class TorqueMatch:
     """How the motor torque of a joint compares with the joint torque sensors.
 
-    correlation : with the sensor of the same joint; gain : slope of the motor torque over that sensor
-    follows, follows_correlation : the joint whose sensor it follows best
+    The motor of a joint carries its sensor's torque, inertia and friction (equation 2 of the model),
+
+        tau = gain tau_l + Ia qdd + Fv qd + Fc sign(qd) + off,
+
+    which is fitted with the sensor and the motion of every joint.
+
+    correlation : multiple correlation of the fit with the joint's own sensor and motion; gain : its gain
+    load : partial correlation of the sensor alone, beside inertia and friction
+    follows, follows_correlation : the joint whose sensor and motion explain it best
     """
 
     joint: str
     correlation: float
     gain: float
+    load: float
     follows: str
     follows_correlation: float
 
     @property
     def swapped(self) -> bool:
-        """Whether another sensor explains it far better than its own: leaves a quarter of the variance."""
+        """Whether another joint explains it far better than its own: leaves a quarter of the variance."""
         own, other = 1.0 - self.correlation**2, 1.0 - self.follows_correlation**2
-        return (
-            self.follows != self.joint
-            and abs(self.follows_correlation) >= _FOLLOWS
-            and own > _CLEARLY * other
-        )
+        return self.follows != self.joint and self.follows_correlation >= _FOLLOWS and own > _CLEARLY * other
 
     @property
     def suspect(self) -> bool:
         """Whether order, sign or scale look wrong; friction and inertia leave the gain of a load near one."""
-        clear = abs(self.correlation) >= _LOADED
-        return self.swapped or (clear and not 1.0 / _GAIN < self.gain < _GAIN)
+        return self.swapped or (self.load >= _LOADED and not 1.0 / _GAIN < self.gain < _GAIN)
 
     def __str__(self) -> str:
         if self.swapped:
@@ -198,20 +204,70 @@ class TorqueMatch:
 def match_torques(joint: JointColumns, motor: JointColumns) -> tuple[TorqueMatch, ...]:
     """Compare motor torques with the joint torque sensors, interpolated at the times of the motor torques.
 
-    Motor torque is sensor torque plus friction and drive inertia, so a joint that carries a load correlates
-    with itself.
+    Where the positions are not recorded, friction and inertia are left out.
     """
-    sensor = np.stack(
-        [np.interp(motor.log_time, joint.log_time, column) for column in joint.effort.T], axis=1
-    )
-    a, b = sensor - sensor.mean(axis=0), motor.effort - motor.effort.mean(axis=0)
-    norm_a, norm_b = np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0)
-    pairs = (b.T @ a) / np.maximum(norm_b[:, None] * norm_a[None, :], 1e-300)
+    sensors, motions = _at_times(joint, motor)
+    torques = motor.effort - motor.effort.mean(axis=0)
+    total = np.maximum((torques**2).sum(axis=0), 1e-300)
+    explained = np.empty((len(joint.names), len(motor.names)))
+    gains, loads = np.zeros(len(motor.names)), np.zeros(len(motor.names))
+    for candidate in range(len(joint.names)):
+        basis = motions[candidate]
+        rest = torques - basis @ (basis.T @ torques)
+        own = sensors[:, candidate] - basis @ (basis.T @ sensors[:, candidate])
+        power = max(float(own @ own), 1e-300)
+        slope = (own @ rest) / power
+        left = np.maximum((rest**2).sum(axis=0) - slope**2 * power, 0.0)
+        explained[candidate] = np.sqrt(1.0 - np.minimum(left / total, 1.0))
+        name = joint.names[candidate]
+        if name in motor.names:
+            place = motor.names.index(name)
+            gains[place] = slope[place]
+            before = max(float((rest[:, place] ** 2).sum()), 1e-300)
+            loads[place] = np.sqrt(max(0.0, 1.0 - float(left[place]) / before))
     matches = []
-    for row, name in enumerate(motor.names):
-        best = int(np.argmax(np.abs(pairs[row])))
-        gain = float(b[:, row] @ a[:, row] / max(float(norm_a[row] ** 2), 1e-300))
+    for place, name in enumerate(motor.names):
+        best = int(np.argmax(explained[:, place]))
+        mine = float(explained[joint.names.index(name), place]) if name in joint.names else 0.0
         matches.append(
-            TorqueMatch(name, float(pairs[row, row]), gain, joint.names[best], float(pairs[row, best]))
+            TorqueMatch(
+                name,
+                mine,
+                float(gains[place]),
+                float(loads[place]),
+                joint.names[best],
+                float(explained[best, place]),
+            )
         )
     return tuple(matches)
+
+
+def _at_times(
+    joint: JointColumns, motor: JointColumns
+) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+    """At the times of the motor torques: sensors (n, J) without their means, and an orthonormal basis of
+    constant, velocity, its sign, and acceleration for each joint.
+    """
+
+    def there(column: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(motor.log_time, joint.log_time, column)
+
+    sensors = np.stack([there(column) for column in joint.effort.T], axis=1)
+    constant = np.ones((len(motor), 1))
+    columns = [[constant[:, 0]] for _ in joint.names]
+    width = 2 * round(0.5 * _SMOOTHING_S / joint.period_s) + 1 if len(joint) > 1 else 0
+    if joint.position.shape[1] and 5 <= width < len(joint):
+        velocity, acceleration = (
+            savgol_filter(joint.position, width, 3, deriv=order, delta=joint.period_s, axis=0)
+            for order in (1, 2)
+        )
+        for place, column in enumerate(columns):
+            qd = there(velocity[:, place])
+            column += [qd, np.tanh(qd / _CREEP), there(acceleration[:, place])]
+    bases = []
+    for column in columns:
+        table = np.stack(column, axis=1)
+        table /= np.maximum(np.linalg.norm(table, axis=0), 1e-300)
+        left, values, _ = np.linalg.svd(table, full_matrices=False)
+        bases.append(left[:, values > 1e-6 * values[0]])
+    return sensors - sensors.mean(axis=0), bases

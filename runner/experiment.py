@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,14 +14,15 @@ from typing import Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fri.errors import LwrError, RefusedError
+from fri.errors import LwrError, RefusedError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, Outcome
 from lwr_driver.driver import Progress as MotionProgress
 from lwr_driver.motion import Motion
+from lwr_driver.motor_torque import match_torques
 from lwr_driver.realtime import Rights
-from lwr_driver.session import session_metadata
+from lwr_driver.session import read_session, session_metadata
 from lwr_driver.trace import import_trace
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.interrupt import Interrupts
@@ -73,7 +75,7 @@ class LinkReport:
 
 @dataclass(frozen=True)
 class Record:
-    """How one session ended: its file, status, reason, and how the link was."""
+    """How one session ended: its file, status, reason, how the link was, and what is odd about its data."""
 
     name: str
     path: Path
@@ -81,6 +83,7 @@ class Record:
     reason: str
     link: LinkReport | None = None
     error: LwrError | None = None
+    warnings: tuple[str, ...] = ()
 
 
 class Onlooker(Protocol):
@@ -161,7 +164,7 @@ class Run:
                     motion, preflight = self._prepare(plan, here)
                 uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
                 driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
-                outcome = self._drive(plan, motion)
+                outcome = self._still_loaded(plan, here, self._drive(plan, motion))
                 recorded = driver.end_record(outcome.status, outcome.reason)
             finally:
                 bench.status.clear()
@@ -172,10 +175,39 @@ class Run:
             return Record(plan.name, path, "fail", f"the log could not be written: {recorded.error}", link)
         if traced:
             self._import_trace(path)
+        warnings = self._torque_warnings(path) if outcome.status == "success" else ()
+        for warning in warnings:
+            bench.status.say(warning)
         if outcome.status == "success":
             self._rest = self._at_rest(plan.payload)
             self._progress.finish(plan.name, self._rest)
-        return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error)
+        return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error, warnings)
+
+    def _still_loaded(self, plan: SessionPlan, before: Rest, outcome: Outcome) -> Outcome:
+        """The outcome; a failure if the payload is not what it was before the motion."""
+        if outcome.status != "success":
+            return outcome
+        check = check_payload(self.bench.arm, before, self._at_rest(plan.payload))
+        if check.ok:
+            return outcome
+        reason = f"the payload changed during the motion: {check.reason(self.bench.arm.joint_names)}"
+        return dataclasses.replace(outcome, status="fail", reason=reason, error=RobotError(reason))
+
+    def _torque_warnings(self, path: Path) -> tuple[str, ...]:
+        """Motor torques of a KRL program that follow another joint, or are of another size."""
+        if self.experiment.motor_torque.source != "krl_reals":
+            return ()
+        session = read_session(path)
+        if session.motor is None or len(session.motor) < 2:
+            return (
+                f"{path.name} has no motor torques: the counter `counter_int` in the KRL variables stands "
+                "still. It serves Model 1",
+            )
+        return tuple(
+            f"{path.name}: {match}; check `reals`, `scale` and `sign` of motor_torque.krl"
+            for match in match_torques(session.joint, session.motor)
+            if match.suspect
+        )
 
     def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
         """The motion of a session from where the arm is; RefusedError unless every check of it holds."""
