@@ -13,6 +13,7 @@ published URDF files.
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -390,6 +391,7 @@ SECTIONS: dict[str, Callable[[int, float], dict[str, Any]]] = {
 )
 def main(sections: tuple[str, ...], seeds: int, budget: float, output: Path | None) -> None:
     """Run the sections and print their figures."""
+    logging.getLogger("ident").setLevel(logging.ERROR)
     results = {}
     for name in sections or tuple(SECTIONS):
         begun = time.process_time()

@@ -8,7 +8,7 @@ the jerk; every joint keeps its velocity, acceleration and jerk limit, and one o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -159,14 +159,15 @@ def random_points(
     workspace: Workspace | None = None,
     checker: PathChecker | None = None,
     clearance_m: float = 0.0,
-    dwell_s: float = 0.0,
+    duration_s: float | None = None,
 ) -> PointToPoint:
     """Motion through `count` random postures and back to the first; every straight line keeps every limit in
     space.
 
     speed_scale : share of the velocity limits; a_max : acceleration limits instead of the arm's [rad/s²]
+    duration_s : total time, reached by a pause in each posture; None: no pauses
 
-    Raises RefusedError where no next posture can be found.
+    Raises RefusedError where no next posture can be found, ConfigurationError if the time is too short.
     """
     rng = np.random.default_rng(seed)
     space = workspace if workspace is not None else Workspace()
@@ -184,7 +185,14 @@ def random_points(
         postures.append(_reachable(rng, limits, free, postures, last=len(postures) == count - 1))
     postures.append(postures[0])
     acceleration = limits.a_max if a_max is None else np.minimum(a_max, limits.a_max)
-    return PointToPoint(np.array(postures), speed_scale * limits.v_max, acceleration, limits.j_max, dwell_s)
+    motion = PointToPoint(np.array(postures), speed_scale * limits.v_max, acceleration, limits.j_max)
+    if duration_s is None:
+        return motion
+    if motion.duration > duration_s:
+        raise ConfigurationError(
+            f"{count} postures take {motion.duration:.1f} s, longer than {duration_s} s; use fewer of them"
+        )
+    return replace(motion, dwell_s=(duration_s - motion.duration) / count)
 
 
 def _draw(rng: np.random.Generator, limits: Limits, free: Callable[[Array], bool]) -> Array:

@@ -72,6 +72,16 @@ def test_points_reach_a_limit_on_every_segment_and_break_none(
     assert slow.duration > points.duration
 
 
+def test_points_take_the_time_asked_for(mechanism: Mechanism, limits: Limits, points: PointToPoint) -> None:
+    paused = random_points(mechanism, limits, count=5, seed=2, duration_s=25.0)
+    assert paused.duration == pytest.approx(25.0)
+    np.testing.assert_array_equal(paused.postures, points.postures)
+    plan = ExcitationPlan(paused, tuple("abcdefg"))
+    assert plan.rows(0.005).shape == (5001, 7)
+    with pytest.raises(ConfigurationError, match=r"5 postures take .* longer than 5\.0 s"):
+        random_points(mechanism, limits, count=5, seed=2, duration_s=5.0)
+
+
 def test_points_obey_the_jerk_limit(mechanism: Mechanism, limits: Limits) -> None:
     smooth = replace(limits, j_max=np.full(7, 20.0))
     motion = random_points(mechanism, smooth, count=3, seed=2)
