@@ -163,26 +163,27 @@ class RcprgHandshake:
 class IdentificationHandshake:
     """The program of this project, configs/krl/lwr_identification.src.
 
-    ``$FRI_FRM_INT[16]`` asks for 1 monitor mode, 2 command mode, 3 the end. ``$FRI_TO_INT[16]`` tells the
-    phase: 1 monitor mode, 2 and 3 on the way to command mode, 4 command mode, 5 ended, 6 command mode was
-    lost and the PC must ask for monitor mode before anything else. ``[14]`` numbers the load data in
-    ``$FRI_FRM_REA[1..7]`` and tells which are in force.
+    ``$FRI_FRM_INT[16]`` asks for 11 monitor mode, 22 command mode, 33 the end: a packet has no check sum, and no
+    single damaged bit makes one of these another or nothing. ``$FRI_TO_INT[16]`` tells the phase: 1 monitor
+    mode, 2 and 3 on the way to command mode, 4 command mode, 5 ended, 6 command mode was lost and the PC must
+    ask for monitor mode before anything else. ``[14]`` numbers the load data in ``$FRI_FRM_REA[1..7]``
+    (``[13]``: the number again, negative; ``$FRI_FRM_REA[8]``: their sum) and tells which are in force.
     """
 
     name = "lwr_identification"
     can_close = True
 
     def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
-        """2 in [16]; the program knows position control only."""
-        cmd["krl_int"][15] = 2
+        """22 in [16]; the program knows position control only."""
+        cmd["krl_int"][15] = 22
 
     def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """1 in [16]."""
-        cmd["krl_int"][15] = 1
+        """11 in [16]."""
+        cmd["krl_int"][15] = 11
 
     def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """3 in [16], taken in monitor mode."""
-        cmd["krl_int"][15] = 3
+        """33 in [16], taken in monitor mode."""
+        cmd["krl_int"][15] = 33
 
     def opened(self, msr: np.ndarray) -> bool:
         """Any phase but the end."""
@@ -202,8 +203,9 @@ class IdentificationHandshake:
         """
         wanted = np.asarray(load, dtype=np.float32)
         if int(cmd["krl_int"][13]) == 0 or not np.array_equal(cmd["krl_real"][:7], wanted):
-            cmd["krl_real"][:7] = wanted
-            cmd["krl_int"][13] = max(int(cmd["krl_int"][13]), int(msr["krl_int"][13])) + 1
+            number = max(int(cmd["krl_int"][13]), int(msr["krl_int"][13])) + 1
+            cmd["krl_real"][:7], cmd["krl_real"][7] = wanted, wanted.sum()
+            cmd["krl_int"][12:14] = (-number, number)
 
     def load_taken(self, cmd: np.ndarray, msr: np.ndarray) -> bool:
         """Whether the load data last asked for are in force."""

@@ -8,6 +8,7 @@ from fri_rig import Rig
 
 from fri.errors import ConfigurationError
 from fri.handshake import IdentificationHandshake
+from fri.krc import EventKind
 from fri.krl import Interpreter
 from fri.krl_machine import AXES, NoMachinery, SourceProgram
 from fri.packets import JOINT_NAMES, new_cmd, new_msr
@@ -218,6 +219,50 @@ def test_phases_on_the_wire() -> None:
     assert not handshake.opened(msr)
     assert not handshake.stopped(msr)
     handshake.request_start(cmd, msr, Control.POSITION)
-    assert cmd["krl_int"][15] == 2
+    assert cmd["krl_int"][15] == 22
     msr["krl_int"][15], msr["state"] = 4, State.MON
     assert not handshake.started(msr)
+
+
+def test_a_damaged_bit_is_no_request_and_no_load() -> None:
+    bench = Bench()
+    bench.cycles(40)
+    bench.handshake.request_start(bench.rig.cmd, bench.rig.msr, Control.POSITION)
+    bench.cycles(200)
+    assert bench.handshake.started(bench.rig.msr)
+    for bit in range(31):
+        bench.rig.cmd["krl_int"][15] = 22 ^ 1 << bit
+        bench.cycles(10)
+        assert bench.rig.session.state is State.CMD, f"bit {bit} of the request"
+    bench.handshake.request_stop(bench.rig.cmd, bench.rig.msr)
+    bench.cycles(60)
+    load = np.array([3.34, 0.0, -66.0, 66.0, 0.01, 0.02, 0.03])
+    bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, load)
+    bench.cycles(40)
+    good = bench.rig.cmd.copy()
+    for bit in range(31):
+        bench.rig.cmd["krl_int"][13] = good["krl_int"][13] ^ 1 << bit
+        bench.rig.cmd["krl_real"][0] = 0.0
+        bench.cycles(10)
+    bench.rig.cmd[...] = good
+    bench.rig.cmd["krl_int"][12:14] = (-7, 7)
+    bench.rig.cmd["krl_real"][3] = 600.0
+    bench.cycles(20)
+    assert bench.machinery.load == pytest.approx(load)
+
+
+def test_after_a_fallback_a_damaged_request_does_not_start_anything() -> None:
+    bench = Bench()
+    bench.cycles(40)
+    bench.handshake.request_start(bench.rig.cmd, bench.rig.msr, Control.POSITION)
+    bench.cycles(200)
+    bench.rig.session.drop(EventKind.EXTERNAL, "test")
+    bench.cycles(100)
+    for bit in range(31):
+        bench.rig.cmd["krl_int"][15] = 22 ^ 1 << bit
+        bench.cycles(10)
+        bench.rig.cmd["krl_int"][15] = 22
+        bench.cycles(10)
+    bench.cycles(200)
+    assert bench.rig.session.state is State.MON
+    assert bench.rig.msr["krl_int"][15] == 6
