@@ -41,7 +41,7 @@ def test_summary_has_counts_parameters_truth_link_and_versions(finished: Finishe
     assert summary["counts"] == {"standard": 136, "not_identifiable": 18, "regrouped": 16, "base": 102}
     assert len(summary["parameters"]) == 102
     for entry in summary["parameters"]:
-        assert set(entry) == {"name", "unit", "estimate", "std", "rsd_percent", "truth"}
+        assert set(entry) == {"name", "unit", "estimate", "std", "rsd_percent", "interval_95", "truth"}
         assert np.isfinite([entry["estimate"], entry["std"], entry["truth"]]).all()
     truth = {entry["name"]: entry["truth"] for entry in summary["parameters"]}
     # Table 2 of the paper
@@ -56,9 +56,11 @@ def test_summary_has_counts_parameters_truth_link_and_versions(finished: Finishe
 def test_even_a_short_motion_finds_mass_and_heavy_moments(finished: Finished) -> None:
     parameters = json.loads((finished.folder / "summary.json").read_text())["parameters"]
     by_name = {entry["name"]: entry for entry in parameters}
-    for name, tolerance in (("M8", 0.02), ("MY2R", 0.02), ("MY4R", 0.02), ("Fcm1", 0.05), ("Fcm4", 0.05)):
+    for name, tolerance in (("M8", 0.02), ("MY2R", 0.05), ("MY4R", 0.05), ("Fcm1", 0.05), ("Fcm4", 0.05)):
         entry = by_name[name]
-        assert abs(entry["estimate"] - entry["truth"]) <= tolerance * abs(entry["truth"]), entry
+        error = abs(entry["estimate"] - entry["truth"])
+        assert error <= tolerance * abs(entry["truth"]), entry
+        assert error <= 3.5 * entry["std"], entry
 
 
 def test_model_file_gives_the_estimate_back(finished: Finished) -> None:
