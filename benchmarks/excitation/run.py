@@ -14,6 +14,9 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,13 +47,17 @@ from ident.excitation import (
     trade_off,
 )
 from ident.excitation.check import Limits
+from ident.excitation.motion import Samples
 from ident.excitation.objectives import TorqueLevel
 from ident.excitation.search import begin, random_start
+from ident.excitation.views import samples_view
+from lwr_driver.arm import Arm
 
 HERE = Path(__file__).resolve().parent
 FAST_ARM = str(HERE / "lwr4plus_urdf_speeds.yaml")
 CONDITION = "condition number, essential 49, unscaled"
 MANY = 100_000
+FIGAROH_PYTHON: str | None = None
 
 
 class Budget:
@@ -311,6 +318,53 @@ def gradient(seeds: int, budget: float) -> dict[str, Any]:
     return results
 
 
+def figaroh(seeds: int, budget: float) -> dict[str, Any]:
+    """FIGAROH's own planner beside ours: 43 rigid base columns, 24 s, the same arm and limits."""
+    knowledge = replace(PlanProblem.load("plans/default.yaml").knowledge, payload=None)
+    problem = base_problem(
+        24.0, FAST_ARM, model=1, sessions=("unloaded",), knowledge=knowledge, parameters="base"
+    )
+    names = assemble(problem).criteria.condition.assembly.names
+    rigid = tuple(name for name in names if not name.startswith(("Ia", "F", "off")))
+    problem = replace(problem, parameters=rigid)
+    assembled = assemble(problem)
+    found, seconds = solve(problem, 1, budget - 2.0)
+    results = {"ours": (*_conditions(assembled, assembled.view(found.motion)), seconds)}
+    if FIGAROH_PYTHON is not None:
+        arm = Arm.load(FAST_ARM)
+        for seed in range(max(1, seeds // 3)):
+            with tempfile.TemporaryDirectory() as folder:
+                output = Path(folder) / "figaroh.npz"
+                speeds = ",".join(f"{speed:.6f}" for speed in arm.v_max)
+                script, urdf = str(HERE / "figaroh_run.py"), str(arm.urdf_path)
+                command = [FIGAROH_PYTHON, script, urdf, str(output), str(seed), speeds]
+                environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+                done = subprocess.run(command, capture_output=True, env=environment, check=False)
+                if done.returncode != 0:
+                    click.echo(f"FIGAROH, seed {seed}: no trajectory")
+                    continue
+                with np.load(output) as data:
+                    q, qd, qdd, spent = data["q"], data["qd"], data["qdd"], float(data["cpu_s"])
+            setup = assembled.setup
+            view = samples_view(
+                Samples(q, qd, qdd, np.zeros_like(q)), setup.mechanism, setup.estimate, setup.columns
+            )
+            results[f"FIGAROH, seed {seed}"] = (*_conditions(assembled, view), spent)
+    else:
+        click.echo("FIGAROH: give its interpreter by --figaroh-python to run it too")
+    click.echo(f"{'43 rigid columns, 24 s':24s} condition  normalised  CPU s   (aim: 50, 12, 60 s)")
+    for label, (plain, normalised, spent) in results.items():
+        click.echo(f"{label:24s} {plain:9.1f} {normalised:11.1f} {spent:6.1f}")
+    return results
+
+
+def _conditions(assembled: Assembled, view: Any) -> tuple[float, float]:
+    criteria = assembled.criteria
+    both = (criteria.condition, criteria.condition_columns)
+    plain, normalised = (float(np.exp(criterion.evaluate(view, np.inf)[0])) for criterion in both)
+    return plain, normalised
+
+
 def _random(assembled: Assembled, speed: float, seed: int, ramp_s: float | None = None) -> Any:
     """Random points; `ramp_s` is the time to reach full velocity, None: acceleration 4 rad/s²."""
     limits = assembled.setup.limits
@@ -377,6 +431,7 @@ SECTIONS: dict[str, Callable[[int, float], dict[str, Any]]] = {
     "deviation": deviation,
     "front": front,
     "robustness": robustness,
+    "figaroh": figaroh,
 }
 
 
@@ -386,11 +441,16 @@ SECTIONS: dict[str, Callable[[int, float], dict[str, Any]]] = {
 )
 @click.option("--seeds", default=10, show_default=True, help="Searches per case.")
 @click.option("--budget", default=30.0, show_default=True, help="CPU seconds of a search.")
+@click.option("--figaroh-python", help="Interpreter of an environment that has figaroh and cyipopt-wheels.")
 @click.option(
     "--json", "output", type=click.Path(path_type=Path), help="Write the figures to a file as well."
 )
-def main(sections: tuple[str, ...], seeds: int, budget: float, output: Path | None) -> None:
+def main(
+    sections: tuple[str, ...], seeds: int, budget: float, figaroh_python: str | None, output: Path | None
+) -> None:
     """Run the sections and print their figures."""
+    global FIGAROH_PYTHON
+    FIGAROH_PYTHON = figaroh_python
     logging.getLogger("ident").setLevel(logging.ERROR)
     results = {}
     for name in sections or tuple(SECTIONS):
