@@ -217,7 +217,9 @@ class Loop:
             return None
         if not ready:
             self._leave()
-            self._held_back = remote.commanding and self._step() is None
+            if remote.commanding:
+                step = self._step()
+                self._held_back = step is None or bool(step.any())
             return None
         if commander.mode is Mode.MIRROR:
             step = self._step()

@@ -8,6 +8,7 @@ import struct
 import numpy as np
 import pytest
 
+from benchmarks.trust.reaction import CAUSES, measure
 from benchmarks.trust.stand import Stand, the_motion
 from benchmarks.trust.wire import FAULTS, PHASES, plan, run
 from fri.controller_end import ControllerEnd
@@ -204,3 +205,11 @@ def test_burst_of_late_packets_is_no_restart(stand):
     s.cycles(60)
     assert s.loop.remote.restarts == 0
     assert s.loop.remote.reordered > 8
+
+
+@pytest.mark.parametrize("cause", list(CAUSES))
+def test_reaction_is_within_the_limits_and_told(ring, tmp_path, cause):
+    found = measure(cause, 1, ring, tmp_path)
+    assert not found["bad"]
+    assert found["reason"]
+    assert found["sent"] <= 4
