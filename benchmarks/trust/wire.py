@@ -226,7 +226,7 @@ _NAMED: dict[str, str] = {
     "delay": f"{_ANSWERS}|{_PACKETS}",
     "jitter": f"{_ANSWERS}|{_PACKETS}",
     "reorder": f"{_ANSWERS}|{_PACKETS}",
-    "truncate": f"{_ANSWERS}|{_DAMAGED}",
+    "truncate": f"{_ANSWERS}|{_DAMAGED}|{_PACKETS}",
     "corrupt": f"{_ANSWERS}|{_DAMAGED}|{_PACKETS}|{_AGAIN}|left|set point|measured position|drives",
     "restart": f"{_AGAIN}|{_PACKETS}",
     "silent": _PACKETS,
@@ -234,6 +234,7 @@ _NAMED: dict[str, str] = {
     "other cycle": f"{_AGAIN}|{_PACKETS}|left command mode",
     "other version": f"{_DAMAGED}",
     "clock pace": _AGAIN,
+    "second client": _AGAIN,
     "foreign": "foreign|left command mode",
 }
 
