@@ -52,7 +52,8 @@ class DynamicModel:
     values : (p,). covariance : (p, p) or None.
     base : the base set when the parameters are base parameters, None for standard parameters.
     provenance : where the values come from (sessions, estimator, date, software), plain content for YAML.
-    effects : entries of further effects (`ident.effects`): cause, side, joints, parameters. `torque` has them,
+    effects : entries of further effects (`ident.effects`): cause, side, joints, parameters.
+    `torque` has them,
         the regressor does not.
 
     Raises ConfigurationError when names are unknown or repeat and when shapes do not fit.
@@ -196,13 +197,14 @@ class DynamicModel:
         with the physics of the model's effects.
 
         q, qd, qdd : (N, n). payload : the payload mounted, one of the structure's. time : (N,) [s], evenly
-        spaced, for effects with a memory; default 1 ms steps. measured : add what the sensors do to the torque.
+        spaced, for effects with a memory; default 1 ms steps. measured : add what the sensors do
+        to the torque.
         """
         position, speed, thrust = regressor.check_states(self.structure.chain, q, qd, qdd)
         chosen = self.structure.sides[0] if side is None else side
-        torque = self.linear_torque(position, speed, thrust, payload=payload, side=chosen)
+        torque: Floats = self.linear_torque(position, speed, thrust, payload=payload, side=chosen)
         if self.effects:
-            linear = {
+            linear: dict[str, Floats] = {
                 of: torque
                 if of == chosen
                 else self.linear_torque(position, speed, thrust, payload=payload, side=of)
@@ -232,7 +234,9 @@ class DynamicModel:
         payload: str | None = None,
         side: Side | None = None,
     ) -> Floats:
-        """Inverse dynamics (N, n) of the linear model alone, without its effects; arguments as in `torque`."""
+        """Inverse dynamics (N, n) of the linear model alone, without its effects; arguments as in
+        `torque`.
+        """
         chosen = self.structure.sides[0] if side is None else side
         chosen = self.structure.condition_sides(Condition(payload, (chosen,)))[0]
         position, speed, thrust = regressor.check_states(self.structure.chain, q, qd, qdd)
