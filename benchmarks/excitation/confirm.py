@@ -82,7 +82,7 @@ def group(name: str) -> str:
     symbol, link = name.rstrip("R").rstrip("0123456789"), int("".join(c for c in name if c.isdigit()))
     if link == 8:
         return "payload"
-    return next(label for label, symbols in GROUPS.items() if symbol in symbols)
+    return next((label for label, symbols in GROUPS.items() if symbol in symbols), "other")
 
 
 @click.command()

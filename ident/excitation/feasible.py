@@ -30,6 +30,7 @@ _log = logging.getLogger(__name__)
 _STARTS = 12
 _ROUNDS = 4
 _RESERVE = 3e-3
+_NEAR = 5e-3
 
 
 def arm_limits(arm: Arm, speed_scale: float = 1.0) -> Limits:
@@ -76,7 +77,7 @@ def feasible_fourier(
     blocked: dict[str, int] = {}
     for start in range(_STARTS):
         plan, check = _from_start(setup, seed, start, work, checker, clearance_m)
-        if check.ok:
+        if plan is not None:
             _log.info("feasible excitation found from start %d of %d", start + 1, _STARTS)
             provenance = {
                 "method": "feasible_fourier",
@@ -85,7 +86,7 @@ def feasible_fourier(
                 "arm": arm.name,
             }
             return ExcitationPlan(plan, arm.joint_names, periods, check=check, provenance=provenance)
-        worst = check.violations[0]
+        worst = (check.violations or check.tightest())[0]
         blame = f"{worst.subject} {worst.constraint}"
         blocked[blame] = blocked.get(blame, 0) + 1
     culprit = max(blocked, key=lambda key: blocked[key])
@@ -97,8 +98,8 @@ def feasible_fourier(
 
 def _from_start(
     setup: Setup, seed: int, start: int, work: Workspace, checker: PathChecker | None, clearance_m: float
-) -> tuple[ParametricMotion, Check]:
-    """The motion nearest to one random start, tightened until it passes or the rounds are over."""
+) -> tuple[ParametricMotion | None, Check]:
+    """The motion nearest to one random start, tightened until it passes; None if it does not."""
     with threadpool_limits(1):
         program = setup.program()
         program.constraints.rate = 200.0
@@ -106,7 +107,9 @@ def _from_start(
         program.anchor = x.copy()
         for _ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))
-            x = minimise(program, x, iterations=40, tolerance=1e-6).x
+            solution = minimise(program, x, iterations=40, tolerance=1e-6)
+            x = solution.x
+            near = float(solution.constraints.min()) > -_NEAR
             motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
             check = check_motion(
                 motion,
@@ -116,9 +119,11 @@ def _from_start(
                 estimate=setup.estimate,
                 checker=checker,
                 clearance_m=clearance_m,
-                continuous=True,
+                step_s=1e-3 if near else 0.05,
+                collision_step_s=1e-2 if near else 0.1,
+                continuous=near,
             )
-            if check.ok:
+            if (check.ok and near) or not near:
                 break
             tighten(program.constraints, check, setup.mechanism.joint_names)
-        return motion, check
+        return (motion if check.ok and near else None), check
