@@ -18,6 +18,8 @@ from lwr_driver.cell import Cell
 from runner.experiment import Bench, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import Laboratory
+from runner.options import json_option
+from runner.plain import as_json as to_json
 from runner.planning import excitation_rows, plan_excitation
 from runner.progress import Progress
 from runner.results import estimate, summarise, write_results
@@ -46,6 +48,7 @@ PLAN = "plan.yaml"
 @click.option(
     "--live-port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --live."
 )
+@json_option
 def command(
     file: str | None,
     out: Path | None,
@@ -54,6 +57,7 @@ def command(
     allow_non_realtime: bool,
     live: bool,
     live_port: int,
+    as_json: bool,
 ) -> None:
     """Run the experiment FILE; without one the default, against the built-in emulator.
 
@@ -80,9 +84,9 @@ def command(
     done = all(record.status == "success" for record in records)
     found = estimate(experiment, arm, records) if done else None
     summary = summarise(experiment, records, found)
-    click.echo(write_results(folder, experiment, arm, summary, found))
+    text = write_results(folder, experiment, arm, summary, found)
     _report(folder)
-    click.echo(str(folder))
+    click.echo(to_json({**summary, "folder": str(folder)}) if as_json else f"{text}\n{folder}")
     if not done:
         raise _failure(records[-1], folder)
 

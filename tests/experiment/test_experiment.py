@@ -87,6 +87,15 @@ def test_log_keeps_the_contract(finished: Finished) -> None:
     assert (spans[0][1] - spans[0][0]) * 1e-9 == pytest.approx(6.0, abs=0.011)
 
 
+def test_a_finished_experiment_is_estimated_again_and_told_as_json(finished: Finished) -> None:
+    again = run("experiment", "--resume", str(finished.folder), "--yes", "--json")
+    assert again.code == 0, again.text
+    told = json.loads(again.text[again.text.index("{") :])
+    assert told["exit_status"] == "success"
+    assert told["folder"] == str(finished.folder)
+    assert len(told["parameters"]) == 102
+
+
 def test_repeating_the_experiment_gives_identical_logs(finished: Finished, tmp_path: Path) -> None:
     again = run("experiment", str(experiment_file(tmp_path)), "--yes", "--out", str(tmp_path / "second"))
     assert again.code == 0, again.text
