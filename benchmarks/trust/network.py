@@ -100,9 +100,10 @@ def campaign(ledger: Ledger, options: Any) -> None:
     finally:
         log.removeHandler(ear)
     line = ledger.line("network", "another controller than the configured")
-    with RemoteEnd("127.0.0.1", 0, controller="127.0.0.2") as end, socket.socket(
-        socket.AF_INET, socket.SOCK_DGRAM
-    ) as other:
+    with (
+        RemoteEnd("127.0.0.1", 0, controller="127.0.0.2") as end,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
         other.bind(("127.0.0.1", 0))
         other.sendto(packet.tobytes(), end.address)
         heard = end.receive(0.1)

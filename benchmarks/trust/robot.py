@@ -59,7 +59,10 @@ def _strike(lab: Lab, what: str, random: np.random.Generator, folder: Path) -> l
     session = read_session(path)
     if session.end is None or session.end["exit_status"] != outcome.status:
         bad.append(f"log ends with {session.end}")
-    if len(session.joint) != recorded.samples or int((session.end or {}).get("missed", -1)) != session.joint.lost:
+    if (
+        len(session.joint) != recorded.samples
+        or int((session.end or {}).get("missed", -1)) != session.joint.lost
+    ):
         bad.append(f"log: {len(session.joint)} samples, {recorded}")
     if what == "arm held by force":
         lab.renew()
