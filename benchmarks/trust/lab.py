@@ -82,6 +82,8 @@ class Lab:
             self.driver.leave_command()
             pendant.release_emergency_stop()
             pendant.mode("EXT")
+            # In lock step the arm comes to rest only while packets go to and fro.
+            self.driver.monitor(100)
             pendant.drives(on=True)
             pendant.reset_monitor()
             self.driver.wait_quality(cycles=50)

@@ -1,0 +1,53 @@
+"""Other people's FRI clients on the emulator: both styles, both published handshakes, 1 to 100 ms."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.trust import compiled
+from benchmarks.trust.table import Ledger
+from runner.laboratory import free_port
+from sim_backend.process import EmulatorProcess
+
+__all__ = ["campaign"]
+
+_PERIODS_MS = (1, 2, 5, 10, 20, 50, 100)
+_PROGRAMS = {"stanford": "stanford", "ros": "ros_control"}
+
+
+def campaign(ledger: Ledger, options: Any) -> None:
+    """A client in C in each style, with each handshake, at each period; it must move the arm undisturbed."""
+    with tempfile.TemporaryDirectory() as name:
+        program = compiled.client(Path(name))
+        if program is None:
+            ledger.line("clients", "no C compiler here: not measured")
+            return
+        for style in ("superpose", "absolute"):
+            for handshake, krl in _PROGRAMS.items():
+                line = ledger.line("clients", f"C client, {style}, {krl}")
+                for period_ms in _PERIODS_MS:
+                    piece = f"{style} {handshake} {period_ms}"
+                    if not ledger.has("clients", piece):
+                        line.count(_one(program, style, handshake, krl, period_ms), f"{period_ms} ms")
+                        ledger.finish("clients", piece)
+                line.figures["periods"] = f"{_PERIODS_MS[0]} to {_PERIODS_MS[-1]} ms"
+
+
+def _one(program: Path, style: str, handshake: str, krl: str, period_ms: int) -> list[str]:
+    packets = 900 + max(300, 2000 // period_ms)
+    port = free_port("127.0.0.1")
+    settings = {"fri.program": krl}
+    with EmulatorProcess(fri_port=port, period_ms=period_ms, settings=settings) as emulator:
+        pc = compiled.start(program, port, style=style, handshake=handshake, packets=packets)
+        output, _ = pc.communicate(timeout=120)
+        received, commanded = (int(word) for word in output.split())
+        status = emulator.status()
+    bad = [] if received == packets else [f"{received} of {packets} packets"]
+    if commanded < 300:
+        bad.append(f"commanded {commanded} cycles only: {status['events'][-3:]}")
+    drops = [event for event in status["events"] if event["kind"] not in ("OPENED", "STARTED", "MISSES")]
+    if drops:
+        bad.append(f"the controller objected: {drops[0]}")
+    return bad

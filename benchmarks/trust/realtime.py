@@ -1,0 +1,186 @@
+"""Reply latency in real time, the driver and a minimal C client in turn, seen by the same sender.
+
+The sender stands in for the controller on the first processor (see `benchmarks/reply_latency.py`). What it sent
+late itself is left out: it says nothing about who answers. With and without real-time rights, with and
+without other programs that want the processors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.reply_latency import START, send
+from benchmarks.trust import compiled
+from benchmarks.trust.table import Ledger
+from lwr_driver.arm import Arm
+from lwr_driver.driver import Driver, LinkSettings
+from lwr_driver.loop_process import Scheduling
+from lwr_driver.motion import move_to
+from lwr_driver.realtime import assess
+from lwr_driver.session import session_metadata
+from runner.laboratory import free_port
+
+__all__ = ["campaign"]
+
+_SECONDS = 600.0
+_TURNS = 2
+_ON_TIME_S = 0.2e-3
+_QUANTILES = (0.5, 0.99, 0.999)
+_RATIO = 1.3
+_BEFORE = 400  # packets before command mode
+
+
+class _Sent:
+    """Latency and own lateness of the sender's packets in command mode [s]."""
+
+    def __init__(self) -> None:
+        self.latency: list[NDArray[np.float64]] = []
+        self.lateness: list[NDArray[np.float64]] = []
+
+    def take(self, port: int, period_ms: int, answer: Callable[[], None]) -> None:
+        """Send while `answer` lasts."""
+        context = multiprocessing.get_context("spawn")
+        mine, theirs = context.Pipe()
+        sender = context.Process(target=send, args=(port, period_ms, theirs), daemon=True)
+        sender.start()
+        try:
+            answer()
+            mine.send("enough")
+            if mine.poll(60.0):
+                latency, lateness = mine.recv()
+                self.latency.append(latency)
+                self.lateness.append(lateness)
+        finally:
+            sender.join(10.0)
+            sender.kill()
+
+    def figures(self) -> dict[str, Any]:
+        """Quantiles over the packets that left on time [us]; unanswered ones count as infinite."""
+        latency, lateness = np.concatenate(self.latency), np.concatenate(self.lateness)
+        chosen = np.sort(latency[lateness < _ON_TIME_S])
+        if not len(chosen):
+            return {"packets": 0}
+        places = [min(len(chosen) - 1, int(np.ceil(q * len(chosen))) - 1) for q in _QUANTILES]
+        micros = [round(1e6 * float(chosen[place]), 1) for place in places]
+        found = {
+            f"p{100 * q:g}": value if np.isfinite(value) else None
+            for q, value in zip(_QUANTILES, micros, strict=True)
+        }
+        return {
+            "packets": len(latency),
+            "on time": len(chosen),
+            "missed": int(np.sum(np.isinf(latency))),
+            **found,
+        }
+
+
+@contextlib.contextmanager
+def _load(count: int) -> Iterator[None]:
+    burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+def _drive(port: int, seconds: float, rights: bool) -> Callable[[], None]:
+    """What answers: the driver with its recorder, moving the arm."""
+
+    def answer() -> None:
+        arm = Arm.load()
+        link = LinkSettings("127.0.0.1", port, realtime="allow", link_timeout_s=5.0)
+
+        def scheduling(apply: bool, required: bool, **more: Any) -> Scheduling:
+            return Scheduling(apply and rights, required and rights, **more)
+
+        with (
+            patch("lwr_driver.driver.Scheduling", scheduling),
+            tempfile.TemporaryDirectory() as folder,
+            Driver(arm, link) as driver,
+        ):
+            driver.connect(timeout_s=60.0)
+            driver.record(Path(folder) / "latency.mcap", session_metadata(robot=arm.name))
+            driver.enter_command()
+            end, motions, period_s = time.monotonic() + seconds, 0, driver.state().period_s
+            while time.monotonic() < end:
+                goal = START + (0.5 if motions % 2 == 0 else 0.0)
+                here = driver.state().q_command
+                driver.execute(move_to(arm, here, goal, period_s, speed_scale=0.3))
+                motions += 1
+            driver.end_record("success")
+
+    return answer
+
+
+def _plain(program: Path, port: int, period_ms: int, seconds: float, rights: bool) -> Callable[[], None]:
+    """What answers: the C client."""
+
+    def answer() -> None:
+        cpu = max(os.sched_getaffinity(0)) if rights else -1
+        packets = _BEFORE + round(seconds / (1e-3 * period_ms))
+        client = compiled.start(program, port, realtime=rights, cpu=cpu, packets=packets)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            client.wait(60.0 + 2.0 * seconds)
+        client.kill()
+        client.wait()
+
+    return answer
+
+
+def campaign(ledger: Ledger, options: Any) -> None:
+    """For each period, rights and load: the driver, the C client, and the ratio at p99.9."""
+    seconds = options.seconds or _SECONDS
+    for shortage in (*assess().missing, *assess().advice):
+        options.say(f"  {shortage}")
+    with tempfile.TemporaryDirectory() as name:
+        program = compiled.client(Path(name))
+        for period_ms in options.periods_ms:
+            for rights in (True, False):
+                for load in (0, len(os.sched_getaffinity(0))):
+                    piece = f"{period_ms} ms{'' if rights else ', no rights'}{', load' if load else ''}"
+                    if not ledger.has("realtime", piece):
+                        with _load(load):
+                            _compare(ledger, program, period_ms, seconds, rights, piece)
+                        ledger.finish("realtime", piece)
+                        options.say(ledger.table("realtime").splitlines()[-1])
+
+
+def _compare(
+    ledger: Ledger, program: Path | None, period_ms: int, seconds: float, rights: bool, piece: str
+) -> None:
+    ours, plain = _Sent(), _Sent()
+    for _ in range(_TURNS):
+        port = free_port("127.0.0.1")
+        ours.take(port, period_ms, _drive(port, seconds / _TURNS, rights))
+        if program is not None:
+            port = free_port("127.0.0.1")
+            plain.take(port, period_ms, _plain(program, port, period_ms, seconds / _TURNS, rights))
+    found = ours.figures()
+    line = ledger.line("realtime", piece)
+    line.figures = {"driver [us]": found}
+    bad = []
+    if program is not None:
+        yardstick = plain.figures()
+        line.figures["C client [us]"] = yardstick
+        if found.get("p99.9") and yardstick.get("p99.9"):
+            ratio = found["p99.9"] / yardstick["p99.9"]
+            line.figures["ratio at p99.9"] = round(ratio, 2)
+            if rights and not ratio <= _RATIO:
+                bad.append(f"p99.9 is {ratio:.2f} times the C client's, at most {_RATIO}")
+    line.figures["load average"] = round(os.getloadavg()[0], 1)
+    line.count(bad)
