@@ -38,6 +38,7 @@ from tally import read_results, summary, tables  # noqa: E402
 @click.option("--without-reference", is_flag=True, help="Diagnose as if the arm had never been commissioned.")
 @click.option("--cause", "causes", multiple=True, help="Hide only these, one at a time.")
 @click.option("--again", is_flag=True, help="Diagnose cases once more that have a result.")
+@click.option("--recommission", is_flag=True, help="Make the references of the healthy arm anew.")
 @click.option("--discard", is_flag=True, help="Delete the logs of a case once it is judged.")
 @click.option("--report", is_flag=True, help="Run nothing.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("discovery"), show_default=True)
@@ -49,6 +50,7 @@ def main(
     without_reference: bool,
     causes: tuple[str, ...],
     again: bool,
+    recommission: bool,
     discard: bool,
     report: bool,
     out: Path,
@@ -56,6 +58,8 @@ def main(
     """Hide physics in simulated sessions, have them diagnosed, and count what is found."""
     plan = Plan(out, cases, seed, days, not without_reference, causes, discard)
     if not report:
+        if recommission:
+            plan.forget_references()
         run(plan, jobs, again, click.echo)
     results = read_results(plan.results)
     if not results:

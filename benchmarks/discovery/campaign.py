@@ -54,6 +54,12 @@ class Plan:
         """Where the sessions are."""
         return Store(self.out / "sessions")
 
+    def forget_references(self) -> None:
+        """Delete the references, and what healthy twins showed by them."""
+        for pattern in ("reference_*.yaml", "*/clean_error_*.json"):
+            for path in self.store.folder.glob(pattern):
+                path.unlink()
+
     def wanted(self) -> Iterator[tuple[int, str, str | None, Encoder]]:
         """Seed, kind, cause (None: drawn) and encoder of each case."""
         names, singles, healthy = list(CAUSES), 0, 0

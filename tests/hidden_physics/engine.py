@@ -5,6 +5,7 @@ file's content out. Nothing of a case but its logs goes in.
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 import time
 from collections.abc import Sequence
 from functools import cache
@@ -14,17 +15,19 @@ from typing import Any
 from hidden_physics.cases import Case, Sessions, Store, twin
 from hidden_physics.motions import SCHEDULES
 from hidden_physics.robots import Day, Encoder
-from ident.discrepancy.diagnose import ArmData, commission, diagnose
-from ident.discrepancy.reference import Reference
+from ident.discrepancy import ArmData, Reference, commission, diagnose
 from ident.kinematics import Chain
 from ident.model_file import read_model, write_model
 from lwr_driver.arm import Arm
 from lwr_driver.session import read_session
 
-__all__ = ["COMMISSIONING_DAYS", "commissioned", "diagnosed", "healthy_sets"]
+__all__ = ["COMMISSIONING_DAYS", "REFERENCE", "commissioned", "diagnosed", "healthy_sets"]
 
 COMMISSIONING_DAYS = 12
 _FIRST_DAY = 5000
+
+REFERENCE = Path(__file__).parent / "reference.yaml"
+"""The healthy arm with the link encoder, commissioned once: `python -m hidden_physics.engine` in `tests`."""
 
 
 @cache
@@ -71,3 +74,13 @@ def diagnosed(sessions: Sessions, reference: Path | None) -> tuple[dict[str, Any
         reference=None if reference is None else Reference.of(read_model(reference)),
     )
     return result.to_dict(), time.process_time() - began
+
+
+def main() -> None:
+    """Commission the arm anew, with 8 healthy days, and keep the reference beside this file."""
+    with tempfile.TemporaryDirectory() as folder:
+        REFERENCE.write_bytes(commissioned(Store(Path(folder)), "link", 8).read_bytes())
+
+
+if __name__ == "__main__":
+    main()
