@@ -10,7 +10,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
 help:
 	@echo "make experiment   set up and run the whole experiment against the built-in emulator"
-	@echo "make test         set up and run every check: ruff, mypy, pytest"
+	@echo "make test         set up and run ruff, mypy and the tests"
 	@echo "make test-slow    run the tests that take longer"
 	@echo "make screenshot   make the pictures of the README anew"
 	@echo "make clean        remove the virtual environment and the caches"
