@@ -77,9 +77,9 @@ def diagnosed(sessions: Sessions, reference: Path | None) -> tuple[dict[str, Any
 
 
 def main() -> None:
-    """Commission the arm anew, with 8 healthy days, and keep the reference beside this file."""
+    """Commission the arm anew, with 4 healthy days, and keep the reference beside this file."""
     with tempfile.TemporaryDirectory() as folder:
-        REFERENCE.write_bytes(commissioned(Store(Path(folder)), "link", 8).read_bytes())
+        REFERENCE.write_bytes(commissioned(Store(Path(folder)), "link", 4).read_bytes())
 
 
 if __name__ == "__main__":

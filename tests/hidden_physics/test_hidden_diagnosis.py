@@ -1,0 +1,61 @@
+"""The diagnosis of sessions whose physics it does not know; it gets logs and a healthy reference, no more."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from hidden_physics.cases import Case, Store, draw
+from hidden_physics.engine import REFERENCE, diagnosed
+from hidden_physics.verdict import judge
+from runner.cli import main
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return Store(tmp_path_factory.mktemp("hidden_cases"))
+
+
+def by_command(store: Store, case: Case) -> dict[str, Any]:
+    """What `lwr-run diagnose` writes about a case."""
+    sessions = store.sessions(case)
+    out = store.folder / "diagnosis"
+    arguments = [*map(str, sessions.train), "--test", str(sessions.test[0])]
+    arguments += ["--reference", str(REFERENCE), "--no-simulation", "--out", str(out)]
+    result = CliRunner().invoke(main, ["diagnose", *arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return dict(json.loads((out / "diagnosis.json").read_text()))
+
+
+def test_nothing_hidden_nothing_claimed_on_the_command_line(store: Store) -> None:
+    case = draw(1, "none", store)
+    verdict = judge(by_command(store, case), case.hidden)
+    assert verdict.silent, verdict.findings
+
+
+@pytest.mark.parametrize(
+    ("cause", "seed"),
+    [
+        ("viscous_nonlinear", 2),
+        pytest.param("sensor_crosstalk", 3, marks=pytest.mark.slow),
+        pytest.param("friction_asymmetry", 4, marks=pytest.mark.slow),
+    ],
+)
+def test_a_hidden_cause_is_named(store: Store, cause: str, seed: int) -> None:
+    case = draw(seed, "single", store, causes=[cause], size=2.5)
+    diagnosis, _ = diagnosed(store.sessions(case), REFERENCE)
+    verdict = judge(diagnosis, case.hidden)
+    assert verdict.first, (case.hidden[0].joints, verdict.findings)
+    assert not verdict.sure_wrong
+
+
+@pytest.mark.slow
+def test_what_no_catalogue_has_is_flagged_and_not_surely_named(store: Store) -> None:
+    case = draw(2, "outside", store, causes=["drag by a neighbour's speed"], size=3.0)
+    diagnosis, _ = diagnosed(store.sessions(case), REFERENCE)
+    verdict = judge(diagnosis, case.hidden)
+    assert not verdict.sure_wrong, verdict.findings
+    assert verdict.unexplained
