@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from ident.discrepancy.diagnose import ArmData, commission, diagnose
+from ident.discrepancy.bench import ArmData
+from ident.discrepancy.commission import commission
+from ident.discrepancy.diagnose import diagnose
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.result import Diagnosis, Finding, SimulationError
 from ident.discrepancy.settings import DiagnosisSettings

@@ -257,6 +257,7 @@ def _neighbours(values: Sequence[float], here: float) -> tuple[float, float]:
 def _setting(nominal: Nominal) -> Setting:
     motions: list[Motion] = nominal.motions
     q = np.concatenate([m.q for m in motions])
+    positive = np.mean(np.concatenate([m.joint_torque for m in motions]) > 0.0, axis=0)
     return Setting(
         sessions=len({m.session for m in motions}),
         durations_s=tuple(
@@ -264,6 +265,7 @@ def _setting(nominal: Nominal) -> Setting:
         ),
         gear_ratio=nominal.arm.gear_ratio,
         torque_range=np.max([np.abs(m.joint_torque).max(axis=0) for m in motions], axis=0),
+        torque_turns=np.minimum(positive, 1.0 - positive) > 0.02,
         speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
     )

@@ -45,6 +45,7 @@ class Arm:
     compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio :
     (n,), one where
     unknown. motor_delay_s, joint_delay_s : of the healthy channels.
+    encoder : `link` or `motor`, the side of the elastic joints whose positions are published.
     """
 
     chain: Chain
@@ -52,6 +53,7 @@ class Arm:
     gear_ratio: Floats
     motor_delay_s: float = 0.0
     joint_delay_s: float = 0.0
+    encoder: str = "link"
 
 
 def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStructure, BaseSet]:
@@ -130,10 +132,10 @@ class Nominal:
         drive = model.drive()
         bodies = {payload: model.inertial(payload) for payload in {r.payload for r in self.recordings}}
         motions = []
-        for recording, stretch in self.stretches:
+        for before, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
             body = bodies[recording.payload]
-            rigid = regressor.torque(self.arm.chain, stretch.q, stretch.qd, stretch.qdd, body)
-            link = rigid + drive["Fvl"] * stretch.qd + drive["Fcl"] * np.sign(stretch.qd) + drive["offl"]
+            rigid = regressor.torque(self.arm.chain, before.q, before.qd, before.qdd, body)
+            link = rigid + drive["Fvl"] * before.qd + drive["Fcl"] * np.sign(before.qd) + drive["offl"]
             motions.append(self._motion(recording, stretch, link, body, drive))
         self.motions = motions
         self.rows = self._rows()
@@ -148,14 +150,20 @@ class Nominal:
     ) -> Motion:
         n = self.arm.chain.n
         dt = float(stretch.time[1] - stretch.time[0])
-        speed, thrust = stretch.qd, stretch.qdd
+        q, qd, qdd = stretch.q, stretch.qd, stretch.qdd
+        speed, thrust = qd, qdd
         if np.any(self.arm.compliance > 0.0):
             # A measured torque is noisy, and its second derivative more so; a predicted one is not.
             wanted = self.settings.deflection_hz if bodies is not None else 20.0
+            if self.arm.encoder == "motor":
+                wanted = 10.0
             cutoff = min(wanted, 0.2 / dt)
             twist = low_pass(link_torque, dt, cutoff) * self.arm.compliance
             first, second = differentiate(twist, dt)
-            speed, thrust = speed + first, thrust + second
+            if self.arm.encoder == "motor":
+                q, qd, qdd = q - twist, qd - first, qdd - second
+            else:
+                speed, thrust = speed + first, thrust + second
         zero = np.zeros(n)
         values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), zero)
 
@@ -169,9 +177,9 @@ class Nominal:
             session=recording.number,
             time=stretch.time,
             duration_s=recording.duration_s,
-            q=stretch.q,
-            qd=stretch.qd,
-            qdd=stretch.qdd,
+            q=q,
+            qd=qd,
+            qdd=qdd,
             motor_speed=speed,
             motor_acceleration=thrust,
             joint_torque=link_torque,
@@ -181,6 +189,7 @@ class Nominal:
             link_coulomb=values["Fcl"],
             motor_coulomb=values["Fcm"],
             friction=friction,
+            measured_torque=stretch.effort if recording.has_effort else None,
         )
 
     # ---- rows ----

@@ -8,7 +8,7 @@ where nothing was wrong: what a claim must exceed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +33,7 @@ class Reference:
 
     model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
     noise : of a row [Nm] by side, (n,). null : largest gain of each candidate by (cause, joint from 0).
-    sets : number of healthy sets of sessions behind the null.
+    sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
     """
 
     model: DynamicModel
@@ -43,6 +43,7 @@ class Reference:
     noise: Mapping[str, Floats]
     null: Mapping[tuple[str, int], float]
     sets: int
+    encoder: str = "link"
 
     @classmethod
     def of(cls, model: DynamicModel) -> Reference:
@@ -56,7 +57,7 @@ class Reference:
             compliance = np.array(stored["compliance"], dtype=np.float64)
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
-            sets = int(stored["sets"])
+            sets, encoder = int(stored["sets"]), str(stored["encoder"])
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
                 f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
@@ -65,7 +66,7 @@ class Reference:
             raise ConfigurationError(
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
-        return cls(model, compliance, *delays, noise, null, sets)
+        return cls(model, compliance, *delays, noise, null, sets, encoder)
 
     def stored(self) -> dict[str, Any]:
         """Content for the provenance of the model."""
@@ -79,6 +80,7 @@ class Reference:
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
                 },
                 "sets": self.sets,
+                "encoder": self.encoder,
             }
         }
 
@@ -98,7 +100,9 @@ class Reference:
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
         covariance = own.covariance[np.ix_(there, there)] * _WIDER**2
         values = own.values[there]
-        tolerance = np.array([_tolerance(base.names[b]) for b in here]) * np.abs(values)
+        # Several sets tell by themselves what changes from day to day; one set cannot.
+        share = 1.0 if self.sets < 3 else 0.25
+        tolerance = share * np.array([_tolerance(base.names[b]) for b in here]) * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
         precision = np.zeros((len(base), len(base)))
@@ -128,9 +132,3 @@ def _same(a: BaseSet, b: BaseSet) -> list[tuple[int, int]]:
 def _combination(base: BaseSet, k: int) -> tuple[tuple[str, float], ...]:
     names, row = base.structure.names, base.matrix[k]
     return tuple((names[c], round(float(row[c]), 6)) for c in np.flatnonzero(np.abs(row) > 1e-9))
-
-
-def merged_null(parts: Sequence[Mapping[tuple[str, int], float]]) -> dict[tuple[str, int], float]:
-    """Largest gain of each candidate over several healthy sets."""
-    keys = {key for part in parts for key in part}
-    return {key: max(part.get(key, 0.0) for part in parts) for key in sorted(keys)}

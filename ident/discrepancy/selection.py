@@ -70,7 +70,8 @@ def select(
         carried = [t for t in found if state.carried(t)]
         if not carried:
             break
-        best = max((state.dictionary.refine(t, state.choices(t)) for t in carried[:4]), key=_gain)
+        refined = [state.dictionary.refine(t, state.choices(t)) for t in carried[:4]]
+        best = state.foremost(accepted, refined)
         log.info("%s: gain %.0f", best.candidate.key, best.score.gain)
         accepted = state.reconsider([*accepted, best])
         if best.candidate.key not in [t.candidate.key for t in accepted]:
@@ -82,7 +83,8 @@ def select(
 
 
 def _gain(trial: Trial) -> float:
-    return trial.score.gain
+    """Gain by which candidates are ordered: of two that explain the same, the one with less freedom."""
+    return trial.score.gain - 2.0 * len(trial.shape)
 
 
 @dataclass(eq=False)
@@ -115,7 +117,7 @@ class _State:
         if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
             for joint in range(nominal.arm.chain.n):
                 candidate = Candidate(EFFECTS["joint_elasticity"], joint)
-                rows = self.dictionary.rows(candidate, {"encoder": 0.0})
+                rows = self.dictionary.rows(candidate, {"encoder": float(nominal.arm.encoder == "motor")})
                 if rows:
                     size = self.settings.compliance_tolerance * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
@@ -151,6 +153,21 @@ class _State:
         taken = {t.candidate.key for t in accepted if not t.candidate.effect.event}
         found = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
         return sorted(found, key=_gain, reverse=True)
+
+    def foremost(self, accepted: Sequence[Trial], contest: Sequence[Trial]) -> Trial:
+        """The best of several trials; of those that come close, the one that leaves least together with the
+        deviations that are tolerated beside it.
+        """
+        top = max(_gain(t) for t in contest)
+        close = [t for t in contest if _gain(t) > 0.7 * top]
+        if len(close) == 1:
+            return close[0]
+        left = []
+        for trial in close:
+            self.tolerate([*accepted, trial])
+            left.append(self.evidence.chi_square + 2.0 * len(trial.shape))
+        self.tolerate(accepted)
+        return close[int(np.argmin(left))]
 
     def choices(self, trial: Trial) -> int:
         """Number of shapes that an event was chosen from."""

@@ -32,7 +32,9 @@ class Backlash(Effect):
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Both places of the encoder, sharp and soft crossing."""
+        """Both places of the encoder, sharp and soft crossing; none where the torque keeps its sign."""
+        if not setting.torque_turns[joint]:
+            return []
         top = float(setting.torque_range[joint])
         return [{"encoder": e, "width": max(1e-3, w * top)} for e in (1.0, 0.0) for w in (0.01, 0.05)]
 

@@ -6,8 +6,11 @@ import numpy as np
 
 from ident.effects.effect import Column
 from ident.effects.motion import Floats, Motion
+from ident.signals.filters import differentiate, low_pass
 
 __all__ = ["deflected"]
+
+_LINK_HZ, _MOTOR_HZ = 15.0, 30.0
 
 
 def deflected(
@@ -19,13 +22,20 @@ def deflected(
     the link the motor moves by the twist beside it: drive inertia and drive friction see its derivatives.
     scale : coefficient about which the columns are linearised.
     """
+    dt = motion.dt
+    # The torque's own acceleration part is noisy, and two more derivatives amplify it: with the link's inertia
+    # behind them more than with the drive's friction.
+    cutoff = min(_LINK_HZ if encoder_at_motor else _MOTOR_HZ, 0.2 / dt)
+    twist = low_pass(twist[:, None], dt, cutoff)
+    first, second = differentiate(twist, dt)
     if encoder_at_motor:
         shift = np.zeros_like(motion.q)
-        shift[:, joint] = -scale * twist
-        change = motion.displaced(shift) / scale
+        shift[:, joint] = -scale * twist[:, 0]
+        rate, thrust = np.zeros_like(shift), np.zeros_like(shift)
+        rate[:, joint], thrust[:, joint] = -scale * first[:, 0], -scale * second[:, 0]
+        change = motion.displaced(shift, rate, thrust) / scale
         return (Column(motor=change, joint=change),)
-    first = np.gradient(twist, motion.dt)
-    second = np.gradient(first, motion.dt)
+    first, second = first[:, 0], second[:, 0]
     # The jump of Coulomb friction moves by a millisecond or so; a column of spikes would say nothing else.
     here, there = motion.motor_speed, motion.motor_speed.copy()
     there[:, joint] += scale * first

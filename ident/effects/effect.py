@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.effects.motion import Floats, Motion
@@ -68,13 +69,15 @@ class Setting:
     """What the grid of shapes depends on.
 
     sessions : number of sessions. durations_s : of each. gear_ratio : (n,). torque_range, speed_range : (n,)
-        largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad].
+        largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad]. torque_turns :
+        (n,) whether the joint torque changes its sign for more than a moment.
     """
 
     sessions: int
     durations_s: tuple[float, ...]
     gear_ratio: Floats
     torque_range: Floats
+    torque_turns: NDArray[np.bool_]
     speed_range: Floats
     position_range: Floats
 

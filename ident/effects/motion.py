@@ -30,6 +30,8 @@ class Motion:
         sensor's noise.
     gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
     link_coulomb, motor_coulomb : (n,) Coulomb friction of link and drive [Nm].
+    measured_torque : (N, n) of the joints' sensors [Nm], for the twist of joints whose motion is not known well
+        enough to predict it; None takes the prediction.
     friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
     """
 
@@ -50,6 +52,7 @@ class Motion:
     link_coulomb: Floats
     motor_coulomb: Floats
     friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
+    measured_torque: Floats | None = None
 
     @property
     def n(self) -> int:
@@ -79,13 +82,10 @@ class Motion:
         tilted = replace(self.chain, gravity=9.81 * np.asarray(direction, dtype=np.float64))
         return regressor.gravity_torque(tilted, self.q, self.bodies)
 
-    def displaced(self, shift: Floats) -> Floats:
-        """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift, shift
-        (N, n) [rad].
+    def displaced(self, shift: Floats, rate: Floats, thrust: Floats) -> Floats:
+        """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift.
 
-        Derivatives of the shift are central differences, low-passed by the grid alone.
+        shift, rate, thrust : (N, n) [rad, rad/s, rad/s^2].
         """
-        first = np.gradient(shift, self.dt, axis=0)
-        second = np.gradient(first, self.dt, axis=0)
-        moved = self.rigid_torque(self.q + shift, self.qd + first, self.qdd + second)
+        moved = self.rigid_torque(self.q + shift, self.qd + rate, self.qdd + thrust)
         return moved - self.rigid_torque(self.q, self.qd, self.qdd)

@@ -78,7 +78,9 @@ def motion(chain: Chain, bodies: np.ndarray) -> Motion:
 
 def setting() -> Setting:
     spread = np.array([[-0.6, 0.6]] * 3)
-    return Setting(1, (4.0,), np.full(3, 100.0), np.full(3, 20.0), np.full(3, 2.0), spread)
+    return Setting(
+        1, (4.0,), np.full(3, 100.0), np.full(3, 20.0), np.ones(3, dtype=bool), np.full(3, 2.0), spread
+    )
 
 
 def shapes(cause: str) -> list[dict[str, float]]:

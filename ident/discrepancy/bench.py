@@ -1,0 +1,153 @@
+"""The bench of a diagnosis: rows, noise and evidence of the nominal arm for given sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fri.errors import DataError
+from ident.discrepancy.candidates import Dictionary
+from ident.discrepancy.evidence import Evidence, Floats, noise_floor
+from ident.discrepancy.nominal import Arm, Nominal, structure_of
+from ident.discrepancy.recording import Recording
+from ident.discrepancy.reference import Reference
+from ident.discrepancy.selection import Selection
+from ident.discrepancy.settings import DiagnosisSettings
+from ident.kinematics import Chain
+
+__all__ = ["ArmData", "Bench", "every_joint_moves", "mean_delay", "nominal_arm", "prepare_bench", "sharper"]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmData:
+    """What the arm's description knows: stiffness (n,) [Nm/rad] and gear ratio (n,); None where unknown."""
+
+    stiffness: Floats | None = None
+    gear_ratio: Floats | None = None
+
+
+@dataclass(eq=False)
+class Bench:
+    """The nominal arm with its evidence and dictionary."""
+
+    nominal: Nominal
+    evidence: Evidence
+    dictionary: Dictionary
+    told: bool
+
+
+def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None) -> Arm:
+    """The nominal arm from a reference, else from the arm's description."""
+    data = data or ArmData()
+    n = chain.n
+    ratio = np.ones(n) if data.gear_ratio is None else np.asarray(data.gear_ratio, dtype=float)
+    compliance = np.zeros(n) if data.stiffness is None else 1.0 / np.asarray(data.stiffness, dtype=float)
+    if reference is not None and len(reference.compliance) == n:
+        return Arm(
+            chain,
+            reference.compliance,
+            ratio,
+            reference.motor_delay_s,
+            reference.joint_delay_s,
+            reference.encoder,
+        )
+    return Arm(chain, compliance, ratio)
+
+
+def every_joint_moves(recordings: Sequence[Recording], chain: Chain) -> None:
+    """Raises DataError for a joint that never moves."""
+    for joint, name in enumerate(chain.joint_names):
+        if not any(np.ptp(s.q[:, joint]) > 0.01 for r in recordings for s in r.stretches):
+            raise DataError(
+                f"joint {name} never moves by more than 0.01 rad; a diagnosis needs motion of every joint. "
+                "Record an excitation, or use a chain in which the joint is fixed"
+            )
+
+
+def prepare_bench(
+    arm: Arm,
+    recordings: Sequence[Recording],
+    settings: DiagnosisSettings,
+    reference: Reference | None,
+    causes: Sequence[str] | None,
+    *,
+    fit_compliance: bool,
+) -> Bench:
+    """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
+    structure, base = structure_of(arm, recordings)
+    nominal = Nominal.of(arm, recordings, settings, structure, base)
+    prior = None if reference is None else reference.prior(base)
+    rounds = 3 if fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2 else 1
+    evidence, _ = _evidence(nominal, settings, None)
+    for _ in range(rounds):
+        nominal.refine(evidence.full.values[: len(base)])
+        evidence, told = _evidence(nominal, settings, prior)
+        if rounds > 1:
+            change = _compliance_step(nominal, evidence, arm)
+            if np.all(np.abs(change) < 0.03 * arm.compliance):
+                break
+            nominal.arm = replace(nominal.arm, compliance=nominal.arm.compliance + change)
+    return Bench(nominal, evidence, Dictionary(nominal, evidence, causes), told)
+
+
+def _evidence(
+    nominal: Nominal, settings: DiagnosisSettings, prior: tuple[Floats, Floats] | None
+) -> tuple[Evidence, bool]:
+    """Evidence with the noise floor that a first fit leaves."""
+    n = nominal.arm.chain.n
+    one = {side: np.ones(n) for side in nominal.rows}
+    first = Evidence(nominal, settings, one, one)
+    floors = _floors(nominal, first.residuals())
+    sigma = {side: floor[0] for side, floor in floors.items()}
+    dilution = {side: floor[1] for side, floor in floors.items()}
+    return Evidence(nominal, settings, sigma, dilution, prior), all(floor[2] for floor in floors.values())
+
+
+def _floors(nominal: Nominal, residual: Mapping[str, Floats]) -> dict[str, tuple[Floats, Floats, bool]]:
+    periods = {r.number: (r.start_s, r.period_s) for r in nominal.recordings}
+    return {side: noise_floor(nominal.rows[side], residual[side], periods) for side in nominal.rows}
+
+
+def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
+    """Gauss-Newton step (n,) of the joints' compliance from the motor rows."""
+    step = np.zeros(nominal.arm.chain.n)
+    dictionary = Dictionary(nominal, evidence, ["joint_elasticity"])
+    for candidate in dictionary.candidates:
+        rows = dictionary.rows(candidate, {"encoder": float(nominal.arm.encoder == "motor")})
+        score = evidence.score(evidence.padded(rows))
+        j = candidate.joint
+        value, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
+        if abs(value) > 3.0 * std:
+            wanted = nominal.arm.compliance[j] + value
+            step[j] = np.clip(wanted, 0.0, 3.0 * arm.compliance[j]) - nominal.arm.compliance[j]
+    return step
+
+
+def sharper(bench: Bench, selection: Selection) -> tuple[dict[str, Floats], dict[str, Floats]] | None:
+    """Noise floor with the findings taken out, None where it hardly differs from the one that was used."""
+    if not selection.claims:
+        return None
+    evidence = bench.evidence
+    evidence.replace([*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
+    floors = _floors(bench.nominal, evidence.residuals())
+    sigma = {side: floor[0] for side, floor in floors.items()}
+    dilution = {side: floor[1] for side, floor in floors.items()}
+    ratio = min(
+        float(
+            np.min(sigma[side] ** 2 * dilution[side] / (evidence.sigma[side] ** 2 * evidence.dilution[side]))
+        )
+        for side in sigma
+    )
+    return (sigma, dilution) if ratio < 0.9 else None
+
+
+def mean_delay(nuisance: Mapping[str, tuple[float, float]], side: str) -> tuple[float, float]:
+    """Weighted mean of the delays of a side that were tolerated, and its standard deviation [s]."""
+    entries = [value for name, value in nuisance.items() if name.startswith(f"{side} delay")]
+    weights = [1.0 / max(std, 1e-6) ** 2 for _, std in entries]
+    if not entries:
+        return 0.0, 2e-4
+    mean = sum(w * value for w, (value, _) in zip(weights, entries, strict=True)) / sum(weights)
+    return float(mean), float(1.0 / np.sqrt(sum(weights)))

@@ -1,0 +1,322 @@
+"""From claims to findings: parameters, evidence on held-out rows, doubts, the extended model, the notes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ident.discrepancy.bench import Bench, mean_delay
+from ident.discrepancy.candidates import Trial
+from ident.discrepancy.evidence import Floats, Rows
+from ident.discrepancy.gain import HeldOut, held_out, interval
+from ident.discrepancy.hygiene import SampleLoss
+from ident.discrepancy.nominal import Arm
+from ident.discrepancy.probes import Remainder, find_remainders
+from ident.discrepancy.reference import Reference
+from ident.discrepancy.result import Diagnosis, Evident, Finding, SimulationError, Unexplained, Value
+from ident.discrepancy.selection import Claim, Selection
+from ident.discrepancy.settings import DiagnosisSettings
+from ident.effects import EFFECTS
+from ident.model import DynamicModel
+
+if TYPE_CHECKING:
+    from lwr_driver.session import Session
+
+__all__ = ["Simulate", "conclude", "timing_finding"]
+
+Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
+"""Replays sessions with a model and says how far off it is; what the runner gives."""
+
+_DOUBT = 0.2
+
+
+def conclude(
+    bench: Bench,
+    selection: Selection,
+    timing: list[Finding],
+    loss: tuple[SampleLoss, ...],
+    settings: DiagnosisSettings,
+    reference: Reference | None,
+    model: DynamicModel | None,
+    simulate: Simulate | None,
+    sessions: Sequence[Session],
+    test: Sequence[Session],
+) -> Diagnosis:
+    """The diagnosis from the claims of a selection, the timing findings and the lost samples."""
+    evidence, nominal = bench.evidence, bench.nominal
+    nuisance = selection.nuisance_rows
+    before = held_out(evidence, nuisance)
+    rows_of = [c.trial.rows for c in selection.claims]
+    after = held_out(evidence, [*rows_of, *nuisance])
+    kept: list[tuple[Claim, Finding]] = []
+    for k, claim in enumerate(selection.claims):
+        others = [*(r for i, r in enumerate(rows_of) if i != k), *nuisance]
+        without = held_out(evidence, others)
+        evidence.replace(others)
+        finding = _finding(claim, bench, without, after, settings)
+        # An extension that makes the held-out error larger is none.
+        if finding.evidence.gain_interval_95[1] > 0.0:
+            kept.append((claim, finding))
+    claims = [claim for claim, _ in kept]
+    evidence.replace([*(c.trial.rows for c in claims), *nuisance])
+    after = held_out(evidence, [*(c.trial.rows for c in claims), *nuisance])
+    remainders = find_remainders(bench.dictionary, evidence, settings)
+    findings = [_doubted(claim, finding, remainders, nominal.arm.chain.n) for claim, finding in kept]
+    findings += timing
+    if loss:
+        findings.append(_loss_finding(loss))
+    findings.sort(key=lambda f: -f.gain)
+    extended_rms, base_rms = after.rms(), before.rms()
+    base_model, extended, changes = _models(bench, claims, nuisance, findings, sessions)
+    unexplained = tuple(
+        Unexplained(
+            r.side,
+            r.joint,
+            r.depends_on,
+            float(extended_rms[r.side][r.joint - 1]),
+            float(evidence.sigma[r.side][r.joint - 1]),
+        )
+        for r in remainders
+    )
+    replayed = list(test) or list(sessions)
+    simulation = extended_simulation = None
+    if simulate is not None:
+        simulation = simulate(model or base_model, replayed)
+        extended_simulation = simulate(extended, replayed) if findings else simulation
+    return Diagnosis(
+        train=tuple(r.name for r in nominal.recordings if not r.test),
+        test=tuple(r.name for r in nominal.recordings if r.test),
+        model_number=nominal.structure.model,
+        findings=tuple(findings),
+        unexplained=unexplained,
+        noise_floor=evidence.sigma,
+        rms_base=base_rms,
+        rms_extended=extended_rms,
+        base_model=base_model,
+        extended_model=extended,
+        changes=changes,
+        scores=selection.scores,
+        nuisance=selection.nuisance,
+        simulation_base=simulation,
+        simulation_extended=extended_simulation,
+        notes=_notes(bench, reference),
+        residuals={"base": before.residual, "extended": after.residual},
+    )
+
+
+def _finding(
+    claim: Claim, bench: Bench, without: HeldOut, after: HeldOut, settings: DiagnosisSettings
+) -> Finding:
+    """The finding of a claim, all others being in the base."""
+    candidate, score = claim.trial.candidate, claim.score
+    keys = [key for key in claim.trial.rows if np.any(claim.trial.rows[key])]
+    keys = sorted(keys, key=lambda key: -_relative(without, after, key))[: max(1, len(keys) // 7)]
+    rms_before, rms_after, low, high = interval(without, after, keys, settings.seed)
+    count = sum(float(m.sum()) for m in bench.evidence.mask.values())
+    parameters = len(candidate.effect.parameters)
+    return Finding(
+        cause=candidate.cause,
+        side=candidate.effect.side,
+        joints=candidate.joints,
+        parameters=_parameters(claim.trial, bench),
+        evidence=Evident(
+            float(-score.fitted + parameters * np.log(count)),
+            score.p_value,
+            rms_before,
+            rms_after,
+            (low, high),
+        ),
+        confidence=claim.confidence,
+        alternatives=tuple(
+            (c.cause, c.joints, float(-gain + np.log(count))) for c, gain in claim.alternatives
+        ),
+        tell_apart=candidate.effect.tell_apart.format(joint=candidate.joint + 1),
+        gain=score.gain,
+        mode=candidate.effect.mode(claim.trial.shape),
+    )
+
+
+def _relative(without: HeldOut, after: HeldOut, key: tuple[str, int]) -> float:
+    side, joint = key
+    a, b = without.residual[side][:, joint], after.residual[side][:, joint]
+    power = np.nanmean(b**2) if np.isfinite(b).any() else 1.0
+    return float((np.nanmean(a**2) - power) / power) if np.isfinite(a).any() else 0.0
+
+
+def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
+    """Values with standard deviations; those of the shape from the columns' derivatives."""
+    evidence, dictionary = bench.evidence, bench.dictionary
+    effect, shape = trial.candidate.effect, dict(trial.shape)
+    joint_rows: dict[tuple[str, int], list[Floats]] = {key: [v] for key, v in trial.rows.items()}
+    moved = []
+    for name in effect.continuous(shape):
+        step = 0.02 * abs(shape[name]) or 0.02
+        upper = dictionary.rows(trial.candidate, {**shape, name: shape[name] + step})
+        lower = dictionary.rows(trial.candidate, {**shape, name: shape[name] - step})
+        derivative = {
+            key: ((upper.get(key, 0.0) - lower.get(key, 0.0)) / (2.0 * step) @ trial.score.coefficients)[
+                :, None
+            ]
+            for key in trial.rows
+        }
+        if any(np.any(v) for v in derivative.values()):
+            moved.append(name)
+            for key, column in derivative.items():
+                joint_rows[key].append(column)
+    rows: Rows = {key: np.concatenate(parts, axis=1) for key, parts in joint_rows.items()}
+    wide = evidence.score(evidence.padded(rows))
+    k = len(trial.score.coefficients)
+    if np.isfinite(wide.gain) and len(wide.coefficients) == k + len(moved):
+        std = np.sqrt(np.maximum(np.diag(wide.covariance), 0.0))
+    else:
+        std = np.append(np.sqrt(np.maximum(np.diag(trial.score.covariance), 0.0)), np.zeros(len(moved)))
+    found = {}
+    for parameter, value, s in zip(effect.linear, trial.score.coefficients, std[:k], strict=False):
+        if parameter.name not in effect.hidden:
+            found[parameter.name] = Value(float(value), float(s), parameter.unit)
+    spread = dict(zip(moved, std[k:], strict=True))
+    for parameter in effect.shape_parameters:
+        if parameter.name in shape:
+            found[parameter.name] = Value(
+                float(shape[parameter.name]), float(spread.get(parameter.name, 0.0)), parameter.unit
+            )
+    return found
+
+
+def _doubted(claim: Claim, finding: Finding, remainders: Sequence[Remainder], joints: int) -> Finding:
+    """Less confidence in a name that leaves much in the rows that it explains."""
+    mine = set(claim.trial.rows)
+    left = sum(r.gain for r in remainders if (r.side, r.joint - 1) in mine)
+    if len(mine) > joints:
+        left /= 2.0
+    if left > _DOUBT * claim.gain:
+        return replace(finding, confidence=min(finding.confidence, 0.75 * claim.gain / (claim.gain + left)))
+    return finding
+
+
+def timing_finding(
+    claim: Claim, known: Arm, bench: Bench, after: Selection, before: HeldOut, settings: DiagnosisSettings
+) -> Finding:
+    """Finding of a late channel: the shift that was made and what is left of it."""
+    candidate = claim.trial.candidate
+    side = "motor" if candidate.cause == "motor_torque_delay" else "joint"
+    arm = bench.nominal.arm
+    made = (
+        arm.motor_delay_s - known.motor_delay_s
+        if side == "motor"
+        else arm.joint_delay_s - known.joint_delay_s
+    )
+    rest, std = mean_delay(after.nuisance, side)
+    now = held_out(bench.evidence, [*(c.trial.rows for c in after.claims), *after.nuisance_rows])
+    same = all(now.residual[s].shape == before.residual[s].shape for s in now.residual)
+    keys = [(side, j) for j in range(bench.nominal.arm.chain.n)]
+    numbers = interval(before, now, keys, settings.seed) if same else (0.0, 0.0, 0.0, 0.0)
+    return Finding(
+        candidate.cause,
+        "timing",
+        (),
+        {"delay": Value(made + rest, std, "s")},
+        Evident(-claim.score.fitted, claim.score.p_value, numbers[0], numbers[1], (numbers[2], numbers[3])),
+        claim.confidence,
+        tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),
+        candidate.effect.tell_apart,
+        claim.gain,
+    )
+
+
+def _loss_finding(loss: tuple[SampleLoss, ...]) -> Finding:
+    worst = loss[0]
+    effect = EFFECTS["lost_samples"]
+    count = worst.samples + worst.lost
+    std = float(np.sqrt(worst.share * (1.0 - worst.share) / count))
+    return Finding(
+        "lost_samples",
+        "timing",
+        (),
+        {"share": Value(worst.share, std, "1")},
+        Evident(-float(count) * worst.share, 1e-12, 0.0, 0.0, (0.0, 0.0)),
+        0.99,
+        (),
+        effect.tell_apart,
+        float(worst.lost + worst.repeated),
+        mode=f"{worst.lost} lost and {worst.repeated} repeated of {count} {worst.channel} samples in "
+        f"{worst.session}",
+    )
+
+
+def _models(
+    bench: Bench,
+    claims: Sequence[Claim],
+    nuisance: Sequence[Rows],
+    findings: Sequence[Finding],
+    sessions: Sequence[Session],
+) -> tuple[DynamicModel, DynamicModel, dict[str, float]]:
+    """Base and extended model, and the change of the base parameters in their standard deviations."""
+    evidence, nominal = bench.evidence, bench.nominal
+    p = evidence.base_count
+    robot = sessions[0].metadata.get("robot", "") or "arm"
+    provenance: dict[str, Any] = {
+        "sessions": [r.name for r in nominal.recordings if not r.test],
+        "estimator": "diagnosis",
+    }
+    models = []
+    for rows, effects in (
+        ([], ()),
+        ([c.trial.rows for c in claims], tuple(_entry(f) for f in findings if f.cause != "lost_samples")),
+    ):
+        evidence.replace([*rows, *nuisance])
+        models.append(
+            DynamicModel(
+                robot,
+                nominal.structure,
+                nominal.base.names,
+                evidence.full.values[:p].copy(),
+                evidence.covariance()[:p, :p],
+                nominal.base,
+                provenance,
+                effects,
+            )
+        )
+    base, extended = models
+    assert extended.std is not None
+    shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
+    order = np.argsort(-np.abs(shift))[:10]
+    changes = {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0} if claims else {}
+    return base, extended, changes
+
+
+def _entry(finding: Finding) -> dict[str, Any]:
+    """A finding as an entry of a model's effects."""
+    return {
+        "cause": finding.cause,
+        "side": finding.side,
+        "joints": list(finding.joints),
+        "parameters": {
+            name: {"value": v.value, "std": v.std, "unit": v.unit} for name, v in finding.parameters.items()
+        },
+    }
+
+
+def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:
+    notes = []
+    if "motor" not in bench.nominal.rows:
+        notes.append(
+            "no motor torque: causes on the motor side cannot be seen, and sensor causes are told "
+            "from physical "
+            "ones by their shape alone"
+        )
+    if reference is None:
+        notes.append(
+            "no reference of the healthy arm: a constant change that base parameters absorb (payload, torque "
+            "constant, wear, offsets) cannot be seen; run `lwr-run commission` when the arm is healthy"
+        )
+    elif bench.evidence.prior is None:
+        notes.append(
+            "the reference shares no base parameter with these sessions: parameters are not compared"
+        )
+    if not bench.told:
+        notes.append("the motion does not repeat: the noise is taken from neighbouring rows")
+    return tuple(notes)
