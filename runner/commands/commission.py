@@ -25,7 +25,8 @@ __all__ = ["command"]
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
 )
 def command(sessions: tuple[Path, ...], sets: int, out: Path, arm: str | None, urdf: Path | None) -> None:
-    """Learn the healthy arm from SESSIONS: its parameters, stiffness, delays, noise, and what chance looks like.
+    """Learn the healthy arm from SESSIONS: its parameters, stiffness, delays, noise, and what
+    chance looks like.
 
     The more sets of sessions, the better known is what each cause may seem to explain where nothing is wrong:
     one set is a beginning, eight are good.
