@@ -13,7 +13,7 @@ import sys
 def main() -> None:
     """Instrument, import, fuzz."""
     try:
-        import atheris
+        import atheris  # type: ignore[import-untyped, import-not-found]
     except ImportError:
         raise SystemExit("atheris is not installed; `pip install .[fuzz]`, or use `trust input`") from None
     with atheris.instrument_imports(

@@ -73,7 +73,8 @@ def mangle(name: str, data: bytes, random: np.random.Generator) -> bytes:
 def _mangle_tree(data: bytes, random: np.random.Generator) -> bytes:
     tree = yaml.safe_load(data)
     for _ in range(int(random.integers(1, 4))):
-        node, path = tree, []
+        node: Any = tree
+        path: list[tuple[Any, Any]] = []
         while isinstance(node, dict | list) and node and (not path or random.random() < 0.75):
             keys = list(node) if isinstance(node, dict) else list(range(len(node)))
             key = keys[int(random.integers(len(keys)))]
