@@ -72,6 +72,9 @@ def figures(results: Sequence[Result]) -> dict[str, Any]:
     rates = {
         "single, rho >= 1.1": _rate([_first(r) for r in singles if r["rho"] >= _VISIBLE]),
         "single, 1.03 <= rho < 1.1": _rate([_first(r) for r in singles if 1.03 <= r["rho"] < 1.1]),
+        "of those named with rho >= 1.03, not as look-alikes": _rate(
+            [r["verdict"]["outright"] for r in singles if r["rho"] >= 1.03 and _first(r)]
+        ),
         "nothing hidden, no finding": _rate([r["verdict"]["silent"] for r in healthy]),
         "pairs exactly right": _rate([r["verdict"]["exact"] for r in pairs]),
         "pairs, at least one right": _rate([any(r["verdict"]["named"]) for r in pairs]),

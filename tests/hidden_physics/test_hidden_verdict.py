@@ -44,6 +44,7 @@ def test_name_and_joint_must_both_be_right() -> None:
     right = judge(diagnosis(found("stribeck", 2)), hidden)
     assert right.named == (True,)
     assert right.first
+    assert right.outright
     assert right.exact
     assert not right.false
     for wrong in (found("stribeck", 3), found("friction_load", 2), found("stribeck", 2, 3)):
@@ -57,6 +58,7 @@ def test_a_look_alike_counts_only_without_certainty() -> None:
     alike = [("stribeck", {})]
     unsure = judge(diagnosis(found("presliding_hysteresis", 2, confidence=0.6, alternatives=alike)), hidden)
     assert unsure.exact
+    assert not unsure.outright
     sure = judge(diagnosis(found("presliding_hysteresis", 2, confidence=0.9, alternatives=alike)), hidden)
     assert not sure.named[0]
     assert sure.sure_wrong

@@ -28,7 +28,7 @@ class Verdict:
     """What a diagnosis is worth.
 
     named : for each hidden cause whether a finding has its name and joint, or names it as a look-alike
-    first : whether the first finding does that for one of them. exact : all are named and nothing else
+    first : whether the first finding does that for one of them; outright : by its own name and joint. exact : all are named and nothing else
     sure_wrong : findings that are false and sure. false : findings that fit nothing hidden
     findings : all of them, in order. unexplained : number of entries
     flagged : for effects outside the catalogue: something is unexplained there and nothing is sure
@@ -39,6 +39,7 @@ class Verdict:
 
     named: tuple[bool, ...]
     first: bool
+    outright: bool
     exact: bool
     false: tuple[str, ...]
     sure_wrong: tuple[str, ...]
@@ -81,6 +82,7 @@ def judge(
     return Verdict(
         named=named,
         first=bool(len(findings) and fits[0].any()),
+        outright=bool(findings) and any(_is(findings[0], cause) for cause in hidden),
         exact=bool(hidden) and all(named) and not false,
         false=tuple(_label(finding) for finding in false),
         sure_wrong=tuple(_label(finding) for finding in false if _sure(finding)),
@@ -110,8 +112,12 @@ def _same_place(stated: Sequence[Any], cause: Hidden) -> bool:
     return {int(joint) for joint in stated} == set(cause.joints)
 
 
+def _is(finding: Mapping[str, Any], cause: Hidden) -> bool:
+    return bool(finding["cause"] == cause.cause and _same_place(finding["joints"], cause))
+
+
 def _fits(finding: Mapping[str, Any], cause: Hidden) -> bool:
-    if finding["cause"] == cause.cause and _same_place(finding["joints"], cause):
+    if _is(finding, cause):
         return True
     if _sure(finding):
         return False
