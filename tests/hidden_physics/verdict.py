@@ -28,7 +28,8 @@ class Verdict:
     """What a diagnosis is worth.
 
     named : for each hidden cause whether a finding has its name and joint, or names it as a look-alike
-    first : whether the first finding does that for one of them; outright : by its own name and joint. exact : all are named and nothing else
+    first : whether the first finding does that for one of them. outright : by its own name
+    and joint. exact : all are named and nothing else
     sure_wrong : findings that are false and sure. false : findings that fit nothing hidden
     findings : all of them, in order. unexplained : number of entries
     flagged : for effects outside the catalogue: something is unexplained there and nothing is sure
