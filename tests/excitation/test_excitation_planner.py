@@ -333,3 +333,15 @@ def test_hypervolume_of_boxes() -> None:
     paper = np.array([[34.01, -1.56, -0.92], [37.23, -1.64, -1.64]])
     assert hypervolume(paper, np.array([84.21, 0.0, 0.0])) == pytest.approx(131.0, abs=1.0)
     np.testing.assert_array_equal(not_dominated(np.array([[1, 2], [2, 1], [2, 2]])), [True, True, False])
+
+
+def test_the_stored_default_plan_solves_the_default_problem() -> None:
+    assembled = assemble(PlanProblem.load("plans/default.yaml"))
+    stored = ExcitationPlan.load(CONFIGS / "plans/default.plan.yaml")
+    check = assembled.check(stored.motion)
+    assert check.ok, check
+    assert all(margin.proven for margin in check.margins)
+    values, deviations = assembled.describe(stored.motion)
+    assert values[CONDITION] <= 35.0
+    assert values == pytest.approx(dict(stored.objectives), rel=1e-6)
+    assert deviations == pytest.approx(dict(stored.rsd_percent), rel=1e-6)
