@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import coal
+import distributed
 import joblib
 import numpy as np
 import pinocchio as pin
@@ -105,7 +106,6 @@ def test_seed_and_counts_decide_not_the_number_of_processes(
 
 
 def test_the_search_runs_on_a_dask_cluster(problem: PlanProblem) -> None:
-    distributed = pytest.importorskip("distributed")
     small = replace(problem, search=Search(seed=3, starts=2, hops=0, jobs=-1))
     alone = plan(replace(small, search=replace(small.search, jobs=1)))
     with (
