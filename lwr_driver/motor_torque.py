@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from fri.errors import ConfigurationError
 from lwr_driver.session.columns import JointColumns
@@ -248,6 +247,8 @@ def _at_times(
     """At the times of the motor torques: sensors (n, J) without their means, and an orthonormal basis of
     constant, velocity, its sign, and acceleration for each joint.
     """
+    # Not at the top: the recorder imports this module and must stay light.
+    from scipy.signal import savgol_filter
 
     def there(column: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.interp(motor.log_time, joint.log_time, column)
