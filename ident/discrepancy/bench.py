@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fri.errors import DataError
-from ident.discrepancy.candidates import Dictionary
+from ident.discrepancy.candidates import Dictionary, Trial
 from ident.discrepancy.evidence import Evidence, Floats, noise_floor
 from ident.discrepancy.nominal import Arm, Nominal, structure_of
 from ident.discrepancy.recording import Recording
@@ -17,7 +17,18 @@ from ident.discrepancy.selection import Selection
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 
-__all__ = ["ArmData", "Bench", "every_joint_moves", "mean_delay", "nominal_arm", "prepare_bench", "sharper"]
+__all__ = [
+    "ArmData",
+    "Bench",
+    "every_joint_moves",
+    "mean_delay",
+    "nominal_arm",
+    "prepare_bench",
+    "slow_delay",
+]
+
+
+_SLOW_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,22 +136,51 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
     return step
 
 
-def sharper(bench: Bench, selection: Selection) -> tuple[dict[str, Floats], dict[str, Floats]] | None:
-    """Noise floor with the findings taken out, None where it hardly differs from the one that was used."""
+def again_with(
+    bench: Bench, selection: Selection, settings: DiagnosisSettings, causes: Sequence[str] | None
+) -> Bench | None:
+    """The bench with predictions and noise floor that know of the claims; None without any.
+
+    The torque that effects of the load depend on is predicted by the base parameters, and these were wrong
+    while the effects were not in the model.
+    """
     if not selection.claims:
         return None
-    evidence = bench.evidence
+    nominal, evidence = bench.nominal, bench.evidence
     evidence.replace([*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
-    floors = _floors(bench.nominal, evidence.residuals())
-    sigma = {side: floor[0] for side, floor in floors.items()}
-    dilution = {side: floor[1] for side, floor in floors.items()}
-    ratio = min(
-        float(
-            np.min(sigma[side] ** 2 * dilution[side] / (evidence.sigma[side] ** 2 * evidence.dilution[side]))
-        )
-        for side in sigma
+    floors = _floors(nominal, evidence.residuals())
+    nominal.refine(evidence.full.values[: evidence.base_count])
+    again = Evidence(
+        nominal,
+        settings,
+        {side: floor[0] for side, floor in floors.items()},
+        {side: floor[1] for side, floor in floors.items()},
+        prior=evidence.prior,
     )
-    return (sigma, dilution) if ratio < 0.9 else None
+    return Bench(nominal, again, Dictionary(nominal, again, causes), bench.told)
+
+
+def slow_delay(bench: Bench, trial: Trial) -> tuple[float, float]:
+    """Delay [s] of a trial of a late channel, and its standard deviation, from means over a tenth of a second.
+
+    A late channel is late at every frequency; a vibration that the positions do not show is not there.
+    """
+    nominal = bench.nominal
+    slow = Nominal(
+        nominal.arm,
+        nominal.recordings,
+        replace(nominal.settings, bin_s=_SLOW_S),
+        nominal.structure,
+        nominal.base,
+        nominal.motions,
+    )
+    slow.make_rows()
+    evidence, _ = _evidence(slow, slow.settings, None)
+    dictionary = Dictionary(slow, evidence, [trial.candidate.cause])
+    rows = dictionary.rows(trial.candidate, trial.shape)
+    score = evidence.score(evidence.padded(rows))
+    delay = float(trial.shape["delay"])
+    return delay * float(score.coefficients[0]), abs(delay) * float(np.sqrt(score.covariance[0, 0]))
 
 
 def mean_delay(nuisance: Mapping[str, tuple[float, float]], side: str) -> tuple[float, float]:

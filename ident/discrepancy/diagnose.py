@@ -7,17 +7,25 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fri.errors import DataError
-from ident.discrepancy.bench import ArmData, every_joint_moves, nominal_arm, prepare_bench, sharper
+from ident.discrepancy.bench import (
+    ArmData,
+    Bench,
+    again_with,
+    every_joint_moves,
+    nominal_arm,
+    prepare_bench,
+    slow_delay,
+)
 from ident.discrepancy.candidates import Dictionary
 from ident.discrepancy.conclusion import Simulate, conclude, timing_finding
-from ident.discrepancy.evidence import Evidence
 from ident.discrepancy.gain import held_out
 from ident.discrepancy.hygiene import sample_loss
 from ident.discrepancy.recording import record
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.result import Diagnosis, Finding
-from ident.discrepancy.selection import select
+from ident.discrepancy.selection import Claim, select
 from ident.discrepancy.settings import DiagnosisSettings
+from ident.effects import EFFECTS
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 
@@ -26,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose"]
 
-_REPEATS = 2
+_REPEATS = 1
 
 
 def diagnose(
@@ -63,6 +71,12 @@ def diagnose(
     timing: list[Finding] = []
     selection = select(bench.dictionary, bench.evidence, settings, null)
     late = [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
+    doubtful = [c.trial.candidate.cause for c in late if not _late_at_all_speeds(bench, c)]
+    if doubtful:
+        causes = [cause for cause in causes or EFFECTS if cause not in doubtful]
+        bench.dictionary = Dictionary(bench.nominal, bench.evidence, causes)
+        selection = select(bench.dictionary, bench.evidence, settings, null)
+        late = [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
     if late:
         shifted = known
         for claim in late:
@@ -85,11 +99,18 @@ def diagnose(
         again.claims = [c for c in again.claims if c.trial.candidate.effect.side != "timing"]
         selection = again
     for _ in range(_REPEATS):
-        floor = sharper(bench, selection)
-        if floor is None:
+        better = again_with(bench, selection, settings, causes)
+        if better is None:
             break
-        bench.evidence = Evidence(bench.nominal, settings, *floor, prior=bench.evidence.prior)
-        bench.dictionary = Dictionary(bench.nominal, bench.evidence, causes)
+        bench = better
         selection = select(bench.dictionary, bench.evidence, settings, null)
         selection.claims = [c for c in selection.claims if c.trial.candidate.effect.side != "timing"]
     return conclude(bench, selection, timing, loss, settings, reference, model, simulate, sessions, test)
+
+
+def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:
+    """Whether the slow part of the motion confirms a late channel."""
+    bench.evidence.replace([])
+    made = float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+    slow, std = slow_delay(bench, claim.trial)
+    return abs(slow - made) < 0.3 * abs(made) + 4.0 * std and abs(slow) > 0.3 * abs(made)

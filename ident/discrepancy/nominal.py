@@ -113,7 +113,7 @@ class Nominal:
         nominal.motions = [
             nominal._motion(r, s, _measured(s)) for r in nominal.recordings for s in r.stretches
         ]
-        nominal.rows = nominal._rows()
+        nominal.make_rows()
         return nominal
 
     @property
@@ -138,7 +138,7 @@ class Nominal:
             link = rigid + drive["Fvl"] * before.qd + drive["Fcl"] * np.sign(before.qd) + drive["offl"]
             motions.append(self._motion(recording, stretch, link, body, drive))
         self.motions = motions
-        self.rows = self._rows()
+        self.make_rows()
 
     def _motion(
         self,
@@ -189,7 +189,6 @@ class Nominal:
             link_coulomb=values["Fcl"],
             motor_coulomb=values["Fcm"],
             friction=friction,
-            measured_torque=stretch.effort if recording.has_effort else None,
         )
 
     # ---- rows ----
@@ -222,8 +221,9 @@ class Nominal:
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
-    def _rows(self) -> dict[str, SideRows]:
-        return {side: self._side_rows(side) for side in self.sides}
+    def make_rows(self) -> None:
+        """Rows of all sides from the present motions."""
+        self.rows = {side: self._side_rows(side) for side in self.sides}
 
     def _side_rows(self, side: str) -> SideRows:
         still = self.settings.standstill_rad_s

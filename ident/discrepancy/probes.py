@@ -21,6 +21,8 @@ __all__ = ["Remainder", "find_remainders"]
 
 _HATS = 7
 _RIDGE = 1e-3
+# Generic functions find a little everywhere; less than this share of the noise is not worth a word.
+_LEAST_INFLATION = 0.012
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def _one(
         for name, rows in groups.items():
             score = evidence.score(evidence.padded(rows), ridge=_RIDGE)
             least = settings.least_gain + 2.0 * _HATS
-            if score.gain > max(least, best_gain) and score.inflation > settings.least_inflation:
+            if score.gain > max(least, best_gain) and score.inflation > _LEAST_INFLATION:
                 best_name, best_gain, best_rows = name, score.gain, rows
                 best_inflation = score.inflation
         if best_rows is None:

@@ -10,7 +10,7 @@ from ident.signals.filters import differentiate, low_pass
 
 __all__ = ["deflected"]
 
-_LINK_HZ, _MOTOR_HZ = 15.0, 30.0
+_LINK_HZ, _MOTOR_HZ = 8.0, 30.0
 
 
 def deflected(

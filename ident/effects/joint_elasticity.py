@@ -40,11 +40,7 @@ class JointElasticity(Effect):
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
-        torque = motion.joint_torque
-        if shape["encoder"] > 0.5 and motion.measured_torque is not None:
-            # With the encoder at the motor the link's vibration is not in the positions.
-            torque = motion.measured_torque
-        twist = torque[:, joint]
+        twist = motion.joint_torque[:, joint]
         return deflected(motion, joint, twist, bool(shape["encoder"] > 0.5), 1e-5)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:

@@ -30,8 +30,6 @@ class Motion:
         sensor's noise.
     gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
     link_coulomb, motor_coulomb : (n,) Coulomb friction of link and drive [Nm].
-    measured_torque : (N, n) of the joints' sensors [Nm], for the twist of joints whose motion is not known well
-        enough to predict it; None takes the prediction.
     friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
     """
 
@@ -52,7 +50,6 @@ class Motion:
     link_coulomb: Floats
     motor_coulomb: Floats
     friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
-    measured_torque: Floats | None = None
 
     @property
     def n(self) -> int:
