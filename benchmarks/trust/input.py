@@ -123,7 +123,7 @@ class _Watched:
                 answer: tuple[str, float] = self._pipe.recv()
                 return answer
             what = f"hangs for {_PATIENCE_S:.0f} s"
-        except EOFError:
+        except (EOFError, OSError):
             what = "crashed the interpreter"
         self.close()
         self._start()

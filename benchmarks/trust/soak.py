@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import time
@@ -19,14 +20,21 @@ __all__ = ["campaign"]
 
 _SECONDS = 3600.0
 _GROWTH_MB = 8.0
+_LAPS = 4
 _WARM = 0.25  # share of the time in which a process may still grow
 _FAULTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("inject", {"kind": "loss", "probability": 0.2, "cycles": 40}),
     ("inject", {"kind": "duplicate", "probability": 0.5, "cycles": 60}),
     ("inject", {"kind": "corrupt", "probability": 0.1, "bits": 2, "cycles": 40}),
     ("inject", {"kind": "reorder", "probability": 0.2, "cycles": 40}),
+    ("inject", {"kind": "truncate", "probability": 0.2, "cycles": 40}),
+    ("inject", {"kind": "delay", "probability": 0.2, "length": 2, "cycles": 40}),
+    ("inject", {"kind": "burst", "probability": 0.1, "length": 20, "cycles": 40}),
+    ("inject", {"kind": "foreign", "probability": 0.5, "cycles": 60}),
     ("emergency_stop", {}),
     ("drives", {"on": False}),
+    ("mode", {"name": "T1"}),
+    ("drive_fault", {"joint": 2}),
     ("degrade_quality", {"cycles": 50}),
     ("restart", {"silent_cycles": 60}),
 )
@@ -55,16 +63,24 @@ def campaign(ledger: Ledger, options: Any) -> None:
             cycles += samples
             for part, pid in pids.items():
                 usage[part].append(_usage(pid))
+            ledger.save()
+        virtual_s = float(lab.emulator.status()["time_s"])
+        ring = Path("/dev/shm") / lab.driver.ring_name.lstrip("/")
         lab.close()
-        left = gone([pid for part, pid in pids.items() if part != "runner"])
+        left = [f"process {pid}" for pid in gone([pid for part, pid in pids.items() if part != "runner"])]
+        left += [f"shared memory {ring}"] if ring.exists() else []
         found = {part: _growth(values) for part, values in usage.items()}
-    line.figures = {"seconds": round(time.monotonic() - began), "cycles": cycles}
+    line.figures = {
+        "wall time [s]": round(time.monotonic() - began),
+        "virtual time [s]": round(virtual_s),
+        "samples logged": cycles,
+    }
     line.figures |= {f"{part} grew [MB, files]": value for part, value in found.items()}
     for part, (memory, files) in found.items():
         if memory > _GROWTH_MB or files > 0:
             line.count([f"{part} grew by {memory} MB and {files} open files"])
     if left:
-        line.count([f"processes left: {left}"])
+        line.count([f"left behind: {', '.join(left)}"])
     ledger.finish("soak", f"{seconds:g} s")
 
 
@@ -78,6 +94,7 @@ def _session(lab: Lab, number: int, random: np.random.Generator, folder: Path) -
         driver.stop()
         driver.leave_command()
         pendant.release_emergency_stop()
+        pendant.mode("EXT")
         # In lock step the arm comes to rest only while packets go to and fro.
         driver.monitor(100)
         pendant.drives(on=True)
@@ -87,13 +104,19 @@ def _session(lab: Lab, number: int, random: np.random.Generator, folder: Path) -
         driver.wait_quality(cycles=50)
         driver.record(path, session_metadata(robot="LWR4+"))
         driver.enter_command()
-        motion = lab.motion()
+        once = lab.motion()
+        motion = once
+        for _ in range(_LAPS - 1):
+            motion = motion.join(once)
         if number % 2:
             command, arguments = _FAULTS[int(random.integers(len(_FAULTS)))]
-            pendant.schedule(command, when="moving", after_cycles=int(random.integers(5, 300)), **arguments)
+            after = int(random.integers(5, len(motion) - 60))
+            pendant.schedule(command, when="moving", after_cycles=after, **arguments)
         outcome = driver.execute(motion)
         recorded = driver.end_record(outcome.status, outcome.reason)
     except LwrError as error:
+        with contextlib.suppress(LwrError):
+            driver.end_record("fail", str(error))
         return [f"{type(error).__name__}: {error}"], 0
     if number % 2 == 0 and outcome.status != "success":
         bad.append(f"without a fault: {outcome.reason}")
