@@ -13,10 +13,18 @@ from ident.discrepancy.candidates import Trial
 from ident.discrepancy.evidence import Floats, Rows
 from ident.discrepancy.gain import HeldOut, held_out, interval
 from ident.discrepancy.hygiene import SampleLoss
-from ident.discrepancy.nominal import Arm
+from ident.discrepancy.nominal import Arm, Nominal
 from ident.discrepancy.probes import Remainder, find_remainders
 from ident.discrepancy.reference import Reference
-from ident.discrepancy.result import Diagnosis, Evident, Finding, SimulationError, Unexplained, Value
+from ident.discrepancy.result import (
+    Diagnosis,
+    Evident,
+    Finding,
+    RowStates,
+    SimulationError,
+    Unexplained,
+    Value,
+)
 from ident.discrepancy.selection import Claim, Selection
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
@@ -104,6 +112,20 @@ def conclude(
         simulation_extended=extended_simulation,
         notes=_notes(bench, reference),
         residuals={"base": before.residual, "extended": after.residual},
+        states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
+    )
+
+
+def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:
+    """Where the arm was in the rows of a side."""
+    rows, motions = nominal.rows[side], nominal.motions
+    return RowStates(
+        rows.time,
+        rows.session,
+        block,
+        nominal.reduce(side, [m.q for m in motions]),
+        nominal.reduce(side, [m.motor_speed for m in motions]),
+        nominal.reduce(side, [m.joint_torque for m in motions]),
     )
 
 

@@ -8,11 +8,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident.discrepancy.evidence import Floats
 from ident.model import DynamicModel
 
-__all__ = ["SCHEMA_VERSION", "Diagnosis", "Evident", "Finding", "SimulationError", "Unexplained", "Value"]
+__all__ = [
+    "SCHEMA_VERSION",
+    "Diagnosis",
+    "Evident",
+    "Finding",
+    "RowStates",
+    "SimulationError",
+    "Unexplained",
+    "Value",
+]
 
 SCHEMA_VERSION = 1
 
@@ -122,12 +132,31 @@ class SimulationError:
 
 
 @dataclass(frozen=True, eq=False)
+class RowStates:
+    """Where the arm was in the m rows of a side: what residuals can be held against.
+
+    time : (m,) [s] in the session. session : (m,) number in the order of the sessions, from 0. block : (m,) of
+    rows that are taken to depend on each other. position, speed, load : (m, n) [rad, rad/s, Nm] of each joint,
+    the load as the model predicts it.
+    """
+
+    time: Floats
+    session: NDArray[np.int64]
+    block: Floats
+    position: Floats
+    speed: Floats
+    load: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
     """Everything that was found; prints itself.
 
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
     notes : sentences on what could not be seen or used.
+    residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN where a row is not
+    used. states : where the arm was in these rows, by side.
     """
 
     train: tuple[str, ...]
@@ -147,6 +176,7 @@ class Diagnosis:
     simulation_extended: SimulationError | None = None
     notes: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
+    states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Content of `diagnosis.json`."""
