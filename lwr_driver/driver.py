@@ -48,7 +48,9 @@ from lwr_driver.link import (
     advise_connect,
     advise_leave,
     advise_load,
+    advise_monitor,
     advise_quality,
+    advise_rest,
     silence_in_lock_step,
 )
 from lwr_driver.loop import LoopSettings
@@ -76,6 +78,7 @@ _NOTIFY_S = 0.5
 _PROGRESS_S = 0.1
 _SHORTEST_CYCLE_S = 1e-3
 _CLOSE_PATIENCE_S = 2.0
+_LONGEST_LOOK_S = 0.1
 _ERRORS: Mapping[Result, type[LwrError]] = {
     Result.REFUSED: RefusedError,
     Result.ROBOT: RobotError,
@@ -211,6 +214,7 @@ class Driver:
                 timeout_s=_CLOSE_PATIENCE_S,
                 patience_s=_CLOSE_PATIENCE_S,
                 awaited="rest",
+                advice=advise_rest,
                 stoppable=False,
             )
 
@@ -285,7 +289,13 @@ class Driver:
             # The request must not be granted after nobody waits for it any more.
             if self._loop is not None:
                 with contextlib.suppress(LwrError):
-                    self._wait(Job.LEAVE, timeout_s=_CLOSE_PATIENCE_S, awaited="rest", stoppable=False)
+                    self._wait(
+                        Job.LEAVE,
+                        timeout_s=_CLOSE_PATIENCE_S,
+                        awaited="rest",
+                        advice=advise_rest,
+                        stoppable=False,
+                    )
             raise
         return self.state()
 
@@ -339,7 +349,7 @@ class Driver:
             a=cycles,
             timeout_s=max(10.0, 20.0 * cycles * self.state().period_s),
             awaited=f"{cycles} cycles",
-            advice=advise_connect,
+            advice=advise_monitor,
             failure=NetworkError,
         )
         q, q_std, tau, tau_std, external, command = self._need(self._control).measured.copy()
@@ -347,7 +357,7 @@ class Driver:
 
     def stop(self) -> LinkState:
         """Stop within the limits and wait until the commanded position rests."""
-        self._wait(Job.HALT, timeout_s=10.0, awaited="rest", stoppable=False)
+        self._wait(Job.HALT, timeout_s=10.0, awaited="rest", advice=advise_rest, stoppable=False)
         words = self._need(self._control).words
         self._stops_seen = int(words[Word.STOP])
         return self.state()
@@ -443,9 +453,9 @@ class Driver:
         *,
         timeout_s: float,
         awaited: str,
+        advice: Callable[[LinkState], str],
         a: int = 0,
         b: int = 0,
-        advice: Callable[[LinkState], str] | None = None,
         failure: type[LwrError] = RobotError,
         stoppable: bool = True,
         patience_s: float | None = None,
@@ -492,10 +502,9 @@ class Driver:
             raise self._with_rows(OperatorError(reason))
         raise self._with_rows(_ERRORS.get(result, failure)(f"{awaited}: {reason}"))
 
-    def _describe(self, waiting: Waiting, advice: Callable[[LinkState], str] | None) -> Waiting:
+    def _describe(self, waiting: Waiting, advice: Callable[[LinkState], str]) -> Waiting:
         state = self.state()
-        text = advice(state) if advice is not None else ""
-        return Waiting(waiting.awaited, state.summary, waiting.since_s, text)
+        return Waiting(waiting.awaited, state.summary, waiting.since_s, advice(state))
 
     def _obey(self, awaited: str) -> None:
         words = self._need(self._control).words
@@ -557,7 +566,14 @@ class Driver:
         """Stop what still moves before an exception leaves."""
         log.info("motion given up: %s", error)
         with contextlib.suppress(LwrError):
-            self._wait(Job.HALT, timeout_s=_CLOSE_PATIENCE_S, awaited="rest", stoppable=False, patience_s=1.0)
+            self._wait(
+                Job.HALT,
+                timeout_s=_CLOSE_PATIENCE_S,
+                awaited="rest",
+                advice=advise_rest,
+                stoppable=False,
+                patience_s=1.0,
+            )
 
     def _failed(self, motion: Motion, error: LwrError) -> Outcome:
         row = int(self._need(self._control).words[Word.ROW])
@@ -602,7 +618,8 @@ class _Watch:
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
         self._cycles = -1
-        self._moved = time.monotonic()
+        self._silence_s = 0.0
+        self._looked = time.monotonic()
         self.error: LwrError | None = None
 
     def check(self, patience_s: float) -> None:
@@ -616,8 +633,11 @@ class _Watch:
             return
         cycles = int(driver._need(driver._control).words[Word.CYCLES])
         now = time.monotonic()
+        # A pause of this process itself tells nothing of the others, which may have stood still as well.
+        self._silence_s += min(now - self._looked, _LONGEST_LOOK_S)
+        self._looked = now
         if cycles != self._cycles:
-            self._cycles, self._moved = cycles, now
-        elif now - self._moved > patience_s:
-            self.error = NetworkError(silence_in_lock_step(driver.state(), now - self._moved))
+            self._cycles, self._silence_s = cycles, 0.0
+        elif self._silence_s > patience_s:
+            self.error = NetworkError(silence_in_lock_step(driver.state(), self._silence_s))
             raise self.error

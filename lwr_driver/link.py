@@ -16,7 +16,9 @@ __all__ = [
     "advise_connect",
     "advise_leave",
     "advise_load",
+    "advise_monitor",
     "advise_quality",
+    "advise_rest",
     "silence_in_lock_step",
 ]
 
@@ -76,9 +78,24 @@ def advise_connect(state: LinkState) -> str:
     if state.foreign:
         return "Packets come from another address than the controller's: check `controller`"
     return (
-        "Start the KRL program; check FRIHOST and FRISOCK on the controller, the cable, the address of this "
+        "At the pendant: select and start the KRL program (in T1 hold enabling switch and start key until "
+        "friOpen is passed); check FRIHOST and FRISOCK on the controller, the cable, the address of this "
         "computer and its firewall"
     )
+
+
+def advise_monitor(state: LinkState) -> str:
+    """What to do while cycles are counted at rest."""
+    if state.age_s > _SILENCE_S:
+        return advise_connect(state)
+    return "Nothing to do: packets come, the arm rests and is measured"
+
+
+def advise_rest(state: LinkState) -> str:
+    """What to do while the arm comes to rest."""
+    if state.age_s > _SILENCE_S:
+        return "No packet comes, so the controller brakes by itself; look at the pendant"
+    return "The arm brakes within its jerk limit; if it does not, press the emergency stop"
 
 
 def advise_quality(state: LinkState) -> str:
@@ -89,7 +106,7 @@ def advise_quality(state: LinkState) -> str:
         return "Another address sends too: set `controller` to the controller's, and find the other"
     if state.late > state.received // 100:
         return "Answers come too late: close other programs, see the real-time rights, or use a longer cycle"
-    return "Check cable and network card, and that only one client answers"
+    return "Nothing to do at the pendant; check cable and network card, and that only one client answers"
 
 
 def advise_command(state: LinkState) -> str:
@@ -97,12 +114,12 @@ def advise_command(state: LinkState) -> str:
     if state.age_s > _SILENCE_S:
         return advise_connect(state)
     if state.state == "CMD" and (state.power != ALL_DRIVES or state.error):
-        return "Switch the drives on and acknowledge messages at the pendant"
+        return "At the pendant: switch the drives on and acknowledge the messages"
     if state.quality in ("UNACCEPTABLE", "BAD"):
         return advise_quality(state)
     if state.control != "POSITION":
-        return "Switch the controller to position control (strategy 10)"
-    return "Start the KRL program, or let it go on; acknowledge messages at the pendant"
+        return "The controller is not in position control: set $STIFFNESS.STRATEGY=10 in the KRL program"
+    return "At the pendant: start the KRL program or let it go on, and acknowledge its messages"
 
 
 def advise_load(state: LinkState) -> str:
