@@ -9,7 +9,8 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.discrepancy.candidates import Dictionary, Trial
-from ident.discrepancy.evidence import Evidence, Floats, noise_floor
+from ident.discrepancy.evidence import Evidence, Floats
+from ident.discrepancy.noise import noise_floor
 from ident.discrepancy.nominal import Arm, Nominal, structure_of
 from ident.discrepancy.recording import Recording
 from ident.discrepancy.reference import Reference
@@ -63,6 +64,7 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             reference.motor_delay_s,
             reference.joint_delay_s,
             reference.encoder,
+            encoder_known=True,
         )
     return Arm(chain, compliance, ratio)
 

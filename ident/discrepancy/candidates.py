@@ -129,10 +129,9 @@ class Dictionary:
             for edge in np.sort(starts)[1:]:
                 on = np.zeros(evidence.blocks)
                 on[mine[starts >= edge]] = 1.0
-                part = Products(
-                    whole.base * on[:, None, None], whole.own * on[:, None, None], whole.target * on[:, None]
+                score = evidence.event_score(
+                    evidence.score_products(whole.only(on), list(padded)), evidence.blocks
                 )
-                score = evidence.event_score(evidence.score_products(part, list(padded)), evidence.blocks)
                 if best is None or score.gain > best[1].gain:
                     best = ({**shape, "time": float(edge)}, score)
         if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
@@ -268,4 +267,5 @@ def _setting(nominal: Nominal) -> Setting:
         torque_turns=np.minimum(positive, 1.0 - positive) > 0.02,
         speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
+        encoder=nominal.arm.encoder if nominal.arm.encoder_known else None,
     )

@@ -71,7 +71,7 @@ def commission(
     votes = [bench.nominal.arm.encoder for bench in benches]
     encoder = max(sorted(set(votes)), key=votes.count)
     agreeing = [b.nominal.arm.compliance for b in benches if b.nominal.arm.encoder == encoder]
-    known = replace(known, encoder=encoder, compliance=np.mean(agreeing, axis=0))
+    known = replace(known, encoder=encoder, encoder_known=True, compliance=np.mean(agreeing, axis=0))
     base = benches[0].nominal.base
     del benches
     days = []

@@ -8,8 +8,9 @@ held back are the same phases of every period, so a motion that repeats never ch
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +18,10 @@ from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from fri.errors import DataError
-from ident.discrepancy.nominal import Nominal, SideRows
+from ident.discrepancy.nominal import Nominal
 from ident.discrepancy.settings import DiagnosisSettings
 
-__all__ = ["Evidence", "Fit", "Products", "Rows", "Score", "noise_floor"]
+__all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
 
 Floats = NDArray[np.float64]
 Key = tuple[str, int]
@@ -35,14 +36,30 @@ class Score:
     gain : fall of the chi-square on the parts held back in turn. fitted : fall on the rows fitted.
     coefficients (k,), covariance (k, k) from blocks. p_value : that all are zero. inflation : the gain over
     the number of rows of the joints and sides it acts on, the relative excess of power that it explains.
+    robust : gives covariance and number of blocks that carry it; asked only where it matters, for most
+    scores it does not. chance : the p-value, where it does not come from the covariance.
     """
 
     gain: float
     fitted: float
     coefficients: Floats
-    covariance: Floats
-    p_value: float
     inflation: float
+    robust: Callable[[], tuple[Floats, int]]
+    chance: float | None = None
+
+    @cached_property
+    def _robust(self) -> tuple[Floats, int]:
+        return self.robust()
+
+    @property
+    def covariance(self) -> Floats:
+        """(k, k), from blocks."""
+        return self._robust[0]
+
+    @cached_property
+    def p_value(self) -> float:
+        """Probability of such coefficients where all are zero."""
+        return _wald(self.coefficients, *self._robust) if self.chance is None else self.chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +72,25 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Products of a group's columns with the base and among themselves in each block."""
+    """Products of a group's columns with the base and among themselves in each block, and their sums over the
+    parts of the motion that are held back in turn; `parts` (parts, blocks) is 1 where a block belongs to one.
+    """
 
     base: Floats
     own: Floats
     target: Floats
+    parts: Floats
+
+    @cached_property
+    def sums(self) -> tuple[Floats, Floats, Floats]:
+        """Base, own and target of each part."""
+        return _sums(self.parts, self.base), _sums(self.parts, self.own), self.parts @ self.target
+
+    def only(self, on: Floats) -> Products:
+        """Of the blocks with weight 1 in `on` (blocks,) alone."""
+        return Products(
+            self.base * on[:, None, None], self.own * on[:, None, None], self.target * on[:, None], self.parts
+        )
 
 
 class Evidence:
@@ -104,6 +135,7 @@ class Evidence:
         self.base_count = len(nominal.base)
         self.extra: list[Rows] = []
         self._known: dict[int, tuple[Rows, dict[Key, Floats], Products]] = {}
+        self._joined: dict[Key, Floats] | None = None
         self._begin()
         self._gram()
 
@@ -136,6 +168,7 @@ class Evidence:
         self.block_session = np.array([session for session, _ in numbers], dtype=np.int64)
         self.block_start = np.array([start[k] + b * length[k] for k, b in numbers])
         self.fold = np.array(folds, dtype=np.int64)
+        self.parts = (np.unique(self.fold)[:, None] == self.fold).astype(float)
         if len(set(folds)) < 2:
             raise DataError("the sessions are too short to hold a part of them back; record at least 5 s")
         for side, found in ids.items():
@@ -195,16 +228,16 @@ class Evidence:
                 place = end
         scale = np.sqrt(np.einsum("bii->i", self.gram))
         self._scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
-        self.full = self._fit(np.ones(self.blocks, dtype=bool))
+        self._part_gram, self._part_target = _sums(self.parts, self.gram), self.parts @ self.target
+        gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
+        self.full = self._fit(gram, target)
         self._held = [
-            (part, self._fit(~part))
-            for f in range(int(self.fold.max()) + 1)
-            if (part := self.fold == f).any() and (~part).any()
+            self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
         ]
 
-    def _fit(self, chosen: NDArray[np.bool_]) -> Fit:
+    def _fit(self, gram: Floats, target: Floats) -> Fit:
         s = self._scale
-        gram, target = self.gram[chosen].sum(axis=0), self.target[chosen].sum(axis=0)
+        gram, target = gram.copy(), target.copy()
         if self.prior is not None:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
@@ -227,13 +260,29 @@ class Evidence:
         columns are made.
         """
         known = self.alone(columns) if known is None else known
-        parts = [known.base]
-        parts += [self._cross(columns, self._known[id(rows)][1]) for rows in self.extra]
-        return Products(np.concatenate(parts, axis=2), known.own, known.target)
+        if not self.extra:
+            return known
+        base = np.concatenate([known.base, self._cross(columns, self._beside())], axis=2)
+        return Products(base, known.own, known.target, self.parts)
+
+    def _beside(self) -> dict[Key, Floats]:
+        """All further columns side by side, padded, by key."""
+        if self._joined is None:
+            width = sum(_width(rows) for rows in self.extra)
+            self._joined = {}
+            place = 0
+            for rows in self.extra:
+                for key, values in self._known[id(rows)][1].items():
+                    if key not in self._joined:
+                        self._joined[key] = np.zeros((*values.shape[:2], width))
+                    self._joined[key][:, :, place : place + values.shape[2]] = values
+                place += _width(rows)
+        return self._joined
 
     def replace(self, extra: Sequence[Rows]) -> None:
         """Let the base be followed by these columns."""
         self.extra = list(extra)
+        self._joined = None
         for rows in self.extra:
             if id(rows) not in self._known:
                 padded = self.padded(rows)
@@ -260,7 +309,7 @@ class Evidence:
             base += np.matmul(turned, self._columns[key])
             own += np.matmul(turned, matrix)
             target += np.matmul(turned, self._targets[key])[:, :, 0]
-        return Products(base, own, target)
+        return Products(base, own, target, self.parts)
 
     # ---- scores ----
 
@@ -276,30 +325,31 @@ class Evidence:
 
     def score_products(self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0) -> Score:
         """Score of columns in the rows of `keys` from their products with all present columns."""
-        gain = 0.0
-        for part, fit in self._held:
-            train = ~part
-            gain += self._held_gain(products, fit, train, part, ridge)
-        whole = np.ones(self.blocks, dtype=bool)
-        lever, inner, reach = self._schur(products, self.full, whole, ridge)
+        base, own, target = products.sums
+        whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
+        lever, inner, reach = _schur(whole, self.full, ridge)
+        k = products.own.shape[1]
         if inner is None:
-            k = products.own.shape[1]
-            return Score(-np.inf, 0.0, np.zeros(k), np.eye(k), 1.0, 0.0)
+            return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
+        gain = 0.0
+        for part, fit in enumerate(self._held):
+            mine = base[part], own[part], target[part]
+            rest = whole[0] - mine[0], whole[1] - mine[1], whole[2] - mine[2]
+            gain += self._held_gain(mine, rest, fit, part, ridge)
         coefficients = inner @ reach
         fitted = float(reach @ coefficients)
-        covariance, active = self._robust(products, lever, inner, coefficients)
         rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
         if self.prior is not None:
             gain += self._strain(self.full.values) - self._strain(self.full.values - lever @ coefficients)
         # Held-back error can also fall because a base fitted without the part was poor: never more than that.
         gain = min(gain, fitted)
+        values, gram, torque = self.full.values - lever @ coefficients, self.gram, self.target
         return Score(
             gain,
             fitted,
             coefficients,
-            covariance,
-            _wald(coefficients, covariance, active),
             gain / max(rows, 1.0),
+            lambda: _robust(products, gram, torque, values, lever, inner, coefficients),
         )
 
     def event_score(self, score: Score, choices: int) -> Score:
@@ -311,44 +361,25 @@ class Evidence:
         penalty = 2.0 * np.log(max(choices, 1)) + 4.0 * k
         p = float(min(1.0, choices * chi2.sf(score.fitted, k)))
         gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
-        return Score(gain, score.fitted, score.coefficients, score.covariance, p, score.inflation)
-
-    def _schur(
-        self, products: Products, fit: Fit, chosen: NDArray[np.bool_], ridge: float
-    ) -> tuple[Floats, Floats | None, Floats]:
-        """The columns' image in the base (P, k), the inverse of their Schur complement (k, k), and their
-        product with the residual (k,)."""
-        cross = products.base[chosen].sum(axis=0)
-        lever = fit.inverse @ cross.T
-        own = products.own[chosen].sum(axis=0)
-        inner = own - cross @ lever
-        size = np.diag(own).copy()
-        # A column that the base explains to a millionth has nothing of its own to say.
-        if np.any(size <= 0.0) or np.any(np.diag(inner) < 1e-7 * size):
-            return lever, None, np.zeros(len(own))
-        inner = inner + ridge * np.diag(size)
-        root = np.sqrt(np.diag(inner))
-        scaled = inner / np.outer(root, root)
-        if np.linalg.eigvalsh(scaled)[0] < 1e-9:
-            return lever, None, np.zeros(len(own))
-        reach = products.target[chosen].sum(axis=0) - cross @ fit.values
-        return lever, np.linalg.inv(scaled) / np.outer(root, root), reach
+        return replace(score, gain=gain, chance=p)
 
     def _held_gain(
-        self, products: Products, fit: Fit, train: NDArray[np.bool_], part: NDArray[np.bool_], ridge: float
+        self,
+        mine: tuple[Floats, Floats, Floats],
+        rest: tuple[Floats, Floats, Floats],
+        fit: Fit,
+        part: int,
+        ridge: float,
     ) -> float:
-        lever, inner, reach = self._schur(products, fit, train, ridge)
+        """Fall of the chi-square on a part of the motion, the columns fitted on the rest."""
+        lever, inner, reach = _schur(rest, fit, ridge)
         if inner is None:
             return 0.0
         c = inner @ reach
         change = -(lever @ c)
-        gram, cross, own = (
-            self.gram[part].sum(axis=0),
-            products.base[part].sum(axis=0),
-            products.own[part].sum(axis=0),
-        )
-        base_reach = self.target[part].sum(axis=0) - gram @ fit.values
-        own_reach = products.target[part].sum(axis=0) - cross @ fit.values
+        gram, (cross, own, target) = self._part_gram[part], mine
+        base_reach = self._part_target[part] - gram @ fit.values
+        own_reach = target - cross @ fit.values
         linear = 2.0 * (change @ base_reach + c @ own_reach)
         square = change @ gram @ change + 2.0 * (c @ cross @ change) + c @ own @ c
         return float(linear - square)
@@ -359,25 +390,6 @@ class Evidence:
             return 0.0
         difference = values[: self.base_count] - self.prior[1]
         return float(difference @ self.prior[0] @ difference)
-
-    def _robust(
-        self, products: Products, lever: Floats, inner: Floats, coefficients: Floats
-    ) -> tuple[Floats, int]:
-        """Covariance from blocks, at least that of independent rows; and the number of blocks that
-        carry it.
-        """
-        values = self.full.values - lever @ coefficients
-        own = products.target - products.base @ values - products.own @ coefficients
-        base = self.target - self.gram @ values - np.einsum("bkp,k->bp", products.base, coefficients)
-        scores = own - base @ lever
-        size = np.einsum("bkk->b", products.own)
-        active = int(np.sum(size > 1e-3 * size.max(initial=0.0)))
-        factor = active / max(active - 1, 1)
-        middle = factor * scores.T @ scores
-        sandwich = inner @ middle @ inner
-        floor = np.sqrt(np.maximum(np.diag(inner), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
-        widen = np.maximum(floor, 1.0)
-        return sandwich * np.outer(widen, widen), active
 
     # ---- results of a fit ----
 
@@ -400,8 +412,8 @@ class Evidence:
         found = {}
         for side, rows in self.nominal.rows.items():
             out = np.full(rows.target.shape, np.nan)
-            for part, fit in self._held:
-                mine = part[self._place[side][0]]
+            for part, fit in zip(self.parts, self._held, strict=True):
+                mine = (part > 0.0)[self._place[side][0]]
                 out[mine] = rows.target[mine] - self._predict(side, fit.values, mine)
             found[side] = np.where(rows.valid & ~rows.test[:, None], out, np.nan)
         return found
@@ -439,6 +451,54 @@ def _width(rows: Rows) -> int:
     return next(iter(rows.values())).shape[1]
 
 
+def _sums(parts: Floats, values: Floats) -> Floats:
+    """Sums (parts, k, l) of values (blocks, k, l) over the blocks of each part."""
+    return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
+
+
+def _schur(
+    products: tuple[Floats, Floats, Floats], fit: Fit, ridge: float
+) -> tuple[Floats, Floats | None, Floats]:
+    """Image in the base (P, k), inverse of the Schur complement (k, k), and product with the residual (k,) of
+    columns with the products base (k, P), own (k, k) and target (k,)."""
+    cross, own, target = products
+    lever = fit.inverse @ cross.T
+    inner = own - cross @ lever
+    size = np.diag(own).copy()
+    # A column that the base explains to a millionth has nothing of its own to say.
+    if np.any(size <= 0.0) or np.any(np.diag(inner) < 1e-7 * size):
+        return lever, None, np.zeros(len(own))
+    inner = inner + ridge * np.diag(size)
+    root = np.sqrt(np.diag(inner))
+    scaled = inner / np.outer(root, root)
+    if len(own) > 1 and np.linalg.eigvalsh(scaled)[0] < 1e-9:
+        return lever, None, np.zeros(len(own))
+    return lever, np.linalg.inv(scaled) / np.outer(root, root), target - cross @ fit.values
+
+
+def _robust(
+    products: Products,
+    gram: Floats,
+    target: Floats,
+    values: Floats,
+    lever: Floats,
+    inner: Floats,
+    coefficients: Floats,
+) -> tuple[Floats, int]:
+    """Covariance from blocks, at least that of independent rows; and the number of blocks that carry it."""
+    own = products.target - products.base @ values - products.own @ coefficients
+    base = target - gram @ values - np.einsum("bkp,k->bp", products.base, coefficients)
+    scores = own - base @ lever
+    size = np.einsum("bkk->b", products.own)
+    active = int(np.sum(size > 1e-3 * size.max(initial=0.0)))
+    factor = active / max(active - 1, 1)
+    middle = factor * scores.T @ scores
+    sandwich = inner @ middle @ inner
+    floor = np.sqrt(np.maximum(np.diag(inner), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
+    widen = np.maximum(floor, 1.0)
+    return sandwich * np.outer(widen, widen), active
+
+
 def _wald(coefficients: Floats, covariance: Floats, active: int) -> float:
     k = len(coefficients)
     try:
@@ -446,64 +506,3 @@ def _wald(coefficients: Floats, covariance: Floats, active: int) -> float:
     except np.linalg.LinAlgError:
         return 1.0
     return float(fisher.sf(value / k, k, max(active - k, 1)))
-
-
-def noise_floor(
-    rows: SideRows, residual: Floats, periods: Mapping[int, tuple[float, float]]
-) -> tuple[Floats, Floats, bool]:
-    """Noise (n,) of a row [Nm], the dilution (n,) of rows by correlation, and whether periods told it.
-
-    Where the excitation repeats, the difference of two periods of the residual is noise and nothing else.
-    Otherwise the difference of neighbouring rows stands for it, which correlated noise escapes.
-    periods : start and length [s] of each session's period.
-    """
-    n = residual.shape[1]
-    pairs: list[Floats] = []
-    for session, (start, length) in periods.items():
-        mine = np.flatnonzero(rows.session == session)
-        phase = (rows.time[mine] - start) / length
-        first, second = mine[(phase >= 0) & (phase < 1)], mine[(phase >= 1) & (phase < 2)]
-        if len(first) < 50 or len(second) < 0.6 * len(first):
-            continue
-        at = rows.time[second] - length
-        step = float(np.median(np.diff(rows.time[first])))
-        nearest = np.clip(np.rint((at - rows.time[first[0]]) / step).astype(int), 0, len(first) - 1)
-        close = np.abs(rows.time[first[nearest]] - at) < 0.6 * step
-        pairs.append((residual[second[close]] - residual[first[nearest[close]]]) / np.sqrt(2.0))
-    sigma, dilution = np.ones(n), np.ones(n)
-    told = bool(pairs)
-    differences = np.concatenate(pairs) if told else residual
-    for j in range(n):
-        d = differences[:, j]
-        if not told:
-            d = np.diff(residual[:, j]) / np.sqrt(2.0)
-        d = d[np.isfinite(d)]
-        if len(d) < 20:
-            continue
-        sigma[j] = max(_robust_rms(d), 1e-9)
-        if told:
-            d = _without_slow(d, max(4, round(1.0 / max(float(np.median(np.diff(rows.time))), 1e-6))))
-            sigma[j] = max(_robust_rms(d), 1e-9)
-            width = max(2, round(0.2 / max(float(np.median(np.diff(rows.time))), 1e-6)))
-            count = len(d) // width
-            if count >= 4:
-                means = d[: count * width].reshape(count, width).mean(axis=1)
-                dilution[j] = float(np.clip(width * np.mean(means**2) / np.mean(d**2), 1.0, width))
-                if dilution[j] < 1.0 + 3.0 * np.sqrt(2.0 / count):
-                    dilution[j] = 1.0
-    return sigma, dilution, told
-
-
-def _without_slow(values: Floats, width: int) -> Floats:
-    """Values less their means over `width` samples: a drift from period to period is no noise."""
-    count = len(values) // width * width
-    if not count:
-        return values
-    parts = values[:count].reshape(-1, width)
-    return ((parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(width / (width - 1.0))).ravel()
-
-
-def _robust_rms(values: Floats) -> float:
-    """Root mean square without the largest five per cent, scaled as for a normal distribution."""
-    limit = np.quantile(np.abs(values), 0.95)
-    return float(np.sqrt(np.mean(values[np.abs(values) <= limit] ** 2)) / 0.8711)

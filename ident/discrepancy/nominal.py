@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,8 @@ class Arm:
     compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio :
     (n,), one where
     unknown. motor_delay_s, joint_delay_s : of the healthy channels.
-    encoder : `link` or `motor`, the side of the elastic joints whose positions are published.
+    encoder : `link` or `motor`, the side of the elastic joints whose positions are published;
+    encoder_known : whether a healthy arm told it.
     """
 
     chain: Chain
@@ -53,7 +55,8 @@ class Arm:
     gear_ratio: Floats
     motor_delay_s: float = 0.0
     joint_delay_s: float = 0.0
-    encoder: str = "link"
+    encoder: Literal["link", "motor"] = "link"
+    encoder_known: bool = False
 
 
 def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStructure, BaseSet]:

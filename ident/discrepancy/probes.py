@@ -7,7 +7,7 @@ finds is reported by its variables, and names that were given while much was lef
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,11 +42,12 @@ def find_remainders(
     """Remainders beside the columns that the evidence holds, largest first; at most two variables each."""
     fixed = list(evidence.extra)
     found = []
+    hats = _hats_of(dictionary)
     for side in evidence.nominal.rows:
         for joint in range(evidence.nominal.arm.chain.n):
             if evidence.mask[side, joint].sum() < 100:
                 continue
-            remainder = _one(dictionary, evidence, settings, side, joint)
+            remainder = _one(dictionary, evidence, settings, hats, side, joint)
             evidence.replace(fixed)
             if remainder is not None:
                 found.append(remainder)
@@ -54,16 +55,24 @@ def find_remainders(
 
 
 def _one(
-    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, side: str, joint: int
+    dictionary: Dictionary,
+    evidence: Evidence,
+    settings: DiagnosisSettings,
+    hats: Mapping[str, Sequence[Floats]],
+    side: str,
+    joint: int,
 ) -> Remainder | None:
     names: list[str] = []
     total = inflation = 0.0
-    groups = _groups(dictionary, side, joint)
+    groups = {}
+    for name, rows in _groups(dictionary, hats, side, joint).items():
+        padded = evidence.padded(rows)
+        groups[name] = rows, padded, evidence.alone(padded)
     fixed = list(evidence.extra)
     for _ in range(2):
         best_name, best_gain, best_rows, best_inflation = "", 0.0, None, 0.0
-        for name, rows in groups.items():
-            score = evidence.score(evidence.padded(rows), ridge=_RIDGE)
+        for name, (rows, padded, known) in groups.items():
+            score = evidence.score(padded, ridge=_RIDGE, known=known)
             least = settings.least_gain + 2.0 * _HATS
             if score.gain > max(least, best_gain) and score.inflation > _LEAST_INFLATION:
                 best_name, best_gain, best_rows = name, score.gain, rows
@@ -79,34 +88,36 @@ def _one(
     return Remainder(side, joint + 1, tuple(names), total, inflation) if names else None
 
 
-def _groups(dictionary: Dictionary, side: str, joint: int) -> dict[str, dict[Key, Floats]]:
-    """Groups of columns by the names of their variables."""
-    n = dictionary.nominal.arm.chain.n
-    variables: dict[str, Callable[[Motion], Floats]] = {
-        f"q{joint + 1}": lambda m: m.q[:, joint],
-        f"qd{joint + 1}": lambda m: m.motor_speed[:, joint],
-        f"load{joint + 1}": lambda m: m.joint_torque[:, joint],
-        "time": lambda m: m.time,
-    }
-    for k in range(n):
-        if k != joint:
-            variables[f"q{k + 1}"] = lambda m, k=k: m.q[:, k]  # type: ignore[misc]
-            variables[f"qd{k + 1}"] = lambda m, k=k: m.motor_speed[:, k]  # type: ignore[misc]
-    found: dict[str, dict[Key, Floats]] = {}
+def _hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
+    """Hat functions of every variable by its name, for each motion."""
+    variables: dict[str, Callable[[Motion], Floats]] = {"time": lambda m: m.time}
+    for k in range(dictionary.nominal.arm.chain.n):
+        variables[f"q{k + 1}"] = lambda m, k=k: m.q[:, k]  # type: ignore[misc]
+        variables[f"qd{k + 1}"] = lambda m, k=k: m.motor_speed[:, k]  # type: ignore[misc]
+        variables[f"load{k + 1}"] = lambda m, k=k: m.joint_torque[:, k]  # type: ignore[misc]
+    found = {}
     for name, variable in variables.items():
         values = [variable(m) for m in dictionary.nominal.motions]
         low = min(float(v.min()) for v in values)
         high = max(float(v.max()) for v in values)
-        if high - low < 1e-6:
+        if high - low >= 1e-6:
+            found[name] = [_hats(v, low, high) for v in values]
+    return found
+
+
+def _groups(
+    dictionary: Dictionary, hats: Mapping[str, Sequence[Floats]], side: str, joint: int
+) -> dict[str, dict[Key, Floats]]:
+    """Groups of columns by the names of their variables."""
+    nominal, found = dictionary.nominal, {}
+    signs = [np.sign(m.motor_speed[:, joint : joint + 1]) for m in nominal.motions]
+    for name, parts in hats.items():
+        if name.startswith("load") and name != f"load{joint + 1}":
             continue
-        hats = [_hats(v, low, high) for v in values]
-        found[name] = {(side, joint): dictionary.nominal.reduce(side, hats)}
+        found[name] = {(side, joint): nominal.reduce(side, parts)}
         if not name.startswith("qd"):
-            signed = [
-                h * np.sign(m.motor_speed[:, joint : joint + 1])
-                for h, m in zip(hats, dictionary.nominal.motions, strict=True)
-            ]
-            found[f"{name} sign(qd{joint + 1})"] = {(side, joint): dictionary.nominal.reduce(side, signed)}
+            signed = [part * sign for part, sign in zip(parts, signs, strict=True)]
+            found[f"{name} sign(qd{joint + 1})"] = {(side, joint): nominal.reduce(side, signed)}
     return found
 
 

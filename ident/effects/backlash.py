@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ident.effects.deflection import deflected
-from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
+from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated, encoder_sides
 from ident.effects.motion import Motion
 
 
@@ -32,11 +32,13 @@ class Backlash(Effect):
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Both places of the encoder, sharp and soft crossing; none where the torque keeps its sign."""
+        """Places of the encoder, sharp and soft crossing; none where the torque keeps its sign."""
         if not setting.torque_turns[joint]:
             return []
         top = float(setting.torque_range[joint])
-        return [{"encoder": e, "width": max(1e-3, w * top)} for e in (1.0, 0.0) for w in (0.01, 0.05)]
+        return [
+            {"encoder": e, "width": max(1e-3, w * top)} for e in encoder_sides(setting) for w in (0.01, 0.05)
+        ]
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
         """The width, loosely."""

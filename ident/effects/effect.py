@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.effects.motion import Floats, Motion
 
-__all__ = ["Column", "Effect", "EffectSide", "Parameter", "Setting", "Shape", "Simulated"]
+__all__ = ["Column", "Effect", "EffectSide", "Parameter", "Setting", "Shape", "Simulated", "encoder_sides"]
 
 EffectSide = Literal["motor", "joint", "sensor", "timing"]
 Shape = Mapping[str, float]
@@ -70,7 +70,8 @@ class Setting:
 
     sessions : number of sessions. durations_s : of each. gear_ratio : (n,). torque_range, speed_range : (n,)
         largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad]. torque_turns :
-        (n,) whether the joint torque changes its sign for more than a moment.
+        (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic
+        joints that publishes the positions, None where unknown.
     """
 
     sessions: int
@@ -80,6 +81,13 @@ class Setting:
     torque_turns: NDArray[np.bool_]
     speed_range: Floats
     position_range: Floats
+    encoder: Literal["link", "motor"] | None = None
+
+
+def encoder_sides(setting: Setting) -> tuple[float, ...]:
+    """Values of a shape's `encoder` to try: 1 motor, 0 link."""
+    known = {"motor": (1.0,), "link": (0.0,)}
+    return (1.0, 0.0) if setting.encoder is None else known[setting.encoder]
 
 
 class Simulated:

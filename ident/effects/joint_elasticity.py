@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ident.effects.deflection import deflected
-from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
+from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated, encoder_sides
 from ident.effects.motion import Motion
 
 
@@ -31,8 +31,8 @@ class JointElasticity(Effect):
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Both places of the encoder."""
-        return [{"encoder": 1.0}, {"encoder": 0.0}]
+        """Places of the encoder."""
+        return [{"encoder": e} for e in encoder_sides(setting)]
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
         """Either or."""
