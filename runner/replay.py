@@ -1,65 +1,114 @@
 """Simulation of a session with a model: the same commands to the emulated arm, measured against simulated.
 
 The arm is the emulator's plant with the model's links, drives and effects and with joints as stiff as the
-arm's description says, under the emulator's position controller; the sensors are without noise. The
-controller of a real arm is another one, so its error of position counts for comparing models, not by itself.
+arm's description says, under the emulator's position controller, which is told the announced load; the sensors
+are without noise. It runs in this process, some ten times faster than the session did. The controller of a real
+arm is another one, so its error of position counts for comparing models, not by itself.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import pinocchio as pin
+import yaml
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
-from fri.errors import DataError
-from ident.cad_prior import cad_prior
+from fri.errors import ConfigurationError, DataError
 from ident.discrepancy import SimulationError
-from ident.effects import Simulated, find_effect
-from ident.effects.model_torque import parameter_values
 from ident.model import DynamicModel
-from ident.parameters import INERTIAL, PER_LINK
+from ident.signals.filters import low_pass
 from lwr_driver.arm import Arm
-from lwr_driver.configuration import find
+from lwr_driver.configuration import find, parse
 from lwr_driver.session import Session
-from sim_backend.configuration import EmulatorConfig, load_configuration
+from runner.experiment_file import Experiment
+from sim_backend.configuration import EmulatorConfig, LoadData, load_configuration
 from sim_backend.controller import ControllerModel, PositionController
-from sim_backend.plant import CYCLE_S, Drive, Effect, ElasticArm, Reading
-from sim_backend.rigid_body import chain, mass_matrix_floor
+from sim_backend.model_arm import drive_of, links_of, model_effects
+from sim_backend.plant import CYCLE_S, ElasticArm, Reading
+from sim_backend.rigid_body import chain
 
-__all__ = ["Replay", "replay", "simulated_arm"]
+__all__ = ["Replay", "Replayed", "replay"]
 
 Floats = NDArray[np.float64]
 
 _BIN = 20
 _SETTLE = 500
+_COMMAND_HZ = 20.0
+_LATEST_S = 0.02
+"""A command acts at most this much later than it was logged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """Measured less simulated, in means over 20 ms: position (m, n) [rad], motor and joint torque [Nm].
+
+    delay_s : how much later than logged the commands acted, as the positions tell.
+    commanded : whether the log has commands; otherwise the measured positions were commanded.
+    """
+
+    position: Floats
+    motor: Floats | None
+    joint: Floats | None
+    delay_s: float
+    commanded: bool
 
 
 class Replay:
     """Replays sessions of `arm`; call it with a model and sessions.
 
-    longest_s : of each session that is simulated. config : emulator whose controller holds the arm.
+    sessions : all of the diagnosis, so that each has its number in their order. longest_s : of each session
+    that is simulated, where no effect belongs to a later moment. config : emulator whose controller holds the
+    arm. notes : after a call, what could not be simulated and why.
     """
 
-    def __init__(self, arm: Arm, *, longest_s: float = 20.0, config: EmulatorConfig | None = None) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        sessions: Sequence[Session] = (),
+        *,
+        longest_s: float = 60.0,
+        config: EmulatorConfig | None = None,
+    ) -> None:
         self.arm = arm
         self.longest_s = longest_s
         self.config = config or load_configuration()
+        self.notes: dict[str, None] = {}
+        self._order = sorted(session.start for session in sessions)
+        self._delays: dict[int, float] = {}
 
     def __call__(self, model: DynamicModel, sessions: Sequence[Session]) -> SimulationError | None:
-        """Error over all sessions; None where none has commands or the model belongs to no arm that moves."""
-        squares, count = np.zeros((3, self.arm.stiffness.size)), np.zeros(3)
+        """Error over all sessions; None where none can be simulated."""
+        squares, count = np.zeros((3, len(self.arm.joint_names))), np.zeros(3)
         for session in sessions:
-            if session.command is None or not len(session.command):
-                continue
+            name = session.path.name
+            number = self._order.index(session.start) if session.start in self._order else None
             try:
-                parts = replay(model, session, self.arm, self.config, self.longest_s)
-            except DataError:
-                return None
-            for k, part in enumerate(parts):
+                done = replay(
+                    model,
+                    session,
+                    self.arm,
+                    self.config,
+                    self.longest_s,
+                    number=number,
+                    delay_s=self._delays.get(session.start),
+                )
+            except (DataError, ConfigurationError) as error:
+                self.notes[f"{name}: no simulation: {error}"] = None
+                continue
+            self._delays.setdefault(session.start, done.delay_s)
+            if not done.commanded:
+                self.notes[
+                    f"{name} has no commands: the simulated arm followed its measured positions, so the simulated "
+                    "position says how well the controller holds a path, not how the arm answered"
+                ] = None
+            for k, part in enumerate((done.position, done.motor, done.joint)):
                 if part is not None:
-                    squares[k] += np.sum(part**2, axis=0)
+                    squares[k] += np.nansum(part**2, axis=0)
                     count[k] += len(part)
         if not count[0]:
             return None
@@ -68,135 +117,177 @@ class Replay:
         return SimulationError(position=rms[0], motor=rms[1], joint=rms[2])
 
 
-def simulated_arm(model: DynamicModel, payload: str | None, arm: Arm, config: EmulatorConfig) -> ElasticArm:
-    """The emulator's plant with a model's parameters and effects.
-
-    Of the standard parameters with the model's torque those next to the URDF's are taken. Raises DataError
-    when their mass matrix is not positive definite.
-    """
-    standard = model.standard_parameters()
-    if model.base is not None and model.structure.chain.urdf is not None:
-        prior = cad_prior(model.base)
-        near = np.zeros(model.structure.n_columns)
-        near[prior.bodies] = prior.inertial
-        standard = model.standard_parameters(near)
-    bodies = model.inertial(payload, standard=standard)
-    n = model.structure.chain.n
-    changed = chain(find(arm.urdf_path))
-    for link, body in enumerate(bodies, start=1):
-        changed.inertias[link] = _inertia(dict(zip(INERTIAL, body, strict=True)))
-    if mass_matrix_floor(changed) <= 0.0:
-        raise DataError("the mass matrix of the model is not positive definite, so it cannot be simulated")
-    table = standard[: len(PER_LINK) * n].reshape(n, -1)[:, len(INERTIAL) :]
-    rows = {symbol: table[:, k].copy() for k, symbol in enumerate(PER_LINK[len(INERTIAL) :])}
-    for symbol in ("Fvl", "Fcl", "Fvm", "Fcm"):
-        rows[symbol] = np.maximum(rows[symbol], 0.0)
-    rows["Ia"] = np.maximum(rows["Ia"], 1e-3)
-    drive = Drive(
-        **rows,
-        stiffness=np.asarray(arm.stiffness, dtype=float),
-        damping=np.array(config.robot.damping, dtype=float),
-    )
-    effects = [_Plugged(part) for part in _parts(model)]
-    return ElasticArm(changed, drive, substeps=config.robot.substeps, effects=effects)
-
-
 def replay(
-    model: DynamicModel, session: Session, arm: Arm, config: EmulatorConfig, longest_s: float
-) -> tuple[Floats, Floats | None, Floats | None]:
-    """Measured less simulated position (m, n) [rad], motor and joint torque [Nm], in means over 20 ms."""
+    model: DynamicModel,
+    session: Session,
+    arm: Arm,
+    config: EmulatorConfig,
+    longest_s: float,
+    *,
+    number: int | None = None,
+    delay_s: float | None = None,
+) -> Replayed:
+    """Simulate a session from the beginning of its excitation.
+
+    number : of the session among those of the diagnosis, from 0. delay_s : of the commands; None: as the
+    positions of a first simulation tell. Raises DataError for a model that no arm can have.
+    """
     chosen = session.select(model.structure.chain.joint_names)
-    command = chosen.command
-    assert command is not None
-    spans = chosen.spans("period") or ((chosen.start, int(chosen.joint.log_time[-1])),)
-    start = max(int(spans[0][0]), int(command.log_time[0]), int(chosen.joint.log_time[0]))
-    stop = min(int(spans[-1][1]), int(command.log_time[-1]), start + int(longest_s * 1e9))
+    source = chosen.command if chosen.command is not None and len(chosen.command) else None
+    if source is None and not len(chosen.joint):
+        raise DataError("the session holds no positions")
+    joint = chosen.joint
+    spans = chosen.spans("period") or ((chosen.start, int(joint.log_time[-1])),)
+    start, stop = max(int(spans[0][0]), int(joint.log_time[0])), int(spans[-1][1])
+    if source is not None:
+        start, stop = max(start, int(source.log_time[0])), min(stop, int(source.log_time[-1]))
+    latest = max((float(e["parameters"]["time"]["value"]) for e in _events(model, number)), default=0.0)
+    stop = min(stop, start + int(max(longest_s, latest + longest_s / 2.0) * 1e9))
     grid = np.arange(start, stop, int(CYCLE_S * 1e9))
-    wanted = _resampled(command.log_time, command.position, grid)
-    payload = chosen.metadata.get("payload", "none").strip()
-    known = payload if payload in model.structure.payloads else None
-    plant = simulated_arm(model, known, arm, config)
-    position, motor, joint = _run(plant, wanted, config)
-    errors = [_binned(_resampled(chosen.joint.log_time, chosen.joint.position, grid) - position)]
+    if len(grid) < 2 * _BIN:
+        raise DataError("less than a moment of it has both commands and positions")
+    bench = _Bench(model, chosen, arm, config, number, begin_s=(start - chosen.start) * 1e-9)
+    measured = _resampled(joint.log_time, joint.position, grid)
+    if source is None:
+        wanted, delay = _smooth(joint.log_time, joint.position, grid), 0.0
+        run = bench.run(wanted)
+    else:
+        wanted = _resampled(source.log_time, source.position, grid)
+        delay = 0.0 if delay_s is None else delay_s
+        run = bench.run(_late(wanted, delay))
+        if delay_s is None:
+            delay = _delay(measured, run[0])
+            run = bench.run(_late(wanted, delay))
+    position, motor, link = run
     motor_error = None
     if chosen.motor is not None and chosen.motor.effort.shape[1]:
         times = chosen.motor.log_time
         inside = (times >= grid[0]) & (times <= grid[-1])
         motor_error = chosen.motor.effort[inside] - _resampled(grid, motor, times[inside])
     joint_error = None
-    if chosen.joint.effort.shape[1]:
-        joint_error = _binned(_resampled(chosen.joint.log_time, chosen.joint.effort, grid) - joint)
-    return errors[0], motor_error, joint_error
+    if joint.effort.shape[1]:
+        joint_error = _binned(_resampled(joint.log_time, joint.effort, grid) - link)
+    return Replayed(_binned(measured - position), motor_error, joint_error, delay, source is not None)
 
 
-class _Plugged(Effect):
-    """An effect of the model as the plant calls it."""
+class _Bench:
+    """A simulated arm under its controller, made for one session."""
 
-    def __init__(self, part: Simulated) -> None:
-        self.part = part
+    def __init__(
+        self,
+        model: DynamicModel,
+        session: Session,
+        arm: Arm,
+        config: EmulatorConfig,
+        number: int | None,
+        begin_s: float,
+    ) -> None:
+        payload = session.metadata.get("payload", "none").strip()
+        known = payload if payload in model.structure.payloads else None
+        stiffness, damping = (
+            np.asarray(arm.stiffness, dtype=float),
+            np.array(config.robot.damping, dtype=float),
+        )
+        if len(stiffness) != model.structure.chain.n or len(damping) != len(stiffness):
+            raise DataError(
+                f"the simulated arm has {len(damping)} joints, the model {model.structure.chain.n}; "
+                "other arms have no simulated controller"
+            )
+        self.config = config
+        self.number, self.begin_s, self.model = number, begin_s - _SETTLE * CYCLE_S, model
+        self.links = links_of(model, chain(find(arm.urdf_path)), known)
+        self.drive = drive_of(model, stiffness, damping)
+        self.load = _announced_load(session)
 
-    def start(self, joints: int, random: np.random.Generator) -> None:
-        self.part.start(joints, random)
+    def run(self, wanted: Floats) -> tuple[Floats, Floats, Floats]:
+        """Position, motor and joint torque (N, n) as noiseless sensors report them, for set points (N, n)."""
+        config = self.config
+        effects = model_effects(self.model, session=self.number, begin_s=self.begin_s)
+        plant = ElasticArm(self.links, self.drive, substeps=config.robot.substeps, effects=effects)
+        controller = PositionController(config.controller)
+        believed = ControllerModel(
+            chain(config.beside(config.controller.urdf)), self.load, config.controller.external_cutoff_hz
+        )
+        n = wanted.shape[1]
+        reading = Reading(*np.zeros((4, n)))
+        out = np.zeros((3, len(wanted), n))
+        plant.reset(wanted[0])
+        controller.reset(wanted[0], believed.update_gravity(wanted[0]), plant.motor_position)
+        for k in range(-_SETTLE, len(wanted)):
+            setpoint = wanted[max(k, 0)]
+            time_s = (k + _SETTLE) * CYCLE_S
+            reading.position[:], reading.motor_position[:] = plant.position, plant.motor_position
+            reading.joint_torque[:] = plant.joint_torque
+            for effect in plant.effects:
+                effect.sense(time_s, plant, reading)
+            torque = controller.cycle(
+                setpoint, believed.update_gravity(setpoint), reading.motor_position, reading.joint_torque
+            )
+            reading.motor_torque[:] = 0.5 * (plant.motor_torque + torque)
+            for effect in plant.effects:
+                effect.sense_motor(time_s, plant, reading)
+            if k >= 0:
+                out[0, k], out[1, k], out[2, k] = reading.position, reading.motor_torque, reading.joint_torque
+            plant.step(torque)
+            if not np.all(np.isfinite(plant.position)):
+                raise DataError("the simulated arm became unstable; the parameters belong to no real arm")
+        return out[0], out[1], out[2]
 
-    def load(self, time_s: float, plant: object, loads: object) -> None:
-        self.part.load(time_s, plant, loads)
 
-    def sense(self, time_s: float, plant: object, reading: object) -> None:
-        self.part.sense(time_s, plant, reading)
-
-    def sense_motor(self, time_s: float, plant: object, reading: object) -> None:
-        self.part.sense_motor(time_s, plant, reading)
-
-
-def _parts(model: DynamicModel) -> list[Simulated]:
-    """The model's effects, those of a moment left out."""
+def _events(model: DynamicModel, number: int | None) -> list[dict[str, Any]]:
+    """Entries of effects that belong to a moment of this session."""
     found = []
     for entry in model.effects:
-        effect = find_effect(str(entry["cause"]))
-        if not effect.event:
-            values = parameter_values(entry)
-            found += [effect.simulate(int(joint) - 1, values) for joint in entry["joints"] or [1]]
+        parameters = entry["parameters"]
+        if "time" in parameters and "session" in parameters:
+            own = round(float(parameters["session"]["value"])) - 1
+            if own == number:
+                found.append(dict(entry))
     return found
 
 
-def _run(plant: ElasticArm, wanted: Floats, config: EmulatorConfig) -> tuple[Floats, Floats, Floats]:
-    """Position, motor and joint torque (N, n) as noiseless sensors report them."""
-    controller = PositionController(config.controller)
-    believed = ControllerModel(
-        chain(config.beside(config.controller.urdf)),
-        config.controller.load,
-        config.controller.external_cutoff_hz,
-    )
-    n = wanted.shape[1]
-    reading = Reading(*np.zeros((4, n)))
-    out = np.zeros((3, len(wanted), n))
-    plant.reset(wanted[0])
-    controller.reset(wanted[0], believed.update_gravity(wanted[0]), plant.motor_position)
-    for k in range(-_SETTLE, len(wanted)):
-        setpoint = wanted[max(k, 0)]
-        time_s = max(k, 0) * CYCLE_S
-        reading.position[:], reading.motor_position[:] = plant.position, plant.motor_position
-        reading.joint_torque[:] = plant.joint_torque
-        for effect in plant.effects:
-            effect.sense(time_s, plant, reading)
-        torque = controller.cycle(
-            setpoint, believed.update_gravity(setpoint), reading.motor_position, reading.joint_torque
-        )
-        reading.motor_torque[:] = 0.5 * (plant.motor_torque + torque)
-        for effect in plant.effects:
-            effect.sense_motor(time_s, plant, reading)
-        if k >= 0:
-            out[0, k], out[1, k], out[2, k] = reading.position, reading.motor_torque, reading.joint_torque
-        plant.step(torque)
-        if not np.all(np.isfinite(plant.position)):
-            raise DataError("the simulated arm became unstable; the parameters belong to no real arm")
-    return out[0], out[1], out[2]
+def _announced_load(session: Session) -> LoadData:
+    """The load data that the controller was given, from the experiment file in the log; else the mass alone."""
+    payload = session.metadata.get("payload", "none").strip()
+    if payload in ("", "none"):
+        return LoadData()
+    text = session.attachments.get("experiment.yaml")
+    if text is not None:
+        try:
+            content = yaml.safe_load(text)
+            announced = parse(Experiment, content, "experiment.yaml").payloads().get(payload)
+        except (ConfigurationError, yaml.YAMLError) as error:
+            logging.getLogger(__name__).info("%s: %s", session.path.name, error)
+            announced = None
+        if announced is not None:
+            return LoadData(announced.mass, announced.com, announced.inertia)
+    return LoadData(float(session.metadata.get("payload_mass", 0.0) or 0.0))
 
 
-def _inertia(values: dict[str, float]) -> pin.Inertia:
-    order = ("MX", "MY", "MZ", "XX", "XY", "YY", "XZ", "YZ", "ZZ")
-    mass = values["M"] if abs(values["M"]) > 1e-9 else 1e-9
-    return pin.Inertia.FromDynamicParameters(np.array([mass, *(values[name] for name in order)]))
+def _delay(measured: Floats, simulated: Floats) -> float:
+    """Time [s] by which the measured positions (N, n) lag the simulated ones, by least squares of all joints."""
+    speed = np.gradient(simulated, CYCLE_S, axis=0)
+    offset = np.mean(measured - simulated, axis=0)
+    late = -float(np.sum(speed * (measured - simulated - offset)) / max(float(np.sum(speed**2)), 1e-12))
+    return float(np.clip(late, 0.0, _LATEST_S))
+
+
+def _late(wanted: Floats, delay_s: float) -> Floats:
+    """Set points (N, n) that act `delay_s` later."""
+    if delay_s <= 0.0:
+        return wanted
+    at = np.arange(len(wanted)) * CYCLE_S
+    return np.column_stack([np.interp(at - delay_s, at, column) for column in wanted.T])
+
+
+def _smooth(times: NDArray[np.int64], position: Floats, grid: NDArray[np.int64]) -> Floats:
+    """Measured positions as a path (N, n) that a controller can follow."""
+    here = (times - times[0]) * 1e-9
+    step = float(np.median(np.diff(here)))
+    even = np.arange(0.0, here[-1], step)
+    values = np.column_stack([np.interp(even, here, column) for column in position.T])
+    values = low_pass(values, step, min(_COMMAND_HZ, 0.2 / step))
+    return np.asarray(CubicSpline(even, values)((grid - times[0]) * 1e-9))
 
 
 def _resampled(times: NDArray[np.int64], values: Floats, wanted: NDArray[np.int64]) -> Floats:

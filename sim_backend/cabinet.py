@@ -23,12 +23,13 @@ from lwr_driver.arm import Arm
 from sim_backend.configuration import EmulatorConfig, LoadData, Plugin
 from sim_backend.controller import ControllerModel, PositionController
 from sim_backend.krl_program import OWN_PROGRAM, krl_program
+from sim_backend.model_arm import model_effects
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
 from sim_backend.recording import ControllerTrace, KrlReals
 from sim_backend.rigid_body import chain
 from sim_backend.sensors import Sensors
-from sim_backend.truth import robot_file, true_arm
+from sim_backend.truth import robot_file, robot_model, true_arm
 
 __all__ = ["Cabinet"]
 
@@ -67,11 +68,9 @@ class Cabinet:
         self.joints = self.plant.position.size
         self.sensors = Sensors(config.sensors, self.joints, sensor_seed)
         self.reading = self.sensors.reading
-        self.model = ControllerModel(
-            chain(config.beside(config.controller.urdf)),
-            config.controller.load,
-            config.controller.external_cutoff_hz,
-        )
+        believed = chain(config.beside(config.controller.urdf))
+        cutoff_hz = config.controller.external_cutoff_hz
+        self.model = ControllerModel(believed, config.controller.load, cutoff_hz)
         self.controller = PositionController(config.controller)
         self.krl_reals = KrlReals(config.krl_reals, self.joints)
         self.currents = np.zeros(self.joints)
@@ -96,13 +95,16 @@ class Cabinet:
         self._commanding = False
         self._zero = np.zeros(self.joints)
         self._begin(np.array(config.robot.start_position))
+        self._compile(ControllerModel(believed, config.controller.load, cutoff_hz))
 
     def _make_plant(self, seed: np.random.SeedSequence) -> Plant:
         robot = self.config.robot
         model, drive = true_arm(self.config, self.file)
         payload = self.file.payload(robot.payload)
         own, others = seed.spawn(2)
-        self.effects: tuple[Effect, ...] = tuple(_load(effect) for effect in robot.effects)
+        identified = robot_model(self.config)
+        own_effects = () if identified is None else model_effects(identified)
+        self.effects: tuple[Effect, ...] = (*own_effects, *(_load(effect) for effect in robot.effects))
         if robot.plant is not None:
             plant = _load(robot.plant, model, drive, np.random.default_rng(own))
             if not isinstance(plant, Plant):
@@ -126,6 +128,13 @@ class Cabinet:
         self.cold_start()
         for _ in range(round(self.config.controller.settle_s / CYCLE_S)):
             self._millisecond(position)
+
+    def _compile(self, scratch: ControllerModel) -> None:
+        """Have compiled, the first time on a computer, what is first needed when somebody waits for it."""
+        scratch.update_model(self.reading.position)
+        scratch.update_external(self.reading.position, self.reading.joint_torque, CYCLE_S)
+        command = np.frombuffer(bytes(4 * self.joints), "<f4", self.joints)
+        CommandMonitor(self.arm, CYCLE_S).take(command, 0)
 
     def cold_start(self) -> None:
         """A new session with its counters at zero, as after switching the cabinet on; no program runs."""

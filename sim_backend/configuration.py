@@ -66,7 +66,8 @@ class Plugin:
 class RobotConfig:
     """The arm as it really is.
 
-    urdf : kinematics. parameters : file with the standard parameters and the payloads known by name
+    urdf : kinematics. parameters : file with the standard parameters and the payloads known by name, or an
+    identified `model.yaml`, whose effects act as well
     stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
     substeps : steps of the joint dynamics within 1 ms
     effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)

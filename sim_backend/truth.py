@@ -11,13 +11,16 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, DataError
+from ident.model import DynamicModel
+from ident.model_file import read_model
 from lwr_driver.configuration import parse, read_mapping
 from sim_backend.configuration import JOINTS, EmulatorConfig, RobotConfig, load_configuration
+from sim_backend.model_arm import model_parameters, model_payloads
 from sim_backend.plant import Drive
 from sim_backend.rigid_body import BODY_PARAMETERS, Payload, chain, with_inertias
 
-__all__ = ["DRIVE_PARAMETERS", "RobotFile", "robot_file", "true_arm", "truth"]
+__all__ = ["DRIVE_PARAMETERS", "RobotFile", "robot_file", "robot_model", "true_arm", "truth"]
 
 DRIVE_PARAMETERS = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")
 
@@ -54,9 +57,30 @@ class RobotFile:
 
 
 def robot_file(config: EmulatorConfig) -> RobotFile:
-    """Read the parameter file that `config` names."""
+    """Read what `config` names as the arm's parameters: a parameter file, or an identified `model.yaml`."""
     path = config.beside(config.robot.parameters)
-    return parse(RobotFile, read_mapping(path), str(path))
+    model = robot_model(config)
+    if model is None:
+        return parse(RobotFile, read_mapping(path), str(path))
+    try:
+        payloads = {name: Payload(**values) for name, values in model_payloads(model).items()}
+        return RobotFile(model_parameters(model), payloads)
+    except (ConfigurationError, DataError) as error:
+        raise ConfigurationError(f"{path}: this model cannot be emulated: {error}") from error
+
+
+def robot_model(config: EmulatorConfig) -> DynamicModel | None:
+    """The identified model that `config` names as the arm's parameters; None where it names a parameter file."""
+    path = config.beside(config.robot.parameters)
+    content = read_mapping(path)
+    if "chain" not in content:
+        return None
+    model = read_model(content)
+    if model.structure.chain.n != JOINTS:
+        raise ConfigurationError(
+            f"{path}: a model of {model.structure.chain.n} joints; the FRI carries {JOINTS}"
+        )
+    return model
 
 
 def truth(config: EmulatorConfig | str | Path, payload: str | None = None) -> dict[str, float]:
