@@ -163,6 +163,7 @@ class RemoteEnd:
         self._torque_set = False
         self._unanswered = False
         self._answered_last = False
+        self._answered_seq = 0
 
         self.send_seq = (first_sequence - 1) & 0xFFFF
         self.sequence = -1
@@ -330,6 +331,7 @@ class RemoteEnd:
             self._cart_pos[:] = msr.cmd_cart_pos
         self._unanswered = False
         self.send_seq = (self.send_seq + 1) & 0xFFFF
+        self._answered_seq = msr.send_seq
         self._pack_sequence(self._out, 0, self.send_seq, msr.send_seq)
         assert self.controller is not None
         try:
@@ -340,6 +342,20 @@ class RemoteEnd:
         self.answered += 1
         self._answered_last = True
         return used
+
+    def remind(self) -> None:
+        """In lock step only: the last answer once more, to say that nothing came after the packet it was for.
+
+        A controller that waits for an answer which was lost, or whose packet was, sends its packet again. A
+        real controller never waits, and must not get this.
+        """
+        if self.controller is None:
+            return
+        self._pack_sequence(self._out, 0, self.send_seq, self._answered_seq)
+        try:
+            self._socket.sendto(self._out, self.controller)
+        except OSError:
+            self.send_errors += 1
 
     def set_krl_bool(self, index: int, value: bool) -> None:
         """Set bit `index` (0..15), which is ``$FRI_FRM_BOOL[index + 1]``, in the answers from now on."""

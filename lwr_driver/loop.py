@@ -33,6 +33,7 @@ _IDLE_S = 0.0005  # pause of a loop in lock step that has nothing to do
 _SLICE_S = 0.02  # longest wait for a packet before requests and silence are looked at
 _FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated
 _RING_PATIENCE_S = 5.0
+_REMIND_S = 1.0  # silence in lock step after which the other side is told that nothing came
 _STILL_RAD = 1e-5  # a set point that moves by no more in a cycle rests
 # What a reason tells of the link: counter and word for it.
 _TOLD = (
@@ -98,7 +99,8 @@ class Loop:
         self._doubted = self._held_back = False
         self._misses, self._misses_before, self._missed_at = 0, 0, -_FEWEST_CYCLES
         self._counted_before = self.remote.counters()
-        self._heard_s = time.monotonic()
+        self._heard_s = self._reminded_s = time.monotonic()
+        self._answered = False
         self._restarts = 0
         self._last_event: LinkEvent | None = None
 
@@ -151,6 +153,7 @@ class Loop:
         answered = self._commander.mode is not Mode.SILENT and not self._held_back
         if answered:
             remote.answer(target, insist=self._doubted)
+        self._answered = answered
         self._write_row(answered)
         self._advance_job(elapsed)
         return True
@@ -162,11 +165,26 @@ class Loop:
         self._take_request()
         if self._job is not Job.NONE:
             self._wait_for_ring()
-            self.cycle(_SLICE_S)
+            if not self.cycle(_SLICE_S):
+                self.remind()
             return
         time.sleep(_IDLE_S)
+        if self._commander.mode is not Mode.MIRROR:
+            self.remind()
         if self._ring is not None:
             self._ring.beat(time.monotonic_ns())
+
+    def remind(self) -> None:
+        """Lock step: after a while without a packet, say that all that came has been answered.
+
+        One datagram lost on either way would else make both sides wait for ever, and in command mode a driver
+        that thinks for long would seem to be gone. What is held back on purpose is no reason to remind.
+        """
+        now = time.monotonic()
+        answering = self._answered and self._commander.mode is not Mode.SILENT
+        if answering and now - max(self._heard_s, self._reminded_s) >= _REMIND_S:
+            self._reminded_s = now
+            self.remote.remind()
 
     def _wait_for_ring(self) -> None:
         ring = self._ring

@@ -37,8 +37,10 @@ def run(
         follow=sys.stdin.fileno() if follow_stdin else None,
     )
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: service.stop())
+        signal.signal(signal.SIGTERM, lambda *_: service.stop())
+        # Ctrl-C at a terminal reaches all its processes; an emulator that follows another ends with that one,
+        # not under an arm that is being braked.
+        signal.signal(signal.SIGINT, signal.SIG_IGN if follow_stdin else lambda *_: service.stop())
         if announce:
             sys.stdout.write(json.dumps({"pendant_port": service.pendant.port}) + "\n")
             sys.stdout.flush()

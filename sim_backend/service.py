@@ -59,6 +59,9 @@ class Service:
         self._ended = False
         self._impatient = False
         self._unanswerable = 0
+        self._stepping = False
+        self._last_head = b""  # counters of the answer taken last
+        self._reminded = False
         self._poller = select.poll()
         self._fri = self.end.fileno()
         self._poller.register(self._fri, select.POLLIN)
@@ -87,6 +90,7 @@ class Service:
         # What start-up made stays; collecting it again would only cost time within a cycle.
         gc.collect()
         gc.freeze()
+        self._stepping = lock_step
         cycle: Callable[[], None] = self._lock_step if lock_step else self._real_time
         self._deadline = time.monotonic()
         while self.running:
@@ -184,10 +188,15 @@ class Service:
         self._foreign[host].sendto(datagram, to)
 
     def _take(self, age_s: float) -> bytes | None:
-        """One datagram of the PC, handed on."""
+        """One datagram of the PC, handed on; in lock step a reminder is noted instead (`Loop.remind`)."""
         datagram = self.end.receive(0.0)
         if datagram is None:
             return None
+        if self._stepping:
+            self._reminded = datagram[:4] == self._last_head
+            if self._reminded:
+                return None
+            self._last_head = datagram[:4]
         cabinet = self.cabinet
         cabinet.arrived(datagram)
         if self.wire.quiet:
@@ -203,7 +212,8 @@ class Service:
 
         In monitor mode for as long as it takes, in command mode for the configured patience. The first packet
         is repeated until the PC is heard. An answer that reflects something else is followed by a short wait
-        only.
+        only. A PC that says that it has answered all it has seen gets the packet again, which may have been
+        lost, and as much time again: it is alive.
         """
         wanted = sent[:2]
         commanding = self.cabinet.session.state is State.CMD
@@ -223,6 +233,10 @@ class Service:
                 continue
             datagram = self._take(age_s)
             if datagram is None:
+                if self._reminded and limit_s != _PERHAPS_S:
+                    self._reminded = False
+                    self.end.send(sent)
+                    deadline = None if limit_s is None else time.monotonic() + limit_s
                 continue
             if datagram[2:4] == wanted:
                 self._impatient = False
