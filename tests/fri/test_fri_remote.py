@@ -14,6 +14,8 @@ from fri.states import Control, State
 
 # Long enough for loopback on a loaded machine, and never waited for in full by a passing test.
 PATIENCE_S = 5.0
+# For what is not handed on: a loaded machine delivers on loopback a little late.
+BRIEF_S = 0.1
 
 
 class Controller:
@@ -218,10 +220,10 @@ def test_timeout_ends_the_wait(end):
 def test_repeated_and_late_packets_are_counted_and_not_answered(end, controller):
     exchange(end, controller)
     controller.again()
-    assert end.receive(0.0) is None
+    assert end.receive(BRIEF_S) is None
     exchange(end, controller, step=3)
     controller.send(step=-1)
-    assert end.receive(0.0) is None
+    assert end.receive(BRIEF_S) is None
     with pytest.raises(RuntimeError, match="no packet"):
         end.answer()
     counters = end.counters()
@@ -254,7 +256,7 @@ def test_a_good_packet_behind_bad_ones_is_found_in_the_same_call(end, controller
 )
 def test_malformed_datagrams_are_counted_by_reason(end, controller, damage, fault):
     controller.raw(damage(controller.msr.tobytes()))
-    assert end.receive(0.0) is None
+    assert end.receive(BRIEF_S) is None
     assert end.controller is None
     assert (end.malformed, end.malformed_by[fault]) == (1, 1)
     exchange(end, controller)
@@ -265,7 +267,7 @@ def test_only_the_controller_is_answered_once_it_is_known(end, controller):
     exchange(end, controller)
     for _ in range(3):
         stranger.send()
-    assert end.receive(0.0) is None
+    assert end.receive(BRIEF_S) is None
     assert stranger.silent()
     assert end.foreign == 3
     events = [event for event in end.events if event.kind is LinkEventKind.FOREIGN]
@@ -279,7 +281,7 @@ def test_configured_controller_is_the_only_one_from_the_beginning():
     with RemoteEnd("127.0.0.1", 0, controller="127.0.0.3") as end:
         stranger, controller = Controller(end), Controller(end, "127.0.0.3")
         stranger.send()
-        assert end.receive(0.0) is None
+        assert end.receive(BRIEF_S) is None
         assert end.foreign == 1
         exchange(end, controller)
         assert end.controller == controller.socket.getsockname()
@@ -292,7 +294,7 @@ def test_second_program_on_the_controllers_host_does_not_take_over(end, controll
     exchange(end, controller)
     second = Controller(end)
     second.send()
-    assert end.receive(0.0) is None
+    assert end.receive(BRIEF_S) is None
     assert (end.foreign, end.port_changes) == (1, 0)
     assert second.silent()
     exchange(end, controller)
@@ -316,7 +318,7 @@ def test_command_mode_does_not_move_to_another_port(end, controller, monkeypatch
     second = Controller(end)
     second.number = controller.number
     second.send(state=State.CMD)
-    assert end.receive(0.0) is None
+    assert end.receive(BRIEF_S) is None
     assert (end.foreign, end.port_changes) == (1, 0)
     assert second.silent()
     exchange(end, controller)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import time
 
 import numpy as np
 from hypothesis import settings
@@ -25,6 +26,8 @@ def bound(host: str = "127.0.0.1") -> socket.socket:
 
 class LinkMachine(RuleBasedStateMachine):
     """One controller, a stranger, and a network that loses, repeats, reorders and damages."""
+
+    arriving = ("received", "repeated", "reordered", "malformed", "foreign")
 
     @initialize(first=st.integers(0, 0xFFFF), uptime=st.sampled_from([0.0, 3000.0]))
     def begin(self, first: int, uptime: float) -> None:
@@ -54,6 +57,16 @@ class LinkMachine(RuleBasedStateMachine):
 
     def post(self, datagram: bytes, source: socket.socket | None = None) -> None:
         (source or self.controller).sendto(datagram, self.end.address)
+
+    def nothing_usable(self) -> None:
+        """Wait until all that was sent has arrived (a loaded machine delivers late); none is handed on."""
+        patience = time.monotonic() + PATIENCE_S
+        while sum(self.end.counters()[name] for name in self.arriving) < sum(
+            self.count[name] for name in self.arriving
+        ):
+            assert self.end.receive(0.001) is None
+            assert time.monotonic() < patience, f"counted {self.end.counters()}, sent {self.count}"
+        assert self.end.receive(0.0) is None
 
     def replies(self, source: socket.socket) -> list[np.ndarray]:
         found = []
@@ -107,16 +120,16 @@ class LinkMachine(RuleBasedStateMachine):
     def repeat(self) -> None:
         if self.known:
             self.post(self.make(self.number))
-            assert self.end.receive(0.0) is None
             self.count["repeated"] += 1
+            self.nothing_usable()
 
     @rule(age=st.integers(1, 60))
     def late(self, age: int) -> None:
         if self.known:
             # An isolated late packet; runs of them are a restart and tested apart.
             self.post(self.make(self.number - age))
-            assert self.end.receive(0.0) is None
             self.count["reordered"] += 1
+            self.nothing_usable()
             self.packet(1, State.MON, 0x7F, Control.POSITION, True)
 
     @rule(cut=st.integers(0, MSR_SIZE - 1), extra=st.binary(max_size=20))
@@ -124,24 +137,24 @@ class LinkMachine(RuleBasedStateMachine):
         datagram = self.make(self.number + 1)[:cut] + extra
         if len(datagram) != MSR_SIZE:
             self.post(datagram)
-            assert self.end.receive(0.0) is None
             self.count["malformed"] += 1
+            self.nothing_usable()
 
     @rule(position=st.integers(4, 7), damage=st.integers(1, 255))
     def damaged(self, position: int, damage: int) -> None:
         datagram = bytearray(self.make(self.number + 1))
         datagram[position] ^= damage
         self.post(bytes(datagram))
-        assert self.end.receive(0.0) is None
         self.count["malformed"] += 1
+        self.nothing_usable()
 
     @rule(datagram=st.binary(max_size=1200))
     def foreign(self, datagram: bytes) -> None:
         if self.known:
             self.post(datagram, self.stranger)
             self.post(self.make(self.number + 5), self.stranger)
-            assert self.end.receive(0.0) is None
             self.count["foreign"] += 2
+            self.nothing_usable()
 
     @invariant()
     def counters_are_those_of_the_model(self) -> None:
