@@ -20,7 +20,18 @@ _LISTEN = "0A"
 
 
 def sockets(pids: list[int]) -> list[tuple[str, str, int]]:
-    """Internet sockets of processes: protocol, local address, local port; TCP only where it listens."""
+    """Internet sockets of processes: protocol, local address, local port; TCP only where it listens.
+
+    The kernel hands its tables out page by page, so that a socket opened or closed meanwhile by anybody
+    shifts the rows: two readings must agree.
+    """
+    last, found = None, _sockets_once(pids)
+    while found != last:
+        last, found = found, _sockets_once(pids)
+    return found
+
+
+def _sockets_once(pids: list[int]) -> list[tuple[str, str, int]]:
     inodes = set()
     for pid in pids:
         try:
