@@ -179,9 +179,10 @@ class Diagnosis:
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Content of `diagnosis.json`."""
-        base = self.simulation_base.to_dict() if self.simulation_base else None
-        extended = self.simulation_extended.to_dict() if self.simulation_extended else None
+        """Content of `diagnosis.json`. Errors of a simulation that was not made are null."""
+        none = {"motor": None, "joint": None, "position": None}
+        base = self.simulation_base.to_dict() if self.simulation_base else none
+        extended = self.simulation_extended.to_dict() if self.simulation_extended else none
         return {
             "schema_version": SCHEMA_VERSION,
             "sessions": {"train": list(self.train), "test": list(self.test)},
@@ -207,9 +208,7 @@ class Diagnosis:
                 "test_rms_extended": _sides(self.rms_extended),
                 "simulation_error_base": base,
                 "simulation_error_extended": extended,
-                "parameter_changes": dict(self.changes),
             },
-            "notes": list(self.notes),
             "model": "model_extended.yaml",
         }
 

@@ -47,41 +47,31 @@ def command(
 ) -> None:
     """Show what the model gets wrong in SESSIONS, name the causes, and extend the model.
 
-    Writes diagnosis.json, model_extended.yaml and plots into the folder of --out. Finding nothing is a result
-    as well.
+    Writes diagnosis.json, model_extended.yaml, plots and, where causes look alike, plans of the motions that
+    would decide into the folder of --out. Finding nothing is a result as well.
 
     \b
     lwr-run diagnose unloaded.mcap loaded.mcap --out diagnosis
     lwr-run diagnose a.mcap b.mcap --test c.mcap --reference commissioned.yaml --out diagnosis
     """
-    from ident.discrepancy import Reference, diagnose
-    from ident.discrepancy.plots import write_plots
-    from ident.model_file import read_model, write_model
+    from ident.model_file import read_model
     from lwr_driver.session import read_session
-    from runner.diagnosis import arm_data, chain_of, known_arm
-    from runner.replay import Replay
+    from runner.diagnosis import chain_of, known_arm, study
+    from runner.diagnosis.deciding import offers_of_sessions
 
     logs = [read_session(path) for path in sessions]
     held = [read_session(path) for path in test]
     chain = chain_of(logs, urdf)
-    description = known_arm(arm, chain)
-    present = None if model is None else read_model(model)
-    healthy = None if reference is None else Reference.of(read_model(reference))
-    found = diagnose(
+    found = study(
         logs,
         chain,
         test=held,
-        arm=arm_data(description),
-        model=present,
-        reference=healthy,
-        simulate=None if no_simulation or description is None else Replay(description),
+        arm=known_arm(arm, chain),
+        model=None if model is None else read_model(model),
+        reference=None if reference is None else read_model(reference),
+        simulate=not no_simulation,
     )
-    out.mkdir(parents=True, exist_ok=True)
-    content = json.dumps(found.to_dict(), indent=1, allow_nan=False)
-    (out / "diagnosis.json").write_text(content + "\n", encoding="utf-8")
-    write_model(found.extended_model, out / "model_extended.yaml")
-    plots = write_plots(found, out)
-    click.echo(content if as_json else str(found))
-    if not as_json and not plots:
-        click.echo("note: no plots, for matplotlib is not installed")
+    found = found.with_offers(offers_of_sessions(found.diagnosis, logs))
+    found.write(out)
+    click.echo(json.dumps(found.diagnosis.to_dict(), indent=1, allow_nan=False) if as_json else str(found))
     click.echo(str(out), err=as_json)

@@ -1,0 +1,150 @@
+"""A diagnosis with what surrounds it: replay in simulation, measured gains, plots, files, deciding motions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ident.discrepancy import Diagnosis, Reference, diagnose
+from ident.kinematics import Chain
+from ident.model import DynamicModel
+from ident.model_file import write_model
+from lwr_driver.arm import Arm
+from lwr_driver.session import Session
+from runner.diagnosis.measures import Moved, RowGain, moved_parameters, row_gains
+from runner.diagnosis.residuals import FILE, Residuals
+from runner.diagnosis.sources import arm_data
+from runner.diagnosis.text import study_text
+from runner.replay import Replay
+
+if TYPE_CHECKING:
+    from runner.diagnosis.deciding import Deciding
+
+__all__ = ["DETAILS", "DIAGNOSIS", "EXTENDED", "TEXT", "Study", "study"]
+
+DIAGNOSIS = "diagnosis.json"
+DETAILS = "details.json"
+EXTENDED = "model_extended.yaml"
+TEXT = "diagnosis.txt"
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A diagnosis, what it gained, what could not be seen, and the motions that would decide what is open.
+
+    sessions : names in the order in which they were run. referenced : whether a healthy reference was at hand.
+    """
+
+    diagnosis: Diagnosis
+    gains: tuple[RowGain, ...]
+    moved: tuple[Moved, ...]
+    notes: tuple[str, ...]
+    residuals: Residuals
+    sessions: tuple[str, ...]
+    referenced: bool
+    offers: tuple[Deciding, ...] = field(default=())
+
+    def __str__(self) -> str:
+        return study_text(self)
+
+    def with_offers(self, offers: Sequence[Deciding]) -> Study:
+        """The same with motions that would decide."""
+        return replace(self, offers=tuple(offers))
+
+    def details(self) -> dict[str, Any]:
+        """What the contract of diagnosis.json has no place for."""
+        return {
+            "schema_version": 1,
+            "sessions": list(self.sessions),
+            "reference": self.referenced,
+            "rows": [gain.to_dict() for gain in self.gains],
+            "base_parameters": [moved.to_dict() for moved in self.moved],
+            "notes": list(self.notes),
+            "deciding_motions": [offer.to_dict() for offer in self.offers],
+        }
+
+    def write(self, folder: Path) -> None:
+        """Write everything into `folder`: numbers, model, text, plots, residuals, deciding motions."""
+        from runner.report.residual_figures import residual_figures
+
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_json(self.diagnosis.to_dict(), folder / DIAGNOSIS)
+        _write_json(self.details(), folder / DETAILS)
+        write_model(self.diagnosis.extended_model, folder / EXTENDED)
+        (folder / TEXT).write_text(f"{self}\n", encoding="utf-8")
+        self.residuals.save(folder / FILE)
+        for side in self.residuals.sides:
+            for figure in residual_figures(self.residuals, side):
+                figure.save(folder / f"{figure.name}.svg")
+        for offer in self.offers:
+            offer.plan.save(folder / offer.file)
+
+
+def study(
+    sessions: Sequence[Session],
+    chain: Chain,
+    *,
+    test: Sequence[Session] = (),
+    arm: Arm | None = None,
+    model: DynamicModel | None = None,
+    reference: DynamicModel | None = None,
+    simulate: bool = True,
+) -> Study:
+    """Diagnose `sessions` and measure what it is worth.
+
+    arm : description of the arm, for stiffness, gear ratios and the simulation; without it nothing is replayed.
+    model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
+    Raises DataError for sessions that cannot be used.
+    """
+    healthy = None if reference is None else Reference.of(reference)
+    everything = sorted([*sessions, *test], key=lambda s: s.start)
+    replay = None
+    if simulate and arm is not None:
+        replay = Replay(_as_stiff(arm, healthy), everything)
+    found = diagnose(
+        list(sessions),
+        chain,
+        test=list(test),
+        arm=arm_data(arm),
+        model=model,
+        reference=healthy,
+        simulate=replay,
+    )
+    notes = list(found.notes)
+    if replay is not None:
+        notes += replay.notes
+    elif simulate:
+        notes.append(
+            "no simulation: the arm is not one that the emulator has; name its description with --arm"
+        )
+    names = tuple(session.path.name for session in everything)
+    ratio = None if arm is None else arm.gear_ratio.astype(float)
+    return Study(
+        found,
+        row_gains(found),
+        moved_parameters(found),
+        tuple(notes),
+        Residuals.of(found, names, ratio),
+        names,
+        healthy is not None,
+    )
+
+
+def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:
+    """The arm with the stiffness that commissioning found."""
+    if (
+        healthy is None
+        or len(healthy.compliance) != len(arm.stiffness)
+        or not np.all(healthy.compliance > 0.0)
+    ):
+        return arm
+    return replace(arm, stiffness=1.0 / healthy.compliance)
+
+
+def _write_json(content: dict[str, Any], path: Path) -> None:
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
