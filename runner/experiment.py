@@ -109,7 +109,7 @@ class Run:
     """One run of an experiment into one folder.
 
     experiment : what to do. folder : where the logs go; sessions that are finished there are not repeated.
-    excite : gives the exciting motion, planned beforehand, at the controller's period [s].
+    excite : gives the exciting motion of a session, planned beforehand, at the controller's period [s].
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Run:
         experiment: Experiment,
         folder: Path,
         bench: Bench,
-        excite: Callable[[float], Motion],
+        excite: Callable[[SessionPlan, float], Motion],
     ) -> None:
         self.experiment = experiment
         self.folder = folder
@@ -217,7 +217,7 @@ class Run:
             bench.arm,
             bench.cell,
             plan,
-            self.excite(state.period_s),
+            self.excite(plan, state.period_s),
             state.q_command,
             self.folder,
         )

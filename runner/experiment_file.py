@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.motor_torque import KrlMotorTorque
 
 __all__ = [
+    "DiagnosisPlan",
     "Excitation",
     "Experiment",
     "Identification",
@@ -66,10 +68,14 @@ class Payload:
 
 @dataclass(frozen=True)
 class SessionPlan:
-    """One motion of the arm with one payload; it becomes `NAME.mcap`."""
+    """One motion of the arm with one payload; it becomes `NAME.mcap`.
+
+    validation : another motion, which the estimate does not see and is held against.
+    """
 
     name: str
     payload: Payload | None = None
+    validation: bool = False
 
     def __post_init__(self) -> None:
         if not self.name.replace("-", "").replace("_", "").isalnum():
@@ -161,6 +167,17 @@ class Identification:
 
 
 @dataclass(frozen=True)
+class DiagnosisPlan:
+    """What the experiment ends with.
+
+    run : look for what the model lacks. reference : model file of `lwr-run commission`, the healthy arm.
+    """
+
+    run: bool = True
+    reference: str | None = None
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A whole experiment as its file describes it; every key but `name` has a default."""
 
@@ -177,6 +194,7 @@ class Experiment:
     excitation: Excitation = field(default_factory=Excitation)
     moves: Moves = field(default_factory=Moves)
     identification: Identification = field(default_factory=Identification)
+    diagnosis: DiagnosisPlan = field(default_factory=DiagnosisPlan)
     sessions: tuple[SessionPlan, ...] = (SessionPlan("unloaded"),)
     source: Path = field(default=Path(), init=False)
     folder: Path = field(default=Path(), init=False)
@@ -193,6 +211,15 @@ class Experiment:
                 raise ConfigurationError(
                     f"session name {name!r} is used {names.count(name)} times; names must differ"
                 )
+        if all(session.validation for session in self.sessions):
+            raise ConfigurationError("every session is for validation; an estimate needs one that is not")
+        known = {session.payload for session in self.sessions if not session.validation}
+        for session in self.sessions:
+            if session.validation and session.payload is not None and session.payload not in known:
+                raise ConfigurationError(
+                    f"session {session.name!r} validates with the payload {session.payload.name!r}, which no "
+                    "session before it identifies; give the payload a session without `validation`"
+                )
         if self.lock_step and self.backend == "fri":
             raise ConfigurationError("lock_step is for the emulator; set `lock_step: false` with backend fri")
 
@@ -208,6 +235,13 @@ class Experiment:
         object.__setattr__(experiment, "folder", path.parent if beside is None else beside)
         object.__setattr__(experiment, "text", path.read_text(encoding="utf-8"))
         return experiment
+
+    def changed(self, **values: Any) -> Experiment:
+        """The same experiment with other values of some keys; it keeps its file."""
+        other = dataclasses.replace(self, **values)
+        for name in ("source", "folder", "text"):
+            object.__setattr__(other, name, getattr(self, name))
+        return other
 
     @property
     def emulator_path(self) -> Path:

@@ -21,7 +21,7 @@ from lwr_driver.collision import Clearance
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.motion import Motion
 from runner.experiment_file import Experiment, Payload
-from runner.planning import checker, excitation_rows, plan_excitation
+from runner.planning import Excitations, checker, excitation_rows
 from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
 from runner.preparation import session_motion
 from runner.progress import Progress
@@ -69,12 +69,10 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     default arm and cell. Raises ConfigurationError for a file that is neither.
     """
     folder = Path(file)
-    stored = None
-    if folder.is_dir():
+    results = folder if folder.is_dir() else None
+    if results is not None:
         path = folder / "experiment.yaml"
         experiment = Experiment.load(path.resolve(), beside=Progress.load(folder).origin)
-        if (folder / "plan.yaml").is_file():
-            stored = ExcitationPlan.load(folder / "plan.yaml")
     else:
         path = find(file)
         if read_mapping(path).get("kind") == "excitation plan":
@@ -87,10 +85,9 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
         raise ConfigurationError(f"session {session!r} is not in {path}; it has {', '.join(plans)}")
     heaviest = max(experiment.sessions, key=lambda one: 0.0 if one.payload is None else one.payload.mass)
     plan = plans[session] if session is not None else heaviest
-    excitation = stored if stored is not None else plan_excitation(experiment, arm, cell)
-    excite = excitation_rows(excitation, experiment.excitation.periods)
+    rows = Excitations.of(experiment, arm, cell, results).rows(plan, period_s)
     home = experiment.home(len(arm.joint_names))
-    motion, preflight = session_motion(experiment, arm, cell, plan, excite(period_s), home)
+    motion, preflight = session_motion(experiment, arm, cell, plan, rows, home)
     margin = max(experiment.moves.clearance_m, cell.margin_m)
     title = f"{experiment.name}, session {plan.name}"
     return _planned(title, arm, cell, plan.payload, motion, preflight, margin)

@@ -17,8 +17,9 @@ from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.model_file import write_model
 from ident.signals.settings import SignalSettings
+from ident.validation import validate
 from lwr_driver.arm import Arm
-from lwr_driver.session import read_session
+from lwr_driver.session import Session, read_session
 from runner.characteristics import characteristics
 from runner.experiment import LinkReport, Record
 from runner.experiment_file import Experiment
@@ -29,7 +30,7 @@ __all__ = ["agreement", "estimate", "identified_model", "summarise", "true_base"
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
-    """Identify the arm from the finished sessions of an experiment."""
+    """Identify the arm from the finished sessions of an experiment, those for validation left out."""
     wanted = experiment.identification
     settings = IdentificationSettings(
         model=wanted.model,
@@ -37,8 +38,18 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
         estimator=wanted.estimator,
         resonance_hz=arm.resonance_hz,
     )
-    sessions = [read_session(record.path, status=False) for record in records if record.status == "success"]
+    unseen = unseen_sessions(experiment)
+    sessions = [
+        read_session(record.path, status=False)
+        for record in records
+        if record.status == "success" and record.name not in unseen
+    ]
     return identify(sessions, Chain.from_urdf(arm.urdf), settings)
+
+
+def unseen_sessions(experiment: Experiment) -> frozenset[str]:
+    """Names of the sessions that the estimate is held against."""
+    return frozenset(plan.name for plan in experiment.sessions if plan.validation)
 
 
 def true_base(experiment: Experiment, found: Identification) -> dict[str, float]:
@@ -65,6 +76,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Content of summary.json: how the experiment ended, what was estimated, how the link was."""
     last = records[-1]
+    unseen = unseen_sessions(experiment)
     summary: dict[str, Any] = {
         "schema_version": 1,
         "experiment": experiment.name,
@@ -76,6 +88,7 @@ def summarise(
                 "file": record.path.name,
                 "exit_status": record.status,
                 "reason": record.reason,
+                "validation": record.name in unseen,
                 "warnings": list(record.warnings),
             }
             for record in records
@@ -85,14 +98,8 @@ def summarise(
     }
     if found is None:
         return summary
-    details = found.to_dict()
-    details["signals"] = details.pop("sessions")
-    summary.update(details)
-    summary["excitation"] = characteristics(found)
-    for entry, interval in zip(summary["parameters"], found.estimate.interval().tolist(), strict=True):
-        entry["interval_95"] = interval
-    if found.essential is not None:
-        summary["essential"]["parameters"] = _estimates(found.essential.estimate)
+    tested = [record.path for record in records if record.name in unseen and record.status == "success"]
+    summary.update(estimated(found, [read_session(path) for path in tested]))
     known = true_base(experiment, found)
     for entry in summary["parameters"]:
         if entry["name"] in known:
@@ -100,6 +107,20 @@ def summarise(
     if known:
         summary["within_3_sigma"] = agreement(summary["parameters"])
     return summary
+
+
+def estimated(found: Identification, tested: Sequence[Session]) -> dict[str, Any]:
+    """What an estimate adds to a summary. tested : sessions that it has not seen and is held against."""
+    content = found.to_dict()
+    content["signals"] = content.pop("sessions")
+    content["excitation"] = characteristics(found)
+    for entry, interval in zip(content["parameters"], found.estimate.interval().tolist(), strict=True):
+        entry["interval_95"] = interval
+    if found.essential is not None:
+        content["essential"]["parameters"] = _estimates(found.essential.estimate)
+    if tested:
+        content["validation"] = [score.to_dict() for score in validate(found.model, tested).scores]
+    return content
 
 
 def write_results(
@@ -168,4 +189,7 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
             f"  {100 * summary['within_3_sigma']:.1f} % of the estimates lie within 3 standard deviations "
             "of the emulated arm's true parameters"
         )
+    for score in summary.get("validation", ()):
+        errors = ", ".join(f"{side} {100 * value:.2f} %" for side, value in score["relative"].items())
+        lines.append(f"  torque of {score['session']}, unseen by the estimate, is computed to: {errors}")
     return "\n".join([*lines, "", found.summary()]) + "\n"

@@ -12,21 +12,20 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
-from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
+from runner.diagnosis.after_run import conclude_run
 from runner.experiment import Bench, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import Laboratory
 from runner.options import json_option
 from runner.plain import as_json as to_json
-from runner.planning import excitation_rows, plan_excitation
+from runner.planning import PLAN, Excitations
 from runner.progress import Progress
 from runner.results import estimate, summarise, write_results
 from runner.status import StatusLine
 
 COPY = "experiment.yaml"
-PLAN = "plan.yaml"
 
 
 @click.command("experiment")
@@ -48,6 +47,10 @@ PLAN = "plan.yaml"
 @click.option(
     "--live-port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --live."
 )
+@click.option("--no-diagnosis", is_flag=True, help="Leave out the search for what the model lacks.")
+@click.option(
+    "--decide", is_flag=True, help="Run the motions that decide between causes that look alike, and conclude."
+)
 @json_option
 def command(
     file: str | None,
@@ -57,12 +60,15 @@ def command(
     allow_non_realtime: bool,
     live: bool,
     live_port: int,
+    no_diagnosis: bool,
+    decide: bool,
     as_json: bool,
 ) -> None:
     """Run the experiment FILE; without one the default, against the built-in emulator.
 
     Plans an exciting motion, checks it, drives the arm through it, logs it, has the payload swapped and
-    checked, drives again, and estimates the model. The last line printed is the folder of the results.
+    checked, drives again, estimates the model, and looks for what the model lacks. The last line printed is
+    the folder of the results.
 
     Ctrl-C once stops the arm within its limits, twice drops the link.
 
@@ -70,22 +76,38 @@ def command(
     lwr-run experiment                                   the default, on the emulator
     lwr-run experiment my_lab.yaml --out results/monday
     lwr-run experiment --resume results/monday           go on after an abort
+    lwr-run experiment --resume results/monday --decide  run what decides between look-alikes
     """
     experiment, folder = _begin(file, out, resume)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     status = StatusLine()
-    plan = _plan(experiment, arm, cell, folder, status)
+    motions = _motions(experiment, arm, cell, folder, status)
     laboratory = Laboratory(experiment, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
     with laboratory as bench, _watched(bench, experiment, live_port if live else None) as watched:
-        records = Run(
-            experiment, folder, watched, excitation_rows(plan, experiment.excitation.periods)
-        ).sessions()
+        records = Run(experiment, folder, watched, motions.rows).sessions()
     done = all(record.status == "success" for record in records)
     found = estimate(experiment, arm, records) if done else None
     summary = summarise(experiment, records, found)
     text = write_results(folder, experiment, arm, summary, found)
-    _report(folder)
+    if done and experiment.diagnosis.run and not no_diagnosis:
+        status.show("diagnosis", 0.0, "")
+        concluded = conclude_run(
+            experiment,
+            arm,
+            cell,
+            motions,
+            folder,
+            records,
+            laboratory=lambda other: Laboratory(
+                other, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status
+            ),
+            decide=decide,
+        )
+        status.clear()
+        summary |= concluded.to_dict()
+        text = f"{text}\n{concluded.text(folder)}"
+    _report(folder, aside=as_json)
     click.echo(to_json({**summary, "folder": str(folder)}) if as_json else f"{text}\n{folder}")
     if not done:
         raise _failure(records[-1], folder)
@@ -132,24 +154,25 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
     return experiment, folder
 
 
-def _plan(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status: StatusLine) -> ExcitationPlan:
-    """The exciting motion: the one already in the folder, or planned now and stored there."""
-    path = folder / PLAN
-    if path.is_file():
-        return ExcitationPlan.load(path)
-    status.show("planning the excitation", 0.0, "")
-    plan = plan_excitation(experiment, arm, cell)
+def _motions(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status: StatusLine) -> Excitations:
+    """The motions already in the folder, or planned now and stored there."""
+    if not (folder / PLAN).is_file():
+        status.show("planning the excitation", 0.0, "")
+    motions = Excitations.of(experiment, arm, cell, folder)
     status.clear()
-    plan.save(path)
-    return plan
+    motions.save(folder)
+    return motions
 
 
-def _report(folder: Path) -> None:
-    """report.html beside the results; a run is not lost because its page cannot be written."""
+def _report(folder: Path, *, aside: bool) -> None:
+    """report.html beside the results; a run is not lost because its page cannot be written.
+
+    aside : its path goes to standard error.
+    """
     from runner.report.page import write_report
 
     try:
-        click.echo(str(write_report(folder)))
+        click.echo(str(write_report(folder)), err=aside)
     except LwrError as error:
         click.echo(f"no report.html: {error}", err=True)
 

@@ -34,6 +34,7 @@ class Curves:
     grid (k,) [s], measured, computed (k, n) : torque and its prediction, both through the same low-pass [Nm].
     error and computed are NaN where a joint stands still.
     cutoff_hz : of that low-pass. scores : numbers of the computed-torque test by joint.
+    unseen : whether the estimate was made without this session.
     relative : residual over torque of all joints.
     """
 
@@ -54,11 +55,12 @@ class Curves:
     computed: Floats
     scores: tuple[Score, ...]
     relative: float
+    unseen: bool = False
 
     @property
     def label(self) -> str:
         """Session and side in words."""
-        return f"{self.session}, {self.side} torque"
+        return f"{self.session}, {self.side} torque{', unseen by the estimate' if self.unseen else ''}"
 
     def relative_error(self, joint: int) -> Floats:
         """(k,) error in percent of the largest measured torque of the joint in this session."""
@@ -67,11 +69,17 @@ class Curves:
 
 
 def curves(
-    model: DynamicModel, session: Session, name: str, *, cutoff_hz: float | None = None
+    model: DynamicModel,
+    session: Session,
+    name: str,
+    *,
+    cutoff_hz: float | None = None,
+    unseen: bool = False,
 ) -> list[Curves]:
     """Curves of a session for each side that the model describes and the session has.
 
     cutoff_hz : cut-off of the position filter, as in the estimation; None takes the default.
+    unseen : whether the estimate was made without this session.
     """
     payload = mounted(model, session)
     settings = None if cutoff_hz is None else SignalSettings(cutoff_hz=cutoff_hz)
@@ -109,6 +117,7 @@ def curves(
                 computed=stacked[7],
                 scores=tuple(score for score in scored.scores if score.side == side),
                 relative=float(scored.relative[side]),
+                unseen=unseen,
             )
         )
     return found

@@ -102,11 +102,12 @@ def motion_figure(results: Results, session: str | None = None, side: str = "joi
 def torque_figure(results: Results, session: str | None = None, side: str | None = None) -> Figure:
     """Figure 3 of the paper: measured and computed torque with the relative error, by joint.
 
-    session : name; by default the loaded one. side : "joint" (default where there is one) or "motor".
+    session : name; by default one that the estimate has not seen, else the loaded one. side : "joint"
+    (default where there is one) or "motor".
     The relative error is the residual over the largest measured torque of the joint in the session. Measured
     and computed torque passed the same low-pass; the samples as logged stand behind them.
     """
-    one = _choose(results, session, side)
+    one = _choose(results, session, side, unseen_first=True)
     panels = []
     for k, joint in enumerate(one.joint_names):
         error = one.relative_error(k)
@@ -129,7 +130,8 @@ def torque_figure(results: Results, session: str | None = None, side: str | None
                 lower_label="error [%]",
             )
         )
-    caption = f"Measured and computed {one.side} torque with relative error, session {one.session}"
+    kind = "unseen session" if one.unseen else "session"
+    caption = f"Measured and computed {one.side} torque with relative error, {kind} {one.session}"
     return Figure(f"torque-{one.session}-{one.side}", caption, tuple(panels))
 
 
@@ -308,17 +310,18 @@ def _folder(results: Results) -> ResultFolder:
     return results if isinstance(results, ResultFolder) else ResultFolder.load(results)
 
 
-def _choose(results: Results, session: str | None, side: str | None) -> Curves:
+def _choose(results: Results, session: str | None, side: str | None, *, unseen_first: bool = False) -> Curves:
     folder = _folder(results)
+    known = sorted(folder.curves, key=lambda one: one.unseen != unseen_first)
     found = [
         one
-        for one in folder.curves
+        for one in known
         if (session is None or one.session == session) and (side is None or one.side == side)
     ]
     if not found:
-        known = ", ".join(one.label for one in folder.curves) or "none"
+        labels = ", ".join(one.label for one in folder.curves) or "none"
         wanted = ", ".join(word for word in (session, side) if word) or "any session"
-        raise ConfigurationError(f"{folder.path}: no torque of {wanted} to show; there is: {known}")
+        raise ConfigurationError(f"{folder.path}: no torque of {wanted} to show; there is: {labels}")
     return found[0]
 
 

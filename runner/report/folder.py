@@ -73,10 +73,16 @@ class ResultFolder:
         """Names of the sessions whose log is missing or broken."""
         return tuple(e["name"] for e in self.summary.get("sessions", []) if e["name"] not in self.sessions)
 
+    @property
+    def diagnosis_folder(self) -> Path:
+        """Where the files of a diagnosis are: `diagnosis`, or the folder itself."""
+        own = self.path / "diagnosis"
+        return own if (own / "diagnosis.json").is_file() else self.path
+
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
         """Content of diagnosis.json, None where there is none. DataError if it is broken."""
-        file = self.path / "diagnosis.json"
+        file = self.diagnosis_folder / "diagnosis.json"
         if not file.is_file():
             return None
         try:
@@ -97,15 +103,17 @@ class ResultFolder:
 
     @cached_property
     def curves(self) -> tuple[Curves, ...]:
-        """Measured and computed torque of each session and side, the loaded session first."""
+        """Measured and computed torque by session and side: what the estimate has seen first, loaded first."""
         if self.model is None:
             return ()
         cutoffs = {entry["name"]: entry["cutoff_hz"] for entry in self.summary.get("signals", [])}
+        unseen = {entry["name"] for entry in self.summary["sessions"] if entry.get("validation")}
         found = []
         for name, session in self.sessions.items():
             if session.end is not None and session.end.get("exit_status") == "success":
-                found += curves(self.model, session, name, cutoff_hz=cutoffs.get(session.path.name))
-        return tuple(sorted(found, key=lambda one: (one.payload is None, one.session, one.side)))
+                cutoff = cutoffs.get(session.path.name)
+                found += curves(self.model, session, name, cutoff_hz=cutoff, unseen=name in unseen)
+        return tuple(sorted(found, key=lambda one: (one.unseen, one.payload is None, one.session, one.side)))
 
     @cached_property
     def lock_step(self) -> bool:

@@ -55,6 +55,7 @@ def session_section(results: ResultFolder) -> str:
         rows.append(
             [
                 name,
+                "validation" if entry.get("validation") else "estimate",
                 entry["exit_status"] + (f": {entry['reason']}" if entry["reason"] else ""),
                 payload,
                 Number(None if log is None else log.duration_s, ".1f"),
@@ -67,7 +68,7 @@ def session_section(results: ResultFolder) -> str:
             ]
         )
     head = (
-        "session", "ended", "payload", "lasted [s]", "cycles", "missed", "lost", "late", "reply 50 % [µs]",
+        "session", "for", "ended", "payload", "lasted [s]", "cycles", "missed", "lost", "late", "reply 50 % [µs]",
         "99 % [µs]", "worst [µs]", "tracking [mrad]",
     )  # fmt: skip
     parts = [table(head, rows, "Sessions and their link")]
@@ -232,20 +233,23 @@ def torque_section(results: ResultFolder) -> str:
         "in the band [Nm]",
         "floor [Nm]",
     )
+    if any(one.unseen for one in results.curves):
+        origin = "The motion that the estimate has not seen stands first."
+    else:
+        origin = (
+            "These are the sessions that the estimate was made from: `lwr-run validate` holds a model against "
+            "others, and so does a session with `validation: true` in the experiment file."
+        )
     parts = [
         paragraph(
             "Computed torque from the filtered measured motion, against the torque measured. Both lines "
-            "passed "
-            "the same low-pass; what was logged stands behind them, every spike included. These are the "
-            "sessions "
-            "that the estimate was made from: `lwr-run validate` holds a model against others. The relative "
-            "error "
-            "is in percent of the largest torque of the joint. In the band: in the pass band of the "
-            "estimation; "
-            "floor: scatter between the periods of the motion, which no model can explain."
+            f"passed the same low-pass; what was logged stands behind them, every spike included. {origin} "
+            "The relative error is in percent of the largest torque of the joint. In the band: in the pass "
+            "band of the estimation; floor: scatter between the periods of the motion, which no model can "
+            "explain."
         )
     ]
-    for index, one in enumerate(results.curves):
+    for index, one in enumerate(sorted(results.curves, key=lambda one: not one.unseen)):
         rows: list[list[Cell]] = [
             [
                 score.joint,

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from runner.report.curves import Curves
 from runner.report.folder import ResultFolder
 
 __all__ = ["Level", "Verdict", "headline", "verdicts"]
@@ -113,22 +114,29 @@ def _tracking(results: ResultFolder) -> Verdict | None:
 
 
 def _residual(results: ResultFolder) -> Verdict | None:
-    rms = results.summary.get("torque_rms")
-    if not rms or not results.curves:
-        return None
+    seen = [one for one in results.curves if not one.unseen]
+    return _share("unexplained torque", seen)
+
+
+def _unseen(results: ResultFolder) -> Verdict | None:
+    return _share("unseen motion", [one for one in results.curves if one.unseen])
+
+
+def _share(subject: str, shown: Sequence[Curves]) -> Verdict | None:
+    """How much of the measured torque is not computed, by side."""
     parts, worst = [], 0.0
-    for side in rms:
-        mine = [one for one in results.curves if one.side == side]
-        if not mine:
-            continue
+    for side in dict.fromkeys(one.side for one in shown):
+        mine = [one for one in shown if one.side == side]
         squares = np.array([[score.band_rms**2 for score in one.scores] for one in mine])
         torque = np.array([np.nanmean(one.measured**2, axis=0) for one in mine])
         share = math.sqrt(float(np.nansum(squares)) / float(np.nansum(torque)))
         worst = max(worst, share)
         parts.append(f"{side} {100 * share:.2f} %")
-    text = f"{', '.join(parts)} of the torque, in the band of the estimation"
+    if not parts:
+        return None
+    text = f"{', '.join(parts)} of the torque unexplained, in the band of the estimation"
     level: Level = "good" if worst <= _RESIDUAL_LOOK else "look"
-    return Verdict("unexplained torque", text, f"below {100 * _RESIDUAL_LOOK:.0f} %", level, "torque")
+    return Verdict(subject, text, f"below {100 * _RESIDUAL_LOOK:.0f} %", level, "torque")
 
 
 def _assumptions(results: ResultFolder) -> Verdict | None:
@@ -238,6 +246,7 @@ _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
     _limits,
     _tracking,
     _residual,
+    _unseen,
     _assumptions,
     _essential,
     _payload,

@@ -12,6 +12,8 @@ from experiment_rig import Finished, experiment_file, messages, records, run
 from ident.model_file import read_model
 from lwr_driver.session import read_session
 
+LOAD = {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
@@ -144,6 +146,23 @@ def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) 
     assert loaded.metadata["uid"] != aborted.metadata["uid"]
     assert loaded.metadata["parent_uid"] == aborted.metadata["uid"]
     assert json.loads((folder / "summary.json").read_text())["exit_status"] == "success"
+
+
+@pytest.mark.parametrize(
+    ("sessions", "message"),
+    [
+        ([{"name": "check", "validation": True}], "every session is for validation"),
+        (
+            [{"name": "unloaded"}, {"name": "check", "validation": True, "payload": LOAD}],
+            "'paper_load', which no session before it identifies",
+        ),
+    ],
+)
+def test_a_validation_needs_an_estimate(tmp_path: Path, sessions: list[object], message: str) -> None:
+    file = experiment_file(tmp_path, sessions=sessions)
+    done = run("check", str(file))
+    assert done.code == 2
+    assert message in done.text
 
 
 def test_motor_torques_from_the_controllers_trace(tmp_path: Path) -> None:

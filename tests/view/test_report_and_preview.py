@@ -18,6 +18,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 from view_rig import CONTRAST, NARROW, WIDE, Seen, browser, chromium, opened
 
+from lwr_driver.session import Session
 from runner.cli import main
 from runner.published import TABLE_1, TABLE_2
 from runner.report.figures import torque_figure
@@ -33,7 +34,10 @@ moves: {home: [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], speed_scale: 0.5, settle_s: 
 sessions:
   - name: unloaded
   - name: loaded
-    payload: {name: paper_load, mass: 3.34, com: [0.0, -0.066, 0.144]}
+    payload: &load {name: paper_load, mass: 3.34, com: [0.0, -0.066, 0.144]}
+  - name: check
+    validation: true
+    payload: *load
 """
 DIAGNOSIS: dict[str, Any] = {
     "schema_version": 1,
@@ -150,6 +154,27 @@ def test_the_published_tables_stand_beside_the_run(report: Seen) -> None:
     second = report.page.inner_text("#table-2")
     assert len(TABLE_2) == 49
     assert all(entry.name in second for entry in TABLE_2)
+
+
+def test_a_motion_that_the_estimate_has_not_seen_stands_first_in_figure_3(
+    finished: Path, report: Seen
+) -> None:
+    summary = json.loads((finished / "summary.json").read_text())
+    assert [entry["name"] for entry in summary["signals"]] == ["unloaded.mcap", "loaded.mcap"]
+    assert [(score["session"], score["seen"]) for score in summary["validation"]] == [("check.mcap", False)]
+    titles = report.page.locator("#torque details > summary").all_inner_texts()
+    assert titles[0].startswith("check, joint torque, unseen by the estimate: ")
+    shown = f"{100 * summary['validation'][0]['relative']['joint']:.2f} %"
+    assert shown in titles[0]
+    row = report.page.locator("table.verdicts tr", has_text="unseen motion").inner_text()
+    assert "motor" in row
+    assert torque_figure(finished).name == "torque-check-joint"
+    plans = [np.load(io.BytesIO(log.attachments["plan.npz"]))["q"] for log in sessions(finished)]
+    assert plans[0].shape != plans[-1].shape or np.abs(plans[0] - plans[-1]).max() > 0.1
+
+
+def sessions(folder: Path) -> list[Session]:
+    return list(ResultFolder.load(folder).sessions.values())
 
 
 def test_every_chart_shows_a_line(report: Seen) -> None:
