@@ -4,35 +4,62 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from runner.options import json_option
+from runner.plain import as_json as to_json
+
+if TYPE_CHECKING:
+    from ident.discrepancy import Reference
+
 __all__ = ["command"]
+
+_RECORDED_SETS = 3
+_LOUDEST = 5
 
 
 @click.command("commission")
-@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("sessions", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--experiment", "file", help="Experiment whose sessions are recorded; default: on the built-in emulator."
+)
 @click.option(
     "--sets",
-    default=1,
-    show_default=True,
     type=click.IntRange(1),
-    help="Number of sets that SESSIONS are made of, in their order, each as a diagnosis will get them.",
+    help="Number of sets: to record (default 3), or that SESSIONS are made of, in their order (default 1).",
 )
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Model file of the healthy arm.")
 @click.option("--arm", help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.")
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
 )
-def command(sessions: tuple[Path, ...], sets: int, out: Path, arm: str | None, urdf: Path | None) -> None:
-    """Learn the healthy arm from SESSIONS: its parameters, stiffness, delays, noise, and what
-    chance looks like.
+@click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
+@click.option(
+    "--allow-non-realtime", is_flag=True, help="Command the real arm without real-time rights; may stutter."
+)
+@json_option
+def command(
+    sessions: tuple[Path, ...],
+    file: str | None,
+    sets: int | None,
+    out: Path,
+    arm: str | None,
+    urdf: Path | None,
+    yes: bool,
+    allow_non_realtime: bool,
+    as_json: bool,
+) -> None:
+    """Learn the healthy arm: its parameters, stiffness, delays, noise, and what chance looks like.
 
-    The more sets of sessions, the better known is what each cause may seem to explain where nothing is wrong:
-    one set is a beginning, eight are good.
+    Without SESSIONS an experiment is recorded first, set after set, beside the file of --out. Each set should be
+    what a later diagnosis will get, at best from another day. One set is a beginning, three tell chance from
+    causes, eight are good.
 
     \b
-    lwr-run commission unloaded.mcap loaded.mcap --out commissioned.yaml
+    lwr-run commission --out commissioned.yaml                          on the emulator
+    lwr-run commission --experiment my_lab.yaml --sets 3 --out commissioned.yaml
     lwr-run commission u1.mcap l1.mcap u2.mcap l2.mcap --sets 2 --out commissioned.yaml
     """
     from fri.errors import ConfigurationError
@@ -41,25 +68,69 @@ def command(sessions: tuple[Path, ...], sets: int, out: Path, arm: str | None, u
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm
 
-    if len(sessions) % sets:
+    if sessions and file is not None:
         raise ConfigurationError(
-            f"{len(sessions)} sessions do not make {sets} sets of equal size; give them set after set"
+            "--experiment records sessions, and SESSIONS are there already; leave one out"
         )
-    logs = [read_session(path) for path in sessions]
-    chain = chain_of(logs, urdf)
-    size = len(logs) // sets
-    parts = [logs[k : k + size] for k in range(0, len(logs), size)]
+    if sessions:
+        count = sets or 1
+        if len(sessions) % count:
+            raise ConfigurationError(
+                f"{len(sessions)} sessions do not make {count} sets of equal size; give them set after set"
+            )
+        size = len(sessions) // count
+        paths = [list(sessions[k : k + size]) for k in range(0, len(sessions), size)]
+    else:
+        paths = _recorded(file, out, sets or _RECORDED_SETS, yes, allow_non_realtime)
+    parts = [[read_session(path, status=False) for path in part] for part in paths]
+    chain = chain_of(parts[0], urdf)
     found = commission(parts, chain, arm=arm_data(known_arm(arm, chain)))
     write_model(replace(found.model, provenance={**found.model.provenance, **found.stored()}), out)
-    loudest = sorted(found.null.items(), key=lambda item: -item[1])[:5]
-    click.echo(f"Commissioned from {len(logs)} sessions in {sets} set{'s' if sets > 1 else ''}")
-    click.echo(
-        f"  delays: motor torque {1e3 * found.motor_delay_s:.2f} ms, "
-        f"joint torque {1e3 * found.joint_delay_s:.2f} ms"
-    )
+    if as_json:
+        click.echo(to_json(_content(found, paths, out)))
+    else:
+        click.echo(_text(found, len(parts), sum(map(len, parts)), chain.joint_names))
+    click.echo(str(out), err=as_json)
+
+
+def _recorded(
+    file: str | None, out: Path, sets: int, yes: bool, allow_non_realtime: bool
+) -> list[list[Path]]:
+    """Logs of an experiment, recorded beside the model file."""
+    from runner.commissioning import record_sets
+    from runner.experiment_file import DEFAULT, Experiment
+
+    experiment = Experiment.load(file if file is not None else DEFAULT)
+    folder = out.with_name(f"{out.stem}_sessions")
+    return record_sets(experiment, folder, sets, assume_yes=yes, allow_non_realtime=allow_non_realtime)
+
+
+def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, Any]:
+    stored = next(iter(found.stored().values()))
+    return {"file": out, "sets": paths, **{k: v for k, v in stored.items() if k != "sets"}}
+
+
+def _text(found: Reference, sets: int, sessions: int, names: tuple[str, ...]) -> str:
+    lines = [
+        f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}",
+        f"  delays: motor torque {1e3 * found.motor_delay_s:.2f} ms, joint torque "
+        f"{1e3 * found.joint_delay_s:.2f} ms; positions are the {found.encoder}s'",
+        f"  {'':<24}" + "".join(f"{name:>9}" for name in names),
+    ]
+    if len(found.compliance) and (found.compliance > 0.0).all():
+        lines.append(f"  {'stiffness [Nm/rad]':<24}" + "".join(f"{1.0 / c:>9.0f}" for c in found.compliance))
     for side, values in found.noise.items():
-        click.echo(f"  noise of a row, {side:<6} " + "".join(f"{v:>9.4f}" for v in values) + " Nm")
-    for (cause, joint), gain in loudest:
-        where = f" joint {joint + 1}" if joint >= 0 else ""
-        click.echo(f"  largest gain by chance: {cause}{where} {gain:.1f}")
-    click.echo(str(out))
+        lines.append(f"  {f'noise, {side} [Nm]':<24}" + "".join(f"{v:>9.4f}" for v in values))
+    loudest = sorted(found.null.items(), key=lambda item: -item[1])[:_LOUDEST]
+    listed = ", ".join(
+        f"{cause}{f' {names[joint]}' if joint >= 0 else ''} {gain:.0f}" for (cause, joint), gain in loudest
+    )
+    lines.append(f"  what chance alone seems to explain, at most (fall of chi-square): {listed}")
+    if sets < _RECORDED_SETS:
+        lines.append(
+            f"  {sets} set{'s say' if sets > 1 else ' says'} little about what changes from day to day; with "
+            f"{_RECORDED_SETS} or more a diagnosis claims more and errs less"
+        )
+    lines.append("A diagnosis uses it with `lwr-run diagnose ... --reference FILE`, an experiment with")
+    lines.append("`diagnosis: {reference: FILE}` in its file")
+    return "\n".join(lines)

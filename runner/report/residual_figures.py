@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from runner.diagnosis.residuals import Residuals, SideResiduals
 from runner.report.figures import _bins as binned
 from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
-from runner.report.thinning import thin
 
 __all__ = ["AGAINST", "residual_figures"]
 
@@ -26,7 +25,6 @@ _LABELS = {
     "motor angle": "motor angle [turns]",
     "run order": "block of the run",
 }
-_POINTS = 500
 _GAP_S = 2.0
 
 
@@ -97,10 +95,14 @@ def _time_marks(residuals: Residuals, rows: SideResiduals, joint: int, against: 
     for role, label, values in _models(residuals, rows, joint):
         offset = 0.0
         for session in np.unique(rows.session):
-            mine = rows.session == session
+            mine = (rows.session == session) & np.isfinite(values)
+            if np.count_nonzero(mine) < 10:
+                continue
             time = rows.time[mine]
-            x, y = thin(time - time[0] + offset, values[mine], _POINTS)
-            marks.append(Line(role, label, x, y))  # type: ignore[arg-type]
+            centre, mean, low, high = binned(time - time[0] + offset, values[mine])
+            if role == "backward":
+                marks.append(Band("spread", "5 to 95 % of the rows, base model", centre, low, high))
+            marks.append(Line(role, f"{label}, mean", centre, mean))  # type: ignore[arg-type]
             offset += float(time[-1] - time[0]) + _GAP_S
     return marks
 

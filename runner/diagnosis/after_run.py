@@ -1,0 +1,175 @@
+"""The diagnosis at the end of an experiment, and the motions that decide what it leaves open.
+
+A failure of the diagnosis never spoils the experiment: it is said, and the results stand.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fri.errors import LwrError, OperatorError
+from ident.kinematics import Chain
+from ident.model_file import read_model
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Cell
+from lwr_driver.configuration import find
+from lwr_driver.motion import Motion
+from lwr_driver.session import Session, read_session
+from runner.diagnosis.deciding import Deciding, offers
+from runner.diagnosis.decision import Answer, decision_text, decisions
+from runner.diagnosis.study import DIAGNOSIS, Study, study
+from runner.experiment import Bench, Record, Run
+from runner.experiment_file import Experiment, SessionPlan
+from runner.planning import Excitations, excitation_rows
+from runner.progress import Progress
+
+__all__ = ["DECIDING", "DECISION", "FOLDER", "Conclusion", "conclude_run"]
+
+log = logging.getLogger(__name__)
+
+FOLDER = "diagnosis"
+DECIDING = "deciding"
+DECISION = "decision.json"
+BEFORE = "before_deciding.json"
+
+Laboratory = Callable[[Experiment], AbstractContextManager[Bench]]
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """How an experiment ends: the diagnosis or why there is none, and what the deciding motions said."""
+
+    study: Study | None
+    failure: str = ""
+    answers: tuple[Answer, ...] = ()
+
+    def text(self, folder: Path) -> str:
+        """For the screen. folder : of the experiment, for what can be run next."""
+        if self.study is None:
+            return f"No diagnosis: {self.failure}. The results of the experiment stand."
+        lines = [str(self.study)]
+        if self.answers:
+            names = self.study.diagnosis.base_model.structure.chain.joint_names
+            lines.append(decision_text(self.answers, names))
+        if self.failure:
+            lines.append(f"The deciding motions came to no end: {self.failure}. The diagnosis above stands.")
+        elif self.study.offers and not self.answers:
+            lines.append(
+                f"`lwr-run experiment --resume {folder} --decide` runs what would decide and concludes."
+            )
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content: the diagnosis, the decision, the failure."""
+        return {
+            "diagnosis": None if self.study is None else self.study.diagnosis.to_dict(),
+            "decision": [answer.to_dict() for answer in self.answers],
+            "failure": self.failure,
+        }
+
+
+def conclude_run(
+    experiment: Experiment,
+    arm: Arm,
+    cell: Cell,
+    motions: Excitations,
+    folder: Path,
+    records: Sequence[Record],
+    *,
+    laboratory: Laboratory,
+    decide: bool = False,
+) -> Conclusion:
+    """Diagnose the finished sessions of an experiment into `folder/diagnosis`.
+
+    motions : of the experiment. laboratory : gives a bench for an experiment, for the deciding motions. decide :
+    run the motions that would decide what is open, diagnose again with them, and say what was decided.
+    """
+    target = folder / FOLDER
+    try:
+        first = _diagnosed(experiment, arm, folder, records)
+        first = first.with_offers(offers(first.diagnosis, experiment, arm, cell, motions.exciting))
+        first.write(target)
+    # Whatever goes wrong here must not take the experiment with it.
+    except Exception as error:
+        return Conclusion(None, _reason(error))
+    if not decide or not first.offers:
+        return Conclusion(first)
+    try:
+        return _decided(experiment, arm, folder, records, first, laboratory)
+    except OperatorError:
+        raise
+    except Exception as error:
+        return Conclusion(first, _reason(error))
+
+
+def _decided(
+    experiment: Experiment,
+    arm: Arm,
+    folder: Path,
+    records: Sequence[Record],
+    first: Study,
+    laboratory: Laboratory,
+) -> Conclusion:
+    """Run the deciding motions, diagnose with them, and answer."""
+    place = folder / FOLDER / DECIDING
+    place.mkdir(parents=True, exist_ok=True)
+    deciding = _with_sessions(experiment, first.offers)
+    if not (place / "progress.json").is_file():
+        Progress.create(place, experiment.folder)
+    plans = {session.name: offer.plan for offer in first.offers for session in offer.sessions}
+
+    def rows(session: SessionPlan, period_s: float) -> Motion:
+        plan = plans[session.name]
+        return excitation_rows(plan, plan.periods)(period_s)
+
+    with laboratory(deciding) as bench:
+        done = Run(deciding, place, bench, rows).sessions()
+    if done[-1].status == "abort":
+        raise OperatorError(f"session {done[-1].name}: {done[-1].reason}")
+    finished = [record for record in done if record.status == "success"]
+    if not finished:
+        return Conclusion(first, f"session {done[-1].name}: {done[-1].reason}")
+    second = _diagnosed(experiment, arm, folder, records, finished)
+    answers = decisions(first.diagnosis, second.diagnosis)
+    target = folder / FOLDER
+    (target / DIAGNOSIS).replace(target / BEFORE)
+    second = second.with_offers(())
+    second.write(target)
+    content = {"schema_version": 1, "answers": [answer.to_dict() for answer in answers]}
+    (target / DECISION).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return Conclusion(second, answers=answers)
+
+
+def _diagnosed(
+    experiment: Experiment,
+    arm: Arm,
+    folder: Path,
+    records: Sequence[Record],
+    further: Sequence[Record] = (),
+) -> Study:
+    """The diagnosis of all finished sessions; those for validation are only measured on."""
+    unseen = {session.name for session in experiment.sessions if session.validation}
+    logs: dict[bool, list[Session]] = {False: [], True: []}
+    for record in records:
+        logs[record.name in unseen].append(read_session(record.path, status=False))
+    logs[False] += [read_session(record.path, status=False) for record in further]
+    wanted = experiment.diagnosis.reference
+    reference = None if wanted is None else read_model(find(wanted, beside=experiment.folder))
+    return study(logs[False], Chain.from_urdf(arm.urdf), test=logs[True], arm=arm, reference=reference)
+
+
+def _with_sessions(experiment: Experiment, motions: Sequence[Deciding]) -> Experiment:
+    """The experiment with the sessions of the deciding motions instead of its own."""
+    sessions = tuple(session for motion in motions for session in motion.sessions)
+    return experiment.changed(sessions=sessions)
+
+
+def _reason(error: Exception) -> str:
+    log.info("the diagnosis failed", exc_info=error)
+    return str(error) if isinstance(error, LwrError) else f"{type(error).__name__}: {error}"
