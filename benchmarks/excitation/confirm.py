@@ -66,6 +66,7 @@ def experiment(folder: Path, name: str, plan: ExcitationPlan) -> list[dict[str, 
     plan.save(folder / f"{name}.plan.yaml")
     content = yaml.safe_load((CONFIGS / "experiments/default.yaml").read_text(encoding="utf-8"))
     content["name"] = name
+    content["diagnosis"] = {"run": False}
     content["excitation"] = {"plan": str(folder / f"{name}.plan.yaml"), "periods": plan.periods}
     file = folder / f"{name}.yaml"
     file.write_text(yaml.safe_dump(content), encoding="utf-8")

@@ -37,6 +37,7 @@ _SHORT = {
     "excitation": {"period_s": 6.0, "harmonics": 3, "periods": 1, "seed": 3},
     "moves": {"home": [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], "speed_scale": 0.5, "settle_s": 0.5},
     "identification": {"model": 1},
+    "diagnosis": {"run": False},
     "sessions": [{"name": "first"}, {"name": "second"}],
 }
 

@@ -20,6 +20,7 @@ SHORT: dict[str, Any] = {
     "emulator_settings": {"fri.period_ms": 10},
     "excitation": {"period_s": 6.0, "harmonics": 3, "periods": 1, "seed": 3},
     "moves": {"home": [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], "speed_scale": 0.5, "settle_s": 0.5},
+    "diagnosis": {"run": False},
     "sessions": [
         {"name": "unloaded"},
         {"name": "loaded", "payload": {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}},

@@ -31,6 +31,7 @@ name: short
 emulator_settings: {fri.period_ms: 5}
 excitation: {period_s: 6.0, harmonics: 3, periods: 2, seed: 3}
 moves: {home: [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], speed_scale: 0.5, settle_s: 0.5}
+diagnosis: {run: false}
 sessions:
   - name: unloaded
   - name: loaded
