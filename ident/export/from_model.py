@@ -87,7 +87,12 @@ def standard_model(
         inertial[-1] += vector[_LINK * link : _LINK * link + _BODY]
     if model.effects:
         named = ", ".join(str(effect["cause"]) for effect in model.effects)
-        notes = (*notes, f"Effects of the model that are not in this file: {named}.")
+        notes = (
+            *notes,
+            f"Effects of the model that are not in this file: {named}.",
+            "The parameters are those beside these effects; without them a model identified without effects "
+            "predicts better.",
+        )
     title = f"{model.robot}, {'bare arm' if payload is None else f'payload {payload}'}"
     return StandardModel(
         chain=structure.chain,
