@@ -51,6 +51,12 @@ class Handshake(Protocol):
     def stopped(self, msr: np.ndarray) -> bool:
         """Whether a stop was granted and monitor mode is on."""
 
+    def fallen(self, msr: np.ndarray) -> bool:
+        """Whether the program believes itself in command mode while FRI has fallen back to monitor mode.
+
+        It takes no start then before a stop.
+        """
+
 
 class StanfordHandshake:
     """Stanford's FRIControl: ``$FRI_FRM_INT[15..16]``, ``$FRI_TO_INT[15..16]``."""
@@ -83,6 +89,10 @@ class StanfordHandshake:
         """10 in [16], state MON."""
         return bool(msr["krl_int"][15] == 10 and msr["state"] == State.MON)
 
+    def fallen(self, msr: np.ndarray) -> bool:
+        """20 in [16], state MON."""
+        return bool(msr["krl_int"][15] == 20 and msr["state"] == State.MON)
+
 
 class RosHandshake:
     """CentroEPiaggio's ros_control: ``$FRI_FRM_INT[1..2]``, ``$FRI_TO_INT[2]``."""
@@ -114,6 +124,10 @@ class RosHandshake:
     def stopped(self, msr: np.ndarray) -> bool:
         """0 or 10 in [2], state MON."""
         return bool(msr["krl_int"][1] in (0, 10) and msr["state"] == State.MON)
+
+    def fallen(self, msr: np.ndarray) -> bool:
+        """1 in [2], state MON."""
+        return bool(msr["krl_int"][1] == 1 and msr["state"] == State.MON)
 
 
 class RcprgHandshake:
@@ -149,6 +163,10 @@ class RcprgHandshake:
     def stopped(self, msr: np.ndarray) -> bool:
         """State MON, and the program is through with the request."""
         return bool(msr["state"] == State.MON and not msr["krl_bool"] & 1)
+
+    def fallen(self, msr: np.ndarray) -> bool:
+        """Never: the published program takes a start at any time."""
+        return False
 
     @staticmethod
     def _request(cmd: np.ndarray, msr: np.ndarray, request: int, wanted: State) -> None:
@@ -196,6 +214,10 @@ class IdentificationHandshake:
     def stopped(self, msr: np.ndarray) -> bool:
         """1 in [16], state MON."""
         return bool(msr["krl_int"][15] == 1 and msr["state"] == State.MON)
+
+    def fallen(self, msr: np.ndarray) -> bool:
+        """4 in [16], state MON."""
+        return bool(msr["krl_int"][15] == 4 and msr["state"] == State.MON)
 
     def request_load(self, cmd: np.ndarray, msr: np.ndarray, load: np.ndarray) -> None:
         """Put load data in force: mass [kg], centre of mass in the flange frame [mm] (3), inertia about it

@@ -106,7 +106,12 @@ def advise_quality(state: LinkState) -> str:
         return "Another address sends too: set `controller` to the controller's, and find the other"
     if state.late > state.received // 100:
         return "Answers come too late: close other programs, see the real-time rights, or use a longer cycle"
-    return "Nothing to do at the pendant; check cable and network card, and that only one client answers"
+    seen = ((state.lost, "lost"), (state.malformed, "malformed"), (state.miss_counter, "unanswered in time"))
+    told = ", ".join(f"{count} {what}" for count, what in seen if count)
+    return (
+        f"Nothing to do at the pendant{f' ({told})' if told else ''}; check cable and network card, and that "
+        "only one client answers"
+    )
 
 
 def advise_command(state: LinkState) -> str:

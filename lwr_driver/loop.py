@@ -317,9 +317,12 @@ class Loop:
     def _lose(self, reason: str, result: Result = Result.NETWORK) -> None:
         if self._commander.mode in (Mode.MIRROR, Mode.SILENT):
             return
-        self._commander.lose(result, reason + self._meanwhile())
+        reason += self._meanwhile()
+        self._commander.lose(result, reason)
         # The KRL program must not start command mode again before it is asked to.
         self._handshake.request_stop(self.remote.command, self.remote.msr)
+        if self._job is Job.START:
+            self._finish(result, reason)
 
     def _meanwhile(self) -> str:
         """What else the link has seen in command mode, for a reason."""
@@ -384,7 +387,8 @@ class Loop:
             self._run_length = self._run_length + 1 if remote.quality >= int(words[Word.B]) else 0
             done = self._run_length >= int(words[Word.A])
         elif job is Job.START:
-            # After a fallback the program wants its stop acknowledged before it takes a start.
+            # After a fallback, seen or not, the program wants its stop acknowledged before it takes a start.
+            self._begun = self._begun and not handshake.fallen(remote.msr)
             self._begun = self._begun or handshake.stopped(remote.msr) or remote.state == State.CMD
             if self._begun:
                 handshake.request_start(remote.command, remote.msr, ControlMode.POSITION)

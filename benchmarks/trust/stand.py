@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fri.controller_end import ControllerEnd
 from fri.krc import KrcSession
-from fri.krl import PROGRAMS, Interpreter
+from fri.krl import Interpreter
 from fri.packets import CMD, CMD_SIZE
 from fri.policy import KrcLimits, KrcPolicy
 from fri.sample import Sample
@@ -37,6 +37,7 @@ from lwr_driver.ring import Ring
 from lwr_driver.session import session_metadata
 from runner.route import dwell
 from sim_backend.faults import FaultyWire, Parcel, WireFault
+from sim_backend.krl_program import krl_program
 from sim_backend.monitor import CommandMonitor
 
 __all__ = ["LABEL", "START", "Stand", "the_arm", "the_motion"]
@@ -158,6 +159,7 @@ class Stand:
         self.packets = 0
         self.silent = 0
         self.hurry = 0
+        self.slow, self.delay_ns = 0, 0
         self.alter: Callable[[bytes, int], bytes] | None = None
         self.beside: Callable[[bytes, int], None] | None = None
         self.commanding = False
@@ -186,7 +188,7 @@ class Stand:
         session = KrcSession(
             self.hard, self.setpoint, self.policy, first_sequence=first_sequence, uptime_s=uptime_s
         )
-        self.interpreter = Interpreter(session, PROGRAMS[self.program](self.period_ms))
+        self.interpreter = Interpreter(session, krl_program(self.program, self.period_ms))
         self.sample.msr_jnt_pos[:] = self.setpoint
         return session
 
@@ -205,7 +207,11 @@ class Stand:
         self.session.fri_close()
         self.period_ms = period_ms
         self.wire.period_s = self.monitor.period_s = period_ms * 1e-3
-        self.interpreter = Interpreter(self.session, PROGRAMS[self.program](period_ms))
+        self.interpreter = Interpreter(self.session, krl_program(self.program, period_ms))
+
+    def slow_down(self, cycles: int, extra: float) -> None:
+        """The next cycles each take longer by `extra` periods."""
+        self.slow, self.delay_ns = cycles, round(extra * self.period_ms * 1e6)
 
     def other(self, host: str) -> socket.socket:
         """A socket of another host."""
@@ -219,6 +225,11 @@ class Stand:
     def cycle(self) -> None:
         """One cycle of the controller, with all that comes of it."""
         session = self.session
+        if self.slow > 0:
+            # The loop looks in vain meanwhile.
+            self.slow -= 1
+            self.clock.now_ns += self.delay_ns
+            self._serve()
         self.clock.now_ns += self.period_ms * 1_000_000
         if session.state is State.OFF:
             self._serve()

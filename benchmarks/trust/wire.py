@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.trust.stand import LABEL, Stand, shared_ring, the_motion
 from benchmarks.trust.table import Ledger
-from benchmarks.trust.wire_faults import FAULTS, NAMED, PERIODS_MS, Fault
+from benchmarks.trust.wire_faults import FAULTS, NAMED, PERIODS_MS, SEEN, Fault
 from fri.states import State
 from lwr_driver.control import Job, Mode, Result, Text, Word
 from lwr_driver.link import advise_command, silence_in_lock_step
@@ -84,7 +84,7 @@ def plan(seed: int, number: int) -> tuple[Plan, np.random.SeedSequence]:
         int(random.integers(0, 12)),
         int(random.choice(PERIODS_MS)),
         int(random.integers(12)),
-        str(random.choice(["stanford", "ros_control"])),
+        str(random.choice(["lwr_identification", "stanford", "ros_control"])),
         bool(random.random() < 0.5),
         first,
         float(random.choice([0.0, 3600.0, 4e4])),
@@ -166,8 +166,12 @@ class _Course:
         self.ended_at = stand.cycle_number
         if done and stand.result is Result.DONE:
             return "success", ""
+        if done and stand.result is not Result.TIMEOUT:
+            return "fail", f"command mode with drives on: {stand.reason}"
+        if not done:
+            # Without a cycle the driver's own clock ends the waiting, some time later.
+            stand.clock.sleep(2.0)
         state = snapshot(stand.control, stand.clock.now_ns, 0)
-        # Without a cycle the driver's own clock ends the waiting.
         return "fail", f"waiting for command mode; seen: {state.summary}. {advise_command(state)}"
 
     def move(self) -> tuple[str, str]:
@@ -229,9 +233,11 @@ class _Course:
             say(f"status {status} with reason {reason!r}")
         if status == "fail" and all(fault.harmless for fault in faults):
             say(f"a harmless fault ended the motion: {reason}")
-        if status == "fail" and "waiting for" not in reason and "does not begin" not in reason:
-            named = "|".join(NAMED.get(fault.name, "$^") for fault in faults)
-            if not re.search(named, reason):
+        if status == "fail" and "does not begin" not in reason:
+            named = [NAMED.get(fault.name, "$^") for fault in faults]
+            if "waiting for" in reason:
+                named += [SEEN.get(fault.name, "$^") for fault in faults]
+            if not re.search("|".join(named), reason):
                 say(f"reason does not name the cause: {reason}")
         if self.struck_at is None and status == "success" and self.plan.phase != "brake":
             say(f"the fault never struck in phase {self.plan.phase}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.trust.stand import Stand
 
-__all__ = ["FAULTS", "NAMED", "PERIODS_MS", "Fault"]
+__all__ = ["FAULTS", "NAMED", "PERIODS_MS", "SEEN", "Fault"]
 
 PERIODS_MS = (1, 2, 4, 5, 10, 20)
 
@@ -85,6 +85,12 @@ def _fast(random: Random) -> Fault:
     """Packets come in heaps, faster than they can be answered."""
     cycles = int(random.integers(2, 40))
     return Fault("too fast", lambda stand: setattr(stand, "hurry", cycles))
+
+
+def _slow(random: Random) -> Fault:
+    """Cycles take longer than the sample time says, by less than what counts as silence."""
+    cycles, extra = int(random.integers(2, 80)), float(random.uniform(0.5, 7.0))
+    return Fault("too slow", lambda stand: stand.slow_down(cycles, extra), harmless=True)
 
 
 def _pace(random: Random) -> Fault:
@@ -190,6 +196,7 @@ FAULTS: dict[str, Callable[[Random], Fault]] = {
     "restart": _restart,
     "silent": _silent,
     "too fast": _fast,
+    "too slow": _slow,
     "clock pace": _pace,
     "other cycle": _reopen,
     "other version": _version,
@@ -217,4 +224,15 @@ NAMED: dict[str, str] = {
     "clock pace": _AGAIN,
     "second client": _AGAIN,
     "foreign": "foreign|left command mode",
+}
+
+# The same while command mode is waited for: what is seen, and the advice.
+_UNHEARD = r"unanswered in time|Answers come too late|answer rate 0|quality (UNACCEPTABLE|BAD)"
+SEEN: dict[str, str] = {
+    **dict.fromkeys(("loss", "burst", "delay", "jitter", "reorder", "truncate", "too fast"), _UNHEARD),
+    "corrupt": f"{_UNHEARD}|not in position control",
+    "other version": "not FRI 1.0",
+    "restart": _UNHEARD,
+    "second client": f"another address|{_UNHEARD}",
+    "foreign": "another address",
 }

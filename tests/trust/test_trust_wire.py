@@ -20,7 +20,7 @@ from lwr_driver.session import read_session
 from lwr_driver.state import snapshot
 
 SEED = 1
-BLOCK = 17
+BLOCK = 18
 
 
 @pytest.fixture
@@ -213,3 +213,35 @@ def test_reaction_is_within_the_limits_and_told(ring, tmp_path, cause):
     assert not found["bad"]
     assert found["reason"]
     assert found["sent"] <= 4
+
+
+@pytest.mark.parametrize("program", ["stanford", "ros_control", "lwr_identification"])
+def test_command_mode_that_fell_back_unseen_is_asked_for_anew(stand, program):
+    s = stand(program=program)
+    while not s.loop.remote.received:
+        s.cycle()
+    s.post(Job.START, limit=2000)
+
+    def deaf_in_command_mode(packet: bytes, number: int) -> bytes:
+        return packet[:-4] if packet[144] == State.CMD else packet
+
+    s.alter = deaf_in_command_mode
+    while s.session.counters()["drops"] == 0:
+        s.cycle()
+    s.alter = None
+    assert s.until_done(2000)
+    assert s.result is Result.DONE
+
+
+def test_command_mode_lost_while_it_begins_ends_the_waiting_with_the_cause(stand):
+    s = stand()
+    while not s.loop.remote.received:
+        s.cycle()
+    s.post(Job.START, limit=2000)
+    while s.loop.mode is not Mode.HOLD:
+        assert not s.done
+        s.cycle()
+    s.session.set_drives(0)
+    assert s.until_done(5)
+    assert s.result is Result.ROBOT
+    assert "drives are off" in s.reason
