@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import maximum_filter1d
 
 from fri.errors import DataError
 
@@ -17,6 +18,9 @@ BoolArray = NDArray[np.bool_]
 
 _JITTER = 0.02
 _TOO_MANY = 0.01
+_GRAINS = 5.0
+# Samples over which the size of a channel's noise is taken to be one.
+_BLOCK = 50
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,10 @@ def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int
     """Flags (n, k) of samples far from the median of five, and the columns with too many for outliers.
 
     Far is more than `scale` robust standard deviations and more than 1 % of the range, the deviation taken
-    from the cubic through the four neighbours, which follows any slope. The median keeps steps, so the
-    reversal of Coulomb friction is no outlier. Where over 1 % of a column is far, nothing of it is flagged:
-    that is not an outlier but a property of the signal.
+    from the cubic through the four neighbours, which follows any slope. It is the larger of that of the whole
+    column and that of the samples around: the torque of a drive is noisier while it works than at rest. The
+    median keeps steps, so the reversal of Coulomb friction is no outlier. Where over 1 % of a column is far,
+    nothing of it is flagged: that is not an outlier but a property of the signal.
     """
     flags = np.zeros(values.shape, dtype=bool)
     crowded = []
@@ -126,12 +131,24 @@ def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int
         distance = np.abs(series - _median_of_five(far_left, left, middle, right, far_right))
         cubic = np.abs(series - (4.0 * (left + right) - far_left - far_right) / 6.0)
         low, high = np.percentile(series, [0.5, 99.5])
-        far = distance > max(scale * 1.4826 * float(np.median(cubic)), 0.01 * float(high - low))
+        steps = np.abs(np.diff(series))
+        # A joint that stands still jumps by a few steps of its encoder.
+        grain = _GRAINS * float(np.min(steps, where=steps > 0.0, initial=np.inf)) if np.any(steps) else 0.0
+        grain = min(grain, 0.5 * float(np.ptp(series)))
+        usual = np.maximum(_median_around(cubic), float(np.median(cubic)))
+        far = distance > np.maximum(scale * 1.4826 * usual, max(0.01 * float(high - low), grain))
         if far.mean() > _TOO_MANY:
             crowded.append(column)
         else:
             flags[:, column] = far
     return flags, crowded
+
+
+def _median_around(values: FloatArray) -> FloatArray:
+    """The largest of the medians of a sample's block (n,) and of the blocks beside it."""
+    whole = len(values) // _BLOCK * _BLOCK
+    medians = np.append(np.median(values[:whole].reshape(-1, _BLOCK), axis=1), np.median(values[-_BLOCK:]))
+    return np.repeat(maximum_filter1d(medians, 3, mode="nearest"), _BLOCK)[: len(values)]
 
 
 def _median_of_five(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, e: FloatArray) -> FloatArray:

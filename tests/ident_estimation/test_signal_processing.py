@@ -136,6 +136,18 @@ def test_spikes_are_outliers_and_reversals_are_not():
     assert crowded == []
 
 
+def test_a_drive_that_is_noisier_in_motion_has_no_outliers_and_spikes_in_both_parts_are_found():
+    random = np.random.default_rng(5)
+    size = np.where((np.arange(9000) // 1500) % 2 == 0, 0.01, 0.8)
+    torque = (20 * np.sin(np.arange(9000) * 2e-3) + size * random.laplace(size=9000))[:, None]
+    flags, crowded = flag_outliers(torque, 8.0)
+    assert not flags.any()
+    assert crowded == []
+    torque[[700, 2200, 8990]] += np.array([[3.0], [-30.0], [30.0]])
+    flags, _ = flag_outliers(torque, 8.0)
+    assert np.flatnonzero(flags).tolist() == [700, 2200, 8990]
+
+
 def test_a_channel_full_of_jumps_is_left_alone_and_named():
     random = np.random.default_rng(2)
     values = 0.01 * random.normal(size=(3000, 1))
