@@ -40,6 +40,7 @@ Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]
 
 REST_CYCLES_S = 0.5
+LEAST_MOTION_RAD = 0.02
 
 
 @dataclass(frozen=True)
@@ -203,10 +204,13 @@ class Run:
                 f"{path.name} has no motor torques: the counter `counter_int` in the KRL variables stands "
                 "still. It serves Model 1",
             )
+        # A joint that stands still shows what the others do to it.
+        moves = np.ptp(session.joint.position, axis=0) > LEAST_MOTION_RAD
+        moving = {name for name, moved in zip(session.joint.names, moves, strict=True) if moved}
         return tuple(
             f"{path.name}: {match}; check `reals`, `scale` and `sign` of motor_torque.krl"
             for match in match_torques(session.joint, session.motor)
-            if match.suspect
+            if match.suspect and match.joint in moving
         )
 
     def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:

@@ -63,7 +63,7 @@ class Replay:
 
     sessions : all of the diagnosis, so that each has its number in their order. longest_s : of each session
     that is simulated, where no effect belongs to a later moment. config : emulator whose controller holds the
-    arm. notes : after a call, what could not be simulated and why.
+    arm.
     """
 
     def __init__(
@@ -77,7 +77,8 @@ class Replay:
         self.arm = arm
         self.longest_s = longest_s
         self.config = config or load_configuration()
-        self.notes: dict[str, None] = {}
+        self._failed: dict[str, dict[str, None]] = {}
+        self._uncommanded: dict[str, None] = {}
         self._order = sorted(session.start for session in sessions)
         self._delays: dict[int, float] = {}
 
@@ -98,14 +99,11 @@ class Replay:
                     delay_s=self._delays.get(session.start),
                 )
             except (DataError, ConfigurationError) as error:
-                self.notes[f"{name}: no simulation: {error}"] = None
+                self._failed.setdefault(str(error), {})[name] = None
                 continue
             self._delays.setdefault(session.start, done.delay_s)
             if not done.commanded:
-                self.notes[
-                    f"{name} has no commands: the simulated arm followed its measured positions, so the simulated "
-                    "position says how well the controller holds a path, not how the arm answered"
-                ] = None
+                self._uncommanded[name] = None
             for k, part in enumerate((done.position, done.motor, done.joint)):
                 if part is not None:
                     squares[k] += np.nansum(part**2, axis=0)
@@ -115,6 +113,18 @@ class Replay:
         rms = [np.sqrt(s / c) if c else None for s, c in zip(squares, count, strict=True)]
         assert rms[0] is not None
         return SimulationError(position=rms[0], motor=rms[1], joint=rms[2])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What could not be simulated and why, and what was simulated otherwise, a sentence each."""
+        found = [f"no simulation of {', '.join(names)}: {reason}" for reason, names in self._failed.items()]
+        if self._uncommanded:
+            found.append(
+                f"{', '.join(self._uncommanded)}: no commands in the log, so the simulated arm followed the measured "
+                "positions; the simulated position says how well the controller holds a path, not how the arm "
+                "answered"
+            )
+        return tuple(found)
 
 
 def replay(

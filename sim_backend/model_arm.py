@@ -1,11 +1,14 @@
 """The emulated arm from an identified model: what of a `model.yaml` a simulated arm needs.
 
 Torque, mass matrix and gravity depend on the base parameters only, so any standard parameters with the model's
-torque will do; those next to the URDF's are taken, which look most like an arm.
+torque will do; those next to the URDF's are taken, which look most like an arm. Where an estimate is that of no
+arm at all (its mass matrix is not positive definite), the nearest bodies that can exist stand for it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,20 +16,31 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
+from ident import regressor
 from ident.cad_prior import cad_prior
 from ident.effects import Simulated, find_effect
 from ident.effects.model_torque import parameter_values
+from ident.export import consistent_parameters
 from ident.model import DynamicModel
 from ident.parameters import INERTIAL, PER_LINK
 from sim_backend.plant import Drive, Effect
 from sim_backend.rigid_body import mass_matrix_floor, with_inertias
 
-__all__ = ["ModelEffect", "drive_of", "links_of", "model_effects", "model_parameters", "model_payloads"]
+__all__ = [
+    "Cause",
+    "ModelEffect",
+    "drive_of",
+    "links_of",
+    "model_effects",
+    "model_parameters",
+    "model_payloads",
+]
 
 Floats = NDArray[np.float64]
 
 _DRIVE = PER_LINK[len(INERTIAL) :]
 _LEAST_INERTIA = 1e-3
+_POSES = 100
 
 
 def model_parameters(model: DynamicModel) -> dict[str, float]:
@@ -108,6 +122,26 @@ class ModelEffect(Effect):
         self.part.sense_motor(max(0.0, time_s + self.begin_s), plant, reading)
 
 
+class Cause(ModelEffect):
+    """An effect of the dictionary as a plug-in of the emulator's configuration: something to be found.
+
+    cause : its name. joint : from 1; of no meaning for the whole arm. parameters : all values by name, SI units.
+    Raises ConfigurationError for an unknown cause and where a parameter is missing or foreign.
+    """
+
+    def __init__(self, cause: str, parameters: Mapping[str, float], joint: int = 1) -> None:
+        effect = find_effect(cause)
+        known = [p.name for p in effect.parameters if p.name not in effect.hidden]
+        wrong = sorted(set(known) ^ set(parameters))
+        if wrong:
+            raise ConfigurationError(
+                f"effect {cause}: `parameters` must be exactly {', '.join(known)}; look at {wrong[0]!r}"
+            )
+        super().__init__(
+            effect.simulate(joint - 1, {name: float(value) for name, value in parameters.items()})
+        )
+
+
 def model_effects(
     model: DynamicModel, *, session: int | None = None, begin_s: float = 0.0
 ) -> tuple[ModelEffect, ...]:
@@ -132,10 +166,26 @@ def model_effects(
     return tuple(found)
 
 
+@lru_cache(maxsize=8)
 def _standard(model: DynamicModel) -> Floats:
-    if model.base is None or model.structure.chain.urdf is None:
+    """Standard parameters next to the URDF's; where no arm can have them, those of the nearest one that can."""
+    if model.base is None:
         return model.standard_parameters()
-    prior = cad_prior(model.base)
-    near = np.zeros(model.structure.n_columns)
-    near[prior.bodies] = prior.inertial
-    return model.standard_parameters(near)
+    near = None
+    if model.structure.chain.urdf is not None:
+        prior = cad_prior(model.base)
+        near = np.zeros(model.structure.n_columns)
+        near[prior.bodies] = prior.inertial
+    exact = model.standard_parameters(near)
+    if all(_possible(model, exact, payload) for payload in (None, *model.structure.payloads)):
+        return exact
+    return consistent_parameters(model).vector
+
+
+def _possible(model: DynamicModel, standard: Floats, payload: str | None) -> bool:
+    """Whether the mass matrix is positive definite at random poses."""
+    random = np.random.default_rng(0)
+    q = random.uniform(-np.pi, np.pi, (_POSES, model.structure.chain.n))
+    bodies = model.inertial(payload, standard=standard)
+    matrices = regressor.mass_matrix(model.structure.chain, q, bodies)
+    return bool(np.min(np.linalg.eigvalsh(matrices)) > 0.0)

@@ -5,6 +5,7 @@ A failure of the diagnosis never spoils the experiment: it is said, and the resu
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
-from lwr_driver.session import Session, read_session
+from lwr_driver.session import JointColumns, Phase, Session, read_session
 from runner.diagnosis.deciding import Deciding, offers
 from runner.diagnosis.decision import Answer, decision_text, decisions
 from runner.diagnosis.study import DIAGNOSIS, Study, study
@@ -37,6 +38,7 @@ FOLDER = "diagnosis"
 DECIDING = "deciding"
 DECISION = "decision.json"
 BEFORE = "before_deciding.json"
+PAUSE_NS = 10_000_000_000
 
 Laboratory = Callable[[Experiment], AbstractContextManager[Bench]]
 
@@ -158,10 +160,35 @@ def _diagnosed(
     logs: dict[bool, list[Session]] = {False: [], True: []}
     for record in records:
         logs[record.name in unseen].append(read_session(record.path, status=False))
-    logs[False] += [read_session(record.path, status=False) for record in further]
+    last = max(log.joint.log_time[-1] for log in (*logs[False], *logs[True]))
+    for record in further:
+        log = read_session(record.path, status=False)
+        # The emulator's clock begins anew with it; what is run later is later.
+        log = _later(log, max(0, int(last) + PAUSE_NS - log.start))
+        last = log.joint.log_time[-1]
+        logs[False].append(log)
     wanted = experiment.diagnosis.reference
     reference = None if wanted is None else read_model(find(wanted, beside=experiment.folder))
     return study(logs[False], Chain.from_urdf(arm.urdf), test=logs[True], arm=arm, reference=reference)
+
+
+def _later(session: Session, shift_ns: int) -> Session:
+    """The session at a later time, without the channels that no diagnosis needs."""
+
+    def shifted(columns: JointColumns) -> JointColumns:
+        return dataclasses.replace(
+            columns, log_time=columns.log_time + shift_ns, publish_time=columns.publish_time + shift_ns
+        )
+
+    return dataclasses.replace(
+        session,
+        joint=shifted(session.joint),
+        motor=None if session.motor is None else shifted(session.motor),
+        command=None if session.command is None else shifted(session.command),
+        phases=tuple(Phase(phase.log_time + shift_ns, phase.name) for phase in session.phases),
+        status=None,
+        controller_model=None,
+    )
 
 
 def _with_sessions(experiment: Experiment, motions: Sequence[Deciding]) -> Experiment:
