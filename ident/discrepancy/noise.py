@@ -33,7 +33,10 @@ def noise_floor(
             continue
         at = rows.time[second] - length
         step = float(np.median(np.diff(rows.time[first])))
-        nearest = np.clip(np.rint((at - rows.time[first[0]]) / step).astype(int), 0, len(first) - 1)
+        # Rows need not be evenly spaced: a slow tick seldom fits the cycle.
+        after = np.clip(np.searchsorted(rows.time[first], at), 1, len(first) - 1)
+        earlier = at - rows.time[first[after - 1]] < rows.time[first[after]] - at
+        nearest = after - earlier
         close = np.abs(rows.time[first[nearest]] - at) < 0.6 * step
         pairs.append((residual[second[close]] - residual[first[nearest[close]]]) / np.sqrt(2.0))
     sigma, dilution = np.ones(n), np.ones(n)
