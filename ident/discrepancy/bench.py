@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fri.errors import DataError
+from ident.base import BaseSet
+from ident.cad_prior import cad_prior
 from ident.discrepancy.candidates import Dictionary, Trial
 from ident.discrepancy.evidence import Evidence, Floats
-from ident.discrepancy.noise import noise_floor
+from ident.discrepancy.noise import noise_floor, repeatability
 from ident.discrepancy.nominal import Arm, Nominal, structure_of
 from ident.discrepancy.recording import Recording
 from ident.discrepancy.reference import Reference
@@ -91,12 +93,13 @@ def prepare_bench(
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
     structure, base = structure_of(arm, recordings)
     nominal = Nominal.of(arm, recordings, settings, structure, base)
-    prior = None if reference is None else reference.prior(base)
+    prior = reference.prior(base) if reference is not None else _drawn(base)
     rounds = 3 if fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2 else 1
-    evidence, _ = _evidence(nominal, settings, None)
+    compared = reference is not None
+    evidence, _ = _evidence(nominal, settings, None if compared else prior, compared=False)
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
-        evidence, told = _evidence(nominal, settings, prior)
+        evidence, told = _evidence(nominal, settings, prior, compared=compared)
         if rounds > 1:
             change = _compliance_step(nominal, evidence, arm)
             if np.all(np.abs(change) < 0.03 * arm.compliance):
@@ -105,17 +108,50 @@ def prepare_bench(
     return Bench(nominal, evidence, Dictionary(nominal, evidence, causes), told)
 
 
+def _drawn(base: BaseSet) -> tuple[Floats, Floats] | None:
+    """Precision (p, p) and values (p,) of the base parameters as the arm was drawn; None without its inertia."""
+    if base.structure.chain.urdf is None:
+        return None
+    prior = cad_prior(base).prior("pullback")
+    return prior.precision, prior.mean
+
+
 def _evidence(
-    nominal: Nominal, settings: DiagnosisSettings, prior: tuple[Floats, Floats] | None
+    nominal: Nominal,
+    settings: DiagnosisSettings,
+    prior: tuple[Floats, Floats] | None,
+    *,
+    compared: bool = False,
 ) -> tuple[Evidence, bool]:
-    """Evidence with the noise floor that a first fit leaves."""
+    """Evidence with the noise floor that a first fit leaves.
+
+    A prior that is not `compared` keeps what the motion hardly excites near the drawing; where the excitation
+    repeats, the data know what they do not know, and it is left out.
+    """
     n = nominal.arm.chain.n
     one = {side: np.ones(n) for side in nominal.rows}
     first = Evidence(nominal, settings, one, one)
     floors = _floors(nominal, first.residuals())
     sigma = {side: floor[0] for side, floor in floors.items()}
     dilution = {side: floor[1] for side, floor in floors.items()}
-    return Evidence(nominal, settings, sigma, dilution, prior), all(floor[2] for floor in floors.values())
+    told = all(floor[2] for floor in floors.values())
+    if told and not compared:
+        prior = None
+    floor = _repeated(nominal, first.residuals(), floors)
+    return Evidence(nominal, settings, sigma, dilution, prior, compared=compared, floor=floor), told
+
+
+def _repeated(
+    nominal: Nominal, residual: Mapping[str, Floats], floors: Mapping[str, tuple[Floats, Floats, bool]]
+) -> dict[str, Floats]:
+    """What repeats of a motion differ by, within a session or from one to another, else what the model leaves."""
+    found = {}
+    for side, (sigma, _, told) in floors.items():
+        found[side] = sigma
+        if not told:
+            between = repeatability(nominal.recordings, nominal.rows[side], residual[side])[0]
+            found[side] = np.where(np.isfinite(between), between, sigma)
+    return found
 
 
 def _floors(nominal: Nominal, residual: Mapping[str, Floats]) -> dict[str, tuple[Floats, Floats, bool]]:
@@ -150,7 +186,9 @@ def again_with(
         return None
     nominal, evidence = bench.nominal, bench.evidence
     evidence.replace([*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
-    floors = _floors(nominal, evidence.residuals())
+    left = evidence.residuals()
+    floors = _floors(nominal, left)
+    repeated = _repeated(nominal, left, floors)
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(
         nominal,
@@ -158,6 +196,8 @@ def again_with(
         {side: floor[0] for side, floor in floors.items()},
         {side: floor[1] for side, floor in floors.items()},
         prior=evidence.prior,
+        compared=evidence.compared,
+        floor=repeated,
     )
     return Bench(nominal, again, Dictionary(nominal, again, causes), bench.told)
 

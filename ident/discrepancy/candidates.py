@@ -63,9 +63,12 @@ class Dictionary:
         wanted = list(EFFECTS) if causes is None else list(causes)
         n = nominal.arm.chain.n
         motor = "motor" in nominal.rows
+        # A low-pass of another hand may have shifted a channel, and the arm is not to blame.
+        hidden = {f"{side}_torque_delay" for side, band in nominal.band_hz.items() if band is not None}
         self.candidates = tuple(
             Candidate(EFFECTS[cause], joint)
             for cause in wanted
+            if cause not in hidden
             if motor or EFFECTS[cause].side != "motor"
             for joint in ([-1] if EFFECTS[cause].whole_arm else range(n))
         )
@@ -201,13 +204,13 @@ class Dictionary:
         grid = effect.shapes(self.setting, max(trial.candidate.joint, 0))
         for name in effect.continuous(trial.shape):
             values = sorted({s[name] for s in grid if name in s and _alike(s, trial.shape, name)})
-            low, high = _neighbours(values, float(trial.shape[name]))
+            limits = next(p for p in effect.shape_parameters if p.name == name)
+            low, high = _neighbours(values, float(trial.shape[name]), signed=limits.low < 0.0 < limits.high)
             if effect.step:
                 low, high = float(trial.shape[name]) - 2.5, float(trial.shape[name]) + 2.5
             elif effect.event:
                 here = float(trial.shape[name])
                 low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
-            limits = next(p for p in effect.shape_parameters if p.name == name)
             low, high = max(low, limits.low), min(high, limits.high)
             if not low < high:
                 continue
@@ -241,11 +244,14 @@ def _alike(a: Shape, b: Shape, besides: str) -> bool:
     return all(a[k] == b[k] for k in a if k != besides and k in b)
 
 
-def _neighbours(values: Sequence[float], here: float) -> tuple[float, float]:
+def _neighbours(values: Sequence[float], here: float, *, signed: bool) -> tuple[float, float]:
+    """The values next to one, on its own side of zero unless the parameter is `signed`."""
     below = [v for v in values if v < here * (1 - 1e-9) - 1e-12]
     above = [v for v in values if v > here * (1 + 1e-9) + 1e-12]
     low = below[-1] if below else (0.4 * here if here > 0 else here - 0.5)
     high = above[0] if above else (2.5 * here if here > 0 else here + 0.5)
+    if signed:
+        return low, high
     if here > 0.0 and low <= 0.0:
         low = 0.3 * here
     if here < 0.0 and high >= 0.0:

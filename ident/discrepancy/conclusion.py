@@ -85,7 +85,7 @@ def conclude(
             r.joint,
             r.depends_on,
             float(extended_rms[r.side][r.joint - 1]),
-            float(evidence.sigma[r.side][r.joint - 1]),
+            float(evidence.floor[r.side][r.joint - 1]),
         )
         for r in remainders
     )
@@ -100,7 +100,7 @@ def conclude(
         model_number=nominal.structure.model,
         findings=tuple(findings),
         unexplained=unexplained,
-        noise_floor=evidence.sigma,
+        noise_floor=evidence.floor,
         rms_base=base_rms,
         rms_extended=extended_rms,
         base_model=base_model,
@@ -339,6 +339,21 @@ def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:
         notes.append(
             "the reference shares no base parameter with these sessions: parameters are not compared"
         )
+    for side, band in bench.nominal.band_hz.items():
+        if band is not None:
+            notes.append(
+                f"the {side} torque was low-passed before it came here, nothing is left above {2.0 * band:.2g} "
+                f"Hz: rows are compared below {band:.2g} Hz; delays, reversals and ripple of the motor's turn "
+                "cannot be seen"
+            )
     if not bench.told:
-        notes.append("the motion does not repeat: the noise is taken from neighbouring rows")
+        notes.append(
+            "no motion repeats within a session: what the model leaves is itself the noise that claims are "
+            "held against, so only what explains much of it is named"
+        )
+    if bench.evidence.prior is not None and not bench.evidence.compared:
+        notes.append(
+            "what the motion hardly excites is held near the inertia of the URDF, within 20 %: a wrong URDF "
+            "would show as a cause"
+        )
     return tuple(notes)

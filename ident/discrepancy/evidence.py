@@ -98,7 +98,8 @@ class Evidence:
 
     sigma : noise of a row [Nm] by side, (n,). dilution : by side, (n,), how much less than a row each row
     counts, because noise is correlated. prior : precision (p, p) and values (p,) of the base parameters, from
-    a reference; then a cause that the base parameters would absorb shows as well.
+    a reference; then a cause that the base parameters would absorb shows as well, where they are `compared`.
+    floor : repeatability of a row [Nm] by side, (n,); default sigma.
     """
 
     def __init__(
@@ -108,9 +109,14 @@ class Evidence:
         sigma: Mapping[str, Floats],
         dilution: Mapping[str, Floats],
         prior: tuple[Floats, Floats] | None = None,
+        *,
+        compared: bool = True,
+        floor: Mapping[str, Floats] | None = None,
     ) -> None:
         self.settings = settings
         self.prior = prior
+        self.compared = compared
+        self.floor = dict(sigma if floor is None else floor)
         self.nominal = nominal
         self.sigma = {side: np.array(value) for side, value in sigma.items()}
         self.dilution = {side: np.array(value) for side, value in dilution.items()}
@@ -339,7 +345,7 @@ class Evidence:
         coefficients = inner @ reach
         fitted = float(reach @ coefficients)
         rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
-        if self.prior is not None:
+        if self.prior is not None and self.compared:
             gain += self._strain(self.full.values) - self._strain(self.full.values - lever @ coefficients)
         # Held-back error can also fall because a base fitted without the part was poor: never more than that.
         gain = min(gain, fitted)

@@ -37,6 +37,8 @@ __all__ = ["Arm", "Nominal", "SideRows", "structure_of"]
 Floats = NDArray[np.float64]
 
 _CHUNK = 2000
+# Share of a low-passed row that must rest on samples of a joint that moves.
+_KNOWN = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,12 +219,41 @@ class Nominal:
                 at = stretch.time if self.arm.joint_delay_s == 0.0 else stretch.time - self.arm.joint_delay_s
                 width = self._bin(stretch)
                 shifted = flat if self.arm.joint_delay_s == 0.0 else _at(stretch.time, flat, at)
-                parts.append(_binned(shifted, width))
+                parts.append(self._slow(side, _binned(shifted, width), width * _step(stretch.time)))
             else:
                 at = stretch.motor_time - self.arm.motor_delay_s
-                parts.append(_binned(_at(stretch.time, flat, at), self.motor_bin(stretch)))
+                width = self.motor_bin(stretch)
+                rows = _binned(_at(stretch.time, flat, at), width)
+                parts.append(self._slow(side, rows, width * _step(stretch.motor_time)))
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
+
+    @cached_property
+    def band_hz(self) -> dict[str, float | None]:
+        """By side, the cut-off that torques and columns both get where torques were low-passed before, else
+        None: half of the band that is left, so that of the earlier filter nothing is felt."""
+        found: dict[str, float | None] = {}
+        for side in self.sides:
+            edges = [r.joint_band_hz if side == "joint" else r.motor_band_hz for r in self.recordings]
+            known = [edge for edge in edges if edge is not None]
+            least = min(known, default=np.inf)
+            found[side] = 0.5 * least if least < 0.5 / self.settings.bin_s else None
+        return found
+
+    def _slow(self, side: str, rows: Floats, dt: float) -> Floats:
+        """Rows (m, k) every `dt` seconds, low-passed and thinned where the torques were low-passed before."""
+        cutoff = self.band_hz[side]
+        if cutoff is None or cutoff >= 0.4 / dt:
+            return rows
+        return self._thin(side, low_pass(rows, dt, cutoff), dt)
+
+    def _thin(self, side: str, rows: Floats, dt: float) -> Floats:
+        """Every so many of the rows (m, ...), without the ends that the low-pass spoils."""
+        cutoff = self.band_hz[side]
+        if cutoff is None or cutoff >= 0.4 / dt:
+            return rows
+        step, edge = max(1, int(0.4 / (cutoff * dt))), int(0.5 / (cutoff * dt))
+        return rows[edge : len(rows) - edge : step]
 
     def make_rows(self) -> None:
         """Rows of all sides from the present motions."""
@@ -246,14 +277,22 @@ class Nominal:
             moves = (np.abs(_at(stretch.time, speed, at)) > still) & (
                 _at(stretch.time, self._steady(speed, stretch), at) > 0.999
             )
-            matrices.append(self._matrix(side, motion, recording, stretch.time, at, width))
-            targets.append(_binned(target, width))
-            moves = _binned(moves.astype(float), width) > 1.0 - 1e-9
-            if side == "joint":
-                # The positions' low-pass rounds the corner that the link's Coulomb friction makes.
-                moves = _guarded(moves, round(self.settings.guard_s * len(moves) / max(at[-1] - at[0], 1e-9)))
-            valid.append((_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves)
-            stamps = _binned(stamp[:, None], width)[:, 0]
+            dt = width * _step(stamp)
+            wide = self._matrix(side, motion, recording, stretch.time, at, width)
+            matrices.append(np.stack([self._slow(side, table, dt) for table in wide]))
+            targets.append(self._slow(side, _binned(target, width), dt))
+            if self.band_hz[side] is not None:
+                # The low-pass that rounds reversals is in the columns too; only longer rests are unknown.
+                known = _binned((usable & moves).astype(float), width)
+                valid.append(self._slow(side, known, dt) > _KNOWN)
+            else:
+                moves = _binned(moves.astype(float), width) > 1.0 - 1e-9
+                if side == "joint":
+                    # The positions' low-pass rounds the corner that the link's Coulomb friction makes.
+                    span = max(at[-1] - at[0], 1e-9)
+                    moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
+                valid.append((_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves)
+            stamps = self._thin(side, _binned(stamp[:, None], width)[:, 0], dt)
             time.append(stamps)
             session.append(np.full(len(stamps), recording.number))
             test.append(np.full(len(stamps), recording.test))
@@ -318,6 +357,10 @@ class Nominal:
             if symbol in ("Ia", "Fvm", "Fcm") and link <= self.arm.chain.n:
                 found[place] = (symbol, link - 1)
         return found
+
+
+def _step(time: Floats) -> float:
+    return float(np.median(np.diff(time)))
 
 
 def _measured(stretch: Stretch) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from ident.discrepancy.bandwidth import passed_band
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 from ident.signals.prepare import PreparedSession, prepare
@@ -49,6 +50,8 @@ class Recording:
     number : in the order of the sessions' beginnings. payload : mounted, None for none.
     period_s : of the excitation, or the duration where it does not repeat; start_s : its beginning.
     has_effort, has_motor : which channels exist.
+    joint_band_hz, motor_band_hz : upper edge of what a low-pass left of the torques, None where they are
+    as measured.
     """
 
     name: str
@@ -63,6 +66,8 @@ class Recording:
     test: bool
     joint_names: tuple[str, ...]
     warnings: tuple[str, ...]
+    joint_band_hz: float | None = None
+    motor_band_hz: float | None = None
 
 
 def record(
@@ -84,6 +89,7 @@ def record(
     last = stretches[-1].time[-1]
     period = float(spans[0][1] - spans[0][0]) * 1e-9 if spans else last - first
     payload = chosen.metadata.get("payload", "none").strip()
+    motor = chosen.motor
     return Recording(
         name=prepared.name,
         number=number,
@@ -97,6 +103,9 @@ def record(
         test=test,
         joint_names=prepared.joint_names,
         warnings=(),
+        # Whoever filtered did it sample by sample, so the samples are looked at as they came.
+        joint_band_hz=passed_band(chosen.joint.effort, chosen.joint.period_s),
+        motor_band_hz=None if motor is None else passed_band(motor.effort, motor.period_s),
     )
 
 

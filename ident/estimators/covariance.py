@@ -328,11 +328,11 @@ def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatAr
                 total = np.pad(total, (0, len(correlation) - len(total)))
             total[: len(correlation)] += correlation
             count += len(group.target)
-        result.append(count / _correlation_time(total) if count else 0.0)
+        result.append(count / correlation_time(total) if count else 0.0)
     return np.array(result)
 
 
-def _correlation_time(autocovariance: FloatArray) -> float:
+def correlation_time(autocovariance: FloatArray) -> float:
     """1 + 2 sum rho_l, summed over pairs of lags while the pair is positive; at least 1."""
     if autocovariance[0] <= 0:
         return 1.0
