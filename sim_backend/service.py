@@ -26,6 +26,8 @@ __all__ = ["Service"]
 log = logging.getLogger(__name__)
 
 _RESEND_S = 0.2
+# A PC that was heard and is silent thinks, or another one has taken its place and waits for its first packet.
+_RESEND_HEARD_S = 5.0
 _IDLE_S = 0.2
 # A damaged datagram that the PC takes for good is answered at once or not at all.
 _PERHAPS_S = 0.02
@@ -211,9 +213,9 @@ class Service:
         """Lock step: wait until the PC has answered `sent`.
 
         In monitor mode for as long as it takes, in command mode for the configured patience. The first packet
-        is repeated until the PC is heard. An answer that reflects something else is followed by a short wait
-        only. A PC that says that it has answered all it has seen gets the packet again, which may have been
-        lost, and as much time again: it is alive.
+        is repeated until the PC is heard, and any now and then, for a PC that was started anew. An answer
+        that reflects something else is followed by a short wait only. A PC that says that it has answered all
+        it has seen gets the packet again, which may have been lost, and as much time again: it is alive.
         """
         wanted = sent[:2]
         commanding = self.cabinet.session.state is State.CMD
@@ -222,6 +224,7 @@ class Service:
         if limit_s is None and self._serve_until_heard(sent):
             return
         deadline = None if limit_s is None else time.monotonic() + limit_s
+        again = time.monotonic() + _RESEND_HEARD_S
         while self.running:
             timeout_s = _IDLE_S if deadline is None else min(_IDLE_S, deadline - time.monotonic())
             if timeout_s <= 0.0:
@@ -230,6 +233,9 @@ class Service:
             if not self._serve(timeout_s):
                 if self.cabinet.session.state is State.OFF or self.operator.silent:
                     return
+                if deadline is None and time.monotonic() >= again:
+                    self.end.send(sent)
+                    again = time.monotonic() + _RESEND_HEARD_S
                 continue
             datagram = self._take(age_s)
             if datagram is None:

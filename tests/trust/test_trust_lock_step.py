@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import signal
 import subprocess
 import sys
@@ -29,8 +30,8 @@ class Ends:
         arm = the_arm()
         self.control = Control.create(5000)
         self.words = self.control.words
-        loop_settings = LoopSettings("127.0.0.1", 0, None, True, "stanford", 0.1, 0.2, arm.joint_names)
-        self.loop = Loop(loop_settings, arm.limits, self.control)
+        self.loop_settings = LoopSettings("127.0.0.1", 0, None, True, "stanford", 0.1, 0.2, arm.joint_names)
+        self.loop = Loop(self.loop_settings, arm.limits, self.control)
         self.relay = Relay(self.loop.remote.address[1], lose)
         overrides = {"fri.period_ms": 5, "controller.settle_s": 0.2, **settings}
         config = load_configuration("emulator/default.yaml", overrides)
@@ -130,6 +131,23 @@ def test_driver_that_has_died_in_command_mode_is_not_waited_for(quick_to_remind)
         while ends.service.cabinet.session.counters()["missed"] == 0:
             assert time.monotonic() < deadline
             time.sleep(0.01)
+
+
+def test_driver_that_was_started_anew_finds_the_emulator_where_it_waits(quick_to_remind, monkeypatch):
+    monkeypatch.setattr("sim_backend.service._RESEND_HEARD_S", 0.1)
+    with Ends(lambda number, to_pc: False) as ends:
+        ends.do(Job.CYCLES, 30)
+        port = ends.loop.remote.address[1]
+        ends.words[Word.QUIT] = 1
+        ends.threads[1].join()
+        ends.words[Word.QUIT] = 0
+        settings = dataclasses.replace(ends.loop_settings, port=port)
+        ends.loop = Loop(settings, the_arm().limits, ends.control)
+        ends.threads[1] = threading.Thread(target=ends.loop.run)
+        ends.threads[1].start()
+        ends.do(Job.CYCLES, 30)
+        ends.do(Job.START)
+        ends.do(Job.LEAVE)
 
 
 def test_emulator_that_follows_another_process_does_not_end_by_ctrl_c():
