@@ -67,6 +67,7 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             reference.joint_delay_s,
             reference.encoder,
             encoder_known=True,
+            reach=reference.reach,
         )
     return Arm(chain, compliance, ratio)
 

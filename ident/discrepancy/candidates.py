@@ -151,7 +151,7 @@ class Dictionary:
         for burst in find_bursts(self.evidence):
             for link in range(min(3, n), n + 1):
                 shape = {
-                    "time": burst.start_s - 0.05,
+                    "time": burst.start_s + 0.5 * burst.duration_s,
                     "duration": burst.duration_s + 0.1,
                     "session": float(burst.session + 1),
                     "link": float(link),

@@ -5,19 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from fri.errors import DataError
 from ident.base import BaseSet
-from ident.discrepancy.bench import ArmData, Bench, every_joint_moves, mean_delay, nominal_arm, prepare_bench
-from ident.discrepancy.candidates import Dictionary
-from ident.discrepancy.evidence import Evidence, Floats
+from ident.discrepancy.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
+from ident.discrepancy.evidence import Floats
 from ident.discrepancy.nominal import Arm
+from ident.discrepancy.presliding import presliding_reach
 from ident.discrepancy.recording import Recording, record
 from ident.discrepancy.reference import Reference
-from ident.discrepancy.selection import select
+from ident.discrepancy.selection import gains, select
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 from ident.model import DynamicModel
@@ -27,21 +27,23 @@ if TYPE_CHECKING:
 
 __all__ = ["commission"]
 
+Side = Literal["link", "motor"]
+
 log = logging.getLogger(__name__)
 
-_STIFFNESS_SETS = 3
+_TUNING_SETS = 3
+_ROUNDS = 4
 _ENOUGH = 3
+_LATEST_S = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class _Day:
-    """What one set says: base parameters (p,) and covariance (p, p), tolerated deviations, noise."""
+    """What one set says: base parameters (p,) and covariance (p, p), noise of a row by side."""
 
     values: Floats
     covariance: Floats
-    nuisance: Mapping[str, tuple[float, float]]
     sigma: Mapping[str, Floats]
-    scores: Mapping[tuple[str, int], float]
 
 
 def commission(
@@ -54,7 +56,7 @@ def commission(
 ) -> Reference:
     """The healthy arm from sets of sessions, each as a later diagnosis will get them.
 
-    The side of the joints that the positions come from and the joints' stiffness come from the first sets;
+    The side of the joints that the positions come from, stiffness and presliding come from the first sets;
     parameters and noise from all, with what changed between them; the null, the largest gain of each
     candidate, from each set against a reference made of the others. Raises DataError for sessions that cannot
     be used, and where the sets differ in their payloads or channels.
@@ -63,34 +65,69 @@ def commission(
     parts = [sorted(part, key=lambda s: s.start) for part in sets if part]
     if not parts:
         raise DataError("no session given; name at least one healthy session")
-    benches = [
-        _bench(_known(chain, arm), _recordings(part, chain, settings), settings)
-        for part in parts[:_STIFFNESS_SETS]
-    ]
-    known = benches[0].nominal.arm
-    votes = [bench.nominal.arm.encoder for bench in benches]
-    encoder = max(sorted(set(votes)), key=votes.count)
-    agreeing = [b.nominal.arm.compliance for b in benches if b.nominal.arm.encoder == encoder]
-    known = replace(known, encoder=encoder, encoder_known=True, compliance=np.mean(agreeing, axis=0))
-    base = benches[0].nominal.base
-    del benches
-    days = []
-    for number, part in enumerate(parts):
-        days.append(_day(known, _recordings(part, chain, settings), settings, base, None))
-        log.info("healthy set %d of %d", number + 1, len(parts))
-    delays = [np.mean([mean_delay(day.nuisance, side)[0] for day in days]) for side in ("motor", "joint")]
-    known = replace(known, motor_delay_s=float(delays[0]), joint_delay_s=float(delays[1]))
+    sides: tuple[Side, ...] = ("link", "motor") if np.any(_known(chain, arm).compliance > 0.0) else ("link",)
+    first = _recordings(parts[0], chain, settings)
+    start = replace(_known(chain, arm), encoder_known=True)
+    misfit, tuned, base = min(
+        (_tuned(replace(start, encoder=side), first, settings, _ROUNDS) for side in sides), key=lambda t: t[0]
+    )
+    log.info("positions of the %s, misfit %.3f", tuned.encoder, misfit)
+    several = [tuned]
+    for part in parts[1:_TUNING_SETS]:
+        several.append(_tuned(tuned, _recordings(part, chain, settings), settings, 1)[1])
+    known = _middle(several)
+    days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
     null: dict[tuple[str, int], float] = {}
     for number, part in enumerate(parts):
         others = [day for k, day in enumerate(days) if k != number]
-        if len(others) >= _ENOUGH - 1:
-            rest = _reference(others, base, known, robot, parts[0], {})
-            day = _day(known, _recordings(part, chain, settings), settings, base, rest)
-        else:
-            day = days[number]
-        for key, gain in day.scores.items():
+        rest = _reference(others, base, known, robot, parts[0], {}) if len(others) >= _ENOUGH - 1 else None
+        bench = prepare_bench(
+            known, _recordings(part, chain, settings), settings, rest, None, fit_compliance=False
+        )
+        for key, gain in gains(bench.dictionary, bench.evidence, settings).items():
             null[key] = max(null.get(key, 0.0), gain)
+        log.info("healthy set %d of %d", number + 1, len(parts))
     return _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
+
+
+def _tuned(
+    arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, rounds: int
+) -> tuple[float, Arm, BaseSet]:
+    """Chi-square of a row, and the arm with stiffness, presliding and delays that suit a set, in turns.
+
+    Each of them is a little like the others near a reversal, so they need a few rounds.
+    """
+    # Whatever the channels' delays are, they are those of the healthy arm.
+    wide = replace(settings, delay_tolerance_s=_LATEST_S)
+    misfit = np.inf
+    for _ in range(rounds):
+        bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=True)
+        evidence, base = bench.evidence, bench.nominal.base
+        nuisance = select(bench.dictionary, evidence, wide, None).nuisance
+        count = max(sum(float(m.sum()) for m in evidence.mask.values()), 1.0)
+        rms = [float(np.log(v).mean()) for v in evidence.sigma.values()]
+        misfit = float(np.log(evidence.chi_square / count) + 2.0 * np.mean(rms))
+        arm = replace(
+            bench.nominal.arm,
+            reach=presliding_reach(bench.nominal, evidence.full.values[: len(base)]),
+            motor_delay_s=arm.motor_delay_s + mean_delay(nuisance, "motor")[0],
+            joint_delay_s=arm.joint_delay_s + mean_delay(nuisance, "joint")[0],
+        )
+    return misfit, arm, base
+
+
+def _middle(arms: Sequence[Arm]) -> Arm:
+    """The mean of tuned arms; of the reaches the geometric one, 0 where most of them see none."""
+    found = np.array([arm.reach for arm in arms])
+    seen = found > 0.0
+    reach = np.exp(np.sum(np.log(np.where(seen, found, 1.0)), axis=0) / np.maximum(seen.sum(axis=0), 1))
+    return replace(
+        arms[0],
+        compliance=np.mean([arm.compliance for arm in arms], axis=0),
+        motor_delay_s=float(np.mean([arm.motor_delay_s for arm in arms])),
+        joint_delay_s=float(np.mean([arm.joint_delay_s for arm in arms])),
+        reach=np.where(2 * seen.sum(axis=0) > len(arms), reach, 0.0),
+    )
 
 
 def _known(chain: Chain, arm: ArmData | None) -> Arm:
@@ -103,45 +140,18 @@ def _recordings(part: Sequence[Session], chain: Chain, settings: DiagnosisSettin
     return recordings
 
 
-def _bench(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings) -> Bench:
-    """Bench with the side of the joints and the stiffness that suit the sessions best."""
-    found = []
-    for encoder in ("link", "motor") if np.any(arm.compliance > 0.0) else ("link",):
-        bench = prepare_bench(
-            replace(arm, encoder=encoder), recordings, settings, None, None, fit_compliance=True
-        )
-        rms = [np.log(v).sum() for v in bench.evidence.sigma.values()]
-        rest = bench.evidence.chi_square / max(sum(m.sum() for m in bench.evidence.mask.values()), 1.0)
-        found.append((2.0 * sum(rms) / max(len(rms), 1) + np.log(rest), bench))
-    return min(found, key=lambda pair: pair[0])[1]
-
-
-def _day(
-    arm: Arm,
-    recordings: Sequence[Recording],
-    settings: DiagnosisSettings,
-    base: BaseSet,
-    reference: Reference | None,
-) -> _Day:
-    bench = prepare_bench(arm, recordings, settings, reference, None, fit_compliance=False)
+def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, base: BaseSet) -> _Day:
+    bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=False)
     if bench.nominal.base.names != base.names:
         raise DataError(
             "the healthy sets differ in payloads or channels, so their parameters are not the same; give sets "
             "of the same kind"
         )
-    found = select(bench.dictionary, bench.evidence, replace(settings, rounds=1), None)
     evidence = bench.evidence
-    plain = Evidence(bench.nominal, settings, evidence.sigma, evidence.dilution)
-    dictionary = Dictionary(bench.nominal, plain, ())
-    nuisance = select(dictionary, plain, settings, None)
-    p = plain.base_count
-    return _Day(
-        plain.full.values[:p].copy(),
-        plain.covariance()[:p, :p],
-        nuisance.nuisance,
-        evidence.sigma,
-        found.scores,
-    )
+    # Leaves the tolerated deviations beside the base.
+    select(bench.dictionary, evidence, settings, None)
+    p = evidence.base_count
+    return _Day(evidence.full.values[:p].copy(), evidence.covariance()[:p, :p], evidence.sigma)
 
 
 def _reference(
@@ -182,6 +192,7 @@ def _reference(
         null,
         len(days),
         arm.encoder,
+        arm.reach,
     )
 
 

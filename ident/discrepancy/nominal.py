@@ -26,6 +26,7 @@ from ident.base import BaseSet, numeric_base
 from ident.discrepancy.recording import Recording, Stretch
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects.motion import Motion
+from ident.effects.operators import dahl
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.parameters import split_name
@@ -50,6 +51,8 @@ class Arm:
     unknown. motor_delay_s, joint_delay_s : of the healthy channels.
     encoder : `link` or `motor`, the side of the elastic joints whose positions are published;
     encoder_known : whether a healthy arm told it.
+    reach : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
+    unknown.
     """
 
     chain: Chain
@@ -59,6 +62,17 @@ class Arm:
     joint_delay_s: float = 0.0
     encoder: Literal["link", "motor"] = "link"
     encoder_known: bool = False
+    reach: Floats | None = None
+
+    def slip(self, speed: Floats, dt: float) -> Floats:
+        """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state."""
+        found = np.sign(speed)
+        if self.reach is not None:
+            path = np.cumsum(speed, axis=0) * dt
+            for joint in np.flatnonzero(self.reach > 0.0):
+                along = np.ascontiguousarray(path[:, joint])
+                found[:, joint] = dahl(along, float(self.reach[joint]), float(found[0, joint]))
+        return found
 
 
 def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStructure, BaseSet]:
@@ -175,7 +189,9 @@ class Nominal:
         def friction(v: Floats) -> Floats:
             return values["Fvm"] * v + values["Fcm"] * np.sign(v)
 
-        motor = link_torque + values["Ia"] * thrust + friction(speed) + values["offm"]
+        slip = self.arm.slip(speed, dt)
+        drag = values["Fvm"] * speed + values["Fcm"] * slip
+        motor = link_torque + values["Ia"] * thrust + drag + values["offm"]
         return Motion(
             chain=self.arm.chain,
             bodies=np.zeros((n, 10)) if bodies is None else bodies,
@@ -194,6 +210,7 @@ class Nominal:
             link_coulomb=values["Fcl"],
             motor_coulomb=values["Fcm"],
             friction=friction,
+            slip=slip,
         )
 
     # ---- rows ----
@@ -325,25 +342,26 @@ class Nominal:
         drive = self._drive_columns() if side == "motor" else {}
         for first in range(0, count, size):
             some = at[first : min(first + size, count)]
-            if exact is not None:
-                pick = exact[first : first + len(some)]
-                state = [
-                    x[pick]
-                    for x in (motion.q, motion.qd, motion.qdd, motion.motor_speed, motion.motor_acceleration)
-                ]
-            else:
-                state = [
-                    _at(grid, x, some)
-                    for x in (motion.q, motion.qd, motion.qdd, motion.motor_speed, motion.motor_acceleration)
-                ]
-            q, qd, qdd, speed, thrust = state
+            pick = None if exact is None else exact[first : first + len(some)]
+            state = [
+                x[pick] if pick is not None else _at(grid, x, some)
+                for x in (
+                    motion.q,
+                    motion.qd,
+                    motion.qdd,
+                    motion.motor_speed,
+                    motion.motor_acceleration,
+                    motion.direction,
+                )
+            ]
+            q, qd, qdd, speed, thrust, slip = state
             wide = self.structure.regressor(
                 q, qd, qdd, payload=recording.payload, sides=(chosen,), columns=columns
             )
             table = wide.T.reshape(len(columns), n, len(some))
             if drive:
                 table = table.copy()
-                signals = {"Ia": thrust, "Fvm": speed, "Fcm": np.sign(speed)}
+                signals = {"Ia": thrust, "Fvm": speed, "Fcm": slip}
                 for place, (symbol, joint) in drive.items():
                     table[place, joint] = signals[symbol][:, joint]
             parts.append(table.reshape(len(columns), n, -1, width).mean(axis=3).transpose(1, 2, 0))

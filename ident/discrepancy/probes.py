@@ -110,7 +110,7 @@ def _groups(
 ) -> dict[str, dict[Key, Floats]]:
     """Groups of columns by the names of their variables."""
     nominal, found = dictionary.nominal, {}
-    signs = [np.sign(m.motor_speed[:, joint : joint + 1]) for m in nominal.motions]
+    signs = [m.direction[:, joint : joint + 1] for m in nominal.motions]
     for name, parts in hats.items():
         if name.startswith("load") and name != f"load{joint + 1}":
             continue

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Reference:
     model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
     noise : of a row [Nm] by side, (n,). null : largest gain of each candidate by (cause, joint from 0).
     sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
+    reach : (n,) of presliding [rad], None where unknown.
     """
 
     model: DynamicModel
@@ -43,7 +44,8 @@ class Reference:
     noise: Mapping[str, Floats]
     null: Mapping[tuple[str, int], float]
     sets: int
-    encoder: str = "link"
+    encoder: Literal["link", "motor"] = "link"
+    reach: Floats | None = None
 
     @classmethod
     def of(cls, model: DynamicModel) -> Reference:
@@ -58,6 +60,7 @@ class Reference:
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
+            reach = np.array(stored["reach"], dtype=np.float64) if stored.get("reach") else None
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
                 f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
@@ -66,7 +69,8 @@ class Reference:
             raise ConfigurationError(
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
-        return cls(model, compliance, *delays, noise, null, sets, encoder)
+        side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
+        return cls(model, compliance, *delays, noise, null, sets, side, reach)
 
     def stored(self) -> dict[str, Any]:
         """Content for the provenance of the model."""
@@ -81,6 +85,7 @@ class Reference:
                 },
                 "sets": self.sets,
                 "encoder": self.encoder,
+                "reach": None if self.reach is None else [float(v) for v in self.reach],
             }
         }
 

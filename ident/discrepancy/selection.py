@@ -20,7 +20,7 @@ from ident.discrepancy.evidence import Evidence, Rows, Score
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 
-__all__ = ["Claim", "Null", "Selection", "confidence", "select"]
+__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "select"]
 
 log = logging.getLogger(__name__)
 
@@ -80,6 +80,14 @@ def select(
     state.tolerate(accepted)
     claims.sort(key=lambda c: -c.gain)
     return Selection(claims, state.nuisance, first, state.nuisance_rows)
+
+
+def gains(
+    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
+) -> dict[tuple[str, int], float]:
+    """Gain of each candidate where nothing is accepted yet: what a healthy arm adds to the null."""
+    found = _State(dictionary, evidence, settings, {}).contenders([])
+    return {t.candidate.key: max(t.score.gain, 0.0) for t in found}
 
 
 def _gain(trial: Trial) -> float:

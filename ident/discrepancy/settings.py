@@ -33,7 +33,7 @@ class DiagnosisSettings:
     """
 
     bin_s: float = 0.02
-    cutoff_hz: float = 40.0
+    cutoff_hz: float = 25.0
     deflection_hz: float = 30.0
     standstill_rad_s: float = 0.01
     reversal_s: float = 0.015

@@ -13,7 +13,7 @@ from ident.effects.motion import Motion
 
 
 class Contact(Effect):
-    """A force [N] on the flange, in axes of the base, from `time` for `duration`, shaped as half a sine."""
+    """A force [N] on a link, in axes of the base, half a sine of length `duration` around `time`."""
 
     cause = "contact"
     side = "joint"
@@ -23,7 +23,7 @@ class Contact(Effect):
         Parameter("force_x", "N", "largest force along x of the base"),
         Parameter("force_y", "N", "largest force along y of the base"),
         Parameter("force_z", "N", "largest force along z of the base"),
-        Parameter("time", "s", "beginning, from the start of the session", shape=True),
+        Parameter("time", "s", "middle of the contact, from the start of the session", shape=True),
         Parameter("duration", "s", "of the contact", shape=True, low=0.02),
         Parameter("session", "1", "number of the session", shape=True),
         Parameter("link", "1", "link that is pushed, at the origin of the frame after it", shape=True),
@@ -37,17 +37,14 @@ class Contact(Effect):
         return []
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Beginning and duration."""
+        """Middle and duration."""
         return ("time", "duration")
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Less the Jacobian's transpose times the force's course, in all rows."""
-        inside = (
-            (motion.time >= shape["time"])
-            & (motion.time <= shape["time"] + shape["duration"])
-            & (motion.session == round(shape["session"]) - 1)
-        )
-        course = np.where(inside, np.sin(np.pi * (motion.time - shape["time"]) / shape["duration"]), 0.0)
+        since = motion.time - shape["time"]
+        inside = (np.abs(since) <= 0.5 * shape["duration"]) & (motion.session == round(shape["session"]) - 1)
+        course = np.where(inside, np.cos(np.pi * since / shape["duration"]), 0.0)
         columns = []
         for axis in range(3):
             torque = np.zeros_like(motion.q)
@@ -70,9 +67,9 @@ class _Push(Simulated):
 
     def load(self, time_s: float, plant: Any, loads: Any) -> None:
         since = time_s - self.values["time"]
-        if not 0.0 <= since <= self.values["duration"]:
+        if abs(since) > 0.5 * self.values["duration"]:
             return
-        course = np.sin(np.pi * since / self.values["duration"])
+        course = np.cos(np.pi * since / self.values["duration"])
         force = np.array([self.values[f"force_{axis}"] for axis in "xyz"])
         jacobian = plant_jacobian(plant, int(self.values["link"]))
         loads.link_torque += course * (jacobian.T @ force)

@@ -40,7 +40,9 @@ class FrictionAsymmetry(Effect):
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """|v| in the motor torque, and a constant."""
         speed = np.abs(motion.motor_speed[:, joint])
-        both = Column(motor=speed), Column(motor=np.ones_like(speed))
+        # Of the Coulomb part, as much as has built up since the last reversal.
+        built = motion.direction[:, joint] * np.sign(motion.motor_speed[:, joint])
+        both = Column(motor=speed), Column(motor=built)
         return both if shape.get("parts", 2.0) > 1.5 else both[:1]
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:

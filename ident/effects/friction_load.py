@@ -32,7 +32,7 @@ class FrictionLoad(Effect):
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """|tau_l| sign(v) in the motor torque."""
         load = np.abs(motion.joint_torque[:, joint])
-        return (Column(motor=load * np.sign(motion.motor_speed[:, joint])),)
+        return (Column(motor=load * motion.direction[:, joint]),)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Raises the Coulomb friction of the drive."""

@@ -37,7 +37,7 @@ class FrictionPosition(Effect):
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) cos(k q) and sign(v) sin(k q) in the motor torque."""
-        sign = np.sign(motion.motor_speed[:, joint])
+        sign = motion.direction[:, joint]
         angle = shape["cycles_per_turn"] * motion.q[:, joint]
         return Column(motor=sign * np.cos(angle)), Column(motor=sign * np.sin(angle))
 

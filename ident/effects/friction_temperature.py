@@ -50,7 +50,7 @@ class FrictionTemperature(Effect):
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The model's friction times w in the motor torque."""
-        friction = motion.friction(motion.motor_speed)[:, joint]
+        friction = motion.drive_friction[:, joint]
         constant = shape["time_constant"]
         if constant > 0.0:
             return (Column(motor=friction * (1.0 - np.exp(-motion.time / constant))),)

@@ -31,6 +31,8 @@ class Motion:
     gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
     link_coulomb, motor_coulomb : (n,) Coulomb friction of link and drive [Nm].
     friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
+    slip : (N, n) Coulomb friction of the drives over its level, which after a reversal goes from one sign to
+        the other within the reach of presliding; None: at once.
     """
 
     chain: Chain
@@ -50,6 +52,7 @@ class Motion:
     link_coulomb: Floats
     motor_coulomb: Floats
     friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
+    slip: Floats | None = None
 
     @property
     def n(self) -> int:
@@ -61,6 +64,18 @@ class Motion:
         """Time between samples [s]."""
         return float(self.time[1] - self.time[0]) if len(self.time) > 1 else 1e-3
 
+    @property
+    def direction(self) -> Floats:
+        """(N, n) `slip`, or the sign of the motors' speed."""
+        return np.sign(self.motor_speed) if self.slip is None else self.slip
+
+    @property
+    def drive_friction(self) -> Floats:
+        """Friction (N, n) of the drives [Nm]."""
+        return self.friction(self.motor_speed) + self.motor_coulomb * (
+            self.direction - np.sign(self.motor_speed)
+        )
+
     def rigid_torque(self, q: Floats, qd: Floats, qdd: Floats, bodies: Floats | None = None) -> Floats:
         """Rigid inverse dynamics (N, n) [Nm] of the links with the payload, or of other `bodies` (n, 10)."""
         return regressor.torque(self.chain, q, qd, qdd, self.bodies if bodies is None else bodies)
@@ -70,7 +85,7 @@ class Motion:
         link = self.link_coulomb * np.sign(self.qd)
         if side == "joint":
             return self.joint_torque - link
-        return self.motor_torque - link - self.motor_coulomb * np.sign(self.motor_speed)
+        return self.motor_torque - link - self.motor_coulomb * self.direction
 
     def gravity_along(self, direction: Floats) -> Floats:
         """Gravity torque (N, n) [Nm] in a field of 9.81 m/s^2 along `direction` (3,), in frame 0."""

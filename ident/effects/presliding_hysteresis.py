@@ -35,7 +35,7 @@ class PreslidingHysteresis(Effect):
         speed = motion.motor_speed[:, joint]
         path = np.cumsum(speed) * motion.dt
         state = dahl(path, shape["length"], float(np.sign(speed[0])))
-        return (Column(motor=state - np.sign(speed)),)
+        return (Column(motor=state - motion.direction[:, joint]),)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Takes the amplitude out of the set-valued friction and gives it back through Dahl's state."""

@@ -21,7 +21,7 @@ class Stribeck(Effect):
     parameters = (
         Parameter("amplitude", "Nm", "friction at standstill above the Coulomb level", low=0.0),
         Parameter("velocity", "rad/s", "speed at which 1/e of it is left", shape=True, low=1e-3, high=1.0),
-        Parameter("exponent", "1", "1: Tustin, 2: Gauss", shape=True),
+        Parameter("exponent", "1", "1: Tustin, 2: Gauss", shape=True, low=0.5, high=3.0),
     )
     tell_apart = "a slow constant-velocity sweep of joint {joint} through 0.01 to 0.2 rad/s"
 
@@ -31,14 +31,14 @@ class Stribeck(Effect):
         return [{"velocity": v, "exponent": e} for e in (1.0, 2.0) for v in speeds]
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """The speed."""
-        return ("velocity",)
+        """Speed and exponent: what is taken for granted of either is missing from the other's uncertainty."""
+        return ("velocity", "exponent")
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) exp(-(|v| / velocity)^exponent) in the motor torque."""
         speed = motion.motor_speed[:, joint]
         fall = np.exp(-((np.abs(speed) / shape["velocity"]) ** shape.get("exponent", 1.0)))
-        return (Column(motor=np.sign(speed) * fall),)
+        return (Column(motor=motion.direction[:, joint] * fall),)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Raises the Coulomb friction of the drive."""

@@ -153,7 +153,7 @@ def _load(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     def sized(size: float) -> Hidden:
         share = size * 2.4 * MOTOR_NOISE[joint - 1] / scene.peaks[joint - 1]
         setting = _trait(joint, load_share=share)
-        return Hidden("friction_load", "motor", (joint,), size, _everywhere(setting), {"share": share})
+        return Hidden("friction_load", "motor", (joint,), size, _everywhere(setting), {"factor": share})
 
     return sized
 
@@ -234,7 +234,12 @@ def _motor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], H
         error = sign * min(0.3, size * 0.025)
         setting = _trait(joint, motor_gain=1.0 + error)
         return Hidden(
-            "motor_torque_gain", "motor", (joint,), size, _everywhere(setting), {"gain": 1.0 / (1.0 + error)}
+            "motor_torque_gain",
+            "motor",
+            (joint,),
+            size,
+            _everywhere(setting),
+            {"error": 1.0 / (1.0 + error) - 1.0},
         )
 
     return sized
@@ -380,7 +385,12 @@ def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     def sized(size: float) -> Hidden:
         gain = 1.0 + sign * min(0.3, 4.0 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1] * size)
         return Hidden(
-            "sensor_gain", "sensor", (joint,), size, _everywhere(_fault(joint, gain=gain)), {"gain": gain}
+            "sensor_gain",
+            "sensor",
+            (joint,),
+            size,
+            _everywhere(_fault(joint, gain=gain)),
+            {"error": gain - 1.0},
         )
 
     return sized
@@ -393,7 +403,7 @@ def _crosstalk(random: Random, joint: int, scene: Scene) -> Callable[[float], Hi
     def sized(size: float) -> Hidden:
         share = sign * size * 1.8 * JOINT_NOISE[joint - 1] / scene.peaks[source - 1]
         setting = Setting(leak={joint: {source: share}})
-        truth = {"source": float(source), "share": share}
+        truth = {"source": float(source), "factor": share}
         return Hidden("sensor_crosstalk", "sensor", (joint,), size, _everywhere(setting), truth)
 
     return sized

@@ -103,9 +103,9 @@ def test_what_is_in_no_catalogue_must_be_flagged_and_not_named() -> None:
 
 def test_parameters_are_compared_in_standard_deviations() -> None:
     hidden = hide("sensor_gain", 3)
-    value = hidden.parameters["gain"] + 0.02
-    finding = found("sensor_gain", 3, parameters={"gain": {"value": value, "std": 0.01, "unit": ""}})
-    assert judge(diagnosis(finding), [hidden]).deviations == {"sensor_gain.gain": pytest.approx(2.0)}
+    value = hidden.parameters["error"] + 0.02
+    finding = found("sensor_gain", 3, parameters={"error": {"value": value, "std": 0.01, "unit": ""}})
+    assert judge(diagnosis(finding), [hidden]).deviations == {"sensor_gain.error": pytest.approx(2.0)}
 
 
 def test_efficiency_is_the_share_of_the_removable_error() -> None:
