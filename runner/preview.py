@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
@@ -26,7 +26,7 @@ from runner.preflight import Preflight, check_motion_limits, check_path, check_t
 from runner.preparation import session_motion
 from runner.progress import Progress
 from runner.report.markup import table
-from runner.report.plot import Line, Panel, Points
+from runner.report.plot import STYLES, Line, Panel, Points
 from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
 
@@ -60,6 +60,34 @@ class Planned:
     margin: float
     time: Floats
     distance: Floats
+
+    def facts(self) -> dict[str, Any]:
+        """What is known of the motion, as plain content."""
+        tight = self.tightest
+        return {
+            "title": self.title,
+            "duration_s": self.motion.duration_s,
+            "ok": self.preflight.ok,
+            "conditions": self.preflight.items,
+            "tightest": {
+                "distance_m": tight.distance,
+                "pair": tight.pair,
+                "time_s": tight.time_s,
+                "q": tight.q,
+            },
+            "must_be_kept_m": self.margin,
+        }
+
+    def at(self, row: int) -> str:
+        """What is near at a row of the motion: distance to anything, and the joint closest to its limit."""
+        limits, q = self.arm.limits, self.motion.q[row]
+        room = np.minimum(limits.q_high - q, q - limits.q_low)
+        joint = int(np.argmin(room))
+        distance = float(np.interp(row * self.motion.period_s, self.time, self.distance))
+        return (
+            f"clearance **{1000 * distance:.0f} mm**, {self.arm.joint_names[joint]} "
+            f"**{np.degrees(room[joint]):.0f}°** from its limit"
+        )
 
 
 def planned_motion(file: str, *, session: str | None = None, period_s: float = 0.005) -> Planned:
@@ -206,31 +234,62 @@ def preview_html(planned: Planned) -> str:
     )
 
 
-def serve(planned: Planned, port: int = 8080) -> None:
-    """Show the motion in a viser server with play and time slider until Ctrl-C."""
+def serve(planned: Planned, port: int, tell: Callable[[str], None]) -> None:
+    """Show the motion in a viser server with play and time slider until Ctrl-C, which ends it quietly.
+
+    tell : called with the address once the page is there. Raises ConfigurationError for a port in use.
+    """
     server = start_server(port)
     try:
         arm = build_scene(server, planned)
-        duration = planned.motion.duration_s
-        with server.gui.add_folder("Motion"):
-            play = server.gui.add_checkbox("play", True)
-            at = server.gui.add_slider("time [s]", 0.0, round(duration, 2), 0.01, 0.0)
-            phase = server.gui.add_markdown("")
-            show = server.gui.add_checkbox("tightest moment", True)
+        duration, tight = planned.motion.duration_s, planned.tightest
+        gui = server.gui
+        gui.configure_theme(control_width="large", show_share_button=False)
+        gui.add_markdown(f"## Preview of {planned.title}")
+        with gui.add_folder("Motion"):
+            play = gui.add_checkbox("play", True)
+            at = gui.add_slider("time [s]", 0.0, round(duration, 2), 0.01, 0.0)
+            now = gui.add_markdown("")
+            show = gui.add_checkbox("show the tightest moment", True)
+            go = gui.add_button("go to the tightest moment")
+        gui.add_markdown(
+            f"Tightest moment: **{1000 * tight.distance:.0f} mm**, {' to '.join(tight.pair)}, at t = "
+            f"{tight.time_s:.2f} s; {1000 * planned.margin:.0f} mm must be kept."
+        )
+        span = np.array([0.0, duration])
+        gui.add_uplot(
+            (planned.time, 1000.0 * planned.distance, np.full(len(planned.time), 1000.0 * planned.margin)),
+            (
+                {"label": "t"},
+                {"label": "clearance", "stroke": STYLES["measured"].colour, "width": 2},
+                {"label": "must be kept", "stroke": STYLES["computed"].colour, "dash": (4, 4)},
+            ),
+            title="clearance [mm] over time [s]",
+            scales={"x": {"time": False, "range": tuple(span)}},
+            height=200,
+        )
         lines = [
             f"{'✓' if item.ok else '✗'} **{item.subject}**: {item.value}, limit {item.limit}"
             for item in planned.preflight.items
         ]
-        server.gui.add_markdown("  \n".join(lines))
+        gui.add_markdown("  \n".join(lines))
         tightest = server.scene.add_frame("/tightest", show_axes=False)
+
+        @go.on_click  # type: ignore[untyped-decorator]
+        def _(event: Any) -> None:
+            play.value, at.value = False, round(tight.time_s, 2)
+
+        tell(f"http://127.0.0.1:{server.get_port()}")
         while True:
             if play.value:
                 at.value = round((at.value + 1.0 / _FRAMES_PER_S) % duration, 2)
             row = min(round(at.value / planned.motion.period_s), len(planned.motion) - 1)
             arm.pose(planned.motion.q[row])
-            phase.content = f"phase **{_phase(planned.motion, row)}**"
+            now.content = f"phase **{_phase(planned.motion, row)}**, {planned.at(row)}"
             tightest.visible = show.value
             time.sleep(1.0 / _FRAMES_PER_S)
+    except KeyboardInterrupt:
+        pass
     finally:
         stop_server(server)
 

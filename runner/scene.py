@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import logging
+import socket
 from contextlib import redirect_stdout
 from typing import Any
 
@@ -44,9 +45,9 @@ _DENSITY = 2700.0  # of a payload whose shape is not given, drawn as an aluminiu
 
 
 def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
-    """A viser server that only this computer reaches. ConfigurationError without the extra `view`.
+    """A viser server that only this computer reaches.
 
-    port : 0 takes any that is free.
+    port : 0 takes any that is free. ConfigurationError without the extra `view` and for a port in use.
     """
     try:
         import viser
@@ -56,6 +57,8 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
         raise ConfigurationError(f"3D view: {INSTALL}") from error
     # The package announces connections on its own loggers and on standard output.
     logging.getLogger("websockets").setLevel(logging.ERROR)
+    # It would take the next free port without a word.
+    _check_free(host, port)
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port or _free_port(host), verbose=False)
     server.scene.set_up_direction("+z")
@@ -77,9 +80,18 @@ def line_colour(colour: Colour) -> Colour:
     return red, green, blue
 
 
-def _free_port(host: str) -> int:
-    import socket
+def _check_free(host: str, port: int) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise ConfigurationError(
+                f"port {port} of {host} is in use ({error.strerror}); choose another one"
+            ) from error
 
+
+def _free_port(host: str) -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.bind((host, 0))
         return int(probe.getsockname()[1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 from contextlib import ExitStack
@@ -14,6 +13,8 @@ from lwr_driver.arm import Arm
 from runner.doctor import Patient, examine
 from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import free_port
+from runner.options import json_option
+from runner.plain import as_json as to_json
 from runner.status import StatusLine
 from sim_backend.process import EmulatorProcess
 
@@ -38,7 +39,7 @@ from sim_backend.process import EmulatorProcess
 @click.option("--port", type=click.IntRange(1, 65535), help="UDP port; default: the experiment file's.")
 @click.option("--controller", help="Address of the controller; default: the experiment file's.")
 @click.option("--period-ms", type=click.FloatRange(1, 100), help="Cycle of the built-in emulator.")
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+@json_option
 def command(
     file: str,
     link: bool,
@@ -90,7 +91,7 @@ def command(
         stack.callback(status.clear)
         found = examine(patient, link_s=seconds if link else None, wait_s=wait_s, report=status.show)
         status.clear()
-    click.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
+    click.echo(to_json(found.to_dict()) if as_json else str(found))
     sys.exit(found.exit_code)
 
 

@@ -7,6 +7,8 @@ import sys
 import click
 
 from fri.errors import LwrError
+from runner.options import json_option
+from runner.plain import as_json as to_json
 from sim_backend.process import EmulatorProcess
 
 
@@ -22,6 +24,7 @@ from sim_backend.process import EmulatorProcess
 @click.option(
     "--lock-step", is_flag=True, help="Own clock: one cycle for each answer, repeatable bit for bit."
 )
+@json_option
 def command(
     config: str,
     fri_host: str,
@@ -30,6 +33,7 @@ def command(
     period_ms: float | None,
     seed: int | None,
     lock_step: bool,
+    as_json: bool,
 ) -> None:
     """Run the emulated controller and arm in real time until Ctrl-C.
 
@@ -39,6 +43,7 @@ def command(
     \b
     lwr-run emulator                             the default arm at its configured cycle
     lwr-run emulator --period-ms 2 --fri-port 7001
+    lwr-run emulator --json                      its ports as one JSON value, for a script
     """
     emulator = EmulatorProcess(
         config,
@@ -50,9 +55,9 @@ def command(
         seed=seed,
     )
     with emulator:
-        click.echo(
-            f"sends to {fri_host}:{fri_port}, pendant on 127.0.0.1:{emulator.pendant_port}; Ctrl-C ends it"
-        )
+        ports = {"fri_host": fri_host, "fri_port": fri_port, "pendant_port": emulator.pendant_port}
+        text = f"sends to {fri_host}:{fri_port}, pendant on 127.0.0.1:{emulator.pendant_port}; Ctrl-C ends it"
+        click.echo(to_json(ports) if as_json else text)
         try:
             emulator.wait()
         except KeyboardInterrupt:

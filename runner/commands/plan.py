@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,8 @@ from ident.excitation import ExcitationPlan
 from ident.excitation.planner import Progress, plan
 from ident.excitation.problem import PlanProblem
 from ident.excitation.table import plan_report
+from runner.options import json_option
+from runner.plain import as_json as to_json
 from runner.status import StatusLine
 
 DEFAULT = "plans/default.yaml"
@@ -22,7 +23,7 @@ DEFAULT = "plans/default.yaml"
 @click.argument("file", default=DEFAULT)
 @click.option("--out", type=click.Path(path_type=Path), help="Plan file; default: NAME.plan.yaml here.")
 @click.option("--force", is_flag=True, help="Replace the plan file if it exists.")
-@click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+@json_option
 def command(file: str, out: Path | None, force: bool, as_json: bool) -> None:
     """Plan the exciting motion of the problem FILE; without one the default, which gives the stored plan.
 
@@ -42,7 +43,7 @@ def command(file: str, out: Path | None, force: bool, as_json: bool) -> None:
     found = plan(problem, lambda now: _show(status, now))
     status.clear()
     found.save(target)
-    click.echo(json.dumps(_summary(found), indent=1) if as_json else plan_report(found))
+    click.echo(to_json(_summary(found)) if as_json else plan_report(found))
     click.echo(str(target), err=as_json)
 
 

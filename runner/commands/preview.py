@@ -7,6 +7,8 @@ from pathlib import Path
 import click
 
 from runner.experiment_file import DEFAULT
+from runner.options import json_option
+from runner.plain import as_json as to_json
 
 __all__ = ["command"]
 
@@ -22,10 +24,11 @@ __all__ = ["command"]
     help="The page to write.",
 )
 @click.option(
-    "--serve", "serving", is_flag=True, help="Serve the page with time slider until Ctrl-C instead."
+    "--serve", "serving", is_flag=True, help="Serve the scene with play and time slider until Ctrl-C instead."
 )
 @click.option("--port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --serve.")
-def command(file: str, session: str | None, out: Path, serving: bool, port: int) -> None:
+@json_option
+def command(file: str, session: str | None, out: Path, serving: bool, port: int, as_json: bool) -> None:
     """Show the motion of an experiment FILE, of a folder of results, or of a plan file in 3D. Nothing moves.
 
     The page is one file that needs no network. It shows the arm along the motion, the path of its flange
@@ -39,13 +42,19 @@ def command(file: str, session: str | None, out: Path, serving: bool, port: int)
     from runner.preview import planned_motion, preview_html, serve
 
     planned = planned_motion(file, session=session)
-    click.echo(f"{planned.title}: {planned.motion.duration_s:.1f} s, tightest moment {planned.tightest}")
-    for item in planned.preflight.items:
-        if not item.ok:
-            click.echo(str(item))
+
+    def tell(place: str) -> None:
+        if as_json:
+            click.echo(to_json({**planned.facts(), "place": place}))
+            return
+        click.echo(f"{planned.title}: {planned.motion.duration_s:.1f} s, tightest moment {planned.tightest}")
+        for item in planned.preflight.items:
+            if not item.ok:
+                click.echo(str(item))
+        click.echo(place)
+
     if serving:
-        click.echo(f"http://127.0.0.1:{port}  (Ctrl-C ends it)")
-        serve(planned, port)
+        serve(planned, port, tell)
         return
     out.write_text(preview_html(planned), encoding="utf-8")
-    click.echo(str(out))
+    tell(str(out))

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import click
 
+from runner.options import json_option
+from runner.plain import as_json as to_json
+
 __all__ = ["command"]
 
 
@@ -23,7 +26,8 @@ __all__ = ["command"]
 @click.option(
     "--width", default=720, show_default=True, type=click.IntRange(200, 3000), help="Of an SVG [px]."
 )
-def command(folder: Path, svg: Path | None, columns: int, width: int) -> None:
+@json_option
+def command(folder: Path, svg: Path | None, columns: int, width: int, as_json: bool) -> None:
     """Write report.html into the FOLDER of an experiment; its first screen says whether the run was good.
 
     The page is one file that needs no network: plots to zoom into, tables to copy from, and a print style, so
@@ -32,17 +36,26 @@ def command(folder: Path, svg: Path | None, columns: int, width: int) -> None:
     \b
     lwr-run report experiments/lwr4plus-20260101-120000
     lwr-run report experiments/lwr4plus-20260101-120000 --svg figures --columns 1 --width 420
+    lwr-run report experiments/lwr4plus-20260101-120000 --json          the verdicts, for a script
     """
     from runner.report.folder import ResultFolder
 
     if svg is None:
         from runner.report.page import write_report
+        from runner.report.verdicts import headline, verdicts
 
-        click.echo(str(write_report(folder)))
+        page = write_report(folder)
+        lines = verdicts(ResultFolder.load(folder))
+        level, sentence = headline(lines)
+        content = {"report": page, "level": level, "headline": sentence, "verdicts": lines}
+        click.echo(to_json(content) if as_json else f"{sentence}\n{page}")
         return
     from runner.report.figures import every_figure
 
     results = ResultFolder.load(folder)
     svg.mkdir(parents=True, exist_ok=True)
-    for figure in every_figure(results):
-        click.echo(str(figure.save(svg / f"{figure.name}.svg", columns=columns, width=float(width))))
+    files = [
+        figure.save(svg / f"{figure.name}.svg", columns=columns, width=float(width))
+        for figure in every_figure(results)
+    ]
+    click.echo(to_json({"figures": files}) if as_json else "\n".join(map(str, files)))

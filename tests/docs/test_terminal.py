@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
+import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,6 +16,7 @@ from typing import Any
 
 import click
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from fri.errors import (
@@ -24,25 +28,15 @@ from fri.errors import (
     RefusedError,
     RobotError,
 )
+from ident.excitation import ExcitationPlan
 from ident.identify import ESTIMATORS
 from ident.model_file import read_model
+from lwr_driver.configuration import find
 from runner.cli import VERBS, main
+from runner.laboratory import free_port
 from runner.plain import as_json
 
 LWR_RUN = str(Path(sys.executable).parent / "lwr-run")
-REPORTING = (
-    "doctor",
-    "check",
-    "identify",
-    "validate",
-    "compare",
-    "payload",
-    "export",
-    "info",
-    "recover",
-    "attach",
-    "import",
-)
 
 
 def run(*arguments: str) -> tuple[int, str]:
@@ -59,9 +53,118 @@ def verb(name: str) -> click.Command:
     return command
 
 
-@pytest.mark.parametrize("name", REPORTING)
-def test_commands_that_report_have_json(name: str) -> None:
-    assert "--json" in {option for parameter in verb(name).params for option in parameter.opts}
+# One call of each, in the folder that the documents speak of; what it must say, as a path into the JSON.
+REPORTS: dict[str, tuple[str, str]] = {
+    "doctor": ("doctor", "findings.0.advice"),
+    "experiment": ("experiment --resume results --yes --no-diagnosis", "sessions.0.exit_status"),
+    "plan": ("plan --out my.plan.yaml", "margins.0.limit"),
+    "check": ("check my_lab.yaml", "loaded.0.limit"),
+    "preview": ("preview my_lab.yaml --out preview.html", "tightest.distance_m"),
+    "report": ("report results", "verdicts.0.level"),
+    "identify": ("identify unloaded.mcap --model 1 --no-essential", "parameters.0.estimate"),
+    "validate": ("validate model.yaml another.mcap", "sessions.0.scores.0.rms"),
+    "commission": ("commission unloaded.mcap loaded.mcap --out commissioned.yaml", "file"),
+    "diagnose": ("diagnose unloaded.mcap loaded.mcap --no-simulation --out diagnosis", "findings"),
+    "compare": ("compare model.yaml another_model.yaml", "level"),
+    "payload": ("payload model.yaml loaded.mcap", "payload"),
+    "export": ("export model.yaml out.urdf", "files.0.format"),
+    "info": ("info loaded.mcap", "metadata.robot"),
+    "recover": ("recover broken.mcap", "needed"),
+    "attach": ("attach bare.mcap other/loaded.trace.csv", "alignment.delay_s"),
+    "import": ("import mapping.yaml recording imported.mcap", "rows_in_source"),
+}
+SLOW_REPORTS = ("commission", "diagnose")
+MAPPING = {
+    "robot": "bench arm",
+    "joints": ["a"],
+    "time": {"column": "t", "file": "arm.csv"},
+    "position": {"file": "arm.csv", "columns": ["q"], "unit": "rad"},
+    "joint_torque": {"file": "arm.csv", "columns": ["tau"], "unit": "Nm"},
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW_REPORTS else n for n in REPORTS]
+)
+def test_commands_that_report_print_one_json_value(
+    name: str, workplace: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = workplace()
+    (place / "other" / "loaded.plain.mcap").rename(place / "bare.mcap")
+    (place / "recording").mkdir()
+    (place / "recording" / "arm.csv").write_text("t,q,tau\n0,0,1\n0.01,0.1,1.1\n0.02,0.2,1\n")
+    (place / "mapping.yaml").write_text(yaml.safe_dump(MAPPING))
+    stored = ExcitationPlan.load(find("plans/default.plan.yaml"))
+    monkeypatch.setattr("runner.commands.plan.plan", lambda problem, report: stored)
+    line, wanted = REPORTS[name]
+    code, text = run(*line.split(), "--json")
+    assert code == 0, text
+    value = json.loads(text, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+    for part in wanted.split("."):
+        value = value[int(part)] if isinstance(value, list) else value[part]
+
+
+def test_every_command_reports_but_two() -> None:
+    assert set(VERBS) - set(REPORTS) == {"emulator", "completion"}
+
+
+def test_the_emulator_tells_its_ports_as_json() -> None:
+    port = free_port("127.0.0.1")
+    command = [LWR_RUN, "emulator", "--json", "--lock-step", "--fri-port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        text = process.stdout.readline()
+        while not text.rstrip().endswith("}"):
+            text += process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+    said = json.loads(text)
+    assert (said["fri_host"], said["fri_port"]) == ("127.0.0.1", port)
+    assert said["pendant_port"] > 0
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_the_help_of_every_command_has_an_example_that_it_understands(name: str) -> None:
+    command = verb(name)
+    result = CliRunner().invoke(main, [name, "-h"])
+    assert result.exit_code == 0
+    examples = [
+        line.strip() for line in str(command.help).splitlines() if line.strip().startswith("lwr-run ")
+    ]
+    assert examples
+    for example in examples:
+        call = re.split(r"\s{2,}", example)[0]
+        assert call in result.output
+        words = shlex.split(call.partition(" >")[0])
+        assert words[1] == name
+        with click.Context(main) as context:
+            command.make_context(name, words[2:], parent=context)
+
+
+# The same thing has the same name in every command.
+MEANINGS = {
+    "--out": "path",
+    "--json": "boolean",
+    "--yes": "boolean",
+    "--force": "boolean",
+    "--arm": "text",
+    "--urdf": "path",
+    "--port": "integer range",
+    "--period-ms": "float range",
+    "--allow-non-realtime": "boolean",
+}
+
+
+def test_options_of_one_name_are_of_one_kind_and_of_one_style() -> None:
+    for name in VERBS:
+        for parameter in verb(name).params:
+            if not isinstance(parameter, click.Option):
+                continue
+            for option in (*parameter.opts, *parameter.secondary_opts):
+                assert option == "-h" or (option.startswith("--") and option == option.lower()), option
+                assert "_" not in option, f"{name} {option}"
+                if option in MEANINGS:
+                    assert parameter.type.name == MEANINGS[option], f"{name} {option}"
 
 
 @pytest.mark.parametrize("name", VERBS)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import signal
+import socket
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -311,7 +314,10 @@ def test_the_preview_shows_the_arm_and_the_limits(preview: Path, chrome: Browser
 def colours(page: Page) -> int:
     """Number of colours in the picture of the scene, once there are more than a few or time is up."""
     page.frame_locator("iframe").locator("canvas").first.wait_for(timeout=120_000)
-    box = page.locator("iframe").bounding_box()
+    return colours_of(page, page.locator("iframe").bounding_box())
+
+
+def colours_of(page: Page, box: Any) -> int:
     assert box is not None
     count = 0
     for _ in range(30):
@@ -321,6 +327,44 @@ def colours(page: Page) -> int:
         if count > 200:
             break
     return count
+
+
+def test_the_preview_server_shows_the_motion_until_ctrl_c(finished: Path, chrome: Browser) -> None:
+    port = str(free_tcp_port())
+    command = [sys.executable, "-m", "runner.cli", "preview", str(finished), "--serve", "--port", port]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        said = [process.stdout.readline().strip() for _ in range(2)]
+        try:
+            assert "tightest moment" in said[0]
+            assert said[1] == f"http://127.0.0.1:{port}"
+            second = CliRunner().invoke(main, ["preview", str(finished), "--serve", "--port", port])
+            assert second.exit_code == 2
+            assert f"port {port} of 127.0.0.1 is in use" in second.output
+            with opened(chrome, said[1], (900, 300)) as seen:
+                seen.page.get_by_role("button", name="go to the tightest moment").click(timeout=120_000)
+                seen.page.get_by_text("Tightest moment:").wait_for()
+                text = seen.page.inner_text("body")
+                assert colours_of(seen.page, seen.page.locator("canvas").first.bounding_box()) > 200
+                assert seen.errors == []
+                assert seen.external == []
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+    for part in (
+        "Preview of short, session loaded",
+        "clearance",
+        "from its limit",
+        "✓ velocity:",
+        "must be kept",
+    ):
+        assert part in text
+
+
+def free_tcp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def test_the_preview_of_a_plan_marks_what_is_not_held(finished: Path, tmp_path: Path) -> None:
