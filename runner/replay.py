@@ -28,7 +28,7 @@ from lwr_driver.session import Session
 from runner.experiment_file import Experiment
 from sim_backend.configuration import EmulatorConfig, LoadData, load_configuration
 from sim_backend.controller import ControllerModel, PositionController
-from sim_backend.model_arm import drive_of, links_of, model_effects
+from sim_backend.model_arm import arm_of, is_possible, model_effects
 from sim_backend.plant import CYCLE_S, ElasticArm, Reading
 from sim_backend.rigid_body import chain
 
@@ -38,6 +38,7 @@ Floats = NDArray[np.float64]
 
 _BIN = 20
 _SETTLE = 500
+_POSES = 100
 _COMMAND_HZ = 20.0
 _LATEST_S = 0.02
 """A command acts at most this much later than it was logged."""
@@ -48,7 +49,8 @@ class Replayed:
     """Measured less simulated, in means over 20 ms: position (m, n) [rad], motor and joint torque [Nm].
 
     delay_s : how much later than logged the commands acted, as the positions tell.
-    commanded : whether the log has commands; otherwise the measured positions were commanded.
+    commanded : whether the log has commands; otherwise the measured positions were commanded. exact : whether
+    the model itself was simulated, or the nearest one of an arm that can exist.
     """
 
     position: Floats
@@ -56,6 +58,7 @@ class Replayed:
     joint: Floats | None
     delay_s: float
     commanded: bool
+    exact: bool
 
 
 class Replay:
@@ -79,6 +82,7 @@ class Replay:
         self.config = config or load_configuration()
         self._failed: dict[str, dict[str, None]] = {}
         self._uncommanded: dict[str, None] = {}
+        self._stood_in: dict[str, None] = {}
         self._order = sorted(session.start for session in sessions)
         self._delays: dict[int, float] = {}
 
@@ -104,6 +108,8 @@ class Replay:
             self._delays.setdefault(session.start, done.delay_s)
             if not done.commanded:
                 self._uncommanded[name] = None
+            if not done.exact:
+                self._stood_in[name] = None
             for k, part in enumerate((done.position, done.motor, done.joint)):
                 if part is not None:
                     squares[k] += np.nansum(part**2, axis=0)
@@ -123,6 +129,11 @@ class Replay:
                 f"{', '.join(self._uncommanded)}: no commands in the log, so the simulated arm followed the measured "
                 "positions; the simulated position says how well the controller holds a path, not how the arm "
                 "answered"
+            )
+        if self._stood_in:
+            found.append(
+                f"replay of {', '.join(self._stood_in)}: no arm that can exist has the estimated inertias, so the "
+                "nearest one was simulated; a motion that excites more would tell them better"
             )
         return tuple(found)
 
@@ -177,7 +188,8 @@ def replay(
     joint_error = None
     if joint.effort.shape[1]:
         joint_error = _binned(_resampled(joint.log_time, joint.effort, grid) - link)
-    return Replayed(_binned(measured - position), motor_error, joint_error, delay, source is not None)
+    commanded = source is not None
+    return Replayed(_binned(measured - position), motor_error, joint_error, delay, commanded, bench.exact)
 
 
 class _Bench:
@@ -205,8 +217,11 @@ class _Bench:
             )
         self.config = config
         self.number, self.begin_s, self.model = number, begin_s - _SETTLE * CYCLE_S, model
-        self.links = links_of(model, chain(find(arm.urdf_path)), known)
-        self.drive = drive_of(model, stiffness, damping)
+        poses = session.joint.position[:: max(1, len(session.joint) // _POSES)]
+        self.exact = is_possible(model, poses)
+        self.links, self.drive = arm_of(
+            model, chain(find(arm.urdf_path)), known, stiffness=stiffness, damping=damping, poses=poses
+        )
         self.load = _announced_load(session)
 
     def run(self, wanted: Floats) -> tuple[Floats, Floats, Floats]:

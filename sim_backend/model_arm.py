@@ -2,7 +2,8 @@
 
 Torque, mass matrix and gravity depend on the base parameters only, so any standard parameters with the model's
 torque will do; those next to the URDF's are taken, which look most like an arm. Where an estimate is that of no
-arm at all (its mass matrix is not positive definite), the nearest bodies that can exist stand for it.
+arm at all where the arm will be (its mass matrix is not positive definite), the nearest bodies that can exist
+stand for it.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from ident.export import consistent_parameters
 from ident.model import DynamicModel
 from ident.parameters import INERTIAL, PER_LINK
 from sim_backend.plant import Drive, Effect
-from sim_backend.rigid_body import mass_matrix_floor, with_inertias
+from sim_backend.rigid_body import with_inertias
 
 __all__ = [
     "Cause",
     "ModelEffect",
-    "drive_of",
-    "links_of",
+    "arm_of",
+    "is_possible",
     "model_effects",
     "model_parameters",
     "model_payloads",
@@ -43,13 +44,14 @@ _LEAST_INERTIA = 1e-3
 _POSES = 100
 
 
-def model_parameters(model: DynamicModel) -> dict[str, float]:
+def model_parameters(model: DynamicModel, poses: Floats | None = None) -> dict[str, float]:
     """All standard parameters of the links by name, `XX1` ... `offm7`, with the model's torque.
 
-    What an estimate may be and an arm cannot is moved to the next possible value: friction below zero, and
-    drives without inertia.
+    poses : (k, n) where the arm will be [rad]; default anywhere. What an estimate may be and an arm cannot is
+    moved to the next possible value: friction below zero, drives without inertia, and, where the mass matrix is
+    not positive definite in the poses, all bodies together.
     """
-    table = _standard(model)[: len(PER_LINK) * model.structure.chain.n].reshape(-1, len(PER_LINK))
+    table = _standard(model, poses)[: len(PER_LINK) * model.structure.chain.n].reshape(-1, len(PER_LINK))
     found = {}
     for link, row in enumerate(table, start=1):
         for symbol, value in zip(PER_LINK, row, strict=True):
@@ -60,9 +62,9 @@ def model_parameters(model: DynamicModel) -> dict[str, float]:
     return found
 
 
-def model_payloads(model: DynamicModel) -> dict[str, dict[str, float]]:
-    """Inertial parameters of the model's payloads by name, in the frame of the last link."""
-    standard, found = _standard(model), {}
+def model_payloads(model: DynamicModel, poses: Floats | None = None) -> dict[str, dict[str, float]]:
+    """Inertial parameters of the model's payloads by name, in the frame of the last link. poses : as above."""
+    standard, found = _standard(model, poses), {}
     for name in model.structure.payloads:
         link = model.structure.payload_link(name)
         assert link is not None
@@ -72,30 +74,30 @@ def model_payloads(model: DynamicModel) -> dict[str, dict[str, float]]:
     return found
 
 
-def links_of(model: DynamicModel, bare: pin.Model, payload: str | None) -> pin.Model:
-    """`bare` with the inertias of the model and, where one is named, of its payload.
+def arm_of(
+    model: DynamicModel,
+    bare: pin.Model,
+    payload: str | None,
+    *,
+    stiffness: Floats,
+    damping: Floats,
+    poses: Floats | None = None,
+) -> tuple[pin.Model, Drive]:
+    """`bare` with the inertias of the model and of its payload, and the model's drives and frictions.
 
+    stiffness, damping : of the joints, (n,) [Nm/rad], [Nm s/rad]. poses : (k, n) where the arm will be [rad].
     Raises DataError where no simulated arm can have them.
     """
-    parameters = model_parameters(model)
-    last = model.structure.chain.n
-    for symbol, value in (model_payloads(model)[payload] if payload is not None else {}).items():
-        parameters[f"{symbol}{last}"] += value
+    parameters = model_parameters(model, poses)
+    n = model.structure.chain.n
+    for symbol, value in (model_payloads(model, poses)[payload] if payload is not None else {}).items():
+        parameters[f"{symbol}{n}"] += value
     try:
-        links = with_inertias(bare, parameters)
+        links = with_inertias(bare, parameters, poses)
     except ConfigurationError as error:
         raise DataError(f"the model cannot be simulated: {error}") from error
-    if mass_matrix_floor(links) <= 0.0:
-        raise DataError("the mass matrix of the model is not positive definite, so it cannot be simulated")
-    return links
-
-
-def drive_of(model: DynamicModel, stiffness: Floats, damping: Floats) -> Drive:
-    """The drives and frictions of the model in joints of a stiffness (n,) [Nm/rad] and damping (n,) [Nm s/rad]."""
-    parameters = model_parameters(model)
-    n = model.structure.chain.n
     rows = {symbol: np.array([parameters[f"{symbol}{k}"] for k in range(1, n + 1)]) for symbol in _DRIVE}
-    return Drive(**rows, stiffness=stiffness, damping=damping)
+    return links, Drive(**rows, stiffness=stiffness, damping=damping)
 
 
 class ModelEffect(Effect):
@@ -166,26 +168,52 @@ def model_effects(
     return tuple(found)
 
 
+def is_possible(model: DynamicModel, poses: Floats | None = None) -> bool:
+    """Whether the mass matrix of the model is positive definite in `poses` (k, n), default random ones, with
+    each of its payloads; where it is not, the nearest bodies that can exist are simulated.
+    """
+    if poses is None:
+        random = np.random.default_rng(0)
+        poses = random.uniform(-np.pi, np.pi, (_POSES, model.structure.chain.n))
+    exact = _nearest(model)
+    for payload in (None, *model.structure.payloads):
+        bodies = model.inertial(payload, standard=exact)
+        if np.min(np.linalg.eigvalsh(regressor.mass_matrix(model.structure.chain, poses, bodies))) <= 0.0:
+            return False
+    return True
+
+
+def _standard(model: DynamicModel, poses: Floats | None) -> Floats:
+    return _nearest(model) if is_possible(model, poses) else _consistent(model)
+
+
 @lru_cache(maxsize=8)
-def _standard(model: DynamicModel) -> Floats:
-    """Standard parameters next to the URDF's; where no arm can have them, those of the nearest one that can."""
-    if model.base is None:
+def _nearest(model: DynamicModel) -> Floats:
+    if model.base is None or model.structure.chain.urdf is None:
         return model.standard_parameters()
-    near = None
-    if model.structure.chain.urdf is not None:
-        prior = cad_prior(model.base)
-        near = np.zeros(model.structure.n_columns)
-        near[prior.bodies] = prior.inertial
-    exact = model.standard_parameters(near)
-    if all(_possible(model, exact, payload) for payload in (None, *model.structure.payloads)):
-        return exact
-    return consistent_parameters(model).vector
+    prior = cad_prior(model.base)
+    near = np.zeros(model.structure.n_columns)
+    near[prior.bodies] = prior.inertial
+    return model.standard_parameters(near)
 
 
-def _possible(model: DynamicModel, standard: Floats, payload: str | None) -> bool:
-    """Whether the mass matrix is positive definite at random poses."""
-    random = np.random.default_rng(0)
-    q = random.uniform(-np.pi, np.pi, (_POSES, model.structure.chain.n))
-    bodies = model.inertial(payload, standard=standard)
-    matrices = regressor.mass_matrix(model.structure.chain, q, bodies)
-    return bool(np.min(np.linalg.eigvalsh(matrices)) > 0.0)
+@lru_cache(maxsize=8)
+def _consistent(model: DynamicModel) -> Floats:
+    """Standard parameters of bodies that can exist, with offsets and frictions moved along with the bodies'.
+
+    An offset that the data hardly tell from a moment follows it, as their covariance says: the conditional mean
+    ``y + C_yx C_xx^-1 (x' - x)`` of what is no inertia given what is.
+    """
+    vector = np.array(consistent_parameters(model).vector)
+    if model.base is None or model.covariance is None:
+        return vector
+    inertial = np.arange(model.structure.n_columns) % len(PER_LINK) < len(INERTIAL)
+    inertial[len(PER_LINK) * model.structure.n_links :] = False
+    bodies = np.any(model.base.matrix[model.positions][:, inertial] != 0.0, axis=1)
+    moved = model.base.reduce(vector)[model.positions] - model.values
+    scale = np.sqrt(np.maximum(np.diag(model.covariance), 1e-300))
+    correlation = model.covariance / np.outer(scale, scale)
+    inverse = np.linalg.pinv(correlation[np.ix_(bodies, bodies)], rcond=1e-10, hermitian=True)
+    follow = correlation[np.ix_(~bodies, bodies)] @ (inverse @ (moved[bodies] / scale[bodies]))
+    vector[model.columns[~bodies]] += follow * scale[~bodies]
+    return vector

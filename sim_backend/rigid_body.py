@@ -17,6 +17,7 @@ from fri.errors import ConfigurationError
 
 __all__ = ["Payload", "chain", "mass_matrix_floor", "with_inertias", "with_payload"]
 
+_POSES = 50
 BODY_PARAMETERS = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
 
 
@@ -95,10 +96,13 @@ def chain(urdf: Path) -> pin.Model:
     return model
 
 
-def with_inertias(model: pin.Model, parameters: Mapping[str, float]) -> pin.Model:
+def with_inertias(
+    model: pin.Model, parameters: Mapping[str, float], poses: np.ndarray | None = None
+) -> pin.Model:
     """Copy of `model` whose link i has the standard parameters `XXi` ... `Mi`.
 
-    Raises ConfigurationError for a missing parameter, or when the mass matrix is not positive definite.
+    poses : (k, n) [rad] in which the mass matrix has to be positive definite; default random ones. Raises
+    ConfigurationError for a missing parameter, or when it is not.
     """
     changed = pin.Model(model)
     for link in range(1, changed.njoints):
@@ -107,7 +111,7 @@ def with_inertias(model: pin.Model, parameters: Mapping[str, float]) -> pin.Mode
         if missing:
             raise ConfigurationError(f"parameter {missing[0]} is missing; give all ten of link {link}")
         changed.inertias[link] = _inertia({name: float(parameters[full]) for name, full in names.items()})
-    floor = mass_matrix_floor(changed)
+    floor = mass_matrix_floor(changed, poses)
     if floor <= 0.0:
         raise ConfigurationError(
             f"smallest eigenvalue of the mass matrix is {floor:.3g} kg m^2; "
@@ -125,13 +129,14 @@ def with_payload(model: pin.Model, payload: Payload | None) -> pin.Model:
     return changed
 
 
-def mass_matrix_floor(model: pin.Model, poses: int = 50) -> float:
-    """Smallest eigenvalue of the mass matrix over `poses` seeded random poses [kg m^2]."""
+def mass_matrix_floor(model: pin.Model, poses: np.ndarray | None = None) -> float:
+    """Smallest eigenvalue of the mass matrix over `poses` (k, n), default 50 seeded random ones [kg m^2]."""
     data = model.createData()
-    random = np.random.default_rng(0)
+    if poses is None:
+        poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSES, model.nq))
     smallest = np.inf
-    for _ in range(poses):
-        mass = pin.crba(model, data, random.uniform(-np.pi, np.pi, model.nq))
+    for pose in poses:
+        mass = pin.crba(model, data, np.asarray(pose, dtype=float))
         mass = np.triu(mass) + np.triu(mass, 1).T
         smallest = min(smallest, float(np.linalg.eigvalsh(mass)[0]))
     return smallest

@@ -10,7 +10,7 @@ from typing import Any
 
 from runner.diagnosis.residuals import FILE as RESIDUALS
 from runner.diagnosis.residuals import Residuals
-from runner.diagnosis.words import CAUSES, joints_text
+from runner.diagnosis.words import CAUSES, joints_text, quantity_text
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
@@ -71,7 +71,7 @@ def _finding(finding: Mapping[str, Any], names: Sequence[str]) -> str:
         rows.append(
             ["could also be", f"{_words(other['cause'])} (ΔBIC {other.get('delta_bic', float('nan')):.3g})"]
         )
-    if finding.get("tell_apart"):
+    if finding.get("tell_apart") and finding.get("alternatives"):
         rows.append(["what would decide", str(finding["tell_apart"])])
     title = f"{_words(cause).capitalize()}, {where}"
     explained = f"{CAUSES.get(cause, '')} ({finding.get('side', 'no')} side{sure})".strip()
@@ -115,7 +115,7 @@ def _gain(diagnosis: Mapping[str, Any], details: Mapping[str, Any], names: Seque
                 cells += [
                     Number(after, ".4f", f"gain.test_rms_extended.{side}.{k}"),
                     Number(change, "+.1f"),
-                    "–" if not interval else f"{interval[0]:+.4f} to {interval[1]:+.4f}",
+                    "–" if not interval else _span(interval),
                 ]
             share = row.get("avoidable_share")
             rows.append([*cells, Number(None if share is None else 100 * share, ".0f")])
@@ -127,6 +127,11 @@ def _gain(diagnosis: Mapping[str, Any], details: Mapping[str, Any], names: Seque
     head = ("joint", "noise floor [Nm]", "base model [Nm]", *middle, "avoidable % of its power")
     title = "Gain of the extended model on unseen motions" if named else "Error on unseen motions"
     return f"<h3>{title}</h3>{text}{table(head, rows, title)}"
+
+
+def _span(interval: Sequence[float]) -> str:
+    text = f"{interval[0]:+.4f} to {interval[1]:+.4f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def _simulated(diagnosis: Mapping[str, Any], names: Sequence[str]) -> str:
@@ -236,8 +241,7 @@ def _words(cause: str) -> str:
 def _quantity(value: Any) -> str:
     if not isinstance(value, Mapping):
         return f"{value:.4g}" if isinstance(value, float) else str(value)
-    std = value.get("std")
-    spread = "" if std is None else f" ± {std:.2g}"
     number = value.get("value")
-    shown = f"{number:.4g}" if isinstance(number, (int, float)) else str(number)
-    return f"{shown}{spread} {value.get('unit', '')}".strip()
+    if not isinstance(number, (int, float)):
+        return str(number)
+    return quantity_text(float(number), float(value.get("std") or 0.0), str(value.get("unit", "1")))

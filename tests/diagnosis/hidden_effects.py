@@ -10,14 +10,14 @@ from sim_backend.plant import Effect, Loads, Plant, Reading
 
 
 class SlowGrip(Effect):
-    """Lubricant film that breaks down at low speed: more Coulomb friction in the drive, a Lorentzian of speed."""
+    """Lubricant film that breaks down at low speed: more Coulomb friction in the drive, a bell over the speed."""
 
     def __init__(self, joint: int, amplitude: float, speed: float) -> None:
         self.joint, self.amplitude, self.speed = joint - 1, amplitude, speed
 
     def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
         ratio = plant.motor_velocity[self.joint] / self.speed
-        loads.Fcm[self.joint] += self.amplitude / (1.0 + ratio**2)
+        loads.Fcm[self.joint] += self.amplitude * math.exp(-(ratio**2))
 
 
 class Hose(Effect):
