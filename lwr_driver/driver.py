@@ -62,6 +62,7 @@ from lwr_driver.recorder import Recorded, Recorder, SessionRequest
 from lwr_driver.ring import Ring
 from lwr_driver.session.writer import ExitStatus
 from lwr_driver.state import LinkState, Measured, Outcome, Progress, Waiting, snapshot
+from lwr_driver.undisturbed import undisturbed
 
 __all__ = ["Driver", "LinkSettings", "LinkState", "Measured", "Outcome", "Progress", "Waiting"]
 
@@ -136,9 +137,10 @@ class Driver:
             return self.state()
         link = self.link
         try:
-            self._control = Control.create(round(link.longest_motion_s / _SHORTEST_CYCLE_S))
-            self._ring = Ring.create()
-            self._recorder = Recorder(self._ring, heartbeat_timeout_s=None if link.lock_step else 2.0)
+            with undisturbed():
+                self._control = Control.create(round(link.longest_motion_s / _SHORTEST_CYCLE_S))
+                self._ring = Ring.create()
+                self._recorder = Recorder(self._ring, heartbeat_timeout_s=None if link.lock_step else 2.0)
             settings = LoopSettings(
                 address=link.address,
                 port=link.port,
@@ -185,6 +187,10 @@ class Driver:
 
     def close(self) -> None:
         """Stop, leave command mode, end the session and both processes. Safe at any time and repeatedly."""
+        with undisturbed():
+            self._close()
+
+    def _close(self) -> None:
         if self._loop is not None:
             with contextlib.suppress(LwrError):
                 self._come_to_rest()

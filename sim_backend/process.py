@@ -17,6 +17,7 @@ from typing import IO, Any
 
 from fri.errors import ConfigurationError, LwrError, NetworkError, RobotError
 from lwr_driver.configuration import find
+from lwr_driver.undisturbed import undisturbed
 from sim_backend.pendant import Pendant
 
 __all__ = ["EmulatorProcess"]
@@ -169,6 +170,10 @@ class EmulatorProcess:
 
     def stop(self) -> int | None:
         """End the process; returns its exit status, None if it never ran. Safe to call twice."""
+        with undisturbed():
+            return self._stop()
+
+    def _stop(self) -> int | None:
         if self._pendant is not None:
             self._pendant.close()
             self._pendant = None
