@@ -19,13 +19,16 @@ from sim_backend.process import EmulatorProcess
 
 __all__ = ["Lab", "descendants", "gone"]
 
-HOP = np.array([0.3, -0.2, 0.3, 0.4, -0.5, 0.2, 0.6])
+HOME = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
+HOP = np.array([0.3, 0.2, 0.3, 0.4, 0.5, 0.2, 0.6])
 
 
 class Lab:
     """A laboratory of processes. A context manager.
 
     settings : of the emulator, by dotted names
+
+    made : whether there are processes
     """
 
     def __init__(
@@ -33,10 +36,11 @@ class Lab:
     ) -> None:
         self.arm = Arm.load()
         self._period_ms, self._lock_step = period_ms, lock_step
-        self._settings = settings or {}
+        # A dead driver is waited for no longer than needed.
+        self._settings = {"fri.patience_s": 2.0, **(settings or {})}
         self.emulator: EmulatorProcess
         self.driver: Driver
-        self._made = False
+        self.made = False
 
     def __enter__(self) -> Lab:
         self.renew()
@@ -47,10 +51,10 @@ class Lab:
 
     def close(self) -> None:
         """End all processes."""
-        if self._made:
+        if self.made:
             self.driver.close()
             self.emulator.stop()
-            self._made = False
+            self.made = False
 
     def renew(self) -> None:
         """New processes."""
@@ -62,6 +66,11 @@ class Lab:
             settings=self._settings,
         )
         self.emulator.start()
+        self.made = True
+        self.reconnect()
+
+    def reconnect(self) -> None:
+        """A new driver at the same emulator."""
         link = LinkSettings(
             "127.0.0.1",
             self.emulator.fri_port,
@@ -70,7 +79,6 @@ class Lab:
             realtime="allow",
         )
         self.driver = Driver(self.arm, link)
-        self._made = True
         self.driver.connect()
 
     def ready(self) -> None:
@@ -95,7 +103,8 @@ class Lab:
         """Away, rest, and back."""
         state = self.driver.state()
         here = state.q_command
-        there = here + (HOP if here[6] < 0.3 else -HOP)
+        # Towards home in every joint, so that motions broken off midway never lead astray.
+        there = here + np.where(here < HOME, HOP, -HOP)
         away = move_to(self.arm, here, there, state.period_s, speed_scale=0.5)
         back = move_to(self.arm, there, here, state.period_s, speed_scale=0.5, phase="excitation")
         return away.join(dwell(there, 0.3, state.period_s, "settle")).join(back)

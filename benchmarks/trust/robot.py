@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.trust.lab import Lab
+from benchmarks.trust.lab import HOME, Lab
 from benchmarks.trust.table import Ledger
 from fri.errors import LwrError, RefusedError
 from lwr_driver.motion import move_to
@@ -102,7 +102,7 @@ def _unexpected_start(random: np.random.Generator) -> list[str]:
         driver.enter_command()
         state = driver.state()
         try:
-            home = move_to(lab.arm, state.q_command, np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0]), 0.005)
+            home = move_to(lab.arm, state.q_command, HOME, 0.005)
             outcome = driver.execute(home)
         except LwrError as error:
             return [f"no way home: {error}"]
