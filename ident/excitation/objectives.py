@@ -42,6 +42,8 @@ __all__ = [
 
 Pullback = Callable[[float], None]
 
+_SMALLEST = -0.999  # of (F - goal) / goal, so that its logarithm exists
+
 
 @dataclass(eq=False)
 class View:
@@ -284,8 +286,10 @@ class GoalAttainment:
             raise ConfigurationError(
                 f"{len(self.criteria)} criteria with {len(self.goals)} goals; one goal each is needed"
             )
-        if any(goal == 0.0 for goal in self.goals):
-            raise ConfigurationError("a goal of zero has no weight |goal|; choose another value")
+        if any(not goal > 0.0 for goal in self.goals):
+            raise ConfigurationError(
+                f"goals {', '.join(f'{goal:g}' for goal in self.goals)}: each must be positive, it is its own weight"
+            )
 
     @property
     def name(self) -> str:
@@ -299,6 +303,17 @@ class GoalAttainment:
         """(F_i - goal_i) / |goal_i| of each criterion, exact."""
         parts = [self._part(k, view, np.inf)[0] for k in range(len(self.criteria))]
         return np.array(parts)
+
+    def log_ratios(self, view: View, sharpness: float) -> tuple[Array, list[Pullback]]:
+        """log(F_i / goal_i) of each criterion, (k,), with its pullback; the largest is log(1 + gamma)."""
+        parts = [self._part(k, view, sharpness) for k in range(len(self.criteria))]
+        values = np.array([np.log1p(max(value, _SMALLEST)) for value, _ in parts])
+
+        def scaled(k: int) -> Pullback:
+            pull, ratio = parts[k][1], float(np.exp(values[k]))
+            return lambda weight: pull(weight / ratio)
+
+        return values, [scaled(k) for k in range(len(parts))]
 
     def _part(self, k: int, view: View, sharpness: float) -> tuple[float, Pullback]:
         criterion, goal = self.criteria[k], self.goals[k]

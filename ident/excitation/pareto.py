@@ -15,7 +15,7 @@ from ident.excitation.constraints import Bound
 from ident.excitation.motion import Array, ParametricMotion
 from ident.excitation.objectives import Criterion
 from ident.excitation.polish import polish
-from ident.excitation.search import Candidate, Setup, begin, hop
+from ident.excitation.search import Candidate, Setup, begin, hop, judge
 
 __all__ = ["FrontPoint", "hypervolume", "not_dominated", "trade_off"]
 
@@ -64,7 +64,7 @@ def trade_off(
                 candidates.append(pool[sequence[position - 1]])
             tasks = [
                 delayed(hop)(
-                    setups[k], _again(setups[k], candidate), (seed, 7000 + sweep, k, which), hops // 2
+                    setups[k], judge(setups[k], candidate.x), (seed, 7000 + sweep, k, which), hops // 2
                 )
                 for which, candidate in enumerate(candidates)
             ]
@@ -84,21 +84,12 @@ def trade_off(
 
 def _first(setup: Setup, known: Sequence[Candidate], seed: tuple[int, ...], starts: int) -> Candidate:
     found = [begin(setup, (*seed, index)) for index in range(starts)]
-    found += [_again(setup, candidate) for candidate in known]
+    found += [judge(setup, candidate.x) for candidate in known]
     best = found[0]
     for candidate in found[1:]:
         if candidate.better_than(best):
             best = candidate
     return best
-
-
-def _again(setup: Setup, candidate: Candidate) -> Candidate:
-    """The same motion judged by another set-up's target and bounds."""
-    program = setup.program()
-    program.sharpness, program.constraints.rate = 64.0, 300.0
-    program.constraints.refresh_deviation(program.signals(candidate.x))
-    _, constraints = program.values(candidate.x)
-    return Candidate(candidate.x, program.exact(candidate.x), float(np.max(-constraints, initial=0.0)))
 
 
 def not_dominated(values: Array) -> Array:

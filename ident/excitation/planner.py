@@ -9,7 +9,7 @@ import importlib.metadata
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,15 +55,37 @@ def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = Non
     motion (naming the limit and by how much), OperatorError if interrupted before anything feasible was
     found. A motion that violates anything is never returned.
     """
+    problem, interrupted = _with_goal(problem, progress)
     assembled = assemble(problem)
     refuse_impossible(assembled)
     tracker = _Tracker(assembled, progress)
+    tracker.interrupted = interrupted
     candidates = search_candidates(assembled, tracker)
     tracker.stage("polish", 1)
     motion, check, value = _first_that_passes(assembled, candidates, tracker.interrupted)
     result = _describe(assembled, motion, check, tracker, value)
     tracker.advance(None)
     return result
+
+
+def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None) -> tuple[PlanProblem, bool]:
+    """The problem with a goal for the condition number: given, or what a search for it alone reaches (Remark 4).
+
+    Also tells whether that search was interrupted.
+    """
+    wanted = problem.objective
+    if wanted.criterion != "goal_attainment" or wanted.goal_condition is not None:
+        return problem, False
+    alone = replace(problem, objective=replace(wanted, criterion="condition_number"))
+    assembled = assemble(alone)
+    refuse_impossible(assembled)
+    tracker = _Tracker(assembled, progress)
+    best = search_candidates(assembled, tracker)[0]
+    if not best.feasible:
+        raise RefusedError(explain(assembled, [polish(assembled, best, quick=True)]))
+    goal = float(np.exp(best.value))
+    _log.info("goal of the condition number from a search for it alone: %.2f", goal)
+    return replace(problem, objective=replace(wanted, goal_condition=goal)), tracker.interrupted
 
 
 class _Tracker:

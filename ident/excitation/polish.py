@@ -54,9 +54,10 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
         for round_ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))
             program.calibrate(x, reserve)
-            solution = minimise(program, x, iterations=15 if quick else 60, tolerance=1e-5)
-            x = solution.x
-            if solution.constraints.min(initial=0.0) < -_GRID_TOLERANCE and round_ < _ROUNDS - 1:
+            solution = minimise(program, program.variables(x), iterations=15 if quick else 60, tolerance=1e-5)
+            x = program.coefficients(solution.x)
+            limits = solution.constraints[: len(program.constraints.rows)]
+            if limits.min(initial=0.0) < -_GRID_TOLERANCE and round_ < _ROUNDS - 1:
                 x = restore(setup, x).x
                 continue
             outcome = _outcome(assembled, program, x)

@@ -64,7 +64,8 @@ class Objective:
     criterion : condition_number, d_optimality, mean_rsd, worst_rsd, or goal_attainment (equation (10))
     scaling : of the columns in condition numbers
     condition_at_most, mean_rsd_at_most, worst_rsd_at_most : bounds; None for no bound
-    goal_condition, goal_wrist : g and k_tau of equation (10)
+    goal_condition, goal_wrist : g and k_tau of equation (10); without g what a search for the condition number
+    alone reaches is the goal, as the paper's Remark 4 advises
     wrist : the two joints of equation (10), counted from 1
     """
 
@@ -75,7 +76,7 @@ class Objective:
     condition_at_most: float | None = None
     mean_rsd_at_most: float | None = None
     worst_rsd_at_most: float | None = None
-    goal_condition: float = 35.0
+    goal_condition: float | None = None
     goal_wrist: float = 0.9
     wrist: tuple[int, ...] = (6, 7)
 

@@ -26,7 +26,7 @@ from ident.excitation.program import Program
 from ident.excitation.space import Space
 from ident.excitation.sqp import minimise
 
-__all__ = ["Candidate", "Setup", "begin", "hop", "random_start", "restore"]
+__all__ = ["Candidate", "Setup", "begin", "hop", "judge", "random_start", "restore"]
 
 _FEASIBLE = 3e-3
 _FIRST = ((50, 8.0, 50.0), (60, 32.0, 150.0))
@@ -148,6 +148,16 @@ def restore(setup: Setup, x: Array, iterations: int = 80) -> Candidate:
     return Candidate(solution.x, np.inf, _violation(solution.constraints), program.evaluations)
 
 
+def judge(setup: Setup, x: Array) -> Candidate:
+    """The motion with coefficients x as the target and the bounds of a set-up see it; nothing is optimised."""
+    program = setup.program()
+    program.sharpness, program.constraints.rate = 64.0, 300.0
+    program.constraints.refresh_deviation(program.signals(x))
+    _, constraints = program.values(program.variables(x))
+    limits = constraints[: len(program.constraints.rows)]
+    return Candidate(x, program.exact(x), _violation(limits), program.evaluations)
+
+
 def _restored(setup: Setup, program: Program, found: Candidate) -> Candidate:
     """Second try for a start that ended infeasible: go to the nearest feasible motion and optimise from
     there.
@@ -158,14 +168,15 @@ def _restored(setup: Setup, program: Program, found: Candidate) -> Candidate:
 
 
 def _solve(program: Program, x: Array, schedule: Sequence[tuple[int, float, float]]) -> Candidate:
-    hessian = None
+    hessian = program.curvature()
     for iterations, sharpness, rate in schedule:
         program.sharpness, program.constraints.rate = sharpness, rate
         program.constraints.refresh_deviation(program.signals(x))
         program.calibrate(x)
-        solution = minimise(program, x, iterations=iterations, hessian=hessian)
-        x, hessian = solution.x, solution.hessian
-    return Candidate(x, program.exact(x), _violation(solution.constraints), program.evaluations)
+        solution = minimise(program, program.variables(x), iterations=iterations, hessian=hessian)
+        x, hessian = program.coefficients(solution.x), solution.hessian
+    limits = solution.constraints[: len(program.constraints.rows)]
+    return Candidate(x, program.exact(x), _violation(limits), program.evaluations)
 
 
 def _violation(constraints: Array) -> float:

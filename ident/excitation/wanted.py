@@ -101,6 +101,11 @@ def wanted_target(
     }
     target: Criterion
     if wanted.criterion == "goal_attainment":
+        if wanted.goal_condition is None:
+            raise ConfigurationError(
+                "objective: `goal_condition` is not known yet; `plan` finds it by a search for the condition number "
+                "alone"
+            )
         target = goal_attainment(
             condition, limits, mechanism, wanted.goal_condition, wanted.goal_wrist, wanted.wrist
         )

@@ -96,3 +96,22 @@ def test_goal_attainment_is_the_worst_shortfall(rng: np.random.Generator) -> Non
     step = rng.normal(size=(50, 2))
     slope = _slope(lambda at: goal.evaluate(View(view.gram, at), 8.0)[0], view.torque, step)
     assert np.sum(view.torque_bar * step) == pytest.approx(slope, rel=1e-5)
+
+
+def test_log_ratios_of_goals_agree_with_the_attainment_and_with_differences(rng: np.random.Generator) -> None:
+    view = View(np.zeros((1, 1, 1)), rng.normal(size=(50, 2)))
+    goal = GoalAttainment((MeanTorque(0, 10.0, "A5"), MeanTorque(1, 20.0, "A6")), (9.0, 18.0))
+    exact, _ = goal.log_ratios(view, np.inf)
+    np.testing.assert_allclose(np.expm1(exact), goal.attainment(view), rtol=1e-12)
+    _, pulls = goal.log_ratios(view, 8.0)
+    step = rng.normal(size=(50, 2))
+    for k, pull in enumerate(pulls):
+        view.clear()
+        pull(1.0)
+
+        def ratio(at: np.ndarray, k: int = k) -> float:
+            return float(goal.log_ratios(View(view.gram, at), 8.0)[0][k])
+
+        assert np.sum(view.torque_bar * step) == pytest.approx(_slope(ratio, view.torque, step), rel=1e-5)
+    with pytest.raises(ConfigurationError, match="must be positive"):
+        GoalAttainment((MeanTorque(0, 10.0, "A5"),), (0.0,))
