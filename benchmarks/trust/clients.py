@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.trust import compiled
+from benchmarks.trust.gathered import gather
 from benchmarks.trust.table import Ledger
 from runner.laboratory import free_port
 from sim_backend.process import EmulatorProcess
@@ -15,6 +16,17 @@ __all__ = ["campaign"]
 
 _PERIODS_MS = (1, 2, 5, 10, 20, 50, 100)
 _PROGRAMS = {"stanford": "stanford", "ros": "ros_control"}
+_KRC = "fri/test_fri_krc.py"
+_LINES = {
+    "packets as published clients send them": [
+        f"{_KRC}::test_clients_that_know_only_the_bytes",
+        f"{_KRC}::test_any_first_count_of_the_client_is_accepted_and_reflected",
+        f"{_KRC}::test_superposing_client_does_not_integrate",
+        f"{_KRC}::test_first_command_away_from_the_mirror",
+        "fri/test_fri_states.py::test_flag_sets_are_those_that_clients_send",
+        "fri/test_fri_krl.py::test_stanford_values_on_the_wire",
+    ],
+}
 
 
 def campaign(ledger: Ledger, options: Any) -> None:
@@ -23,8 +35,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
         program = compiled.client(Path(name))
         if program is None:
             ledger.line("clients", "no C compiler here: not measured")
-            return
-        for style in ("superpose", "absolute"):
+        for style in ("superpose", "absolute") if program else ():
             for handshake, krl in _PROGRAMS.items():
                 line = ledger.line("clients", f"C client, {style}, {krl}")
                 for period_ms in _PERIODS_MS:
@@ -33,6 +44,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
                         line.count(_one(program, style, handshake, krl, period_ms), f"{period_ms} ms")
                         ledger.finish("clients", piece)
                 line.figures["periods"] = f"{_PERIODS_MS[0]} to {_PERIODS_MS[-1]} ms"
+    gather(ledger, "clients", _LINES)
 
 
 def _one(program: Path, style: str, handshake: str, krl: str, period_ms: int) -> list[str]:

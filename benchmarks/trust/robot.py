@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.trust.gathered import gather
 from benchmarks.trust.lab import HOME, Lab
 from benchmarks.trust.table import Ledger
 from fri.errors import LwrError, RefusedError
@@ -30,6 +31,14 @@ _FAULTS: dict[str, tuple[str, dict[str, Any], str | None]] = {
     "program cancelled": ("stop_program", {}, "no packet|in lock step"),
     "arm held by force": ("push", {"torque": [0.0, 600.0, 0.0, 0.0, 0.0, 0.0, 0.0]}, "is .* rad from"),
     "controller restarts": ("restart", {"silent_cycles": 60}, "started again|left command|drives|lost"),
+}
+_LINES = {
+    "wrong payload, by lwr-run": [
+        "experiment/test_experiment.py::test_a_payload_that_is_not_there_is_noticed_before_anything_moves"
+    ],
+    "payload lost in motion, by lwr-run": [
+        "experiment/test_payload_and_torque.py::test_payload_that_is_lost_in_motion_fails_the_session"
+    ],
 }
 
 
@@ -94,6 +103,26 @@ def _moved_by_hand(lab: Lab, random: np.random.Generator) -> list[str]:
     return bad + lab.violations()
 
 
+def _rejected(lab: Lab, random: np.random.Generator) -> list[str]:
+    """The controller rejects commands: in T1 its speed limit is a quarter, which no packet tells."""
+    driver, pendant = lab.driver, lab.emulator.pendant
+    pendant.mode("T1")
+    driver.monitor(50)
+    pendant.drives(on=True)
+    driver.wait_quality(cycles=50)
+    driver.enter_command()
+    state = driver.state()
+    goal = state.q_command + np.where(state.q_command < HOME, 1.0, -1.0) * random.uniform(0.5, 0.9)
+    outcome = driver.execute(move_to(lab.arm, state.q_command, goal, state.period_s, speed_scale=0.8))
+    bad = lab.violations()
+    if outcome.status != "fail" or "left command mode" not in outcome.reason:
+        bad.append(f"{outcome.status}: {outcome.reason!r}")
+    kinds = [event["kind"] for event in lab.emulator.status()["events"]]
+    if "VELOCITY" not in kinds:
+        bad.append(f"the controller did not reject: {kinds}")
+    return bad
+
+
 def _unexpected_start(random: np.random.Generator) -> list[str]:
     """The arm stands anywhere as the connection begins, even near a limit; a way home is found."""
     with Lab(settings={"robot.start_position": random.uniform(-1.6, 1.6, 7).tolist()}) as lab:
@@ -111,7 +140,7 @@ def _unexpected_start(random: np.random.Generator) -> list[str]:
 
 
 def campaign(ledger: Ledger, options: Any) -> None:
-    """A line for each fault. Wrong payload, payload lost and rejected start are runs of `lwr-run`, tested there."""
+    """A line for each fault; what only a whole experiment shows is gathered from its tests."""
     runs = options.runs or _RUNS
     with tempfile.TemporaryDirectory() as name, Lab() as lab:
 
@@ -132,4 +161,6 @@ def campaign(ledger: Ledger, options: Any) -> None:
         for what in _FAULTS:
             work(what, lambda random, w=what: _strike(lab, w, random, Path(name)), runs)
         work("arm moved by a person", lambda random: _moved_by_hand(lab, random), runs)
+        work("command rejected", lambda random: _rejected(lab, random), runs)
         work("unexpected start position", _unexpected_start, max(1, runs // 4))
+    gather(ledger, "robot", _LINES)
