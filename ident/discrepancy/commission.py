@@ -178,7 +178,7 @@ def _reference(
         base.structure,
         base.names,
         values,
-        covariance,
+        _sound(covariance),
         base,
         {"sessions": [s.path.name for s in sessions]},
     )
