@@ -31,6 +31,7 @@ from sim_backend.controller import ControllerModel, PositionController
 from sim_backend.model_arm import arm_of, is_possible, model_effects
 from sim_backend.plant import CYCLE_S, ElasticArm, Reading
 from sim_backend.rigid_body import chain
+from sim_backend.truth import robot_file, true_arm
 
 __all__ = ["Replay", "Replayed", "replay"]
 
@@ -220,7 +221,13 @@ class _Bench:
         poses = session.joint.position[:: max(1, len(session.joint) // _POSES)]
         self.exact = is_possible(model, poses)
         self.links, self.drive = arm_of(
-            model, chain(find(arm.urdf_path)), known, stiffness=stiffness, damping=damping, poses=poses
+            model,
+            chain(find(arm.urdf_path)),
+            known,
+            stiffness=stiffness,
+            damping=damping,
+            poses=poses,
+            motors=true_arm(config, robot_file(config))[1],
         )
         self.load = _announced_load(session)
 

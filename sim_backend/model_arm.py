@@ -82,10 +82,12 @@ def arm_of(
     stiffness: Floats,
     damping: Floats,
     poses: Floats | None = None,
+    motors: Drive | None = None,
 ) -> tuple[pin.Model, Drive]:
     """`bare` with the inertias of the model and of its payload, and the model's drives and frictions.
 
     stiffness, damping : of the joints, (n,) [Nm/rad], [Nm s/rad]. poses : (k, n) where the arm will be [rad].
+    motors : drives that stand for those of a model that knows the joint torques only.
     Raises DataError where no simulated arm can have them.
     """
     parameters = model_parameters(model, poses)
@@ -97,6 +99,8 @@ def arm_of(
     except ConfigurationError as error:
         raise DataError(f"the model cannot be simulated: {error}") from error
     rows = {symbol: np.array([parameters[f"{symbol}{k}"] for k in range(1, n + 1)]) for symbol in _DRIVE}
+    if motors is not None and "motor" not in model.structure.sides:
+        rows |= {"Ia": motors.Ia, "Fvm": motors.Fvm, "Fcm": motors.Fcm, "offm": motors.offm}
     return links, Drive(**rows, stiffness=stiffness, damping=damping)
 
 

@@ -18,6 +18,7 @@ __all__ = ["study_text"]
 _WIDTH = 100
 _SURE = 0.8
 _MOST_MOVED = 5
+_UNEXPLAINED_SHARE = 0.3
 _MOST_UNEXPLAINED = 4
 
 
@@ -50,7 +51,14 @@ def study_text(study: Study) -> str:
 def _headline(study: Study) -> list[str]:
     found, rest = study.diagnosis.findings, study.diagnosis.unexplained
     if not found and not rest:
-        return ["Nothing is wrong that these data could show."]
+        worst = max((gain.avoidable_share for gain in study.gains), default=0.0)
+        if worst < _UNEXPLAINED_SHARE:
+            return ["Nothing is wrong that these data could show."]
+        return [
+            "No cause is claimed: these data do not carry one. Yet what was not fitted is predicted worse than",
+            f"noise explains (up to {100 * worst:.0f} % of the error's power is avoidable): more motions, or repeated "
+            "ones, would tell.",
+        ]
     if not found:
         return ["No cause can be named, but the model misses something that these data show:"]
     many = f"{len(found)} findings, the one that matters most first" if len(found) > 1 else "One finding"
@@ -114,7 +122,7 @@ def _simulated(diagnosis: Diagnosis, names: Sequence[str]) -> list[str]:
     base, extended = diagnosis.simulation_base, diagnosis.simulation_extended
     if base is None:
         return []
-    lines = ["Replayed in simulation with the same commands, measured less simulated (rms)"]
+    lines = ["Replayed in simulation, measured less simulated (rms)"]
     for label, key, scale in (
         ("position [mrad]", "position", 1e3),
         ("motor [Nm]", "motor", 1.0),
