@@ -317,7 +317,8 @@ def _program(patient: Patient, link: LinkTest) -> list[Finding]:
         found[0] = Finding("KRL program", value, handshake.name, "fail", advice, RobotError)
     elif isinstance(handshake, IdentificationHandshake):
         mass, *centre = handshake.load(link.msr).tolist()
-        text = f"{mass:.3f} kg at ({', '.join(f'{value:.0f}' for value in centre)}) mm from the flange"
+        place = ", ".join(f"{value:.0f}" for value in centre)
+        text = f"{mass:.3f} kg at ({place}) mm from the flange" if mass else "none: the empty flange"
         found.append(Finding("load data", text, "as mounted", "ok"))
     if link.fresh is None:
         return found

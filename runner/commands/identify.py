@@ -16,8 +16,10 @@ from ident.kinematics import Chain
 from ident.model_file import write_model
 from ident.mounting import find_mounting
 from ident.signals.settings import SignalSettings
+from ident.validation import validate
 from lwr_driver.session import read_session
 from runner.estimation import EstimatorChoice, announced, coulomb, couplings
+from runner.log_results import new_folder, write_log_results
 from runner.options import GroupedCommand, json_option, number_or
 from runner.plain import as_json as to_json
 from runner.versions import software
@@ -165,7 +167,20 @@ def _signal(name: str, text: str, **named: Any) -> Any:
 )
 @click.option("--keep", multiple=True, metavar="NAME", help="A parameter, or a kind, that stays.")
 @click.option("--drop", multiple=True, metavar="NAME", help="A parameter, or a kind, that goes untested.")
+@click.option(
+    "--test",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="SESSION",
+    help="Session that the estimate does not see and is held against (repeatable).",
+)
 @click.option("--out", type=click.Path(path_type=Path), help="Write the model to this file, e.g. model.yaml.")
+@click.option(
+    "--results",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Write a folder as an experiment leaves it: summary.json, model.yaml, report.html.",
+)
 @json_option
 def command(
     sessions: tuple[Path, ...],
@@ -186,7 +201,9 @@ def command(
     largest_loss: float,
     keep: tuple[str, ...],
     drop: tuple[str, ...],
+    test: tuple[Path, ...],
     out: Path | None,
+    results: Path | None,
     as_json: bool,
     **others: Any,
 ) -> None:
@@ -198,12 +215,16 @@ def command(
     \b
     lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
     lwr-run identify unloaded.mcap --model 1 --estimator huber --tuning 2
+    lwr-run identify unloaded.mcap loaded.mcap --test another.mcap --results monday
     lwr-run identify short.mcap --model 1 --estimator physical --tilt
     lwr-run identify unloaded.mcap loaded.mcap --essential --keep Fcm --drop offl7 --out small.yaml
     """
     if essential is False and (keep or drop):
         raise ConfigurationError("--keep and --drop say which parameters are essential; leave --no-essential")
-    logs = announced([read_session(path, status=False) for path in sessions], payload)
+    if results is not None:
+        new_folder(results)
+    logs = announced([read_session(path, status=False) for path in (*sessions, *test)], payload)
+    logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     if urdf is None and logs[0].robot_description is None:
         raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
     chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
@@ -223,16 +244,23 @@ def command(
     )
     mounting = find_mounting(logs, chain, settings) if tilt else None
     found = identify(logs, chain, settings) if mounting is None else mounting.identification
-    if as_json:
-        click.echo(to_json(found.to_dict() | ({} if mounting is None else {"mounting": mounting.to_dict()})))
-    else:
-        click.echo(found.summary() if mounting is None else f"{found.summary()}\n\n{mounting}")
+    result = found.essential_model if essential else found.model
+    provenance = {**result.provenance, "software": software()}
+    result = dataclasses.replace(result, robot=logs[0].metadata.get("robot", "arm"), provenance=provenance)
+    content, text = found.to_dict(), found.summary()
+    if mounting is not None:
+        content["mounting"], text = mounting.to_dict(), f"{text}\n\n{mounting}"
+    if tested:
+        validation = validate(result, tested)
+        content["validation"] = validation.to_dict()["sessions"]
+        text = f"{text}\n\n{validation}"
+    click.echo(to_json(content) if as_json else text)
     if out is not None:
-        result = found.essential_model if essential else found.model
-        robot = logs[0].metadata.get("robot", "arm")
-        provenance = {**result.provenance, "software": software()}
-        write_model(dataclasses.replace(result, robot=robot, provenance=provenance), out)
+        write_model(result, out)
         click.echo(str(out), err=as_json)
+    if results is not None:
+        page = write_log_results(results, found, logs, tested, result, text=text)
+        click.echo(str(page), err=as_json)
 
 
 _CHOICE = ("tuning", "memory_s", "relative_noise", "prior_strength", "prior_metric", "prior_std")

@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.parameters import PER_LINK
 from runner.published import TABLE_2
+from runner.report.correlation import MatrixFigure, correlation_figure
 from runner.report.curves import Curves
 from runner.report.folder import ResultFolder
 from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
 from runner.report.thinning import thin
 
 __all__ = [
+    "correlation_figure",
     "every_figure",
     "motion_figure",
     "parameter_figure",
@@ -239,10 +241,10 @@ def parameter_figure(results: Results) -> Figure:
     return Figure("parameters", "Base parameters with their 95 % intervals", tuple(panels))
 
 
-def every_figure(results: Results) -> list[Figure]:
+def every_figure(results: Results) -> list[Figure | MatrixFigure]:
     """All figures that a folder allows."""
     folder = _folder(results)
-    figures = []
+    figures: list[Figure | MatrixFigure] = []
     for one in folder.curves:
         if one.side == "joint":
             figures.append(velocity_figure(folder, one.session))
@@ -254,6 +256,8 @@ def every_figure(results: Results) -> list[Figure]:
         ]
     if folder.summary.get("parameters"):
         figures.append(parameter_figure(folder))
+    if folder.model is not None and folder.model.covariance is not None:
+        figures.append(correlation_figure(folder))
     return figures
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -63,9 +63,11 @@ class ResultFolder:
         for entry in self.summary.get("sessions", []):
             file = self.path / entry["file"]
             try:
-                found[entry["name"]] = read_session(file)
+                session = read_session(file)
             except (LwrError, OSError):
                 continue
+            announced = {**session.metadata, **entry.get("metadata", {})}
+            found[entry["name"]] = replace(session, metadata=announced)
         return found
 
     @property
@@ -107,22 +109,29 @@ class ResultFolder:
         if self.model is None:
             return ()
         cutoffs = {entry["name"]: entry["cutoff_hz"] for entry in self.summary.get("signals", [])}
-        unseen = {entry["name"] for entry in self.summary["sessions"] if entry.get("validation")}
         found = []
-        for name, session in self.sessions.items():
-            if session.end is not None and session.end.get("exit_status") == "success":
-                cutoff = cutoffs.get(session.path.name)
-                found += curves(self.model, session, name, cutoff_hz=cutoff, unseen=name in unseen)
+        for entry in self.summary["sessions"]:
+            session = self.sessions.get(entry["name"])
+            if session is not None and entry["exit_status"] == "success":
+                cutoff, unseen = cutoffs.get(session.path.name), bool(entry.get("validation"))
+                found += curves(self.model, session, entry["name"], cutoff_hz=cutoff, unseen=unseen)
         return tuple(sorted(found, key=lambda one: (one.unseen, one.payload is None, one.session, one.side)))
 
     @cached_property
-    def lock_step(self) -> bool:
-        """Whether the emulator waited for each answer, so that reply times say nothing of the link."""
+    def _experiment(self) -> Mapping[str, Any] | None:
         text = self.text("experiment.yaml")
         content = yaml.safe_load(text) if text is not None else None
-        if not isinstance(content, dict):
-            return False
-        return content.get("backend", "emulator") == "emulator" and bool(content.get("lock_step", True))
+        return content if isinstance(content, dict) else None
+
+    @property
+    def emulated(self) -> bool:
+        """Whether the arm was the built-in emulator's."""
+        return self._experiment is not None and self._experiment.get("backend", "emulator") == "emulator"
+
+    @property
+    def lock_step(self) -> bool:
+        """Whether the emulator waited for each answer, so that reply times say nothing of the link."""
+        return self.emulated and bool((self._experiment or {}).get("lock_step", True))
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from runner.report.plot import STYLES, Band, Figure, Line, Mark, Panel, limits
 
-__all__ = ["INSTALL", "heatmap_chart", "panel_chart", "plotly_figure", "plotly_script"]
+__all__ = [
+    "DIVERGING",
+    "INSTALL",
+    "heatmap_chart",
+    "heatmap_figure",
+    "panel_chart",
+    "plotly_figure",
+    "plotly_script",
+]
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +33,10 @@ FONT = {
 _SYMBOLS = {"circle": "circle", "cross": "x-thin-open", "diamond": "diamond-open"}
 _GRID = "#e3e3e3"
 _SPLIT = 0.32
-_DIVERGING = [[0.0, "#d55e00"], [0.25, "#f2b98c"], [0.5, "#ffffff"], [0.75, "#8cbfdd"], [1.0, "#0072b2"]]
+DIVERGING: tuple[tuple[float, str], ...] = (
+    (0.0, "#d55e00"), (0.25, "#f2b98c"), (0.5, "#ffffff"), (0.75, "#8cbfdd"), (1.0, "#0072b2"),
+)  # fmt: skip
+"""Colours of values from -1 (place 0) over 0 to 1, distinguishable with every common colour vision."""
 
 
 def plotly_script() -> str:
@@ -91,7 +102,7 @@ def heatmap_chart(names: tuple[str, ...], matrix: Floats) -> dict[str, Any]:
                 "z": {**_packed(values.ravel()), "shape": f"{values.shape[0]}, {values.shape[1]}"},
                 "zmin": -1,
                 "zmax": 1,
-                "colorscale": _DIVERGING,
+                "colorscale": [list(stop) for stop in DIVERGING],
                 "colorbar": {
                     "thickness": 10,
                     "len": 0.8,
@@ -110,6 +121,19 @@ def heatmap_chart(names: tuple[str, ...], matrix: Floats) -> dict[str, Any]:
             "yaxis": {"autorange": "reversed", "showgrid": False, "scaleanchor": "x", "constrain": "domain"},
         },
     }
+
+
+def heatmap_figure(chart: dict[str, Any], caption: str) -> Any:
+    """The chart of a matrix as a `plotly.graph_objects.Figure`."""
+    try:
+        import plotly.graph_objects as go
+    except ImportError as error:
+        raise ConfigurationError(f"plotly figure: {INSTALL}") from error
+    trace = dict(chart["data"][0])
+    trace["z"] = _unpacked(trace["z"]).reshape(len(trace["y"]), len(trace["x"]))
+    whole = go.Figure(trace, chart["layout"])
+    whole.update_layout(title={"text": caption}, margin={"t": 40}, height=900)
+    return whole
 
 
 def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:

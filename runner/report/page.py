@@ -100,10 +100,12 @@ def _subtitle(results: ResultFolder) -> str:
     robot = (
         f"{logs[0].metadata.get('robot', '')} {logs[0].metadata.get('serial', '')}".strip() if logs else ""
     )
-    emulated = " (emulated)" if "within_3_sigma" in summary else ""
+    emulated = " (emulated)" if results.emulated else ""
     started = logs[0].metadata.get("utc_start", "")[:10] if logs and not emulated else ""
+    # Where a recording has no date its clock begins with the epoch.
+    started = "" if started.startswith("1970") else started
     parts = [
-        f"Experiment {summary['experiment']}",
+        "Identification from logs" if summary.get("from_logs") else f"Experiment {summary['experiment']}",
         f"{robot}{emulated}" if robot else "",
         started,
         results.path.resolve().name,

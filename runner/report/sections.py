@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from html import escape
 
-import numpy as np
-
 from runner.published import SOURCE, TABLE_1, TABLE_2
+from runner.report.correlation import correlation_figure
 from runner.report.figures import (
     interval_95,
     motion_figure,
@@ -18,7 +17,6 @@ from runner.report.figures import (
     velocity_figure,
 )
 from runner.report.folder import ResultFolder
-from runner.report.interactive import heatmap_chart
 from runner.report.markup import Cell, Number, chart_html, figure_html, fold, paragraph, section, table
 
 __all__ = [
@@ -33,9 +31,9 @@ __all__ = [
     "torque_section",
 ]
 
-_STRONG_CORRELATION = 0.7
 _PAIRS = 12
 _SLOWEST_S = 2e-3
+_WORDS: dict[bool | None, str] = {True: "yes", False: "no", None: "–"}
 
 
 def session_section(results: ResultFolder) -> str:
@@ -72,6 +70,9 @@ def session_section(results: ResultFolder) -> str:
         "99 % [µs]", "worst [µs]", "tracking [mrad]",
     )  # fmt: skip
     parts = [table(head, rows, "Sessions and their link")]
+    if results.lock_step:
+        text = "Lock step: the emulator waited for every reply, so the reply times say nothing of a link."
+        parts.append(paragraph(text, "soft"))
     if results.unread:
         parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
     for name, items in results.preflights.items():
@@ -94,7 +95,8 @@ def table_1_section(results: ResultFolder) -> str:
     excitation = results.summary.get("excitation", {})
     condition, torque = excitation.get("condition", {}), excitation.get("mean_torque_nm", {})
     joints = results.joint_names
-    kept = all(item["ok"] for items in results.preflights.values() for item in items)
+    names = {session.path.name: name for name, session in results.sessions.items()}
+    kept = {name: all(item["ok"] for item in items) for name, items in results.preflights.items()}
     rows: list[list[Cell]] = [
         [
             entry.name,
@@ -109,7 +111,7 @@ def table_1_section(results: ResultFolder) -> str:
         rows.append(
             [
                 f"This run, {file.removesuffix('.mcap')}",
-                ("yes" if kept else "no") if results.preflights else "–",
+                _WORDS[kept.get(names.get(file, ""))],
                 Number(condition.get("paper"), ".2f", "excitation.condition.paper"),
                 *(Number(means.get(j), ".2f", f"excitation.mean_torque_nm.{file}.{j}") for j in joints),
             ]
@@ -150,7 +152,9 @@ def table_2_section(results: ResultFolder) -> str:
     for printed in TABLE_2:
         entry, key = kept.get(printed.name) or base.get(printed.name) or (None, "")
         truth = base.get(printed.name, ({}, ""))[0].get("truth")
-        name = printed.name if printed.name in kept or not kept else f"{printed.name} *"
+        name = (
+            f"{printed.name} *" if kept and entry is not None and printed.name not in kept else printed.name
+        )
         rows.append(
             [
                 name,
@@ -186,6 +190,9 @@ def table_2_section(results: ResultFolder) -> str:
     if others:
         title = f"{len(others)} further essential parameters of this run, not in Table 2"
         parts.append(fold(title, table(("parameter", "unit", "estimate", "std", "RSD %"), others, title)))
+    absent = [printed.name for printed in TABLE_2 if printed.name not in base]
+    if absent:
+        parts.append(paragraph(_why_absent(results, absent), "soft"))
     eliminated = (results.summary.get("essential") or {}).get("eliminated", [])
     if eliminated:
         title = f"{len(eliminated)} parameters eliminated, in this order"
@@ -204,6 +211,22 @@ def table_2_section(results: ResultFolder) -> str:
         paragraph(f"Published: {SOURCE}; the arm and the payload were others than those of this run.", "soft")
     )
     return section("table-2", "Table 2: essential base parameters", *parts)
+
+
+def _why_absent(results: ResultFolder, absent: list[str]) -> str:
+    """What the estimate of this run cannot know."""
+    reasons = []
+    if any(name.endswith("8") for name in absent):
+        carried = {s.metadata.get("payload", "none") for s in results.sessions.values()} - {"none"}
+        reasons.append(
+            "no session without the payload, so it is part of link 7, and of what is regrouped with that"
+            if carried
+            else "no session with a payload"
+        )
+    if any("m" in name for name in absent) or "Ia1" in absent:
+        reasons.append("no motor torques in the estimate")
+    rest = "; ".join(reasons) or "the motion or the model does not show them"
+    return f"{len(absent)} published parameters are not in this run: {rest}."
 
 
 def motion_section(results: ResultFolder) -> str:
@@ -298,12 +321,17 @@ def assumption_section(results: ResultFolder) -> str:
         ]
         for name, check in checks.items()
     ]
+    textbook = str(results.summary["covariance"]).startswith("textbook")
+    covered = (
+        "They rest on every assumption above."
+        if textbook
+        else "They do not rest on uncorrelated or normal residuals of equal variance; a lack of fit or of "
+        "exogeneity they cannot cover."
+    )
     parts = [
         table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
         paragraph(
-            f"Standard deviations: {results.summary['covariance']}. They do not rest on uncorrelated "
-            "residuals "
-            "of equal variance; a lack of fit or of exogeneity they cannot cover.",
+            f"Standard deviations: {results.summary['covariance']}. {covered}",
             "soft",
         ),
     ]
@@ -352,32 +380,20 @@ def parameter_section(results: ResultFolder) -> str:
 
 def _correlation(results: ResultFolder) -> str:
     model = results.model
-    if model is None or model.covariance is None or model.std is None:
+    if model is None or model.covariance is None:
         return ""
-    std = np.where(model.std > 0, model.std, 1.0)
-    matrix = np.clip(model.covariance / np.outer(std, std), -1.0, 1.0)
-    first, second = np.triu_indices(len(matrix), 1)
-    order = np.argsort(-np.abs(matrix[first, second]))[:_PAIRS]
-    strong = int(np.sum(np.abs(matrix[first, second]) > _STRONG_CORRELATION))
+    figure = correlation_figure(results)
     rows: list[list[Cell]] = [
-        [
-            f"{model.names[first[k]]} and {model.names[second[k]]}",
-            Number(float(matrix[first[k], second[k]]), ".3f"),
-        ]
-        for k in order
+        [f"{first} and {second}", Number(value, ".3f")] for first, second, value in figure.strongest(_PAIRS)
     ]
-    alt = (
-        f"Correlation matrix of {len(matrix)} parameters. {strong} pairs are correlated by more than "
-        f"{_STRONG_CORRELATION}; the strongest: {rows[0][0]}."
-    )
     return section(
         "correlation",
         "Correlation of the parameters",
         paragraph(
-            f"{strong} pairs are correlated by more than {_STRONG_CORRELATION} either way: their sum or "
-            "difference is known better than each of them."
+            f"{figure.alt} Of a strongly correlated pair the sum or difference is known better than each of "
+            "the two."
         ),
-        chart_html(heatmap_chart(model.names, matrix), alt, "square"),
+        chart_html(figure.chart(), figure.alt, "square"),
         fold(
             "The strongest pairs",
             table(("pair", "correlation"), rows, "Strongest correlations"),

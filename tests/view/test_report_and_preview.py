@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 from playwright.sync_api import Browser, Page
-from view_rig import CONTRAST, NARROW, WIDE, Seen, browser, chromium, opened
+from view_rig import CONTRAST, NARROW, WIDE, Seen, opened
 
 from lwr_driver.session import Session
 from runner.cli import main
@@ -29,20 +29,6 @@ from runner.report.folder import ResultFolder
 from runner.report.page import write_report
 from runner.report.verdicts import headline, verdicts
 
-EXPERIMENT = """
-name: short
-emulator_settings: {fri.period_ms: 5}
-excitation: {period_s: 6.0, harmonics: 3, periods: 2, seed: 3}
-moves: {home: [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], speed_scale: 0.5, settle_s: 0.5}
-diagnosis: {run: false}
-sessions:
-  - name: unloaded
-  - name: loaded
-    payload: &load {name: paper_load, mass: 3.34, com: [0.0, -0.066, 0.144]}
-  - name: check
-    validation: true
-    payload: *load
-"""
 DIAGNOSIS: dict[str, Any] = {
     "schema_version": 1,
     "findings": [
@@ -71,25 +57,6 @@ DIAGNOSIS: dict[str, Any] = {
         "test_rms_extended": {"motor": [0.5, 0.4, 0.5, 0.5, 0.5, 0.5, 0.5]},
     },
 }
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a finished experiment."""
-    place = tmp_path_factory.mktemp("view")
-    (place / "short.yaml").write_text(EXPERIMENT)
-    out = place / "run"
-    done = CliRunner().invoke(main, ["experiment", str(place / "short.yaml"), "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    return out
-
-
-@pytest.fixture(scope="module")
-def chrome() -> Iterator[Browser]:
-    if chromium() is None:
-        pytest.skip("no chromium on this computer; install the system's package `chromium`")
-    with browser() as opened_browser:
-        yield opened_browser
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +218,8 @@ def test_figures_are_written_as_well_formed_svg(finished: Path, tmp_path: Path) 
     assert done.exit_code == 0, done.output
     files = sorted((tmp_path / "figures").glob("*.svg"))
     assert [str(path) for path in files] == sorted(done.output.split())
-    assert {"torque-loaded-joint.svg", "torque-loaded-motor.svg", "parameters.svg"} <= {f.name for f in files}
+    names = {"torque-loaded-joint.svg", "torque-check-motor.svg", "parameters.svg", "correlation.svg"}
+    assert names <= {path.name for path in files}
     for path in files:
         root = ElementTree.parse(path).getroot()
         assert root.findtext("{http://www.w3.org/2000/svg}desc")
