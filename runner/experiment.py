@@ -128,6 +128,12 @@ class Run:
         self._mounted: Payload | None = None
         self._rest: Rest | None = None
 
+    def followed_by(self, experiment: Experiment, excite: Callable[[SessionPlan, float], Motion]) -> Run:
+        """A run of further sessions, which begins with the arm and its payload as this one left them."""
+        run = Run(experiment, self.folder, self.bench, excite)
+        run._mounted, run._rest = self._mounted, self._rest
+        return run
+
     def sessions(self) -> list[Record]:
         """Run every session that is not finished yet; returns the record of each, finished earlier or now.
 

@@ -27,6 +27,7 @@ __all__ = [
     "MotorTorque",
     "Moves",
     "Payload",
+    "Replan",
     "SessionPlan",
 ]
 
@@ -178,6 +179,22 @@ class DiagnosisPlan:
 
 
 @dataclass(frozen=True)
+class Replan:
+    """Further rounds, each with a motion planned from what the rounds before have taught.
+
+    rounds : how many. problem : the planning problem, whose arm, cell, sessions, knowledge and prior are the
+    experiment's own.
+    """
+
+    rounds: int = 0
+    problem: str = "plans/replan.yaml"
+
+    def __post_init__(self) -> None:
+        if self.rounds < 0:
+            raise ConfigurationError(f"replan.rounds {self.rounds} is negative")
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A whole experiment as its file describes it; every key but `name` has a default."""
 
@@ -195,6 +212,7 @@ class Experiment:
     moves: Moves = field(default_factory=Moves)
     identification: Identification = field(default_factory=Identification)
     diagnosis: DiagnosisPlan = field(default_factory=DiagnosisPlan)
+    replan: Replan = field(default_factory=Replan)
     sessions: tuple[SessionPlan, ...] = (SessionPlan("unloaded"),)
     source: Path = field(default=Path(), init=False)
     folder: Path = field(default=Path(), init=False)

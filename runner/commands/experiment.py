@@ -22,6 +22,7 @@ from runner.options import json_option
 from runner.plain import as_json as to_json
 from runner.planning import PLAN, Excitations
 from runner.progress import Progress
+from runner.replanning import Rounds, rounds_begun
 from runner.results import estimate, summarise, write_results
 from runner.status import StatusLine
 
@@ -51,6 +52,12 @@ COPY = "experiment.yaml"
 @click.option(
     "--decide", is_flag=True, help="Run the motions that decide between causes that look alike, and conclude."
 )
+@click.option(
+    "--replan",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="N further rounds: plan again with the estimate so far, drive, and estimate from all rounds.",
+)
 @json_option
 def command(
     file: str | None,
@@ -62,6 +69,7 @@ def command(
     live_port: int,
     no_diagnosis: bool,
     decide: bool,
+    replan: int | None,
     as_json: bool,
 ) -> None:
     """Run the experiment FILE; without one the default, against the built-in emulator.
@@ -77,6 +85,7 @@ def command(
     lwr-run experiment my_lab.yaml --out results/monday
     lwr-run experiment --resume results/monday           go on after an abort
     lwr-run experiment --resume results/monday --decide  run what decides between look-alikes
+    lwr-run experiment my_lab.yaml --replan 1            a second round with a motion planned from the first
     """
     experiment, folder = _begin(file, out, resume)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
@@ -85,7 +94,9 @@ def command(
     motions = _motions(experiment, arm, cell, folder, status)
     laboratory = Laboratory(experiment, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
     with laboratory as bench, _watched(bench, experiment, live_port if live else None) as watched:
-        records = Run(experiment, folder, watched, motions.rows).sessions()
+        first = Run(experiment, folder, watched, motions.rows)
+        rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
+        records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
     done = all(record.status == "success" for record in records)
     found = estimate(experiment, arm, records) if done else None
     summary = summarise(experiment, records, found)

@@ -9,11 +9,12 @@ import click
 
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan
-from ident.excitation.planner import Progress, plan
+from ident.excitation.planner import plan
 from ident.excitation.problem import PlanProblem
 from ident.excitation.table import plan_report
 from runner.options import json_option
 from runner.plain import as_json as to_json
+from runner.replanning import show_search
 from runner.status import StatusLine
 
 DEFAULT = "plans/default.yaml"
@@ -40,16 +41,11 @@ def command(file: str, out: Path | None, force: bool, as_json: bool) -> None:
     if target.exists() and not force:
         raise ConfigurationError(f"{target} exists; choose another --out, or replace it with --force")
     status = StatusLine()
-    found = plan(problem, lambda now: _show(status, now))
+    found = plan(problem, lambda now: show_search(status, now))
     status.clear()
     found.save(target)
     click.echo(to_json(_summary(found)) if as_json else plan_report(found))
     click.echo(str(target), err=as_json)
-
-
-def _show(status: StatusLine, now: Progress) -> None:
-    best = "none yet" if now.best is None else f"{now.best:.4g}"
-    status.show(now.stage, now.done / max(now.total, 1), f"best feasible {best}, {now.elapsed_s:.0f} s")
 
 
 def _summary(found: ExcitationPlan) -> dict[str, Any]:

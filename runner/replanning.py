@@ -1,0 +1,193 @@
+"""Further rounds of an experiment: plan again with what the rounds before have taught, drive, estimate jointly.
+
+The motion of a round is planned with the present estimate of the parameters (torque limits hold for their
+uncertainty), the noise that the identification found, and the information of every session so far: it adds
+what those lack. It passes the same checks as any other motion before the arm moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ident.excitation import ExcitationPlan
+from ident.excitation.estimate import split_name
+from ident.excitation.planner import Progress as SearchProgress
+from ident.excitation.planner import plan
+from ident.excitation.problem import Knowledge, PlanProblem, Prior
+from ident.identify import Identification
+from ident.model_file import write_model
+from lwr_driver.arm import Arm
+from lwr_driver.cell import Cell
+from lwr_driver.configuration import find
+from lwr_driver.motion import Motion
+from runner.experiment import Record, Run
+from runner.experiment_file import Experiment, Payload, SessionPlan
+from runner.planning import excitation_rows
+from runner.results import estimate, identified_model, summarise, write_results
+from runner.status import StatusLine
+
+__all__ = ["Rounds", "next_problem", "rounds_begun", "show_search"]
+
+PLAN = "round-{}.plan.yaml"
+MODEL = "round-{}.model.yaml"
+
+
+def rounds_begun(folder: Path) -> int:
+    """Further rounds that the experiment in `folder` has a plan of."""
+    count = 0
+    while (folder / PLAN.format(count + 2)).is_file():
+        count += 1
+    return count
+
+
+def show_search(status: StatusLine, now: SearchProgress) -> None:
+    """The progress of a search on the status line."""
+    best = "none yet" if now.best is None else f"{now.best:.4g}"
+    status.show(now.stage, now.done / max(now.total, 1), f"best feasible {best}, {now.elapsed_s:.0f} s")
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """The rounds after the first one, in the same folder: sessions NAME-round2, NAME-round3, ..."""
+
+    experiment: Experiment
+    arm: Arm
+    cell: Cell
+    folder: Path
+    status: StatusLine
+
+    def run(self, first: Run, records: Sequence[Record], rounds: int) -> list[Record]:
+        """Run `rounds` further rounds after the `first` one, which left `records`; all records.
+
+        The results of the rounds so far are written before each new one, so that they stand whatever happens.
+        A session that aborts or fails ends the sequence: its record is the last one.
+        """
+        found, run = list(records), first
+        for number in range(2, rounds + 2):
+            if found[-1].status != "success":
+                break
+            motion = self._motion(number, found)
+            again = tuple(
+                replace(session, name=f"{session.name}-round{number}")
+                for session in self.experiment.sessions
+                if not session.validation
+            )
+            excite = _always(motion, self.experiment.excitation.periods)
+            run = run.followed_by(self.experiment.changed(sessions=again), excite)
+            found += run.sessions()
+        return found
+
+    def _motion(self, number: int, records: Sequence[Record]) -> ExcitationPlan:
+        """The motion of a round: the one already in the folder, or planned now and stored there."""
+        path = self.folder / PLAN.format(number)
+        if path.is_file():
+            return ExcitationPlan.load(path)
+        status = self.status
+        status.show(f"estimate before round {number}", 0.0, "")
+        found = estimate(self.experiment, self.arm, records)
+        summary = summarise(self.experiment, records, found)
+        write_results(self.folder, self.experiment, self.arm, summary, found)
+        model = self.folder / MODEL.format(number - 1)
+        write_model(identified_model(found, self.arm.name), model)
+        problem = next_problem(self.experiment, self.cell, records, found, model)
+        status.show(
+            f"planning round {number}", 0.0, "Ctrl-C ends the search and keeps the best motion so far"
+        )
+        motion = plan(problem, lambda now: show_search(status, now))
+        motion.save(path)
+        status.clear()
+        essential = found.estimate if found.essential is None else found.essential.estimate
+        before = float(np.median(essential.rsd_percent))
+        after = float(np.median(list(motion.rsd_percent.values())))
+        status.say(
+            f"round {number}: median relative deviation of {len(essential.names)} parameters {before:.2f} % now, "
+            f"{after:.2f} % predicted after it"
+        )
+        return motion
+
+
+def next_problem(
+    experiment: Experiment, cell: Cell, records: Sequence[Record], found: Identification, model: Path
+) -> PlanProblem:
+    """The planning problem of the next round.
+
+    The problem file that the experiment names says what is wanted (motion, objective, workspace, search); arm,
+    cell, sessions, payload, present estimate (`model`, with its covariance), noise, and the sessions recorded
+    so far as prior come from the experiment.
+    """
+    wanted = PlanProblem.load(find(experiment.replan.problem, beside=experiment.folder))
+    payload = _heaviest(experiment)
+    sessions = [session for session in experiment.sessions if not session.validation]
+    loads: list[Literal["unloaded", "loaded"]] = []
+    for session in sessions:
+        load: Literal["unloaded", "loaded"] = "unloaded" if session.payload is None else "loaded"
+        if load not in loads:
+            loads.append(load)
+    unseen = {session.name for session in experiment.sessions if session.validation}
+    prior = tuple(Prior(session=str(r.path.resolve())) for r in records if r.name not in unseen)
+    clearance = 0.0 if wanted.clearance_m is None else wanted.clearance_m
+    return replace(
+        wanted,
+        arm=str(find(experiment.arm, beside=experiment.folder)),
+        cell=str(find(experiment.cell, beside=experiment.folder)),
+        payload_shape=None if payload is None else payload.shape,
+        motion=replace(wanted.motion, periods=experiment.excitation.periods),
+        knowledge=_knowledge(wanted.knowledge, payload, found, model),
+        parameters=_names(found, payload),
+        sessions=tuple(loads),
+        model=experiment.identification.model,
+        clearance_m=max(clearance, experiment.moves.clearance_m, cell.margin_m),
+        prior=prior,
+    )
+
+
+def _always(motion: ExcitationPlan, periods: int) -> Callable[[SessionPlan, float], Motion]:
+    """The same motion for every session."""
+    rows = excitation_rows(motion, periods)
+    return lambda session, period_s: rows(period_s)
+
+
+def _heaviest(experiment: Experiment) -> Payload | None:
+    payloads = sorted(experiment.payloads().values(), key=lambda payload: payload.mass)
+    return payloads[-1] if payloads else None
+
+
+def _knowledge(wanted: Knowledge, payload: Payload | None, found: Identification, model: Path) -> Knowledge:
+    """What is known now: the estimate with its covariance, and the noise that its residuals show."""
+    joints = found.structure.chain.joint_names
+    fits = {(fit.side, fit.joint): fit for fit in found.estimate.classes}
+    # rows of the difference of both sides are weighted as motor rows
+    sides = {"joint": "joint", "motor": "difference" if found.settings.model == 3 else "motor"}
+    noise = {
+        side: tuple(fits[label, joint].sigma if (label, joint) in fits else 1.0 for joint in joints)
+        for side, label in sides.items()
+    }
+    independent = float(np.median([fit.n_eff for fit in fits.values()]))
+    return replace(
+        wanted,
+        file=str(model.resolve()),
+        payload=None if payload is None else payload.name,
+        noise_motor=noise["motor"],
+        noise_joint=noise["joint"],
+        samples=max(1.0, independent / len(found.prepared)),
+    )
+
+
+def _names(found: Identification, payload: Payload | None) -> tuple[str, ...]:
+    """The essential parameters of the arm and of the payload that is planned with."""
+    names = found.base.names if found.essential is None else found.essential.names
+    joints = found.structure.chain.n
+    link = None if payload is None else found.structure.payload_link(payload.name)
+    kept = []
+    for name in names:
+        kind, body = split_name(name)
+        if body <= joints:
+            kept.append(name)
+        elif link is not None and body == link + 1:
+            kept.append(f"{kind}{joints + 1}")
+    return tuple(kept)
