@@ -216,8 +216,8 @@ class IdentificationHandshake:
         return bool(msr["krl_int"][15] == 1 and msr["state"] == State.MON)
 
     def fallen(self, msr: np.ndarray) -> bool:
-        """4 in [16], state MON."""
-        return bool(msr["krl_int"][15] == 4 and msr["state"] == State.MON)
+        """6 in [16], or still 4 in it, and state MON."""
+        return bool(msr["krl_int"][15] in (4, 6) and msr["state"] == State.MON)
 
     def request_load(self, cmd: np.ndarray, msr: np.ndarray, load: np.ndarray) -> None:
         """Put load data in force: mass [kg], centre of mass in the flange frame [mm] (3), inertia about it

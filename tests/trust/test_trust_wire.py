@@ -228,6 +228,9 @@ def test_command_mode_that_fell_back_unseen_is_asked_for_anew(stand, program):
     s.alter = deaf_in_command_mode
     while s.session.counters()["drops"] == 0:
         s.cycle()
+    # Until the program, too, has noticed.
+    s.silent = 30
+    s.cycles(30)
     s.alter = None
     assert s.until_done(2000)
     assert s.result is Result.DONE
