@@ -22,7 +22,7 @@ from lwr_driver.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
-from runner.diagnosis.deciding import Deciding, offers
+from runner.diagnosis.deciding import Deciding, offers, open_findings
 from runner.diagnosis.decision import Answer, decision_text, decisions
 from runner.diagnosis.study import DIAGNOSIS, Study, study
 from runner.experiment import Bench, Record, Run
@@ -45,11 +45,15 @@ Laboratory = Callable[[Experiment], AbstractContextManager[Bench]]
 
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """How an experiment ends: the diagnosis or why there is none, and what the deciding motions said."""
+    """How an experiment ends: the diagnosis or why there is none, and what the deciding motions said.
+
+    asked : whether deciding motions were wanted.
+    """
 
     study: Study | None
     failure: str = ""
     answers: tuple[Answer, ...] = ()
+    asked: bool = False
 
     def text(self, folder: Path) -> str:
         """For the screen. folder : of the experiment, for what can be run next."""
@@ -61,6 +65,12 @@ class Conclusion:
             lines.append(decision_text(self.answers, names))
         if self.failure:
             lines.append(f"The deciding motions came to no end: {self.failure}. The diagnosis above stands.")
+        elif self.asked and not self.answers:
+            still = open_findings(self.study.diagnosis)
+            reason = (
+                "no deciding motion passes every check" if still else "no finding is open between look-alikes"
+            )
+            lines.append(f"Nothing was run to decide: {reason}.")
         elif self.study.offers and not self.answers:
             lines.append(
                 f"`lwr-run experiment --resume {folder} --decide` runs what would decide and concludes."
@@ -101,7 +111,7 @@ def conclude_run(
     except Exception as error:
         return Conclusion(None, _reason(error))
     if not decide or not first.offers:
-        return Conclusion(first)
+        return Conclusion(first, asked=decide)
     try:
         return _decided(experiment, arm, folder, records, first, laboratory)
     except OperatorError:

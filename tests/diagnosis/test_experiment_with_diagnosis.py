@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from fri.errors import DataError
 from ident.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
+from lwr_driver.session import read_session
 from runner.cli import main
 from runner.commissioning import record_sets
 from runner.diagnosis import after_run
@@ -24,9 +26,11 @@ from runner.diagnosis.after_run import conclude_run
 from runner.diagnosis.residuals import Residuals
 from runner.experiment_file import Experiment
 from runner.planning import Excitations
+from runner.replay import Replay, replay
 from runner.report.folder import ResultFolder
 from runner.report.page import report_html
 from runner.report.residual_figures import AGAINST
+from sim_backend.configuration import load_configuration
 
 SHORT: dict[str, Any] = {
     "name": "short",
@@ -116,6 +120,20 @@ def test_the_extended_model_simulates_the_hidden_arm_better(done: Done) -> None:
     gain = content(done, "diagnosis.json")["gain"]
     base, extended = gain["simulation_error_base"], gain["simulation_error_extended"]
     assert extended["motor"][1] < 0.95 * base["motor"][1]
+
+
+def test_the_replay_finds_when_commands_act_and_lives_without_them(done: Done) -> None:
+    model = read_model(done.folder / "diagnosis" / "model_extended.yaml")
+    session = read_session(done.folder / "unloaded.mcap")
+    done_once = replay(model, session, Arm.load(), load_configuration(), 3.0)
+    # A command acts in the cycle after the one it answers.
+    assert done_once.delay_s == pytest.approx(0.01, abs=0.002)
+    silent = dataclasses.replace(session, command=None)
+    follower = Replay(Arm.load(), [silent], longest_s=3.0)
+    error = follower(model, [silent])
+    assert error is not None
+    assert np.all(error.position < 0.01)
+    assert any("no commands in the log" in note for note in follower.notes)
 
 
 def test_gains_have_intervals_beside_the_noise_floor(done: Done) -> None:
