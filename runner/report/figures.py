@@ -27,6 +27,7 @@ from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
 from runner.report.thinning import thin
 
 __all__ = [
+    "bin_means",
     "correlation_figure",
     "every_figure",
     "motion_figure",
@@ -280,24 +281,24 @@ def _binned(one: Curves, residual: Floats, joint: int, against: str) -> tuple[Ma
     qd = np.interp(one.grid[moving], one.time, one.qd[:, joint])
     residual = residual[moving]
     if against == "velocity":
-        x, mean, low, high = _bins(qd, residual)
+        x, mean, low, high = bin_means(qd, residual)
         return (
             Band("spread", "5 to 95 % of the samples", x, low, high),
             Line("measured", "mean", x, mean),
         )
-    x, _, low, high = _bins(q, residual)
+    x, _, low, high = bin_means(q, residual)
     marks: list[Mark] = [Band("spread", "5 to 95 % of the samples", x, low, high)]
     for role, label, chosen in (
         ("forward", "mean, joint moving up", qd > _MOVING),
         ("backward", "mean, joint moving down", qd < -_MOVING),
     ):
         if np.count_nonzero(chosen) > _BINS:
-            x, mean, _, _ = _bins(q[chosen], residual[chosen])
+            x, mean, _, _ = bin_means(q[chosen], residual[chosen])
             marks.append(Line(role, label, x, mean))  # type: ignore[arg-type]
     return tuple(marks)
 
 
-def _bins(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def bin_means(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Centres, means, 5 % and 95 % quantiles of y in bins of x that hold three samples or more."""
     edges = np.linspace(x.min(), x.max(), _BINS + 1)
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)

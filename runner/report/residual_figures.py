@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.diagnosis.residuals import Residuals, SideResiduals
-from runner.report.figures import _bins as binned
+from runner.report.figures import bin_means
 from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
 
 __all__ = ["AGAINST", "residual_figures"]
@@ -82,7 +82,7 @@ def _binned_marks(residuals: Residuals, rows: SideResiduals, joint: int, against
         good = np.isfinite(values) & np.isfinite(x)
         if np.count_nonzero(good) < 10 or np.ptp(x[good]) <= 0.0:
             continue
-        centre, mean, low, high = binned(x[good], values[good])
+        centre, mean, low, high = bin_means(x[good], values[good])
         if role == "backward":
             marks.append(Band("spread", "5 to 95 % of the rows, base model", centre, low, high))
         marks.append(Line(role, f"{label}, mean", centre, mean))  # type: ignore[arg-type]
@@ -99,7 +99,7 @@ def _time_marks(residuals: Residuals, rows: SideResiduals, joint: int, against: 
             if np.count_nonzero(mine) < 10:
                 continue
             time = rows.time[mine]
-            centre, mean, low, high = binned(time - time[0] + offset, values[mine])
+            centre, mean, low, high = bin_means(time - time[0] + offset, values[mine])
             if role == "backward":
                 marks.append(Band("spread", "5 to 95 % of the rows, base model", centre, low, high))
             marks.append(Line(role, f"{label}, mean", centre, mean))  # type: ignore[arg-type]
