@@ -143,8 +143,8 @@ def _text(source: str | Path) -> tuple[str, str]:
         return source, "URDF text"
     try:
         return Path(source).read_text(encoding="utf-8"), str(source)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{source}: cannot be read: {error}") from error
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"{str(source)[:200]}: cannot be read: {error}") from error
 
 
 def _numbers(

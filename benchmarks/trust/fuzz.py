@@ -16,14 +16,16 @@ def main() -> None:
         import atheris  # type: ignore[import-untyped, import-not-found]
     except ImportError:
         raise SystemExit("atheris is not installed; `pip install .[fuzz]`, or use `trust input`") from None
-    with atheris.instrument_imports(
-        include=["fri", "lwr_driver", "ident.urdf", "ident.import_log", "runner"]
-    ):
+    with atheris.instrument_imports(include=["fri", "lwr_driver", "ident", "sim_backend", "runner"]):
         from benchmarks.trust import targets
-    if len(sys.argv) < 2 or sys.argv[1] not in targets.TARGETS:
-        raise SystemExit(f"name a target: {', '.join(targets.TARGETS)}")
-    name = sys.argv.pop(1)
-    corpus = targets.corpus(name)
+
+        if len(sys.argv) < 2 or sys.argv[1] not in targets.TARGETS:
+            raise SystemExit(f"name a target: {', '.join(targets.TARGETS)}")
+        name = sys.argv.pop(1)
+        corpus = targets.corpus(name)
+        # What a target imports on its way is instrumented too.
+        for data in corpus:
+            targets.check(name, data)
 
     def once(data: bytes) -> None:
         # The first byte chooses a good input, the next ones where and what is put over it.

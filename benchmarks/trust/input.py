@@ -1,13 +1,19 @@
 """Mangled input, seeded: packets, logs, files. An error of ours or a correct result, in bounded time and memory.
 
-`python -m benchmarks.trust.fuzz TARGET` does the same guided by coverage, where atheris is installed.
+Where atheris is installed (`pip install .[fuzz]`), a coverage-guided fuzzer goes on from there, `--seconds` for
+each target; `python -m benchmarks.trust.fuzz TARGET` runs it alone. What breaks a promise is left in a file
+`crash-...` beside the results.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import multiprocessing
+import re
 import resource
+import subprocess
+import sys
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -16,12 +22,13 @@ import numpy as np
 import yaml
 
 from benchmarks.trust import targets
-from benchmarks.trust.table import Ledger
+from benchmarks.trust.table import Ledger, Line
 
 __all__ = ["campaign", "mangle"]
 
 _RUNS = 2000
 _BLOCK = 50
+_GUIDED_S = 60.0
 _PATIENCE_S = 60.0
 _MEMORY = 6 << 30
 _TEXT = frozenset({"experiment", "arm", "cell", "emulator", "mapping"})
@@ -163,3 +170,24 @@ def campaign(ledger: Ledger, options: Any) -> None:
                 ledger.finish("input", f"{name} {first}")
     finally:
         watched.close()
+    for name in targets.TARGETS:
+        if not ledger.has("input", f"{name}, guided"):
+            _guided(ledger.line("input", f"{name}, guided by coverage"), name, options)
+            ledger.finish("input", f"{name}, guided")
+
+
+def _guided(line: Line, name: str, options: Any) -> None:
+    """Run the fuzzer in a process of its own and take its count of runs, and what it found."""
+    if importlib.util.find_spec("atheris") is None:
+        line.figures = {"not run": "atheris is not installed"}
+        return
+    seconds = options.seconds or _GUIDED_S
+    command = [sys.executable, "-m", "benchmarks.trust.fuzz", name, f"-max_total_time={seconds:.0f}"]
+    command += [f"-seed={options.seed}", f"-timeout={_PATIENCE_S:.0f}", "-rss_limit_mb=6144"]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    counts = re.findall(r"^#(\d+)\s.*?cov: (\d+)", done.stderr, re.MULTILINE)
+    line.runs += int(counts[-1][0]) if counts else 0
+    line.figures = {"seconds": seconds, "edges covered": int(counts[-1][1]) if counts else 0}
+    if done.returncode:
+        line.failed += 1
+        line.failures.append(" | ".join(done.stderr.strip().splitlines()[-6:])[:400])

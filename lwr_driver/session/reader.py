@@ -142,10 +142,12 @@ def _session(
         samples={topic: item.lost for topic, item in columns.items() if item is not None and item.lost},
         notes=tuple(notes),
     )
-    description = texts["/robot_description"]
     attachments = {name: data for name, (_, _, data) in scan.attachments.items()}
-    # Imported logs have no transforms, hence no topic with the URDF; the attachment says the same.
-    attached = attachments["robot.urdf"].decode("utf-8") if "robot.urdf" in attachments else None
+    described = texts["/robot_description"]
+    description = described[0][1] if described else _attached_description(source, attachments)
+    if description is not None and not description.lstrip().startswith("<"):
+        # Whoever takes it for the name of a file must not be led to one by a log.
+        raise DataError(f"{source}: /robot_description begins with {description[:20]!r}, which is no XML")
     session = Session(
         path=scan.path,
         metadata=metadata or {},
@@ -157,11 +159,19 @@ def _session(
         phases=phases,
         status=status,
         controller_model=model,
-        robot_description=description[0][1] if description else attached,
+        robot_description=description,
         attachments=attachments,
         missing=missing,
     )
     return session if joint_names is None else session.select(joint_names)
+
+
+def _attached_description(source: str, attachments: Mapping[str, bytes]) -> str | None:
+    """The URDF among the attachments: imported logs have no transforms, hence no topic with it."""
+    try:
+        return attachments["robot.urdf"].decode("utf-8") if "robot.urdf" in attachments else None
+    except UnicodeDecodeError as error:
+        raise DataError(f"{source}: attachment robot.urdf is not UTF-8: {error}") from error
 
 
 def _metadata(scan: Scan, name: str) -> dict[str, str] | None:

@@ -46,6 +46,14 @@ def test_what_was_written_is_read(tmp_path):
     assert session.joint.period_s == pytest.approx(1e-3)
 
 
+@pytest.mark.parametrize("content", [b"/etc/hostname", b"robot.urdf", b"\xff<robot/>"])
+def test_robot_description_that_is_no_xml_is_refused_and_never_taken_for_a_file(tmp_path, content):
+    path = tmp_path / "a.mcap"
+    write_session(path, attachments={"robot.urdf": content})
+    with pytest.raises(DataError, match=r"no XML|not UTF-8"):
+        read_session(path)
+
+
 def test_description_in_words_and_as_data(tmp_path):
     path = tmp_path / "a.mcap"
     write_session(path)

@@ -50,6 +50,10 @@ def test_arbitrary_datagrams_never_move_the_set_point_out_of_its_limits(data):
     assert targets.check("measurement", data) == "ok"
 
 
+def test_urdf_that_cannot_be_the_name_of_a_file():
+    assert targets.check("urdf", b"\x00'") == "refused"
+
+
 def test_signalling_nan_in_a_command_is_objected_to_without_a_warning():
     good = bytearray(targets.corpus("command")[0])
     # The first command is answered in monitor mode, the second one counts.
