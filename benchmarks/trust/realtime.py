@@ -3,6 +3,10 @@
 The sender stands in for the controller on the first processor (see `benchmarks/reply_latency.py`). What it sent
 late itself is left out: it says nothing about who answers. With and without real-time rights, with and
 without other programs that want the processors.
+
+The tail of the latency is made by a few stalls of the computer, so its quantile is uncertain: the ratio comes
+with the range in which it lies when the seconds of both measurements are drawn anew. The promise is broken
+where even the lower end is above it, and open where only the ratio is.
 """
 
 from __future__ import annotations
@@ -41,6 +45,7 @@ _TURN_S = 20.0  # of the driver, then of the client: what else the computer does
 _ON_TIME_S = 0.2e-3
 _QUANTILES = (0.5, 0.99, 0.999)
 _RATIO = 1.3
+_DRAWS = 200
 _BEFORE = 400  # packets before command mode
 
 
@@ -71,6 +76,19 @@ class _Sent:
         finally:
             sender.join(10.0)
             sender.kill()
+
+    def spread(self, random: np.random.Generator) -> NDArray[np.float64]:
+        """p99.9 [s] of data sets drawn anew, with repetition, from the seconds of this one (bootstrap)."""
+        blocks = []
+        for latency, lateness in zip(self.latency, self.lateness, strict=True):
+            count = max(1, round(len(latency) * self._period_s))
+            parts = zip(np.array_split(latency, count), np.array_split(lateness, count), strict=True)
+            blocks += [part[late < _ON_TIME_S] for part, late in parts]
+        found = []
+        for _ in range(_DRAWS):
+            drawn = np.concatenate([blocks[k] for k in random.integers(0, len(blocks), len(blocks))])
+            found.append(np.quantile(drawn, 0.999, method="inverted_cdf") if len(drawn) else np.inf)
+        return np.array(found)
 
     def figures(self) -> dict[str, Any]:
         """Quantiles over the packets that left on time [us], answers later than a cycle included; packets
@@ -193,8 +211,14 @@ def _compare(
         line.figures["C client [us]"] = yardstick
         if found.get("p99.9") and yardstick.get("p99.9"):
             ratio = found["p99.9"] / yardstick["p99.9"]
+            random = np.random.default_rng(1)
+            low, high = np.quantile(ours.spread(random) / plain.spread(random), (0.05, 0.95))
             line.figures["ratio at p99.9"] = round(ratio, 2)
-            if rights and not ratio <= _RATIO:
-                bad.append(f"p99.9 is {ratio:.2f} times the C client's, at most {_RATIO}")
+            line.figures["ratio, 5 to 95 %"] = [round(float(low), 2), round(float(high), 2)]
+            if rights:
+                held = "yes" if ratio <= _RATIO else "open" if low <= _RATIO else "no"
+                line.figures[f"within {_RATIO}"] = held
+                if held == "no":
+                    bad.append(f"p99.9 is {ratio:.2f} times the C client's, at most {_RATIO}")
     line.figures["load average"] = round(os.getloadavg()[0], 1)
     line.count(bad)
