@@ -1,12 +1,13 @@
 """The trust campaign: one command, seeded, resumable, with a table as its result.
 
-    python -m benchmarks.trust                         all sections
-    python -m benchmarks.trust wire --runs 10000       faults on the wire, in lock step
-    python -m benchmarks.trust realtime --seconds 600  ten minutes at each period
-    python -m benchmarks.trust wire --only 857         repeat one run and tell all about it
+    python benchmarks/trust                         all sections, with their full numbers
+    python benchmarks/trust wire --runs 10000       faults on the wire, in lock step
+    python benchmarks/trust realtime --seconds 600  ten minutes of each measurement
+    python benchmarks/trust wire --only 857         repeat one run and tell all about it
+    python benchmarks/trust table                   what there is, as a table
 
-Results go to a JSON file after every piece of work; the same command goes on where it was broken off. Exit
-code 1 if a promise was broken.
+Results go to a JSON file after every piece of work; the same command goes on where it was broken off. `table`
+joins several such files into the first and writes Markdown. Exit code 1 if a promise was broken.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ from pathlib import Path
 
 import click
 
-from benchmarks.trust.table import Ledger
+_ROOT = str(Path(__file__).resolve().parents[2])
+if _ROOT not in sys.path:
+    # Run as a folder: the modules are found by their full names only.
+    sys.path[0] = _ROOT
+
+from benchmarks.trust.table import Ledger  # noqa: E402
 
 SECTIONS = {
     "wire": "faults on the wire, alone and mixed, in every phase",
@@ -49,13 +55,14 @@ class Options:
 
 
 @click.command(help=__doc__, context_settings={"max_content_width": 110})
-@click.argument("sections", nargs=-1, type=click.Choice(list(SECTIONS)))
+@click.argument("sections", nargs=-1, type=click.Choice([*SECTIONS, "table"]))
 @click.option("--seed", default=1, show_default=True)
 @click.option("--runs", type=int, help="Runs of each line of a section; wire: of all lines together.")
 @click.option("--seconds", type=float, help="Duration of soak and of each real-time measurement.")
 @click.option("--periods-ms", default="1,2,5,10", show_default=True, help="FRI cycles of `realtime`.")
 @click.option("--only", type=int, help="One run of `wire` by its number.")
 @click.option("--anew", is_flag=True, help="Forget what the file holds of these sections.")
+@click.option("--join", multiple=True, type=click.Path(path_type=Path, exists=True), help="For `table`.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("trust.json"), show_default=True)
 def main(
     sections: tuple[str, ...],
@@ -65,10 +72,17 @@ def main(
     periods_ms: str,
     only: int | None,
     anew: bool,
+    join: tuple[Path, ...],
     out: Path,
 ) -> None:
     """Run the sections and print the table."""
     ledger = Ledger(None if only is not None else out, seed)
+    if "table" in sections:
+        for path in join:
+            ledger.join(Ledger(path, seed))
+        ledger.save()
+        click.echo(ledger.markdown(tuple(SECTIONS)))
+        sys.exit(1 if ledger.failed else 0)
     periods = tuple(int(text) for text in periods_ms.split(","))
     options = Options(seed, runs, seconds, only, periods, click.echo)
     for section in sections or tuple(SECTIONS):

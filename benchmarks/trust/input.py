@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from benchmarks.trust.table import Ledger, Line
 
 __all__ = ["campaign", "mangle"]
 
+_ROOT = Path(__file__).resolve().parents[2]
 _RUNS = 2000
 _BLOCK = 50
 _GUIDED_S = 60.0
@@ -184,7 +186,8 @@ def _guided(line: Line, name: str, options: Any) -> None:
     seconds = options.seconds or _GUIDED_S
     command = [sys.executable, "-m", "benchmarks.trust.fuzz", name, f"-max_total_time={seconds:.0f}"]
     command += [f"-seed={options.seed}", f"-timeout={_PATIENCE_S:.0f}", "-rss_limit_mb=6144"]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    command.append(f"-artifact_prefix={Path.cwd()}/")
+    done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, errors="replace")
     counts = re.findall(r"^#(\d+)\s.*?cov: (\d+)", done.stderr, re.MULTILINE)
     line.runs += int(counts[-1][0]) if counts else 0
     line.figures = {"seconds": seconds, "edges covered": int(counts[-1][1]) if counts else 0}

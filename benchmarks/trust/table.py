@@ -34,6 +34,11 @@ class Line:
         if complaints and len(self.failures) < 20:
             self.failures += [f"{name}: {complaint}" if name else complaint for complaint in complaints]
 
+    def markdown(self) -> str:
+        """The line as a row of a table."""
+        figures = "; ".join(f"{name} {_plain(value)}" for name, value in self.figures.items())
+        return f"| {self.what} | {self.runs} | {self.failed} | {figures} |".replace("|  |", "| |")
+
     def __str__(self) -> str:
         figures = "  ".join(f"{name} {_short(value)}" for name, value in self.figures.items())
         return f"{self.section:<10} {self.what:<34} {self.runs:>6} {self.failed:>6}  {figures}".rstrip()
@@ -43,6 +48,14 @@ def _short(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return json.dumps(value) if isinstance(value, list | dict) else str(value)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_plain(item)}" for name, item in value.items())
+    if isinstance(value, list):
+        return " to ".join(map(_plain, value))
+    return "none" if value is None else _short(value).replace("|", "/")
 
 
 class Ledger:
@@ -81,6 +94,12 @@ class Ledger:
         self.done.pop(section, None)
         self.lines = {key: line for key, line in self.lines.items() if key[0] != section}
 
+    def join(self, other: Ledger) -> None:
+        """Take over the sections of another ledger of the same seed that this one lacks."""
+        ours = {section for section, _ in self.lines}
+        self.lines |= {key: line for key, line in other.lines.items() if key[0] not in ours}
+        self.done |= {section: done for section, done in other.done.items() if section not in ours}
+
     def save(self) -> None:
         """Write the file, whole or not at all."""
         if self.path is None:
@@ -101,6 +120,17 @@ class Ledger:
         head = f"{'section':<10} {'what':<34} {'runs':>6} {'failed':>6}  figures"
         chosen = [line for line in self.lines.values() if section in (None, line.section)]
         return "\n".join([head, *map(str, chosen)])
+
+    def markdown(self, sections: tuple[str, ...]) -> str:
+        """The lines of the sections as tables of Markdown, one each."""
+        blocks = []
+        for section in sections:
+            rows = [line for line in self.lines.values() if line.section == section]
+            if not rows:
+                continue
+            head = f"### {section}\n\n| | runs | failed | |\n| --- | ---: | ---: | --- |"
+            blocks.append("\n".join([head, *(line.markdown() for line in rows)]))
+        return "\n\n".join(blocks)
 
     @property
     def failed(self) -> int:
