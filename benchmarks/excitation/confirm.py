@@ -2,8 +2,8 @@
 
     python benchmarks/excitation/confirm.py [--out FOLDER]
 
-Both experiments move for the same time with the same arm, payload, noise and identification; only the motion
-differs.
+Both experiments move for the same time with the same arm, payload, noise, cycle (5 ms) and identification; only the
+motion differs. What is finished in FOLDER is not repeated.
 """
 
 from __future__ import annotations
@@ -67,12 +67,18 @@ def experiment(folder: Path, name: str, plan: ExcitationPlan) -> list[dict[str, 
     content = yaml.safe_load((CONFIGS / "experiments/default.yaml").read_text(encoding="utf-8"))
     content["name"] = name
     content["diagnosis"] = {"run": False}
+    content["emulator_settings"] = {"fri.period_ms": 5}
+    content["sessions"] = [session for session in content["sessions"] if not session.get("validation")]
     content["excitation"] = {"plan": str(folder / f"{name}.plan.yaml"), "periods": plan.periods}
     file = folder / f"{name}.yaml"
     file.write_text(yaml.safe_dump(content), encoding="utf-8")
     out = folder / name
-    command = [sys.executable, "-m", "runner.cli", "experiment", str(file), "--yes", "--out", str(out)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    if not (out / "summary.json").is_file():
+        begun = (
+            ["--resume", str(out)] if (out / "experiment.yaml").is_file() else [str(file), "--out", str(out)]
+        )
+        command = [sys.executable, "-m", "runner.cli", "experiment", *begun, "--yes", "--no-diagnosis"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     parameters: list[dict[str, Any]] = summary["parameters"]
     return parameters

@@ -1,4 +1,10 @@
-"""The arm's geometry as plain arrays, the form that the compiled sweeps read."""
+"""The arm's geometry as plain arrays, the form that the compiled sweeps read.
+
+`ident.kinematics.Chain` is the arm everywhere else, and every number here is taken from it. The search for a motion
+needs the same numbers as contiguous arrays of rotations and translations, because its forward and reverse sweeps
+(`sweep`, `space`: values and exact gradients in one compiled loop over the samples) cannot read an object, and it
+needs the flange, which the limits of the workspace are about and which no dynamic parameter refers to.
+"""
 
 from __future__ import annotations
 
