@@ -29,6 +29,10 @@ Rows = Mapping[Key, Floats]
 """Columns in rows: (m, k) for each side and joint in which they are not zero."""
 
 
+# A fall of the chi-square up to this is nothing, whatever the parts that are held back say to it.
+_NOTHING = 12.0
+
+
 @dataclass(frozen=True, eq=False)
 class Score:
     """What a group of k columns adds to the model.
@@ -127,11 +131,15 @@ class Evidence:
             for j in range(nominal.arm.chain.n)
         }
         self._columns: dict[Key, Floats] = {}
+        self._acting: dict[Key, NDArray[np.int64]] = {}
         self._targets: dict[Key, Floats] = {}
         for side, rows in nominal.rows.items():
             for j in range(nominal.arm.chain.n):
                 keep = rows.valid[:, j] & ~rows.test
-                self._columns[side, j] = self._padded(side, np.where(keep[:, None], rows.matrix[j], 0.0))
+                wide = np.where(keep[:, None], rows.matrix[j], 0.0)
+                # Most base columns do not reach most joints.
+                self._acting[side, j] = np.flatnonzero(np.any(wide != 0.0, axis=0))
+                self._columns[side, j] = self._padded(side, wide[:, self._acting[side, j]])
                 self._targets[side, j] = self._padded(side, np.where(keep, rows.target[:, j], 0.0)[:, None])
         self.mask = {
             (side, j): self._padded(side, (rows.valid[:, j] & ~rows.test).astype(float)[:, None])
@@ -160,8 +168,9 @@ class Evidence:
         }
         ids: dict[str, NDArray[np.int64]] = {}
         for side, rows in nominal.rows.items():
-            found = np.empty(len(rows.time), dtype=np.int64)
-            for k, (session, time) in enumerate(zip(rows.session, rows.time, strict=True)):
+            found = np.full(len(rows.time), -1)
+            for k in np.flatnonzero(~rows.test):
+                session, time = rows.session[k], rows.time[k]
                 since = time - start[int(session)]
                 block = (int(session), int(since / length[int(session)]))
                 if block not in numbers:
@@ -178,17 +187,19 @@ class Evidence:
         if len(set(folds)) < 2:
             raise DataError("the sessions are too short to hold a part of them back; record at least 5 s")
         for side, found in ids.items():
-            order = np.argsort(found, kind="stable")
-            counts = np.bincount(found, minlength=self.blocks)
-            within = np.empty(len(found), dtype=np.int64)
+            fitted = np.flatnonzero(found >= 0)
+            order = fitted[np.argsort(found[fitted], kind="stable")]
+            counts = np.bincount(found[fitted], minlength=self.blocks)
+            within = np.zeros(len(found), dtype=np.int64)
             within[order] = np.concatenate([np.arange(c) for c in counts])
             self._place[side] = (found, within, int(counts.max(initial=1)))
 
     def _padded(self, side: str, values: Floats) -> Floats:
-        """(blocks, L, k) of rows (m, k); zeros where a block is shorter."""
+        """(blocks, L, k) of rows (m, k); zeros where a block is shorter. Rows that are never fitted have none."""
         block, within, length = self._place[side]
+        fitted = block >= 0
         out = np.zeros((self.blocks, length, values.shape[1]))
-        out[block, within] = values
+        out[block[fitted], within[fitted]] = values[fitted]
         return out
 
     # ---- products ----
@@ -203,8 +214,9 @@ class Evidence:
             weight = self._weights[key]
             t = self._targets[key]
             turned = weight * matrix.transpose(0, 2, 1)
-            self._base_gram += np.matmul(turned, matrix)
-            self._base_target += np.matmul(turned, t)[:, :, 0]
+            on = self._acting[key]
+            self._base_gram[:, on[:, None], on] += np.matmul(turned, matrix)
+            self._base_target[:, on] += np.matmul(turned, t)[:, :, 0]
             self.energy += weight * np.sum(t[:, :, 0] ** 2, axis=1)
 
     def _gram(self) -> None:
@@ -312,7 +324,7 @@ class Evidence:
         target = np.zeros((self.blocks, width))
         for key, matrix in columns.items():
             turned = self._weights[key] * matrix.transpose(0, 2, 1)
-            base += np.matmul(turned, self._columns[key])
+            base[:, :, self._acting[key]] += np.matmul(turned, self._columns[key])
             own += np.matmul(turned, matrix)
             target += np.matmul(turned, self._targets[key])[:, :, 0]
         return Products(base, own, target, self.parts)
@@ -337,15 +349,17 @@ class Evidence:
         k = products.own.shape[1]
         if inner is None:
             return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
-        gain = 0.0
-        for part, fit in enumerate(self._held):
-            mine = base[part], own[part], target[part]
-            rest = whole[0] - mine[0], whole[1] - mine[1], whole[2] - mine[2]
-            gain += self._held_gain(mine, rest, fit, part, ridge)
         coefficients = inner @ reach
         fitted = float(reach @ coefficients)
+        gain = fitted
+        if fitted > _NOTHING:
+            gain = 0.0
+            for part, fit in enumerate(self._held):
+                mine = base[part], own[part], target[part]
+                rest = whole[0] - mine[0], whole[1] - mine[1], whole[2] - mine[2]
+                gain += self._held_gain(mine, rest, fit, part, ridge)
         rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
-        if self.prior is not None and self.compared:
+        if self.prior is not None and self.compared and fitted > _NOTHING:
             gain += self._strain(self.full.values) - self._strain(self.full.values - lever @ coefficients)
         # Held-back error can also fall because a base fitted without the part was poor: never more than that.
         gain = min(gain, fitted)
@@ -400,7 +414,7 @@ class Evidence:
     # ---- results of a fit ----
 
     def block_of(self, side: str) -> Floats:
-        """Number (m,) of the block of each row of a side."""
+        """Number (m,) of the block of each row of a side, -1 for rows that are never fitted."""
         return self._place[side][0].astype(float)
 
     def residuals(self, *, test: bool = False) -> dict[str, Floats]:

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
+from scipy.sparse import csr_array
 
 from ident import regressor
 from ident.base import BaseSet, numeric_base
@@ -117,6 +118,9 @@ class Nominal:
     base: BaseSet
     motions: list[Motion] = field(default_factory=list)
     rows: dict[str, SideRows] = field(default_factory=dict)
+    _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     @classmethod
     def of(
@@ -230,20 +234,36 @@ class Nominal:
     def reduce(self, side: str, values: Sequence[Floats]) -> Floats:
         """Rows (m,) or (m, k) of signals given on the grid of each motion, (N,) or (N, k)."""
         parts = []
-        for (_, stretch), signal in zip(self.stretches, values, strict=True):
-            flat = signal.reshape(len(signal), -1)
-            if side == "joint":
-                at = stretch.time if self.arm.joint_delay_s == 0.0 else stretch.time - self.arm.joint_delay_s
-                width = self._bin(stretch)
-                shifted = flat if self.arm.joint_delay_s == 0.0 else _at(stretch.time, flat, at)
-                parts.append(self._slow(side, _binned(shifted, width), width * _step(stretch.time)))
-            else:
-                at = stretch.motor_time - self.arm.motor_delay_s
-                width = self.motor_bin(stretch)
-                rows = _binned(_at(stretch.time, flat, at), width)
-                parts.append(self._slow(side, rows, width * _step(stretch.motor_time)))
+        for number, ((_, stretch), signal) in enumerate(zip(self.stretches, values, strict=True)):
+            operator, dt = self._operator(side, number, stretch)
+            parts.append(self._slow(side, operator @ signal.reshape(len(signal), -1), dt))
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
+
+    def _operator(self, side: str, number: int, stretch: Stretch) -> tuple[csr_array, float]:
+        """Matrix (m, N) from the grid of a stretch to its rows, at the channel's delay, and the rows' distance [s]."""
+        delay = self.arm.joint_delay_s if side == "joint" else self.arm.motor_delay_s
+        key = (side, number, delay)
+        if key not in self._operators:
+            stamp = stretch.time if side == "joint" else stretch.motor_time
+            width = self._bin(stretch) if side == "joint" else self.motor_bin(stretch)
+            count = len(stamp) // width
+            place = (stamp[: count * width] - delay - stretch.time[0]) / _step(stretch.time)
+            nearest = np.rint(place)
+            place = np.where(np.abs(place - nearest) < 1e-4, nearest, place)
+            place = np.clip(place, 0.0, len(stretch.time) - 1.000001)
+            low = place.astype(np.int64)
+            share = place - low
+            row = np.arange(len(low)) // width
+            matrix = csr_array(
+                (
+                    np.concatenate([1.0 - share, share]) / width,
+                    (np.concatenate([row, row]), np.concatenate([low, low + 1])),
+                ),
+                shape=(count, len(stretch.time)),
+            )
+            self._operators[key] = matrix, width * _step(stamp) if len(stamp) > 1 else 0.0
+        return self._operators[key]
 
     @cached_property
     def band_hz(self) -> dict[str, float | None]:
