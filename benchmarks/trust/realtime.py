@@ -180,15 +180,15 @@ def campaign(ledger: Ledger, options: Any) -> None:
         options.say(f"  {shortage}")
     with tempfile.TemporaryDirectory() as name:
         program = compiled.client(Path(name))
-        for period_ms in options.periods_ms:
-            for rights in (True, False):
-                for load in (0, len(os.sched_getaffinity(0))):
-                    piece = f"{period_ms} ms{'' if rights else ', no rights'}{', load' if load else ''}"
-                    if not ledger.has("realtime", piece):
-                        with _load(load):
-                            _compare(ledger, program, period_ms, seconds, rights, piece)
-                        ledger.finish("realtime", piece)
-                        options.say(ledger.table("realtime").splitlines()[-1])
+        processors = len(os.sched_getaffinity(0))
+        for load, rights in ((0, True), (0, False), (processors, True), (processors, False)):
+            for period_ms in options.periods_ms:
+                piece = f"{period_ms} ms{'' if rights else ', no rights'}{', load' if load else ''}"
+                if not ledger.has("realtime", piece):
+                    with _load(load):
+                        _compare(ledger, program, period_ms, seconds, rights, piece)
+                    ledger.finish("realtime", piece)
+                    options.say(ledger.table("realtime").splitlines()[-1])
 
 
 def _compare(

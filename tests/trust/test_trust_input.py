@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.trust import targets
@@ -48,6 +48,18 @@ def test_more_mangled_input(name):
 def test_arbitrary_datagrams_never_move_the_set_point_out_of_its_limits(data):
     assert targets.check("command", data) == "ok"
     assert targets.check("measurement", data) == "ok"
+
+
+@pytest.mark.parametrize("name", list(targets.TARGETS))
+@settings(max_examples=15, derandomize=True, deadline=None)
+@given(st.data())
+def test_good_input_with_anything_put_over_it_is_refused_or_right(name, data):
+    base = data.draw(st.sampled_from(targets.corpus(name)))
+    place = data.draw(st.integers(0, len(base)))
+    patch = data.draw(st.binary(max_size=40))
+    kept = data.draw(st.sampled_from([len(base), place]))
+    changed = base[:place] + patch + base[place + len(patch) : kept]
+    assert targets.check(name, changed) in ACCEPTED
 
 
 def test_urdf_that_cannot_be_the_name_of_a_file():
