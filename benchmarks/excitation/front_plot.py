@@ -11,6 +11,13 @@ WIDTH, HEIGHT = 640, 400
 LEFT, BOTTOM, TOP, RIGHT = 70, 60, 40, 20
 
 
+def ticks(low: float, high: float) -> list[float]:
+    """Four to ten round numbers between two values."""
+    size = 10.0 ** np.floor(np.log10((high - low) / 4.0))
+    step = next(size * factor for factor in (10.0, 5.0, 2.0, 1.0) if (high - low) / (size * factor) >= 4.0)
+    return [round(step * k, 10) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
+
+
 def scatter(
     path: Path, points: Sequence[tuple[float, float]], x_label: str, y_label: str, title: str
 ) -> None:
@@ -35,11 +42,15 @@ def scatter(
         f'<g transform="rotate(-90 18 {HEIGHT / 2})"><text x="18" y="{HEIGHT / 2}" text-anchor="middle">'
         f"{y_label}</text></g>",
     ]
-    for share in np.linspace(0.0, 1.0, 6):
-        x, y = place(low + share * (high - low))
-        at = low + share * (high - low)
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{at[0]:.1f}</text>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{at[1]:.2f}</text>')
+    for at in ticks(low[0], high[0]):
+        x, _ = place(np.array([at, low[1]]))
+        parts.append(f'<path d="M{x:.1f} {HEIGHT - BOTTOM}v5" stroke="black"/>')
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 19}" text-anchor="middle">{at:g}</text>')
+    for at in ticks(low[1], high[1]):
+        _, y = place(np.array([low[0], at]))
+        parts.append(f'<path d="M{LEFT} {y:.1f}h-5" stroke="black"/>')
+        parts.append(f'<path d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}" stroke="#dddddd"/>')
+        parts.append(f'<text x="{LEFT - 9}" y="{y + 4:.1f}" text-anchor="end">{at:g}</text>')
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
     parts.append(f'<polyline points="{line}" fill="none" stroke="#4878a8"/>')
     parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#204a87"/>' for x, y in places]
