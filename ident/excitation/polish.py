@@ -50,6 +50,7 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
         x = candidate.x
         program.sharpness, program.constraints.rate = 256.0, 1000.0
         best: Outcome | None = None
+        best_x = x
         reserve = _BOUND_RESERVE
         for round_ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))
@@ -62,7 +63,7 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
                 continue
             outcome = _outcome(assembled, program, x)
             if best is None or shortfall(best) > shortfall(outcome):
-                best = outcome
+                best, best_x = outcome, x
             if outcome.check.ok and outcome.bounds_kept:
                 return outcome
             if outcome.bound_excess > _HOPELESS:
@@ -70,7 +71,24 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
             tighten(program.constraints, outcome.check, setup.mechanism.joint_names)
             if outcome.bound_excess > 0.0:
                 reserve += 1.2 * outcome.bound_excess + 1e-5
-        return best if best is not None else _outcome(assembled, program, x)
+        if best is None:
+            best, best_x = _outcome(assembled, program, x), x
+        return best if best.bound_excess > _HOPELESS else _nearest(assembled, program, best, best_x)
+
+
+def _nearest(assembled: Assembled, program: Program, best: Outcome, x: np.ndarray) -> Outcome:
+    """The motion nearest to x that keeps every limit, whatever it costs in value; `best` where none is found."""
+    near = Program(program.evaluator, program.constraints, None)
+    near.sharpness, near.anchor = program.sharpness, x.copy()
+    for _ in range(_ROUNDS):
+        tighten(near.constraints, best.check, assembled.setup.mechanism.joint_names)
+        x = minimise(near, x, iterations=60, tolerance=1e-6).x
+        outcome = _outcome(assembled, program, x)
+        if shortfall(outcome) < shortfall(best) or outcome.check.ok:
+            best = outcome
+        if outcome.check.ok and outcome.bounds_kept:
+            return outcome
+    return best
 
 
 def shortfall(outcome: Outcome) -> float:

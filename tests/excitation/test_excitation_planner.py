@@ -35,6 +35,8 @@ from ident.excitation.estimate import ArmEstimate
 from ident.excitation.mechanism import Mechanism
 from ident.excitation.motion import Samples
 from ident.excitation.point_to_point import random_points
+from ident.excitation.polish import polish
+from ident.excitation.search import judge
 from ident.excitation.torque import rigid_torque, torque_bounds
 from ident.model import DynamicModel
 from ident.model_file import write_model
@@ -139,6 +141,18 @@ def test_interruption_returns_the_best_so_far_and_says_so(problem: PlanProblem) 
 
     with pytest.raises(OperatorError, match="before any motion was found"):
         plan(problem, at_once)
+
+
+def test_a_quick_polish_still_ends_inside_every_limit(problem: PlanProblem, solved: ExcitationPlan) -> None:
+    """What an interruption leaves may be some way outside; the nearest motion inside is handed out."""
+    assembled = assemble(problem)
+    setup = assembled.setup
+    times = np.linspace(0.0, setup.basis.duration, 400, endpoint=False)
+    x = np.linalg.lstsq(setup.basis.matrix(times), solved.sample(times).q, rcond=None)[0].T.ravel()
+    outside = judge(setup, 1.06 * x)
+    assert outside.violation > 0.03
+    outcome = polish(assembled, outside, quick=True)
+    assert outcome.check.ok, outcome.check.violations
 
 
 def test_bounds_on_other_criteria_are_kept(problem: PlanProblem, solved: ExcitationPlan) -> None:
