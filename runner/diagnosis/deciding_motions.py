@@ -24,7 +24,17 @@ GRAIN_S = 0.12
 _REST_S = 1.0
 _COARSE_S, _FINE_S = 0.1, 0.04
 
-_SWEEPS = ((1.0, 0.3), (0.6, 0.18), (0.5, 0.1), (0.3, 0.06), (0.2, 0.035), (0.1, 0.02))
+_SWEEPS = (
+    (1.0, 0.6),
+    (1.0, 0.6),
+    (1.0, 0.3),
+    (0.6, 0.15),
+    (0.5, 0.09),
+    (0.35, 0.055),
+    (0.2, 0.033),
+    (0.12, 0.02),
+    (0.08, 0.013),
+)
 """Share of the range and speed [rad/s], each there and back."""
 
 _LADDER = ((0.01, 2.0, 6), (0.02, 1.2, 6), (0.05, 0.5, 4), (0.1, 0.25, 3), (0.3, 0.08, 1))
@@ -38,7 +48,7 @@ _POSE_REST_S = 0.4
 
 
 def slow_sweep(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion:
-    """Constant speeds of `joint` (from 0) from 0.3 down to 0.02 rad/s, there and back, over `reach` [rad].
+    """Constant speeds of `joint` (from 0) from 0.6 down to 0.013 rad/s, there and back, over `reach` [rad].
 
     The large sweeps are repeated with the next joint turned, so that what depends on the load is told from what
     depends on the angle.

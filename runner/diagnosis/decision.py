@@ -33,8 +33,9 @@ class Answer:
         asked = " or ".join(_said(place, names) for place in self.rivals)
         if self.outcome == "decided" and self.named is not None:
             return f"decided: {_said(self.named, names)}, confidence {self.confidence:.2f}; asked was {asked}"
-        if self.outcome == "open":
-            return f"still open after the deciding motions: {asked} (confidence {self.confidence:.2f})"
+        if self.outcome == "open" and self.named is not None:
+            better = f"{_said(self.named, names)} is the better now, confidence {self.confidence:.2f}"
+            return f"still open after the deciding motions: {asked}; {better}"
         instead = "nothing" if self.named is None else _said(self.named, names)
         return f"decided against all that was asked ({asked}); found instead: {instead}"
 
