@@ -1,8 +1,10 @@
-"""A real LWR4+: held-out accuracy, repeatability floor and honesty of the standard deviations.
+"""Real arms: held-out accuracy, repeatability floor, honesty of the standard deviations, and what the diagnosis finds.
 
 Run `python benchmarks/real_data.py [--data FOLDER]`. The folder holds measurements_1.npz to _3.npz and the
 URDF files that FloBaRoID published (github kjyv/FloBaRoID, data/KUKA/HW and model, LGPL-3): Model 1, joint
 torque sensors, 25 s a run. Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast.
+
+The diagnosis of these runs follows, and of the TX40 and iiwa 14 recordings beside them (`real_cases.py`).
 
 Each estimate is made with the settings as they come, from the training runs alone. The score is the one that
 others use on these files: the file's own q, qd, qdd, all samples from the first to the last, every ninth,
@@ -26,12 +28,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from real_cases import iiwa14, lwr4, tx40
 
 from ident.cad_prior import cad_prior
 from ident.estimators import Estimate
 from ident.identify import Identification, IdentificationSettings, identify
 from ident.import_log import LogMapping, import_log
 from ident.kinematics import Chain
+from ident.model import DynamicModel
 from ident.mounting import Mounting, find_mounting
 from lwr_driver.configuration import CONFIGS, find
 from lwr_driver.session import Session, read_session
@@ -99,6 +103,14 @@ class Recordings:
 
     def relative(self, found: Identification, run: int) -> float:
         error, torque = self.errors(found, run)
+        return float(100.0 * np.linalg.norm(error) / np.linalg.norm(torque))
+
+    def model_relative(self, model: DynamicModel, run: int) -> float:
+        """Relative error [%] of a model with what the sensors add."""
+        names = ("positions", "velocities", "accelerations", "torques", "times")
+        q, qd, qdd, torque, times = (self.raw[run][name][::EVERY] for name in names)
+        even = np.linspace(0.0, float(np.ptp(times)), len(q))
+        error = torque - model.torque(q, qd, qdd, side="joint", time=even, measured=True)
         return float(100.0 * np.linalg.norm(error) / np.linalg.norm(torque))
 
     def joint_rms(self, found: Identification, run: int) -> FloatArray:
@@ -199,16 +211,27 @@ def tilts(data: Recordings) -> None:
 def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
+        "--diagnosis-only", action="store_true", help="leave out the tables of the estimators"
+    )
+    parser.add_argument(
         "--data", type=Path, default=CONFIGS.parents[1] / "shared" / "data" / "lwr4_flobaroid"
     )
-    folder = parser.parse_args(arguments).data
+    wanted = parser.parse_args(arguments)
+    folder = wanted.data
     if not (folder / "measurements_1.npz").is_file():
         print(f"no recordings in {folder}: fetch them (see the head of this file) and name them with --data")
         return 2
     start = time.process_time()
     data = Recordings(folder)
-    for table in (held_out, per_joint, honesty, priors, tilts):
-        table(data)
+    if not wanted.diagnosis_only:
+        for table in (held_out, per_joint, honesty, priors, tilts):
+            table(data)
+    lwr4(data)
+    for name, case in (("tx40", tx40), ("iiwa14", iiwa14)):
+        if (folder.parent / name).is_dir():
+            case(folder.parent / name)
+        else:
+            print(f"\nno recordings of the {name} in {folder.parent}")
     print(f"\nCPU {time.process_time() - start:.1f} s")
     return 0
 

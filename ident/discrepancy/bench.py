@@ -13,12 +13,13 @@ from ident.cad_prior import cad_prior
 from ident.discrepancy.candidates import Dictionary, Trial
 from ident.discrepancy.evidence import Evidence, Floats
 from ident.discrepancy.noise import noise_floor, repeatability
-from ident.discrepancy.nominal import Arm, Nominal, structure_of
+from ident.discrepancy.nominal import TRAVEL_RAD, Arm, Nominal, structure_of
 from ident.discrepancy.recording import Recording
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.selection import Selection
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
+from ident.structure import Coupling
 
 __all__ = [
     "ArmData",
@@ -28,6 +29,7 @@ __all__ = [
     "nominal_arm",
     "prepare_bench",
     "slow_delay",
+    "some_joint_moves",
 ]
 
 
@@ -36,10 +38,12 @@ _SLOW_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ArmData:
-    """What the arm's description knows: stiffness (n,) [Nm/rad] and gear ratio (n,); None where unknown."""
+    """What the arm's description knows: stiffness (n,) [Nm/rad] and gear ratio (n,), None where unknown, and pairs
+    of joints whose drives are coupled."""
 
     stiffness: Floats | None = None
     gear_ratio: Floats | None = None
+    couplings: tuple[Coupling, ...] = ()
 
 
 @dataclass(eq=False)
@@ -68,8 +72,19 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             reference.encoder,
             encoder_known=True,
             reach=reference.reach,
+            couplings=data.couplings,
         )
-    return Arm(chain, compliance, ratio)
+    return Arm(chain, compliance, ratio, couplings=data.couplings)
+
+
+def some_joint_moves(recordings: Sequence[Recording]) -> None:
+    """Raises DataError where no joint moves in what is fitted."""
+    fitted = [s for r in recordings if not r.test for s in r.stretches]
+    if not any(np.any(np.ptp(s.q, axis=0) > TRAVEL_RAD) for s in fitted):
+        raise DataError(
+            f"no joint moves by more than {TRAVEL_RAD} rad; a pose says nothing about what moves. Record an "
+            "excitation"
+        )
 
 
 def every_joint_moves(recordings: Sequence[Recording], chain: Chain) -> None:
@@ -148,10 +163,11 @@ def _repeated(
     """What repeats of a motion differ by, within a session or from one to another, else what the model leaves."""
     found = {}
     for side, (sigma, _, told) in floors.items():
-        found[side] = sigma
+        between = np.full(len(sigma), np.nan)
         if not told:
             between = repeatability(nominal.recordings, nominal.rows[side], residual[side])[0]
-            found[side] = np.where(np.isfinite(between), between, sigma)
+        seen = np.isfinite(residual[side]).any(axis=0)
+        found[side] = np.where(np.isfinite(between), between, np.where(seen, sigma, np.nan))
     return found
 
 

@@ -61,16 +61,18 @@ class Dictionary:
         self.evidence = evidence
         self.setting = _setting(nominal)
         wanted = list(EFFECTS) if causes is None else list(causes)
-        n = nominal.arm.chain.n
         motor = "motor" in nominal.rows
         # A low-pass of another hand may have shifted a channel, and the arm is not to blame.
         hidden = {f"{side}_torque_delay" for side, band in nominal.band_hz.items() if band is not None}
+        if nominal.moving.sum() < 2:
+            # A late channel is late in all joints; of one joint it could be its elasticity as well.
+            hidden |= {"motor_torque_delay", "joint_torque_delay"}
         self.candidates = tuple(
             Candidate(EFFECTS[cause], joint)
             for cause in wanted
             if cause not in hidden
             if motor or EFFECTS[cause].side != "motor"
-            for joint in ([-1] if EFFECTS[cause].whole_arm else range(n))
+            for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
         self._kept: dict[tuple[str, int], list[tuple[Shape, Rows, dict[Key, Floats], Products]]] = {}
 

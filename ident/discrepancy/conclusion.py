@@ -13,7 +13,7 @@ from ident.discrepancy.candidates import Trial
 from ident.discrepancy.evidence import Floats, Rows
 from ident.discrepancy.gain import HeldOut, held_out, interval
 from ident.discrepancy.hygiene import SampleLoss
-from ident.discrepancy.nominal import Arm, Nominal
+from ident.discrepancy.nominal import TRAVEL_RAD, Arm, Nominal
 from ident.discrepancy.probes import Remainder, find_remainders
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.result import (
@@ -346,6 +346,10 @@ def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:
                 f"Hz: rows are compared below {band:.2g} Hz; delays, reversals and ripple of the motor's turn "
                 "cannot be seen"
             )
+    still = np.flatnonzero(~bench.nominal.moving)
+    if len(still):
+        names = ", ".join(bench.nominal.arm.chain.joint_names[j] for j in still)
+        notes.append(f"{names}: no motion of {TRAVEL_RAD} rad, so nothing can be said there")
     if not bench.told:
         notes.append(
             "no motion repeats within a session: what the model leaves is itself the noise that claims are "

@@ -11,10 +11,10 @@ from ident.discrepancy.bench import (
     ArmData,
     Bench,
     again_with,
-    every_joint_moves,
     nominal_arm,
     prepare_bench,
     slow_delay,
+    some_joint_moves,
 )
 from ident.discrepancy.candidates import Dictionary
 from ident.discrepancy.conclusion import Simulate, conclude, timing_finding
@@ -23,7 +23,7 @@ from ident.discrepancy.hygiene import sample_loss
 from ident.discrepancy.recording import record
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.result import Diagnosis, Finding
-from ident.discrepancy.selection import Claim, select
+from ident.discrepancy.selection import Claim, Null, Selection, hopeful, select
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 from ident.kinematics import Chain
@@ -63,13 +63,15 @@ def diagnose(
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     held = {id(s) for s in test}
     recordings = [record(s, k, chain, settings, test=id(s) in held) for k, s in enumerate(everything)]
-    every_joint_moves(recordings, chain)
+    some_joint_moves(recordings)
     loss = sample_loss(list(sessions))
     known = nominal_arm(chain, arm, reference)
     bench = prepare_bench(known, recordings, settings, reference, causes, fit_compliance=reference is None)
     null = reference.null if reference is not None else None
     timing: list[Finding] = []
     selection = select(bench.dictionary, bench.evidence, settings, null)
+    if not bench.told and not selection.claims:
+        bench, selection = _with_hope(bench, selection, settings, causes, null)
     late = [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
     doubtful = [c.trial.candidate.cause for c in late if not _late_at_all_speeds(bench, c)]
     if doubtful:
@@ -106,6 +108,22 @@ def diagnose(
         selection = select(bench.dictionary, bench.evidence, settings, null)
         selection.claims = [c for c in selection.claims if c.trial.candidate.effect.side != "timing"]
     return conclude(bench, selection, timing, loss, settings, reference, model, simulate, sessions, test)
+
+
+def _with_hope(
+    bench: Bench,
+    selection: Selection,
+    settings: DiagnosisSettings,
+    causes: Sequence[str] | None,
+    null: Null | None,
+) -> tuple[Bench, Selection]:
+    """Selection with the noise that the best candidate leaves, where that carries a claim; else the one given."""
+    hope = hopeful(bench.dictionary, bench.evidence, settings)
+    quieter = None if hope is None else again_with(bench, hope, settings, causes)
+    if quieter is None:
+        return bench, selection
+    again = select(quieter.dictionary, quieter.evidence, settings, null)
+    return (quieter, again) if again.claims else (bench, selection)
 
 
 def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:

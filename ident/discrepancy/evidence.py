@@ -24,6 +24,9 @@ from ident.discrepancy.settings import DiagnosisSettings
 __all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
 
 Floats = NDArray[np.float64]
+# Share of a column's power that free base parameters must leave, where the others lean on a drawing.
+_OWN_SHARE = 3e-3
+
 Key = tuple[str, int]
 Rows = Mapping[Key, Floats]
 """Columns in rows: (m, k) for each side and joint in which they are not zero."""
@@ -163,9 +166,9 @@ class Evidence:
         self._place: dict[str, tuple[NDArray[np.int64], NDArray[np.int64], int]] = {}
         start = {r.number: r.start_s for r in nominal.recordings}
         period = {r.number: r.period_s for r in nominal.recordings}
-        length = {
-            r.number: min(settings.block_s, r.period_s / (2.0 * settings.folds)) for r in nominal.recordings
-        }
+        # A motion that does not repeat gives half as long a block, for enough of them.
+        parts = {r.number: (2.0 if r.repeats else 4.0) * settings.folds for r in nominal.recordings}
+        length = {r.number: min(settings.block_s, r.period_s / parts[r.number]) for r in nominal.recordings}
         ids: dict[str, NDArray[np.int64]] = {}
         for side, rows in nominal.rows.items():
             found = np.full(len(rows.time), -1)
@@ -249,14 +252,18 @@ class Evidence:
         self._part_gram, self._part_target = _sums(self.parts, self.gram), self.parts @ self.target
         gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
         self.full = self._fit(gram, target)
+        self._free = None
+        if self.prior is not None and not self.compared:
+            self._free = self._fit(gram, target, leaning=False)
         self._held = [
             self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
         ]
 
-    def _fit(self, gram: Floats, target: Floats) -> Fit:
+    def _fit(self, gram: Floats, target: Floats, *, leaning: bool = True) -> Fit:
+        """Values from sums of products, `leaning` on the prior where there is one."""
         s = self._scale
         gram, target = gram.copy(), target.copy()
-        if self.prior is not None:
+        if self.prior is not None and leaning:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
             target[:p] += self.prior[0] @ self.prior[1]
@@ -363,6 +370,8 @@ class Evidence:
             gain += self._strain(self.full.values) - self._strain(self.full.values - lever @ coefficients)
         # Held-back error can also fall because a base fitted without the part was poor: never more than that.
         gain = min(gain, fitted)
+        if self._free is not None and self._absorbed(whole[0], whole[1]):
+            gain = min(gain, 0.0)
         values, gram, torque = self.full.values - lever @ coefficients, self.gram, self.target
         return Score(
             gain,
@@ -371,6 +380,13 @@ class Evidence:
             gain / max(rows, 1.0),
             lambda: _robust(products, gram, torque, values, lever, inner, coefficients),
         )
+
+    def _absorbed(self, base: Floats, own: Floats) -> bool:
+        """Whether base parameters that do not lean on the drawing explain the columns: such a cause could only
+        make up for a wrong drawing."""
+        assert self._free is not None
+        left = np.diag(own) - np.einsum("kp,pq,kq->k", base, self._free.inverse, base)
+        return bool(np.all(left < _OWN_SHARE * np.diag(own)))
 
     def event_score(self, score: Score, choices: int) -> Score:
         """A score of columns that are active in a few blocks only, the best of `choices`: the fall
@@ -423,6 +439,7 @@ class Evidence:
         found = {}
         for side, rows in self.nominal.rows.items():
             keep = rows.valid & (rows.test if test else ~rows.test)[:, None]
+            keep &= np.array([self.mask[side, j].any() for j in range(rows.target.shape[1])])
             predicted = self._predict(side, self.full.values, np.ones(len(rows.time), dtype=bool))
             found[side] = np.where(keep, rows.target - predicted, np.nan)
         return found

@@ -32,15 +32,17 @@ from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.parameters import split_name
 from ident.signals.filters import differentiate, low_pass
-from ident.structure import Condition, ModelStructure, Side
+from ident.structure import Condition, Coupling, ModelStructure, Side
 
-__all__ = ["Arm", "Nominal", "SideRows", "structure_of"]
+__all__ = ["TRAVEL_RAD", "Arm", "Nominal", "SideRows", "structure_of"]
 
 Floats = NDArray[np.float64]
 
 _CHUNK = 2000
 # Share of a low-passed row that must rest on samples of a joint that moves.
 _KNOWN = 0.8
+# A joint that stays within this range says nothing about its friction, gears and cables.
+TRAVEL_RAD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,7 @@ class Arm:
     encoder_known : whether a healthy arm told it.
     reach : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
     unknown.
+    couplings : pairs of joints whose drives are coupled.
     """
 
     chain: Chain
@@ -64,6 +67,7 @@ class Arm:
     encoder: Literal["link", "motor"] = "link"
     encoder_known: bool = False
     reach: Floats | None = None
+    couplings: tuple[Coupling, ...] = ()
 
     def slip(self, speed: Floats, dt: float) -> Floats:
         """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state."""
@@ -80,11 +84,10 @@ def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStruct
     """Columns for the sessions' payloads and sides."""
     payloads = tuple(dict.fromkeys(r.payload for r in recordings if r.payload is not None))
     motor = any(r.has_motor for r in recordings)
-    structure = ModelStructure(arm.chain, 2 if motor else 1, payloads)
+    structure = ModelStructure(arm.chain, 2 if motor else 1, payloads, couplings=arm.couplings)
     conditions: dict[Condition, None] = {}
     for r in recordings:
-        sides: tuple[Side, ...] = ("motor", "joint") if r.has_motor else ("joint",)
-        conditions[Condition(r.payload, sides)] = None
+        conditions[Condition(r.payload, r.sides)] = None
     return structure, numeric_base(structure, tuple(conditions))
 
 
@@ -147,7 +150,14 @@ class Nominal:
     @cached_property
     def sides(self) -> tuple[str, ...]:
         """Sides that have rows."""
-        return ("motor", "joint") if any(r.has_motor for r in self.recordings) else ("joint",)
+        return tuple(s for s in ("motor", "joint") if any(s in r.sides for r in self.recordings))
+
+    @cached_property
+    def moving(self) -> NDArray[np.bool_]:
+        """Joints (n,) that travel in what is fitted; of the others the torque says nothing, and has no rows."""
+        fitted = [s.q for r, s in self.stretches if not r.test]
+        travel = np.max([np.ptp(q, axis=0) for q in fitted], axis=0) if fitted else np.zeros(self.arm.chain.n)
+        return np.asarray(travel > TRAVEL_RAD)
 
     def refine(self, values: Floats) -> None:
         """Predict the torques with the base parameters (b,) and make the rows anew."""
@@ -234,7 +244,9 @@ class Nominal:
     def reduce(self, side: str, values: Sequence[Floats]) -> Floats:
         """Rows (m,) or (m, k) of signals given on the grid of each motion, (N,) or (N, k)."""
         parts = []
-        for number, ((_, stretch), signal) in enumerate(zip(self.stretches, values, strict=True)):
+        for number, ((recording, stretch), signal) in enumerate(zip(self.stretches, values, strict=True)):
+            if not _holds(recording, stretch, side):
+                continue
             operator, dt = self._operator(side, number, stretch)
             parts.append(self._slow(side, operator @ signal.reshape(len(signal), -1), dt))
         whole = np.concatenate(parts)
@@ -300,12 +312,12 @@ class Nominal:
         still = self.settings.standstill_rad_s
         matrices, targets, valid, session, time, test = [], [], [], [], [], []
         for motion, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
+            if not _holds(recording, stretch, side):
+                continue
             if side == "motor":
                 width = self.motor_bin(stretch)
                 at = stretch.motor_time - self.arm.motor_delay_s
                 target, usable, stamp = stretch.motor, stretch.motor_usable, stretch.motor_time
-                if not len(at):
-                    continue
             else:
                 width = self._bin(stretch)
                 at = stretch.time - self.arm.joint_delay_s
@@ -329,6 +341,7 @@ class Nominal:
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
                 valid.append((_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves)
+            valid[-1] &= self.moving
             stamps = self._thin(side, _binned(stamp[:, None], width)[:, 0], dt)
             time.append(stamps)
             session.append(np.full(len(stamps), recording.number))
@@ -395,6 +408,11 @@ class Nominal:
             if symbol in ("Ia", "Fvm", "Fcm") and link <= self.arm.chain.n:
                 found[place] = (symbol, link - 1)
         return found
+
+
+def _holds(recording: Recording, stretch: Stretch, side: str) -> bool:
+    """Whether a stretch has torques of a side."""
+    return side in recording.sides and (side == "joint" or len(stretch.motor_time) > 1)
 
 
 def _step(time: Floats) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ident.discrepancy.candidates import Dictionary
 from ident.discrepancy.evidence import Evidence, Floats, Key
+from ident.discrepancy.nominal import TRAVEL_RAD
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects.motion import Motion
 
@@ -100,7 +101,7 @@ def _hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
         values = [variable(m) for m in dictionary.nominal.motions]
         low = min(float(v.min()) for v in values)
         high = max(float(v.max()) for v in values)
-        if high - low >= 1e-6:
+        if high - low >= (TRAVEL_RAD if name[1:].isdigit() else 1e-6):
             found[name] = [_hats(v, low, high) for v in values]
     return found
 

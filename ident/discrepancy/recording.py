@@ -14,6 +14,7 @@ from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 from ident.signals.prepare import PreparedSession, prepare
 from ident.signals.settings import SignalSettings
+from ident.structure import Side
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
@@ -69,6 +70,17 @@ class Recording:
     joint_band_hz: float | None = None
     motor_band_hz: float | None = None
 
+    @property
+    def repeats(self) -> bool:
+        """Whether the excitation repeats within the session."""
+        return self.period_s < 0.999 * self.duration_s
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides whose torque was recorded."""
+        present: dict[Side, bool] = {"motor": self.has_motor, "joint": self.has_effort}
+        return tuple(side for side, there in present.items() if there)
+
 
 def record(
     session: Session, number: int, chain: Chain, settings: DiagnosisSettings, *, test: bool = False
@@ -98,7 +110,7 @@ def record(
         start_s=float(first),
         period_s=period,
         duration_s=float(last - first),
-        has_effort=True,
+        has_effort=bool(chosen.joint.effort.shape[1]),
         has_motor=prepared.has_motor,
         test=test,
         joint_names=prepared.joint_names,

@@ -20,7 +20,7 @@ from ident.discrepancy.evidence import Evidence, Rows, Score
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 
-__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "select"]
+__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "select"]
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def select(
         carried = [t for t in found if state.carried(t)]
         if not carried:
             break
-        refined = [state.dictionary.refine(t, state.choices(t)) for t in carried[:4]]
+        refined = [state.refined(t) for t in carried[:4]]
         best = state.foremost(accepted, refined)
         log.info("%s: gain %.0f", best.candidate.key, best.score.gain)
         accepted = state.reconsider([*accepted, best])
@@ -88,6 +88,20 @@ def gains(
     """Gain of each candidate where nothing is accepted yet: what a healthy arm adds to the null."""
     found = _State(dictionary, evidence, settings, {}).contenders([])
     return {t.candidate.key: max(t.score.gain, 0.0) for t in found}
+
+
+def hopeful(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings) -> Selection | None:
+    """The best candidate as if it were accepted, whether the data carry it or not; None where none explains
+    anything.
+
+    Where noise is known from the residual alone, a strong cause counts as noise until it is in the model: how
+    much it explains must be held against what it leaves.
+    """
+    state = _State(dictionary, evidence, settings, {})
+    best = next(iter(state.contenders([])), None)
+    if best is None or best.score.gain < _HOPE:
+        return None
+    return Selection([Claim(best, best.score)], state.nuisance, {}, state.nuisance_rows)
 
 
 def _gain(trial: Trial) -> float:
@@ -161,6 +175,12 @@ class _State:
         taken = {t.candidate.key for t in accepted if not t.candidate.effect.event}
         found = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
         return sorted(found, key=_gain, reverse=True)
+
+    def refined(self, trial: Trial) -> Trial:
+        """The trial with its shape at the best fit, where that is still carried: a fit that held-back parts
+        contradict is none."""
+        found = self.dictionary.refine(trial, self.choices(trial))
+        return found if self.carried(found) else trial
 
     def foremost(self, accepted: Sequence[Trial], contest: Sequence[Trial]) -> Trial:
         """The best of several trials; of those that come close, the one that leaves least together with the
@@ -249,7 +269,22 @@ class _State:
         scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
         sure = confidence(_gain(again), [g for _, g in scores])
         alike = tuple((c, g) for c, g in scores if _gain(again) - g < _reach(_gain(again)))
+        if here.candidate.effect.side == "sensor" and "motor" not in self.dictionary.nominal.rows:
+            # Without a motor torque nothing but the shape tells a sensor's error from a torque of the arm.
+            sure = min(sure, _SHAPE_ALONE)
+            physical = (
+                (t.candidate, _gain(t))
+                for t in rivals
+                if t.candidate.joint == here.candidate.joint and t.candidate.effect.side == "joint"
+            )
+            alike = alike or tuple(physical)[:1]
         return Claim(again, again.score, alike, sure)
+
+
+# Gain from which on it is worth seeing what a candidate leaves.
+_HOPE = 10.0
+# Confidence in a sensor's error where only the joint torque was recorded.
+_SHAPE_ALONE = 0.7
 
 
 def _reach(gain: float) -> float:

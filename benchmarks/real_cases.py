@@ -1,0 +1,99 @@
+"""What the diagnosis says of recordings of real arms that others published, and what it gains; printed by
+`python benchmarks/real_data.py`.
+
+LWR4+: joint torque sensors, low-passed at 2 Hz by the source (github kjyv/FloBaRoID). TX40: motor torques of six
+joints at 5 kHz (github thanhndv212/figaroh-examples). iiwa 14: constant-velocity sweeps of one joint, torque
+sensors (github HarvardAgileRoboticsLab/drake).
+"""
+
+from __future__ import annotations
+
+import tarfile
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident.discrepancy import ArmData, Diagnosis, diagnose
+from ident.import_log import LogMapping, import_log
+from ident.kinematics import Chain
+from ident.structure import Coupling
+from lwr_driver.arm import Arm
+from lwr_driver.session import Session, read_session
+
+__all__ = ["iiwa14", "lwr4", "tx40"]
+
+_SWEEPS = {
+    "joint 4, 0.2 rad/s": ("joint4/vel_p2",),
+    "joint 5, 0.3 rad/s": ("joint5/vel_p3",),
+    "joint 6, 0.2, 0.5 and 0.9 rad/s": ("joint6/vel_p2", "joint6/vel_p5", "joint6/vel_p9"),
+}
+
+
+def lwr4(data: Any) -> None:
+    """Both splits with the same settings, the relative error before and after."""
+    arm = Arm.load("lwr4plus.yaml")
+    known = ArmData(arm.stiffness, arm.gear_ratio.astype(float))
+    for train, test in (((1, 2), 3), ((3,), 1)):
+        start = time.process_time()
+        found = diagnose(data.sessions(train), data.chain(), test=data.sessions((test,)), arm=known)
+        _show(f"LWR4+, runs {', '.join(map(str, train))}, measured on run {test}", found, start)
+        before, after = (data.model_relative(m, test) for m in (found.base_model, found.extended_model))
+        print(f"  relative error over all joints {before:.2f} % -> {after:.2f} %")
+
+
+def tx40(folder: Path) -> None:
+    """One session, motor torques alone; parts of the motion held back in turn."""
+    chain = Chain.from_urdf(folder / "tx40_mdh_modified.urdf")
+    known = ArmData(couplings=(Coupling(("joint_5", "joint_6")),))
+    start = time.process_time()
+    found = diagnose([_imported("tx40", folder)], chain, arm=known)
+    _show("TX40, parts of the motion held back in turn", found, start)
+
+
+def iiwa14(folder: Path) -> None:
+    """Sweeps of one joint; parts of the motion held back in turn."""
+    chain = Chain.from_urdf(folder / "iiwa14.urdf")
+    known = ArmData(gear_ratio=np.array([160.0, 160.0, 160.0, 160.0, 100.0, 160.0, 160.0]))
+    with tempfile.TemporaryDirectory() as place:
+        with tarfile.open(folder / "friction_sweeps_J4_J5_J6.tar.xz") as bundle:
+            bundle.extractall(place, filter="data")
+        for title, names in _SWEEPS.items():
+            start = time.process_time()
+            sweeps = [_imported("iiwa14", Path(place) / "friction_model" / name) for name in names]
+            _show(
+                f"iiwa 14, {title}, parts of the motion held back in turn",
+                diagnose(sweeps, chain, arm=known),
+                start,
+            )
+
+
+def _imported(mapping: str, source: Path) -> Session:
+    with tempfile.TemporaryDirectory() as folder:
+        return read_session(
+            import_log(LogMapping.load(mapping), source, Path(folder) / f"{source.name}.mcap").path
+        )
+
+
+def _show(title: str, found: Diagnosis, start: float) -> None:
+    print(f"\n{title} (CPU {time.process_time() - start:.0f} s)")
+    for finding in found.findings:
+        print(finding)
+    for rest in found.unexplained:
+        print(
+            f"  unexplained: {rest.side} torque of joint {rest.joint} depends on {', '.join(rest.depends_on)} "
+            f"({rest.test_rms:.3g} Nm, repeatability {rest.noise_floor:.3g} Nm)"
+        )
+    if not found.findings and not found.unexplained:
+        print("  nothing")
+    for side in found.rms_base:
+        tables: Sequence[tuple[str, Any]] = (
+            ("repeats", found.noise_floor[side]),
+            ("base", found.rms_base[side]),
+            ("extended", found.rms_extended[side]),
+        )
+        for name, values in tables:
+            print(f"  {side:<6}{name:<9}" + "".join(f"{v:>9.4f}" for v in values) + "  Nm rms, held out")
