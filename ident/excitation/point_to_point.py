@@ -24,6 +24,7 @@ __all__ = ["PointToPoint", "random_points"]
 
 _LINE = 60
 _TRIES = 400
+_INSTANT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class _Profile:
         times = np.array([-blend - 1.0, 0.0, ramp, end - ramp, end, end + blend + 1.0])
         slope = self.cruise / ramp
         coefficients = np.array([[0.0, slope, 0.0, -slope, 0.0], [0.0, 0.0, self.cruise, self.cruise, 0.0]])
+        if end - 2.0 * ramp <= _INSTANT * end:  # a triangle: full speed is reached for an instant only
+            times, coefficients = np.delete(times, 3), np.delete(coefficients, 2, axis=1)
         return PPoly(coefficients, times)
 
 

@@ -104,3 +104,17 @@ def test_plan_files_keep_every_kind_of_motion(
     read = ExcitationPlan.load(tmp_path / "plan.yaml")
     t = np.linspace(0.0, motion.duration, 50)
     np.testing.assert_array_equal(read.motion.sample(t).qd, motion.sample(t).qd)
+
+
+@pytest.mark.parametrize("way", [0.9, 1.0, 1.1, 1.7, 2.3])
+def test_a_segment_that_just_fails_to_cruise_is_a_smooth_triangle(way: float) -> None:
+    """Speed and acceleration limits that meet exactly leave no time at full speed, whatever the rounding."""
+    acceleration = 1.3
+    motion = PointToPoint(
+        np.array([[0.0], [way]]), np.array([10.0]), np.array([acceleration]), np.array([1000.0])
+    )
+    times = np.linspace(0.0, motion.duration, 2001)
+    samples = motion.sample(times)
+    assert samples.q[-1, 0] == pytest.approx(way, abs=1e-9)
+    assert np.abs(samples.qd).max() == pytest.approx(np.sqrt(acceleration * way), rel=1e-2)
+    assert np.abs(samples.qdd).max() <= acceleration * (1.0 + 1e-9)
