@@ -126,7 +126,11 @@ def estimated(found: Identification, tested: Sequence[Session]) -> dict[str, Any
 def write_results(
     folder: Path, experiment: Experiment, arm: Arm, summary: dict[str, Any], found: Identification | None
 ) -> str:
-    """Write model.yaml, report.txt and summary.json into `folder`; returns the report."""
+    """Write model.yaml, report.txt and summary.json into `folder`; returns the report.
+
+    How the link was in sessions that an earlier run has finished stays in the summary.
+    """
+    summary["link"] = {**_earlier_link(folder, summary), **summary["link"]}
     report = _report(experiment, summary, found)
     if found is not None:
         model = identified_model(found, arm.name)
@@ -134,6 +138,18 @@ def write_results(
     (folder / "report.txt").write_text(report, encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     return report
+
+
+def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
+    """The link of the sessions that the last summary in the folder and this one both call finished."""
+    try:
+        earlier = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        kept = {entry["name"] for entry in earlier["sessions"] if entry["exit_status"] == "success"}
+        link = dict(earlier["link"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    names = [entry["name"] for entry in summary["sessions"] if entry["exit_status"] == "success"]
+    return {name: link[name] for name in names if name in kept and name in link}
 
 
 def identified_model(found: Identification, robot: str) -> DynamicModel:

@@ -145,7 +145,10 @@ def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) 
     assert aborted.end["exit_status"] == "fail"
     assert loaded.metadata["uid"] != aborted.metadata["uid"]
     assert loaded.metadata["parent_uid"] == aborted.metadata["uid"]
-    assert json.loads((folder / "summary.json").read_text())["exit_status"] == "success"
+    whole = json.loads((folder / "summary.json").read_text())
+    assert whole["exit_status"] == "success"
+    assert whole["link"]["unloaded"] == summary["link"]["unloaded"]
+    assert whole["link"]["loaded"]["cycles"] > summary["link"]["loaded"]["cycles"]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import socket
 import subprocess
 import sys
 import time
@@ -116,6 +118,44 @@ def test_the_page_shows_arm_progress_and_link(ring: Ring) -> None:
         assert seen.errors == []
         assert seen.external == []
     assert view._process.returncode is not None
+
+
+EXPERIMENT = """
+name: watched
+emulator_settings: {fri.period_ms: 2}
+excitation: {period_s: 20.0, harmonics: 3, periods: 2, seed: 3}
+diagnosis: {run: false}
+sessions:
+  - name: loaded
+    payload: {name: paper_load, mass: 3.34, com: [0.0, -0.066, 0.144]}
+"""
+
+
+@pytest.mark.slow
+def test_an_experiment_in_lock_step_is_watched_while_it_runs(tmp_path: Path) -> None:
+    if chromium() is None:
+        pytest.skip("no chromium on this computer; install the system's package `chromium`")
+    (tmp_path / "watched.yaml").write_text(EXPERIMENT)
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "runner.cli", "experiment", str(tmp_path / "watched.yaml"), "--yes"]
+    command += ["--live", "--live-port", str(port), "--out", str(tmp_path / "out")]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        said = next(line for line in process.stderr if "live view" in line)
+        assert said.strip() == f"live view: http://127.0.0.1:{port}"
+        with browser() as chrome, opened(chrome, f"http://127.0.0.1:{port}", (700, 420)) as seen:
+            title = seen.page.get_by_role("heading", name=re.compile("loaded: period"))
+            title.wait_for(timeout=120_000)
+            seen.page.get_by_text(" s left").wait_for(timeout=120_000)
+            text = seen.page.inner_text("body")
+            assert seen.errors == []
+            assert seen.external == []
+        process.stderr.read()
+        assert process.wait(600) == 0
+    assert "quality PERFECT" in text
+    assert "0 missed, 0 lost" in text
 
 
 def test_the_process_ends_with_the_one_that_started_it(ring: Ring) -> None:
