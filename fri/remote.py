@@ -265,6 +265,10 @@ class RemoteEnd:
                 return None
             flags = self._set_timeout(remaining if timeout_s > 0.0 else 0.0)
 
+    def wait(self, timeout_s: float) -> bool:
+        """Sleep until a datagram is there, at most `timeout_s` [s], more finely than ``receive`` can."""
+        return bool(select.select((self._socket,), (), (), timeout_s)[0])
+
     def pending(self) -> bool:
         """Whether another datagram is waiting, which makes the one in hand a stale one."""
         return bool(self._poll.poll(0))

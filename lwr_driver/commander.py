@@ -117,6 +117,15 @@ class Commander:
                 f"limit {limit:.3f} rad {self.place()}; something holds the arm, or it does not follow",
             )
 
+    def rehearse(self, setpoint: NDArray[np.float32], q: NDArray[np.float32]) -> None:
+        """What the next value takes, without any effect, so that its code and data are at hand then."""
+        if self.mode is not Mode.MOTION:
+            return
+        np.abs(q - self.target).argmax()
+        np.abs(setpoint - self.target).max()
+        target = self._plan[min(self.index + 1, self._rows - 1)].astype(np.float32)
+        self._guard.check(target, self._since_sent + 1, remember=False)
+
     def begin(self, rows: int, sequence: int) -> None:
         """Begin the motion of `rows` rows that lies in the shared memory with packet number `sequence`."""
         self.ended = (Result.NONE, "")

@@ -82,7 +82,7 @@ class Guard:
         """Shrink the velocity limit by the controller's `safety_limits`, where that is below 1."""
         self._bounds[1] = self._limits.v_max * (factor if 0.0 < factor < 1.0 else 1.0)
 
-    def check(self, q: NDArray[np.float32], cycles: int) -> Violation | None:
+    def check(self, q: NDArray[np.float32], cycles: int, *, remember: bool = True) -> Violation | None:
         """Why q must not be sent `cycles` cycles after the last value, or None; then it is remembered."""
         h3 = cycles * self._period
         two, three = h3 + self._h2, h3 + self._h2 + self._h1
@@ -102,6 +102,8 @@ class Guard:
         # Also false for values that are no numbers.
         if not excess.max() <= _SLACK:
             return self._violation(x)
+        if not remember:
+            return None
         if self._outside:
             # The way back is one-way.
             np.maximum(self._half, np.abs(values[0]), out=self._bounds[0])

@@ -171,6 +171,7 @@ def main(arguments: Sequence[str]) -> None:
         rights = realtime.set_up(scheduling.priority, scheduling.cpu) if scheduling.apply else Rights()
         if scheduling.required:
             rights.enforce()
+        loop.looks_out = scheduling.apply and rights.ok and rights.processor is not None
     except LwrError as error:
         _say({"error": str(error), "kind": type(error).__name__})
         return

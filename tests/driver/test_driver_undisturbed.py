@@ -12,17 +12,26 @@ from lwr_driver.undisturbed import undisturbed
 
 def test_interrupt_comes_when_the_block_is_done():
     done = []
-    with pytest.raises(KeyboardInterrupt), undisturbed():
-        signal.raise_signal(signal.SIGINT)
-        done.append("gave back")
+
+    def work():
+        with undisturbed():
+            signal.raise_signal(signal.SIGINT)
+            done.append("gave back")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
     assert done == ["gave back"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_error_of_the_block_is_not_hidden():
-    with pytest.raises(ValueError, match="broken"), undisturbed():
-        signal.raise_signal(signal.SIGINT)
-        raise ValueError("broken")
+    def work():
+        with undisturbed():
+            signal.raise_signal(signal.SIGINT)
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        work()
 
 
 def test_other_handlers_of_the_signal_stay_in_force(monkeypatch):
