@@ -33,6 +33,7 @@ __all__ = ["campaign"]
 _RUNS = 200
 _FEW = 20
 _CHUNK_S = 0.5
+_END_PATIENCE_S = 600.0
 _SHORT: dict[str, Any] = {
     "name": "short",
     "emulator_settings": {"fri.period_ms": 5},
@@ -296,10 +297,11 @@ class _Runner:
                 os.killpg(process.pid, number) if number == signal.SIGINT else os.kill(process.pid, number)
                 time.sleep(float(random.uniform(0.02, 0.4)))
         try:
-            _, text = process.communicate(timeout=120.0)
+            # What is finished is still estimated and reported.
+            _, text = process.communicate(timeout=_END_PATIENCE_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            return ["still there two minutes after the signal"]
+            return [f"still there {_END_PATIENCE_S:.0f} s after the signal"]
         bad = [f"processes left: {left}"] if (left := gone(children)) else []
         if number != signal.SIGKILL:
             if "Traceback" in text and "KeyboardInterrupt" not in text:

@@ -51,7 +51,7 @@ def _strike(lab: Lab, what: str, random: np.random.Generator, folder: Path) -> l
     driver.enter_command()
     motion = lab.motion()
     after = int(random.integers(1, len(motion) - 60))
-    pendant.schedule(command, when="moving", after_cycles=after, **arguments)
+    pendant.schedule(command, after_cycles=after, **arguments)
     outcome = driver.execute(motion)
     recorded = driver.end_record(outcome.status, outcome.reason)
     bad = lab.violations()

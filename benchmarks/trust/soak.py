@@ -111,7 +111,7 @@ def _session(lab: Lab, number: int, random: np.random.Generator, folder: Path) -
         if number % 2:
             command, arguments = _FAULTS[int(random.integers(len(_FAULTS)))]
             after = int(random.integers(5, len(motion) - 60))
-            pendant.schedule(command, when="moving", after_cycles=after, **arguments)
+            pendant.schedule(command, after_cycles=after, **arguments)
         outcome = driver.execute(motion)
         recorded = driver.end_record(outcome.status, outcome.reason)
     except LwrError as error:
