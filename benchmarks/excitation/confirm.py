@@ -35,8 +35,8 @@ GROUPS = {
 }
 
 
-def random_plan(planned: ExcitationPlan, seed: int) -> ExcitationPlan:
-    """As many random points as fit into the planned motion's time, at full speed, 1 s to reach it."""
+def random_plan(planned: ExcitationPlan, seed: int, speed: float) -> ExcitationPlan:
+    """As many random points as fit into the planned motion's time, at a share of full speed, 1 s to reach it."""
     assembled = assemble(replace(PlanProblem.load("plans/default.yaml"), speed_scale=0.95))
     # far below the jerk limit: the third difference of float32 positions is noisy
     limits = replace(assembled.setup.limits, j_max=np.full(7, 20.0))
@@ -47,7 +47,8 @@ def random_plan(planned: ExcitationPlan, seed: int) -> ExcitationPlan:
                 limits,
                 count=count,
                 seed=seed,
-                a_max=limits.v_max,
+                speed_scale=speed,
+                a_max=speed * limits.v_max,
                 workspace=assembled.problem.workspace,
                 checker=assembled.checker,
                 clearance_m=assembled.clearance_m,
@@ -95,14 +96,17 @@ def group(name: str) -> str:
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to keep the experiments in.")
 @click.option("--seed", default=1, show_default=True, help="Of the random points.")
-def main(out: Path | None, seed: int) -> None:
+@click.option("--speed", default=1.0, show_default=True, help="Of the random points, share of full speed.")
+def main(out: Path | None, seed: int, speed: float) -> None:
     """Run both experiments and print ratios, random over planned, by parameter group."""
     folder = out if out is not None else Path(tempfile.mkdtemp(prefix="excitation-"))
     folder.mkdir(parents=True, exist_ok=True)
     planned = ExcitationPlan.load(find("plans/default.plan.yaml"))
     found = {
         "planned": experiment(folder, "planned", planned),
-        "random": experiment(folder, "random", random_plan(planned, seed)),
+        "random": experiment(
+            folder, f"random-seed{seed}-speed{100 * speed:.0f}", random_plan(planned, seed, speed)
+        ),
     }
     click.echo(f"{planned.duration_s:g} s each; random points over planned motion, medians and rms by group")
     click.echo(
