@@ -143,7 +143,8 @@ class Dictionary:
             return None
         # The rows themselves are made only where the step may matter.
         if best[1].gain < 10.0:
-            return Trial(candidate, best[0], best[1], self._kept[candidate.cause, -2][0][1])
+            session = int(best[0]["session"]) - 1
+            return Trial(candidate, best[0], best[1], self._kept[candidate.cause, -2 - session][0][1])
         return Trial(candidate, best[0], best[1], self.rows(candidate, best[0]))
 
     def _contacts(self, candidate: Candidate) -> Trial | None:

@@ -41,6 +41,8 @@ Floats = NDArray[np.float64]
 _CHUNK = 2000
 # Share of a low-passed row that must rest on samples of a joint that moves.
 _KNOWN = 0.8
+# Length of the windows that are used of a long session [s].
+_WINDOW_S = 10.0
 # A joint that stays within this range says nothing about its friction, gears and cables.
 TRAVEL_RAD = 0.1
 
@@ -248,7 +250,8 @@ class Nominal:
             if not _holds(recording, stretch, side):
                 continue
             operator, dt = self._operator(side, number, stretch)
-            parts.append(self._slow(side, operator @ signal.reshape(len(signal), -1), dt))
+            rows = self._slow(side, operator @ signal.reshape(len(signal), -1), dt)
+            parts.append(rows[self._windows(recording, self._stamps(side, stretch))])
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
@@ -304,6 +307,24 @@ class Nominal:
         step, edge = max(1, int(0.4 / (cutoff * dt))), int(0.5 / (cutoff * dt))
         return rows[edge : len(rows) - edge : step]
 
+    def _stamps(self, side: str, stretch: Stretch) -> Floats:
+        """Times (m,) of the rows of a stretch [s], all of them."""
+        stamp = stretch.time if side == "joint" else stretch.motor_time
+        width = self._bin(stretch) if side == "joint" else self.motor_bin(stretch)
+        return self._thin(side, _binned(stamp[:, None], width)[:, 0], width * _step(stamp))
+
+    def _windows(self, recording: Recording, stamps: Floats) -> NDArray[np.bool_]:
+        """Rows (m,) to use: of long sessions the beginning, two periods at least, and windows spread evenly, so
+        that what drifts is seen and rows stay within memory."""
+        share = self.settings.most_s / len(self.recordings)
+        since = stamps - recording.start_s
+        if recording.duration_s <= share:
+            return np.ones(len(stamps), dtype=bool)
+        lead = 2.0 * recording.period_s if recording.repeats else 0.0
+        lead = lead if lead < 0.8 * share else _WINDOW_S
+        every = _WINDOW_S * (recording.duration_s - lead) / (share - lead)
+        return np.asarray((since < lead) | (np.mod(since - lead, every) < _WINDOW_S))
+
     def make_rows(self) -> None:
         """Rows of all sides from the present motions."""
         self.rows = {side: self._side_rows(side) for side in self.sides}
@@ -341,8 +362,10 @@ class Nominal:
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
                 valid.append((_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves)
-            valid[-1] &= self.moving
-            stamps = self._thin(side, _binned(stamp[:, None], width)[:, 0], dt)
+            stamps = self._stamps(side, stretch)
+            chosen = self._windows(recording, stamps)
+            stamps, valid[-1] = stamps[chosen], (valid[-1] & self.moving)[chosen]
+            matrices[-1], targets[-1] = matrices[-1][:, chosen], targets[-1][chosen]
             time.append(stamps)
             session.append(np.full(len(stamps), recording.number))
             test.append(np.full(len(stamps), recording.test))

@@ -28,6 +28,7 @@ class DiagnosisSettings:
     least_inflation : smallest relative excess of the residual's power in the affected rows that matters.
     margin : share of the null's largest gain that a candidate must exceed, times 1 + margin.
     rounds : largest number of effects.
+    most_s : length of motion that is used; of longer sessions windows spread evenly.
     delay_tolerance_s : delays of a channel up to this are a property of the arm, and no finding.
     compliance_tolerance : relative deviation of the joints' compliance that is no finding.
     """
@@ -45,12 +46,13 @@ class DiagnosisSettings:
     least_inflation: float = 0.005
     margin: float = 0.5
     rounds: int = 8
+    most_s: float = 240.0
     delay_tolerance_s: float = 1.0e-3
     compliance_tolerance: float = 0.3
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("bin_s", "cutoff_hz", "deflection_hz", "block_s", "alpha", "least_gain"):
+        for name in ("bin_s", "cutoff_hz", "deflection_hz", "block_s", "alpha", "least_gain", "most_s"):
             if not getattr(self, name) > 0.0:
                 raise ConfigurationError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.folds < 2:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.discrepancy import Diagnosis, diagnose
+from ident.discrepancy import Diagnosis, DiagnosisSettings, diagnose
 from ident.kinematics import Chain
 from ident.regressor import torque
 from ident.signals.filters import low_pass
@@ -146,6 +146,11 @@ def test_one_session_for_fitting_and_testing() -> None:
     assert sound(diagnose([session()], arm(), test=[session(name="b.mcap")])).findings == ()
 
 
+def test_the_session_for_testing_may_be_the_older_one() -> None:
+    older = session(seed=1, name="older.mcap")
+    assert sound(diagnose([session(seed=2)], arm(), test=[older])).findings == ()
+
+
 def test_a_session_with_and_one_without_motor_torque() -> None:
     pair = [session(seed=1), session(seed=2, motor=False, name="b.mcap")]
     assert sound(diagnose(pair, arm())).findings == ()
@@ -176,3 +181,13 @@ def test_two_seconds_say_nothing() -> None:
 def test_a_session_in_which_nothing_moves_is_refused() -> None:
     with pytest.raises(DataError, match="moves"):
         diagnose([session(moving=(False, False))], arm())
+
+
+def test_of_a_long_session_windows_from_beginning_to_end_are_used() -> None:
+    long = session(seconds=90.0, rate=50.0, extra=6.0)
+    found = sound(diagnose([long], arm(), settings=DiagnosisSettings(most_s=30.0)))
+    time = found.states["joint"].time
+    assert 25.0 < len(time) * np.median(np.diff(time)) < 40.0
+    assert time[0] < 5.0
+    assert time[-1] > 75.0
+    assert found.findings[0].cause == "cable_spring"
