@@ -203,8 +203,10 @@ def _later(session: Session, shift_ns: int) -> Session:
 
 def _with_sessions(experiment: Experiment, motions: Sequence[Deciding]) -> Experiment:
     """The experiment with the sessions of the deciding motions instead of its own."""
-    sessions = tuple(session for motion in motions for session in motion.sessions)
-    return experiment.changed(sessions=sessions)
+    sessions = [session for motion in motions for session in motion.sessions]
+    # As few swaps of the payload as can be.
+    order = list(dict.fromkeys(session.payload for session in sessions))
+    return experiment.changed(sessions=tuple(sorted(sessions, key=lambda one: order.index(one.payload))))
 
 
 def _reason(error: Exception) -> str:
