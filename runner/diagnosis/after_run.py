@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fri.errors import LwrError, OperatorError
+from fri.errors import LwrError
 from ident.kinematics import Chain
 from ident.model_file import read_model
 from lwr_driver.arm import Arm
@@ -103,6 +103,9 @@ def conclude_run(
     run the motions that would decide what is open, diagnose again with them, and say what was decided.
     """
     target = folder / FOLDER
+    # What was decided once stays decided: its sessions are there and are not run again.
+    decide = decide or (target / DECISION).is_file()
+    (target / DECISION).unlink(missing_ok=True)
     try:
         first = _diagnosed(experiment, arm, folder, records)
         first = first.with_offers(offers(first.diagnosis, experiment, arm, cell, motions.exciting))
@@ -114,8 +117,6 @@ def conclude_run(
         return Conclusion(first, asked=decide)
     try:
         return _decided(experiment, arm, folder, records, first, laboratory)
-    except OperatorError:
-        raise
     except Exception as error:
         return Conclusion(first, _reason(error))
 
@@ -142,11 +143,9 @@ def _decided(
 
     with laboratory(deciding) as bench:
         done = Run(deciding, place, bench, rows).sessions()
-    if done[-1].status == "abort":
-        raise OperatorError(f"session {done[-1].name}: {done[-1].reason}")
     finished = [record for record in done if record.status == "success"]
-    if not finished:
-        return Conclusion(first, f"session {done[-1].name}: {done[-1].reason}")
+    if len(finished) < len(done):
+        return Conclusion(first, f"session {done[-1].name}: {done[-1].reason}; `--decide` goes on from there")
     second = _diagnosed(experiment, arm, folder, records, finished)
     answers = decisions(first.diagnosis, second.diagnosis)
     target = folder / FOLDER
