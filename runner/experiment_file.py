@@ -172,10 +172,16 @@ class DiagnosisPlan:
     """What the experiment ends with.
 
     run : look for what the model lacks. reference : model file of `lwr-run commission`, the healthy arm.
+    sure : confidence below which a finding with look-alikes asks for a motion that decides.
     """
 
     run: bool = True
     reference: str | None = None
+    sure: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.sure < 1.0:
+            raise ConfigurationError(f"sure {self.sure} is outside 0.5 to 1; 0.8 is usual")
 
 
 @dataclass(frozen=True)

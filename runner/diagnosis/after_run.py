@@ -22,7 +22,7 @@ from lwr_driver.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
-from runner.diagnosis.deciding import Deciding, offers, open_findings
+from runner.diagnosis.deciding import SURE, Deciding, offers, open_findings
 from runner.diagnosis.decision import Answer, decision_text, decisions
 from runner.diagnosis.study import DIAGNOSIS, Study, study
 from runner.experiment import Bench, Record, Run
@@ -47,13 +47,14 @@ Laboratory = Callable[[Experiment], AbstractContextManager[Bench]]
 class Conclusion:
     """How an experiment ends: the diagnosis or why there is none, and what the deciding motions said.
 
-    asked : whether deciding motions were wanted.
+    asked : whether deciding motions were wanted. sure : confidence below which a finding is open.
     """
 
     study: Study | None
     failure: str = ""
     answers: tuple[Answer, ...] = ()
     asked: bool = False
+    sure: float = SURE
 
     def text(self, folder: Path) -> str:
         """For the screen. folder : of the experiment, for what can be run next."""
@@ -66,7 +67,7 @@ class Conclusion:
         if self.failure:
             lines.append(f"The deciding motions came to no end: {self.failure}. The diagnosis above stands.")
         elif self.asked and not self.answers:
-            still = open_findings(self.study.diagnosis)
+            still = open_findings(self.study.diagnosis, self.sure)
             reason = (
                 "no deciding motion passes every check" if still else "no finding is open between look-alikes"
             )
@@ -114,7 +115,7 @@ def conclude_run(
     except Exception as error:
         return Conclusion(None, _reason(error))
     if not decide or not first.offers:
-        return Conclusion(first, asked=decide)
+        return Conclusion(first, asked=decide, sure=experiment.diagnosis.sure)
     try:
         return _decided(experiment, arm, folder, records, first, laboratory)
     except Exception as error:
@@ -147,7 +148,7 @@ def _decided(
     if len(finished) < len(done):
         return Conclusion(first, f"session {done[-1].name}: {done[-1].reason}; `--decide` goes on from there")
     second = _diagnosed(experiment, arm, folder, records, finished)
-    answers = decisions(first.diagnosis, second.diagnosis)
+    answers = decisions(first.diagnosis, second.diagnosis, experiment.diagnosis.sure)
     target = folder / FOLDER
     (target / DIAGNOSIS).replace(target / BEFORE)
     second = second.with_offers(())

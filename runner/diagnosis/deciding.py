@@ -126,9 +126,9 @@ class Deciding:
         }
 
 
-def open_findings(diagnosis: Diagnosis) -> tuple[Finding, ...]:
-    """The findings that these data leave open between look-alikes."""
-    return tuple(f for f in diagnosis.findings if f.confidence < SURE and f.alternatives)
+def open_findings(diagnosis: Diagnosis, sure: float = SURE) -> tuple[Finding, ...]:
+    """The findings that these data leave open between look-alikes: of a confidence below `sure`."""
+    return tuple(f for f in diagnosis.findings if f.confidence < sure and f.alternatives)
 
 
 def offers(
@@ -139,7 +139,7 @@ def offers(
     A motion that no size of passes is left out, with a line in the log. At most three.
     """
     found: dict[str, Deciding] = {}
-    for finding in open_findings(diagnosis):
+    for finding in open_findings(diagnosis, experiment.diagnosis.sure):
         rivals = ((finding.cause, finding.joints), *((c, j) for c, j, _ in finding.alternatives))
         for cause, joints in rivals:
             kind = _KINDS.get(cause)
@@ -164,7 +164,7 @@ def offers_of_sessions(diagnosis: Diagnosis, sessions: Sequence[Session]) -> tup
     text = next(
         (s.attachments["experiment.yaml"] for s in sessions if "experiment.yaml" in s.attachments), None
     )
-    if text is None or not open_findings(diagnosis):
+    if text is None or not any(finding.alternatives for finding in diagnosis.findings):
         return ()
     try:
         experiment = parse(Experiment, yaml.safe_load(text), "experiment.yaml")

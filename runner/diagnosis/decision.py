@@ -49,16 +49,16 @@ class Answer:
         }
 
 
-def decisions(before: Diagnosis, after: Diagnosis) -> tuple[Answer, ...]:
-    """One answer for each finding that was open before."""
+def decisions(before: Diagnosis, after: Diagnosis, sure: float = SURE) -> tuple[Answer, ...]:
+    """One answer for each finding that was open before. sure : confidence that decides."""
     found = []
-    for finding in open_findings(before):
+    for finding in open_findings(before, sure):
         rivals = (_place(finding), *((cause, joints) for cause, joints, _ in finding.alternatives))
         rivals = tuple(dict.fromkeys(rivals))
         mine = [f for f in after.findings if _place(f) in rivals]
-        sure = [f for f in mine if f.confidence >= SURE]
-        if sure:
-            found.append(Answer(rivals, "decided", _place(sure[0]), sure[0].confidence))
+        certain = [f for f in mine if f.confidence >= sure]
+        if certain:
+            found.append(Answer(rivals, "decided", _place(certain[0]), certain[0].confidence))
         elif mine:
             found.append(Answer(rivals, "open", _place(mine[0]), mine[0].confidence))
         else:

@@ -41,7 +41,8 @@ SHORT: dict[str, Any] = {
 }
 LOADED = {"name": "loaded", "payload": {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}}
 BRISTLES = {"type": "hidden_effects:Bristles", "options": {"joint": 2, "amplitude": 2.5, "length": 0.005}}
-SMALL_GAIN = {"type": "hidden_effects:WrongGain", "options": {"joint": 2, "sensor": 0.0047}}
+SMALL_GAIN = {"type": "hidden_effects:WrongGain", "options": {"joint": 2, "sensor": 0.01}}
+SURE = 0.9
 
 
 @dataclass(frozen=True)
@@ -231,10 +232,11 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
     plugins(monkeypatch)
     out = tmp_path / "out"
     settings = {"fri.period_ms": 5, "robot.effects": [SMALL_GAIN]}
-    file = experiment_file(tmp_path, [], sessions=[*SHORT["sessions"], LOADED], emulator_settings=settings)
+    changes = {"sessions": [*SHORT["sessions"], LOADED], "emulator_settings": settings}
+    file = experiment_file(tmp_path, [], diagnosis={"sure": SURE}, **changes)
     first = lwr_run("experiment", str(file), "--yes", "--out", str(out))
     before = json.loads((out / "diagnosis" / "diagnosis.json").read_text())["findings"][0]
-    assert before["confidence"] < 0.8
+    assert before["confidence"] < SURE
     assert len(before["alternatives"]) > 0
     assert f"--resume {out} --decide" in first
     text = lwr_run("experiment", "--resume", str(out), "--yes", "--decide")
@@ -244,7 +246,7 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
     assert "decided: sensor_gain (joint A2)" in text
     after = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
     assert len(after["sessions"]["train"]) > 2
-    assert after["findings"][0]["confidence"] >= 0.8
+    assert after["findings"][0]["confidence"] >= SURE
     assert (out / "diagnosis" / "before_deciding.json").is_file()
 
 
