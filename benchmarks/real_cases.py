@@ -85,13 +85,13 @@ def _show(title: str, found: Diagnosis, start: float) -> None:
     for rest in found.unexplained:
         print(
             f"  unexplained: {rest.side} torque of joint {rest.joint} depends on {', '.join(rest.depends_on)} "
-            f"({rest.test_rms:.3g} Nm, repeatability {rest.noise_floor:.3g} Nm)"
+            f"({rest.test_rms:.3g} Nm, floor {rest.noise_floor:.3g} Nm)"
         )
     if not found.findings and not found.unexplained:
         print("  nothing")
     for side in found.rms_base:
         tables: Sequence[tuple[str, Any]] = (
-            ("repeats", found.noise_floor[side]),
+            ("floor", found.noise_floor[side]),
             ("base", found.rms_base[side]),
             ("extended", found.rms_extended[side]),
         )
