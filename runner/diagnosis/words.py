@@ -53,4 +53,7 @@ def quantity_text(value: float, std: float, unit: str) -> str:
     places = max(0, 1 - math.floor(math.log10(std)))
     if places > 4:
         return f"{value:.4g} ± {std:.2g}{unit}"
-    return f"{value:.{places}f} ± {std:.{places}f}{unit}"
+    shown, spread = f"{value:.{places}f}", f"{std:.{places}f}"
+    while "." in shown and shown[-1] == spread[-1] == "0":
+        shown, spread = shown[:-1].rstrip("."), spread[:-1].rstrip(".")
+    return f"{shown} ± {spread}{unit}"

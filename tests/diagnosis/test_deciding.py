@@ -17,6 +17,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from runner.diagnosis.deciding import _KINDS, Deciding, offers, open_findings
 from runner.diagnosis.decision import decision_text, decisions
+from runner.diagnosis.words import quantity_text
 from runner.experiment_file import Experiment
 from runner.planning import excitation_rows, plan_excitation
 from runner.preparation import session_motion
@@ -153,3 +154,18 @@ def test_the_decision_says_that_none_of_them_stands() -> None:
     assert (other.outcome, other.named) == ("neither", ("friction_load", (2,)))
     (nothing,) = decisions(before, diagnosis())
     assert "found instead: nothing" in nothing.text(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "unit", "text"),
+    [
+        (1.9, 0.2, "Nm", "1.9 ± 0.2 Nm"),
+        (0.01021, 0.00074, "1", "0.01021 ± 0.00074"),
+        (12.3456, 3.0, "s", "12.3 ± 3.0 s"),
+        (100.0, 20.0, "kg m^2", "100 ± 20 kg m²"),
+        (5.0, 0.0, "1", "5"),
+        (2.5e-7, 3e-8, "rad/Nm", "2.5e-07 ± 3e-08 rad/Nm"),
+    ],
+)
+def test_quantities_are_shown_to_what_is_known(value: float, std: float, unit: str, text: str) -> None:
+    assert quantity_text(value, std, unit) == text
