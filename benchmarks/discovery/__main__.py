@@ -33,6 +33,7 @@ from tally import read_results, summary, tables  # noqa: E402
 @click.command()
 @click.option("--cases", default=60, show_default=True, help="Number of cases altogether.")
 @click.option("--seed", default=1, show_default=True, help="Of the first case; case i has seed + i.")
+@click.option("--skip", default=0, show_default=True, help="Leave out so many of the first cases.")
 @click.option("--jobs", default=1, show_default=True, help="Processes at a time.")
 @click.option("--days", default=12, show_default=True, help="Healthy days that the reference rests on.")
 @click.option("--without-reference", is_flag=True, help="Diagnose as if the arm had never been commissioned.")
@@ -40,11 +41,18 @@ from tally import read_results, summary, tables  # noqa: E402
 @click.option("--again", is_flag=True, help="Diagnose cases once more that have a result.")
 @click.option("--recommission", is_flag=True, help="Make the references of the healthy arm anew.")
 @click.option("--discard", is_flag=True, help="Delete the logs of a case once it is judged.")
+@click.option(
+    "--members/--no-members",
+    default=True,
+    show_default=True,
+    help="Record each cause of a pair or triple by itself too, for how visible it is alone.",
+)
 @click.option("--report", is_flag=True, help="Run nothing.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("discovery"), show_default=True)
 def main(
     cases: int,
     seed: int,
+    skip: int,
     jobs: int,
     days: int,
     without_reference: bool,
@@ -52,11 +60,12 @@ def main(
     again: bool,
     recommission: bool,
     discard: bool,
+    members: bool,
     report: bool,
     out: Path,
 ) -> None:
     """Hide physics in simulated sessions, have them diagnosed, and count what is found."""
-    plan = Plan(out, cases, seed, days, not without_reference, causes, discard)
+    plan = Plan(out, cases, seed, days, not without_reference, causes, discard, members, skip)
     if not report:
         if recommission:
             plan.forget_references()

@@ -43,6 +43,8 @@ class Plan:
     reference: bool = True
     causes: tuple[str, ...] = ()
     discard: bool = False
+    members: bool = True
+    skip: int = 0
 
     @property
     def results(self) -> Path:
@@ -64,9 +66,11 @@ class Plan:
         """Seed, kind, cause (None: drawn) and encoder of each case."""
         names, singles, healthy = list(CAUSES), 0, 0
         for number in range(self.cases):
-            seed = self.seed + number
+            seed, left_out = self.seed + number, number < self.skip
             if self.causes:
                 name = self.causes[number % len(self.causes)]
+                if left_out:
+                    continue
                 yield seed, "outside" if name in OUTSIDE else "single", name, "link"
                 continue
             kind = _KINDS[number % len(_KINDS)]
@@ -78,7 +82,8 @@ class Plan:
             elif kind == "none":
                 healthy += 1
                 encoder = "motor" if healthy % _MOTOR_SIDE == 0 else "link"
-            yield seed, kind, cause, encoder
+            if not left_out:
+                yield seed, kind, cause, encoder
 
 
 def run(plan: Plan, jobs: int, again: bool, say: Callable[[str], Any]) -> None:
@@ -125,7 +130,7 @@ def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) 
     healthy = twin(case.schedule, case.day)
     twin_error = store.error(healthy)
     result["rho"] = inflation(store.error(case), twin_error) if case.hidden else 1.0
-    if len(case.hidden) > 1:
+    if len(case.hidden) > 1 and plan.members:
         result["rho_alone"] = [
             inflation(store.error(case.alone(index)), twin_error) for index in range(len(case.hidden))
         ]

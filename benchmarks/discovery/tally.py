@@ -86,7 +86,7 @@ def figures(results: Sequence[Result]) -> dict[str, Any]:
     members = [
         (rho, named)
         for r in _kind(results, "pair", "triple")
-        for rho, named in zip(r["rho_alone"], r["verdict"]["named"], strict=True)
+        for rho, named in zip(r.get("rho_alone", ()), r["verdict"]["named"], strict=False)
     ]
     rates["members of pairs and triples with rho >= 1.1 alone"] = _rate(
         [named for rho, named in members if rho >= _VISIBLE]

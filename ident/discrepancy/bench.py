@@ -110,13 +110,15 @@ def prepare_bench(
     structure, base = structure_of(arm, recordings)
     nominal = Nominal.of(arm, recordings, settings, structure, base)
     prior = reference.prior(base) if reference is not None else _drawn(base)
-    rounds = 3 if fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2 else 1
+    fitted = fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2
+    # Predictions of the second round know what the reference knows; a third changes nothing.
+    rounds = 3 if fitted else 2 if reference is not None else 1
     compared = reference is not None
     evidence, _ = _evidence(nominal, settings, None if compared else prior, compared=False)
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
         evidence, told = _evidence(nominal, settings, prior, compared=compared)
-        if rounds > 1:
+        if fitted:
             change = _compliance_step(nominal, evidence, arm)
             if np.all(np.abs(change) < 0.03 * arm.compliance):
                 break
@@ -206,12 +208,17 @@ def again_with(
     left = evidence.residuals()
     floors = _floors(nominal, left)
     repeated = _repeated(nominal, left, floors)
+    sigma = {side: value.copy() for side, value in evidence.sigma.items()}
+    dilution = {side: value.copy() for side, value in evidence.dilution.items()}
+    # Where nothing was claimed the noise stays what it was: the null was counted in it.
+    for side, joint in {key for c in selection.claims for key in c.trial.rows}:
+        sigma[side][joint], dilution[side][joint] = floors[side][0][joint], floors[side][1][joint]
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(
         nominal,
         settings,
-        {side: floor[0] for side, floor in floors.items()},
-        {side: floor[1] for side, floor in floors.items()},
+        sigma,
+        dilution,
         prior=evidence.prior,
         compared=evidence.compared,
         floor=repeated,

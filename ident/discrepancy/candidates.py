@@ -277,4 +277,5 @@ def _setting(nominal: Nominal) -> Setting:
         speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
         encoder=nominal.arm.encoder if nominal.arm.encoder_known else None,
+        reach=nominal.arm.reach,
     )

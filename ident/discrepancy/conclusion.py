@@ -65,8 +65,9 @@ def conclude(
         without = held_out(evidence, others)
         evidence.replace(others)
         finding = _finding(claim, bench, without, after, settings)
-        # An extension that makes the held-out error larger is none.
-        if finding.evidence.gain_interval_95[1] > 0.0:
+        # An extension that makes the held-out error larger is none, but for what was another in other sessions.
+        passing = claim.trial.candidate.effect.event or finding.mode == "between"
+        if passing or finding.evidence.gain_interval_95[1] > 0.0:
             kept.append((claim, finding))
     claims = [claim for claim, _ in kept]
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])

@@ -14,6 +14,8 @@ _WINDOW_S = 0.1
 _FAR = 8.0
 _LONGEST_S = 4.0
 _MOST = 4
+# Filters and wide bins are at a loss so near to the ends of a session.
+_EDGE_S = 0.6
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,10 @@ def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
     for session in np.unique(rows.session):
         mine = (rows.session == session) & ~rows.test
         if not mine.any():
+            continue
+        ends = rows.time[mine].min() + _EDGE_S, rows.time[mine].max() - _EDGE_S
+        mine &= (rows.time >= ends[0]) & (rows.time <= ends[1])
+        if mine.sum() < 3:
             continue
         time, values = rows.time[mine], normal[mine]
         window = ((time - time[0]) / _WINDOW_S).astype(int)

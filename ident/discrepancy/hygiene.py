@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["SampleLoss", "sample_loss"]
+__all__ = ["SampleLoss", "held_times", "sample_loss"]
 
 _LEAST = 10
 _SHARE = 0.001
@@ -45,6 +46,14 @@ def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
         if session.motor is not None:
             found.append(_channel(session.path.name, "motor", session.motor))
     return tuple(sorted((loss for loss in found if loss.matters), key=lambda loss: -loss.share))
+
+
+def held_times(columns: JointColumns) -> NDArray[np.float64]:
+    """Times (k,) [s] from the first sample of samples that repeat the one before, where that matters."""
+    if not _channel("", "", columns).matters:
+        return np.zeros(0)
+    same = np.concatenate([[False], np.all(np.diff(columns.effort, axis=0) == 0.0, axis=1)])
+    return (columns.log_time[same] - columns.log_time[0]) * 1e-9
 
 
 def _channel(name: str, channel: str, columns: JointColumns) -> SampleLoss:

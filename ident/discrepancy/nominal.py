@@ -227,21 +227,28 @@ class Nominal:
             motor_coulomb=values["Fcm"],
             friction=friction,
             slip=slip,
+            loaded=recording.payload is not None or all(r.payload is None for r in self.recordings),
         )
 
     # ---- rows ----
 
+    @property
+    def bin_s(self) -> float:
+        """Length of a bin [s]."""
+        settings = self.settings
+        return max(settings.bin_s, settings.ringing_s) if self.arm.encoder == "motor" else settings.bin_s
+
     def _bin(self, stretch: Stretch) -> int:
         """Samples in a bin of the joint torque."""
         dt = float(stretch.time[1] - stretch.time[0])
-        return max(1, round(self.settings.bin_s / dt))
+        return max(1, round(self.bin_s / dt))
 
     def motor_bin(self, stretch: Stretch) -> int:
         """Samples in a bin of the motor torque."""
         if len(stretch.motor_time) < 2:
             return 1
         step = float(np.median(np.diff(stretch.motor_time)))
-        return max(1, round(self.settings.bin_s / step)) if step < 0.6 * self.settings.bin_s else 1
+        return max(1, round(self.bin_s / step)) if step < 0.6 * self.bin_s else 1
 
     def reduce(self, side: str, values: Sequence[Floats]) -> Floats:
         """Rows (m,) or (m, k) of signals given on the grid of each motion, (N,) or (N, k)."""
@@ -289,7 +296,7 @@ class Nominal:
             edges = [r.joint_band_hz if side == "joint" else r.motor_band_hz for r in self.recordings]
             known = [edge for edge in edges if edge is not None]
             least = min(known, default=np.inf)
-            found[side] = 0.5 * least if least < 0.5 / self.settings.bin_s else None
+            found[side] = 0.5 * least if least < 0.5 / self.bin_s else None
         return found
 
     def _slow(self, side: str, rows: Floats, dt: float) -> Floats:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.discrepancy.bandwidth import passed_band
+from ident.discrepancy.hygiene import held_times
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 from ident.signals.prepare import PreparedSession, prepare
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["Recording", "Stretch", "record"]
 
 Floats = NDArray[np.float64]
+
+_HELD_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +96,7 @@ def record(
         cutoff_hz=cutoff, decimate_hz=min(10.0, 0.5 * cutoff), motor_delay_s=0.0, standstill_share=1.0
     )
     prepared = prepare(chosen, signals)
-    stretches = tuple(_stretches(prepared, rate))
+    stretches = tuple(_stretches(prepared, rate, held_times(chosen.joint)))
     if not stretches:
         raise DataError(f"{prepared.name}: no stretch of the session is long enough for a diagnosis")
     spans = chosen.spans("period")
@@ -121,7 +124,7 @@ def record(
     )
 
 
-def _stretches(prepared: PreparedSession, rate: float) -> list[Stretch]:
+def _stretches(prepared: PreparedSession, rate: float, held: Floats) -> list[Stretch]:
     found = []
     for passage in prepared.passages:
         joint = passage.joint
@@ -137,7 +140,8 @@ def _stretches(prepared: PreparedSession, rate: float) -> list[Stretch]:
             m = passage.motor
             # A margin keeps the samples inside the grid when the channel is shifted.
             keep = (m.times >= joint.times[pick[0]] + 0.06) & (m.times <= joint.times[pick[-1]] - 0.06)
-            motor_time, motor, usable = m.times[keep], m.torque[keep], ~m.flagged[keep]
+            motor_time, motor = m.times[keep], m.torque[keep]
+            usable = ~m.flagged[keep] & _apart(motor_time, held)[:, None]
         found.append(
             Stretch(
                 joint.times[pick],
@@ -145,10 +149,20 @@ def _stretches(prepared: PreparedSession, rate: float) -> list[Stretch]:
                 joint.qd[pick],
                 joint.qdd[pick],
                 joint.torque[pick],
-                ~joint.flagged[pick],
+                ~joint.flagged[pick] & _apart(joint.times[pick], held)[:, None],
                 motor_time,
                 motor,
                 usable,
             )
         )
     return found
+
+
+def _apart(times: Floats, held: Floats) -> NDArray[np.bool_]:
+    """Whether times (N,) are far enough from samples that were held, where the filtered positions are wrong too."""
+    if not len(held):
+        return np.ones(len(times), dtype=bool)
+    after = np.searchsorted(held, times)
+    before = np.maximum(after - 1, 0)
+    after = np.minimum(after, len(held) - 1)
+    return np.minimum(np.abs(times - held[before]), np.abs(times - held[after])) > _HELD_S

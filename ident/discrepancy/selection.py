@@ -30,12 +30,16 @@ Null = Mapping[tuple[str, int], float]
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """An accepted trial: its score beside all other claims, and the candidates that do almost as well."""
+    """An accepted trial: its score beside all other claims, and the candidates that do almost as well.
+
+    outdone : a rival that the data do not carry does better on the same rows.
+    """
 
     trial: Trial
     score: Score
     alternatives: tuple[tuple[Candidate, float], ...] = ()
     confidence: float = 1.0
+    outdone: bool = False
 
     @property
     def gain(self) -> float:
@@ -77,6 +81,10 @@ def select(
         if best.candidate.key not in [t.candidate.key for t in accepted]:
             break
     claims = [state.claim(accepted, k) for k in range(len(accepted))]
+    while outdone := [k for k, claim in enumerate(claims) if claim.outdone]:
+        # What explains the same rows better is itself not carried by the data: neither is a claim.
+        accepted.pop(min(outdone, key=lambda k: claims[k].gain))
+        claims = [state.claim(accepted, k) for k in range(len(accepted))]
     state.tolerate(accepted)
     claims.sort(key=lambda c: -c.gain)
     return Selection(claims, state.nuisance, first, state.nuisance_rows)
@@ -264,6 +272,9 @@ class _State:
             key=_gain,
             reverse=True,
         )
+        # What acts on other rows explains something else.
+        mine = set(again.rows)
+        rivals = [t for t in rivals if mine & set(t.rows)]
         close = [t for t in rivals[:6] if _gain(t) > 0.6 * _gain(again)]
         close = [self.dictionary.refine(t, self.choices(t)) for t in close]
         scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
@@ -278,7 +289,8 @@ class _State:
                 if t.candidate.joint == here.candidate.joint and t.candidate.effect.side == "joint"
             )
             alike = alike or tuple(physical)[:1]
-        return Claim(again, again.score, alike, sure)
+        outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in close)
+        return Claim(again, again.score, alike, sure, outdone)
 
 
 # Gain from which on it is worth seeing what a candidate leaves.

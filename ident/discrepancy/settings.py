@@ -16,6 +16,8 @@ class DiagnosisSettings:
     bin_s : length of the mean that joint torque and regressor pass alike; motor torque too where
     it is sampled
         faster. Slower channels give a row a sample.
+    ringing_s : the same where the positions are the motors': about a period of the links' ringing on their
+    springs, which motors held by friction do not show.
     cutoff_hz : zero-phase low-pass on the positions; lowered to a fifth of the sampling rate.
     deflection_hz : low-pass on the torque from which the joints' twist is computed.
     standstill_rad_s : below that speed the friction of a joint is unknown, and its row is left out.
@@ -34,6 +36,7 @@ class DiagnosisSettings:
     """
 
     bin_s: float = 0.02
+    ringing_s: float = 0.1
     cutoff_hz: float = 25.0
     deflection_hz: float = 30.0
     standstill_rad_s: float = 0.01

@@ -71,7 +71,8 @@ class Setting:
     sessions : number of sessions. durations_s : of each. gear_ratio : (n,). torque_range, speed_range : (n,)
         largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad]. torque_turns :
         (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic
-        joints that publishes the positions, None where unknown.
+        joints that publishes the positions, None where unknown. reach : (n,) of the presliding that the model has
+        already [rad], None where unknown.
     """
 
     sessions: int
@@ -82,6 +83,7 @@ class Setting:
     speed_range: Floats
     position_range: Floats
     encoder: Literal["link", "motor"] | None = None
+    reach: Floats | None = None
 
 
 def encoder_sides(setting: Setting) -> tuple[float, ...]:

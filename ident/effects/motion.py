@@ -33,6 +33,7 @@ class Motion:
     friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
     slip : (N, n) Coulomb friction of the drives over its level, which after a reversal goes from one sign to
         the other within the reach of presliding; None: at once.
+    loaded : whether the payload hangs there, or the last link is what is spoken of.
     """
 
     chain: Chain
@@ -53,6 +54,7 @@ class Motion:
     motor_coulomb: Floats
     friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
     slip: Floats | None = None
+    loaded: bool = True
 
     @property
     def n(self) -> int:

@@ -36,8 +36,13 @@ class PayloadError(Effect):
         return [{}]
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Torque of a unit mass and unit first moments in the last link, in all rows."""
-        return body_columns(motion, 4)
+        """Torque of a unit mass and unit first moments in the last link, in all rows of loaded sessions."""
+        share = float(motion.loaded)
+        return tuple(
+            Column(motor=share * c.motor, joint=share * c.joint)
+            for c in body_columns(motion, 4)
+            if c.motor is not None and c.joint is not None
+        )
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Gravity of the difference."""

@@ -27,8 +27,10 @@ class PreslidingHysteresis(Effect):
     tell_apart = "reversals of joint {joint} at three accelerations and amplitudes (0.5, 2 and 10 mrad)"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """From half a milliradian to a tenth of a radian."""
-        return [{"length": x} for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15)]
+        """From half a milliradian, or ten times the reach that the model has, to a tenth of a radian."""
+        # Near the reach of the healthy drive it is that reach which is a little different.
+        least = 0.0 if setting.reach is None else 10.0 * float(setting.reach[joint])
+        return [{"length": x} for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Dahl's state less sign(v) in the motor torque."""
