@@ -39,24 +39,24 @@ def main(arguments: list[str]) -> None:
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         preview = Path(place) / "preview.html"
         preview.write_text(preview_html(planned_motion(str(folder))), encoding="utf-8")
-        take(browser, write_report(folder), preview)
+        take(browser, write_report(folder), preview, HERE)
 
 
-def take(browser: str, report: Path, preview: Path) -> None:
-    """Open the pages and write the pictures beside this file."""
+def take(browser: str, report: Path, preview: Path, target: Path) -> None:
+    """Open the pages and write the pictures into the folder `target`."""
     with sync_playwright() as playwright:
         opened = playwright.chromium.launch(executable_path=browser, args=FLAGS)
         page = opened.new_page(viewport=SIZE)
         page.goto(report.resolve().as_uri())
-        page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=120_000)
-        page.screenshot(path=HERE / "report.png")
-        page.locator("#torque .panels").first.screenshot(path=HERE / "report_torque.png")
+        page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=600_000)
+        page.screenshot(path=target / "report.png", timeout=600_000)
+        page.locator("#torque .panels").first.screenshot(path=target / "report_torque.png", timeout=600_000)
         page.goto(preview.resolve().as_uri())
         frame = page.frames[-1]
-        frame.wait_for_selector("canvas", timeout=120_000)
+        frame.wait_for_selector("canvas", timeout=600_000)
         frame.add_style_tag(content=CLEAN)
         page.wait_for_timeout(8_000)
-        page.screenshot(path=HERE / "preview.png", timeout=240_000)
+        page.screenshot(path=target / "preview.png", timeout=600_000)
         opened.close()
 
 
