@@ -473,6 +473,8 @@ class Evidence:
         scores = self.target - self.gram @ self.full.values
         middle = self.blocks / max(self.blocks - 1, 1) * scores.T @ scores
         sandwich = self.full.inverse @ middle @ self.full.inverse
+        # Columns that nothing excites leave a variance of nothing, on either side of zero by rounding.
+        np.fill_diagonal(sandwich, np.maximum(np.diag(sandwich), 0.0))
         floor = np.sqrt(np.maximum(np.diag(self.full.inverse), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
         widen = np.maximum(floor, 1.0)
         return sandwich * np.outer(widen, widen)
