@@ -113,6 +113,7 @@ def _rejected(lab: Lab, random: np.random.Generator) -> list[str]:
     driver.enter_command()
     state = driver.state()
     goal = state.q_command + np.where(state.q_command < HOME, 1.0, -1.0) * random.uniform(0.5, 0.9)
+    goal = np.clip(goal, lab.arm.limits.q_low + 0.1, lab.arm.limits.q_high - 0.1)
     outcome = driver.execute(move_to(lab.arm, state.q_command, goal, state.period_s, speed_scale=0.8))
     bad = lab.violations()
     if outcome.status != "fail" or "left command mode" not in outcome.reason:
