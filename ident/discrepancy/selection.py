@@ -219,7 +219,8 @@ class _State:
         return (
             score.gain > max(least, known)
             and score.p_value < settings.alpha
-            and score.inflation > strict * settings.least_inflation
+            # What lasts a moment is large then, and little of the whole session.
+            and (trial.candidate.effect.event or score.inflation > strict * settings.least_inflation)
         )
 
     def beside(self, accepted: Sequence[Trial], without: int) -> list[Trial]:
