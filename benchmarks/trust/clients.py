@@ -35,12 +35,13 @@ def campaign(ledger: Ledger, options: Any) -> None:
         program = compiled.client(Path(name))
         if program is None:
             ledger.line("clients", "no C compiler here: not measured")
-        for style in ("superpose", "absolute") if program else ():
+        for style in ("superpose", "absolute") if program is not None else ():
             for handshake, krl in _PROGRAMS.items():
                 line = ledger.line("clients", f"C client, {style}, {krl}")
                 for period_ms in _PERIODS_MS:
                     piece = f"{style} {handshake} {period_ms}"
                     if not ledger.has("clients", piece):
+                        assert program is not None
                         line.count(_one(program, style, handshake, krl, period_ms), f"{period_ms} ms")
                         ledger.finish("clients", piece)
                 line.figures["periods"] = f"{_PERIODS_MS[0]} to {_PERIODS_MS[-1]} ms"

@@ -403,12 +403,12 @@ def campaign(ledger: Ledger, options: Any) -> None:
             work.append(
                 (f"kill -9 {victim}", runs, on(True, lambda lab, r, v=victim: _kill(lab, v, r, folder)))
             )
-        for what, times, count, number in (
+        for what, times, count, sent in (
             ("kill -9 runner", runs, 1, signal.SIGKILL),
             ("Ctrl-C", few, 1, signal.SIGINT),
             ("Ctrl-C twice", few, 2, signal.SIGINT),
         ):
-            work.append((what, times, lambda random, c=count, n=number: runner(random, c, n)))
+            work.append((what, times, lambda random, c=count, n=sent: runner(random, c, n)))
         for number in range(max(runs, few)):
             for what, count, one in work:
                 if number < count and not ledger.has("computer", f"{what} {number}"):
