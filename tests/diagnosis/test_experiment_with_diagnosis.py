@@ -21,7 +21,7 @@ from lwr_driver.cell import Cell
 from lwr_driver.session import read_session
 from runner.cli import main
 from runner.commissioning import record_sets
-from runner.diagnosis import after_run
+from runner.diagnosis import Study, after_run
 from runner.diagnosis.after_run import conclude_run
 from runner.diagnosis.residuals import Residuals
 from runner.experiment_file import Experiment
@@ -41,8 +41,7 @@ SHORT: dict[str, Any] = {
 }
 LOADED = {"name": "loaded", "payload": {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}}
 BRISTLES = {"type": "hidden_effects:Bristles", "options": {"joint": 2, "amplitude": 2.5, "length": 0.005}}
-SMALL_GAIN = {"type": "hidden_effects:WrongGain", "options": {"joint": 2, "sensor": 0.01}}
-SURE = 0.9
+WRONG_GAIN = {"type": "hidden_effects:WrongGain", "options": {"joint": 2, "sensor": 0.015}}
 
 
 @dataclass(frozen=True)
@@ -230,24 +229,35 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plugins(monkeypatch)
+    diagnosed = after_run.study
+    asked: list[Study] = []
+
+    def doubtful(*arguments: Any, **named: Any) -> Study:
+        """The diagnosis, the first time in doubt between two causes, the wrong one ahead."""
+        found = diagnosed(*arguments, **named)
+        asked.append(found)
+        if len(asked) > 1:
+            return found
+        mine = found.diagnosis.findings[0]
+        other = ((mine.cause, mine.joints, -30.0),)
+        doubted = dataclasses.replace(mine, cause="sensor_crosstalk", confidence=0.6, alternatives=other)
+        return dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, findings=(doubted,)))
+
+    monkeypatch.setattr(after_run, "study", doubtful)
     out = tmp_path / "out"
-    settings = {"fri.period_ms": 5, "robot.effects": [SMALL_GAIN]}
+    settings = {"fri.period_ms": 10, "robot.effects": [WRONG_GAIN]}
     changes = {"sessions": [*SHORT["sessions"], LOADED], "emulator_settings": settings}
-    file = experiment_file(tmp_path, [], diagnosis={"sure": SURE}, **changes)
-    first = lwr_run("experiment", str(file), "--yes", "--out", str(out))
-    before = json.loads((out / "diagnosis" / "diagnosis.json").read_text())["findings"][0]
-    assert before["confidence"] < SURE
-    assert len(before["alternatives"]) > 0
-    assert f"--resume {out} --decide" in first
-    text = lwr_run("experiment", "--resume", str(out), "--yes", "--decide")
-    answer = json.loads((out / "diagnosis" / "decision.json").read_text())["answers"][0]
+    file = experiment_file(tmp_path, [], **changes)
+    text = lwr_run("experiment", str(file), "--yes", "--decide", "--out", str(out))
+    (answer,) = json.loads((out / "diagnosis" / "decision.json").read_text())["answers"]
     assert answer["outcome"] == "decided"
     assert answer["named"] == {"cause": "sensor_gain", "joints": [2]}
     assert "decided: sensor_gain (joint A2)" in text
+    before = json.loads((out / "diagnosis" / "before_deciding.json").read_text())["findings"][0]
+    assert (before["cause"], before["confidence"]) == ("sensor_crosstalk", 0.6)
     after = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
-    assert len(after["sessions"]["train"]) > 2
-    assert after["findings"][0]["confidence"] >= SURE
-    assert (out / "diagnosis" / "before_deciding.json").is_file()
+    assert {"static_poses-paper_load.mcap", "static_poses-bare.mcap"} < set(after["sessions"]["train"])
+    assert after["findings"][0]["confidence"] >= 0.8
 
 
 @pytest.mark.slow
