@@ -335,6 +335,16 @@ def assumption_section(results: ResultFolder) -> str:
             "soft",
         ),
     ]
+    if checks.get("lack of fit", {}).get("verdict") == "VIOLATED":
+        parts.append(
+            paragraph(
+                "Lack of fit: a part of the residual comes back in every period, so it is no noise but physics that "
+                "the base model leaves out. Twisting gears and drives that slide a little after a reversal do this in "
+                "a healthy arm as well; the finding says how many Nm it is. The diagnosis names a cause only where "
+                "there is more than that, so it may find nothing beside a lack of fit.",
+                "soft",
+            )
+        )
     if results.summary.get("warnings"):
         items = "".join(f"<li>{escape(warning)}</li>" for warning in results.summary["warnings"])
         parts.append(f"<h3>Warnings</h3><ul>{items}</ul>")
