@@ -113,11 +113,14 @@ def test_the_emulator_tells_its_ports_as_json() -> None:
     command = [LWR_RUN, "emulator", "--json", "--lock-step", "--fri-port", str(port)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        text = process.stdout.readline()
-        while not text.rstrip().endswith("}"):
-            text += process.stdout.readline()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+        try:
+            text = process.stdout.readline()
+            while not text.rstrip().endswith("}"):
+                text += process.stdout.readline()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
     said = json.loads(text)
     assert (said["fri_host"], said["fri_port"]) == ("127.0.0.1", port)
     assert said["pendant_port"] > 0

@@ -316,9 +316,10 @@ def test_the_preview_server_shows_the_motion_until_ctrl_c(finished: Path, chrome
                 assert colours_of(seen.page, seen.page.locator("canvas").first.bounding_box()) > 200
                 assert seen.errors == []
                 assert seen.external == []
-        finally:
             process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
     for part in (
         "Preview of short, session loaded",
         "clearance",
