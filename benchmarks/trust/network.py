@@ -13,6 +13,7 @@ from benchmarks.trust.table import Ledger
 from fri.errors import NetworkError
 from fri.packets import new_msr
 from fri.remote import RemoteEnd
+from lwr_driver.control import Text, Word
 
 __all__ = ["campaign"]
 
@@ -98,8 +99,12 @@ def campaign(ledger: Ledger, options: Any) -> None:
             if after.foreign - before.foreign != 20:
                 bad.append(f"{after.foreign - before.foreign} of 20 foreign datagrams counted")
             driver._report_notes()
-            if not any("127.0.0.9" in message for message in said):
-                bad.append(f"nobody was told: {said}")
+            control = driver._need(driver._control)
+            note = control.text(Text.NOTE)
+            if "127.0.0.9" not in note:
+                bad.append(f"the loop does not name the stranger: {note!r}")
+            elif log.isEnabledFor(logging.WARNING) and not any("127.0.0.9" in message for message in said):
+                bad.append(f"nobody was told {note!r} (note {control.words[Word.NOTES]}): {said}")
             line.count(bad)
 
             line = ledger.line("network", "a second client on the port is refused")

@@ -57,8 +57,8 @@ def command(
     with emulator:
         ports = {"fri_host": fri_host, "fri_port": fri_port, "pendant_port": emulator.pendant_port}
         text = f"sends to {fri_host}:{fri_port}, pendant on 127.0.0.1:{emulator.pendant_port}; Ctrl-C ends it"
-        click.echo(to_json(ports) if as_json else text)
         try:
+            click.echo(to_json(ports) if as_json else text)
             emulator.wait()
         except KeyboardInterrupt:
             click.echo("ended", err=True)

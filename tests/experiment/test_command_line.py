@@ -53,7 +53,7 @@ def test_resume_needs_a_folder_that_was_begun(tmp_path: Path) -> None:
 def test_check_prints_value_and_limit_of_every_item(tmp_path: Path) -> None:
     done = run("check", str(experiment_file(tmp_path)), "--json")
     assert done.code == 0
-    for items in json.loads(done.text.strip().splitlines()[-1]).values():
+    for items in json.loads(done.text).values():
         subjects = {item["subject"] for item in items}
         assert {
             "position",
