@@ -16,6 +16,9 @@ from ident.effects.motion import Motion
 
 __all__ = ["Candidate", "Dictionary", "Trial"]
 
+# What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
+_STEP_ROOM_S = 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -132,6 +135,8 @@ class Dictionary:
             _, _, padded, known = self._kept[key][0]
             whole = evidence.products(padded, known)
             for edge in np.sort(starts)[1:]:
+                if not _STEP_ROOM_S <= edge <= self.setting.durations_s[session] - _STEP_ROOM_S:
+                    continue
                 on = np.zeros(evidence.blocks)
                 on[mine[starts >= edge]] = 1.0
                 score = evidence.event_score(
@@ -210,7 +215,9 @@ class Dictionary:
             limits = next(p for p in effect.shape_parameters if p.name == name)
             low, high = _neighbours(values, float(trial.shape[name]), signed=limits.low < 0.0 < limits.high)
             if effect.step:
-                low, high = float(trial.shape[name]) - 2.5, float(trial.shape[name]) + 2.5
+                last = self.setting.durations_s[int(trial.shape["session"]) - 1] - _STEP_ROOM_S
+                here = float(trial.shape[name])
+                low, high = max(here - 2.5, _STEP_ROOM_S), min(here + 2.5, last)
             elif effect.event:
                 here = float(trial.shape[name])
                 low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)

@@ -8,7 +8,11 @@ import numpy as np
 
 from ident.effects.body import Body, body_columns
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
-from ident.effects.motion import Motion
+from ident.effects.motion import Floats, Motion
+
+# What comes off hangs within so much of the last link's frame; a load of 7 kg slips by 0.2 m at most.
+_LEVER_M = 0.5
+_SLIP_KG_M = 1.4
 
 
 class PayloadChange(Effect):
@@ -42,6 +46,12 @@ class PayloadChange(Effect):
     def continuous(self, shape: Shape) -> tuple[str, ...]:
         """The time."""
         return ("time",)
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether the part that comes off, or the slip, is within reach of the flange."""
+        mass, *moments = coefficients[:4]
+        within_reach = np.linalg.norm(moments) <= _LEVER_M * abs(mass) + _SLIP_KG_M
+        return super().plausible(coefficients, shape) and bool(within_reach)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Torque of a unit mass and unit first moments in the last link after the time, in all rows."""
