@@ -207,3 +207,11 @@ def test_wrong_entries_are_refused(change: dict[str, object], message: str) -> N
     entry = {"cause": "stribeck", "side": "motor", "joints": [2], "parameters": {}, **change}
     with pytest.raises(ConfigurationError, match=message):
         check_entry(entry, 7)
+
+
+def test_a_payload_does_not_come_loose_metres_from_the_flange() -> None:
+    effect, shape = EFFECTS["payload_change"], {"time": 5.0, "session": 1.0}
+    assert effect.plausible(np.array([-0.5, 0.02, 0.0, -0.1]), shape)
+    assert effect.plausible(np.array([0.0, 0.3, 0.0, 0.4]), shape)
+    assert not effect.plausible(np.array([0.4, 3.2, 0.0, 1.2]), shape)
+    assert not effect.plausible(np.array([-60.0, 0.0, 0.0, -9.0]), shape)
