@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from view_rig import browser, chromium, opened
+from playwright.sync_api import Browser
+from view_rig import opened
 
 from fri.errors import ConfigurationError
 from fri.states import Quality, State
@@ -95,11 +96,9 @@ def test_the_phase_is_the_last_one_that_began(row: int, phase: str) -> None:
     assert phase_at({"phases": [[0, "move_to_start"], [10, "period 1"]]}, row) == phase
 
 
-def test_the_page_shows_arm_progress_and_link(ring: Ring) -> None:
-    if chromium() is None:
-        pytest.skip("no chromium on this computer; install the system's package `chromium`")
+def test_the_page_shows_arm_progress_and_link(ring: Ring, chrome: Browser) -> None:
     motion = Motion(np.zeros((101, 7)), 0.005, ((0, "move_to_start"), (20, "period 1")))
-    with LiveView(Experiment.load(), ring.name, port=0) as view, browser() as chrome:
+    with LiveView(Experiment.load(), ring.name, port=0) as view:
         view.begin("loaded", Payload("weight", 2.0, (0.0, 0.0, 0.1)), motion)
         with opened(chrome, view.url, (700, 420)) as seen:
             deadline = time.monotonic() + 120.0
@@ -132,9 +131,7 @@ sessions:
 
 
 @pytest.mark.slow
-def test_an_experiment_in_lock_step_is_watched_while_it_runs(tmp_path: Path) -> None:
-    if chromium() is None:
-        pytest.skip("no chromium on this computer; install the system's package `chromium`")
+def test_an_experiment_in_lock_step_is_watched_while_it_runs(tmp_path: Path, chrome: Browser) -> None:
     (tmp_path / "watched.yaml").write_text(EXPERIMENT)
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.bind(("127.0.0.1", 0))
@@ -145,7 +142,7 @@ def test_an_experiment_in_lock_step_is_watched_while_it_runs(tmp_path: Path) -> 
         assert process.stderr is not None
         said = next(line for line in process.stderr if "live view" in line)
         assert said.strip() == f"live view: http://127.0.0.1:{port}"
-        with browser() as chrome, opened(chrome, f"http://127.0.0.1:{port}", (700, 420)) as seen:
+        with opened(chrome, f"http://127.0.0.1:{port}", (700, 420)) as seen:
             title = seen.page.get_by_role("heading", name=re.compile("loaded: period"))
             title.wait_for(timeout=120_000)
             seen.page.get_by_text(" s left").wait_for(timeout=120_000)
