@@ -73,8 +73,13 @@ class Ends:
         self.control.put_motion(motion.q, [])
         self.do(Job.MOTION, len(motion))
         self.do(Job.LEAVE)
+        # The loop has answered its last packet; the emulator may still be on the cycle of that answer.
         with Pendant(self.service.pendant.port) as pendant:
-            return pendant.status()
+            status, last = pendant.status(), None
+            while last is None or status["cycle"] != last["cycle"]:
+                time.sleep(0.1)
+                last, status = status, pendant.status()
+            return status
 
 
 @pytest.fixture
