@@ -116,6 +116,8 @@ def test_driver_that_thinks_for_long_in_command_mode_is_waited_for(quick_to_remi
     with Ends(lambda number, to_pc: False, **{"fri.patience_s": 0.2}) as ends:
         ends.do(Job.CYCLES, 30)
         ends.do(Job.START)
+        # The emulator may still be on the cycle of the last answer.
+        time.sleep(0.2)
         cycle = ends.service.cabinet.cycle
         thought = time.monotonic() + 0.7
         while time.monotonic() < thought:
