@@ -151,6 +151,22 @@ class Control:
         control.words[Word.INDEX] = control.words[Word.ROW] = -1
         return control
 
+    def post(self, job: Job, a: int = 0, b: int = 0, limit: int = 0) -> None:
+        """Ask the loop for a job with its arguments and its limit in cycles (0: none)."""
+        words = self.words
+        words[Word.JOB], words[Word.A], words[Word.B], words[Word.LIMIT] = int(job), a, b, limit
+        words[Word.REQUEST] += 1
+
+    @property
+    def done(self) -> bool:
+        """Whether the loop has done what it was asked for last."""
+        return int(self.words[Word.DONE]) == int(self.words[Word.REQUEST])
+
+    @property
+    def result(self) -> Result:
+        """How the last job ended."""
+        return Result(int(self.words[Word.RESULT]))
+
     def write_text(self, place: Text, text: str) -> None:
         """Put a text, cut to what fits."""
         content = text.encode()[: _TEXT_BYTES - 1]

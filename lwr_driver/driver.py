@@ -321,13 +321,13 @@ class Driver:
             return Outcome("abort", "stop requested before the motion began", self._rows(), -1, len(motion))
         self._check_executable(motion, state)
         control.put_motion(motion.q, self._number_phases(motion))
-        self._post(Job.MOTION, a=len(motion), b=self._stops_seen)
+        self._need(self._control).post(Job.MOTION, a=len(motion), b=self._stops_seen)
         names = dict(zip(control.phase_ids.tolist(), (name for _, name in motion.phases), strict=False))
         trouble: LwrError | None = None
         following = time.monotonic()
         watch = _Watch(self)
         try:
-            while not self._done():
+            while not self._need(self._control).done:
                 time.sleep(_POLL_S)
                 watch.check(self.link.lock_step_patience_s)
                 if time.monotonic() < following:
@@ -444,15 +444,6 @@ class Driver:
             raise NetworkError("the driver is not connected; call `connect` first")
         return part
 
-    def _post(self, job: Job, a: int = 0, b: int = 0, limit: int = 0) -> None:
-        words = self._need(self._control).words
-        words[Word.JOB], words[Word.A], words[Word.B], words[Word.LIMIT] = int(job), a, b, limit
-        words[Word.REQUEST] += 1
-
-    def _done(self) -> bool:
-        words = self._need(self._control).words
-        return int(words[Word.DONE]) == int(words[Word.REQUEST])
-
     def _wait(
         self,
         job: Job,
@@ -472,11 +463,11 @@ class Driver:
         """
         state = self.state()
         limit = round(timeout_s / state.period_s) if state.period_s > 0.0 else 0
-        self._post(job, a, b, limit)
+        self._need(self._control).post(job, a, b, limit)
         began = notified = time.monotonic()
         patience = self.link.lock_step_patience_s if patience_s is None else patience_s
         watch = _Watch(self)
-        while not self._done():
+        while not self._need(self._control).done:
             time.sleep(_POLL_S)
             if state.sequence >= 0:
                 watch.check(patience)
@@ -496,7 +487,7 @@ class Driver:
             wall = timeout_s if state.sequence < 0 or not self.link.lock_step else np.inf
             if waiting.since_s > wall:
                 raise self._with_rows(failure(str(self._describe(waiting, advice))))
-        result = Result(int(self._need(self._control).words[Word.RESULT]))
+        result = self._need(self._control).result
         if result is Result.DONE:
             return
         waiting = Waiting(awaited, "", time.monotonic() - began, "")
@@ -587,7 +578,7 @@ class Driver:
 
     def _outcome(self, motion: Motion, trouble: LwrError | None) -> Outcome:
         control = self._need(self._control)
-        result = Result(int(control.words[Word.RESULT]))
+        result = control.result
         reason = control.text(Text.REASON)
         rows, row = self._rows(), int(control.words[Word.ROW])
         self._report_notes()

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -173,19 +174,24 @@ def _full_disk(lab: Lab, random: Random, folder: Path) -> list[str]:
     return bad + _readable(path, 0, 5, folder)
 
 
+def _standstill(lab: Lab, victim: str, pause_s: float) -> Callable[[], None]:
+    """What makes the victim's process stand still for so long."""
+    driver = lab.driver
+    pid = driver._need(driver._loop if victim == "loop" else driver._recorder).pid
+
+    def stall() -> None:
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(pause_s)
+        os.kill(pid, signal.SIGCONT)
+
+    return stall
+
+
 def _stalled(lab: Lab, victim: str, random: Random, folder: Path) -> list[str]:
     """The process stands still for a while in the middle of a motion; in lock step nothing is lost."""
     path = folder / "stalled.mcap"
     path.unlink(missing_ok=True)
-    driver = lab.driver
-    pid = driver._need(driver._loop if victim == "loop" else driver._recorder).pid
-    pause = float(random.uniform(0.05, 1.5))
-
-    def stall() -> None:
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(pause)
-        os.kill(pid, signal.SIGCONT)
-
+    stall = _standstill(lab, victim, float(random.uniform(0.05, 1.5)))
     status, reason, recorded = _session(lab, path, int(random.integers(1, 700)), stall)
     bad = lab.violations()
     if status != "success":
@@ -199,15 +205,7 @@ def _starved(lab: Lab, victim: str, random: Random, folder: Path) -> list[str]:
     """The same in real time: the controller notices a loop that is late; a late logger harms nothing."""
     path = folder / "starved.mcap"
     path.unlink(missing_ok=True)
-    driver = lab.driver
-    pid = driver._need(driver._loop if victim == "loop" else driver._recorder).pid
-    pause = float(random.uniform(0.005, 0.6))
-
-    def stall() -> None:
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(pause)
-        os.kill(pid, signal.SIGCONT)
-
+    stall = _standstill(lab, victim, float(random.uniform(0.005, 0.6)))
     status, reason, recorded = _session(lab, path, int(random.integers(60, 200)), stall)
     bad = lab.violations()
     # On a busy computer the controller may find other reasons to end the motion, and says so.

@@ -164,17 +164,15 @@ class Rig:
             self.cycle()
 
     def post(self, job: Job, a: int = 0, b: int = 0, limit: int = 0) -> None:
-        words = self.control.words
-        words[Word.JOB], words[Word.A], words[Word.B], words[Word.LIMIT] = int(job), a, b, limit
-        words[Word.REQUEST] += 1
+        self.control.post(job, a, b, limit)
 
     @property
     def done(self) -> bool:
-        return bool(self.control.words[Word.DONE] == self.control.words[Word.REQUEST])
+        return self.control.done
 
     @property
     def result(self) -> Result:
-        return Result(int(self.control.words[Word.RESULT]))
+        return self.control.result
 
     @property
     def reason(self) -> str:

@@ -57,13 +57,12 @@ class Ends:
         self.control.close()
 
     def do(self, job, a=0, b=0):
-        self.words[Word.JOB], self.words[Word.A], self.words[Word.B] = int(job), a, b
-        self.words[Word.REQUEST] += 1
+        self.control.post(job, a, b)
         deadline = time.monotonic() + 120.0
-        while self.words[Word.DONE] != self.words[Word.REQUEST]:
+        while not self.control.done:
             assert time.monotonic() < deadline, f"{job.name} waits for ever"
             time.sleep(0.001)
-        assert Result(int(self.words[Word.RESULT])) is Result.DONE, self.control.text(Text.REASON)
+        assert self.control.result is Result.DONE, self.control.text(Text.REASON)
 
     def session(self):
         self.do(Job.CYCLES, 30)
