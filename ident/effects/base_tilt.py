@@ -47,11 +47,17 @@ class BaseTilt(Effect):
 class _Tilt(Simulated):
     def __init__(self, tilt_x: float, tilt_y: float) -> None:
         self.tilt = np.array([tilt_x, tilt_y, 0.0])
+        self.turned: Any = None
+
+    def start(self, joints: int, random: np.random.Generator) -> None:
+        self.turned = None
 
     def load(self, time_s: float, plant: Any, loads: Any) -> None:
         gravity = np.array(plant.model.gravity.linear)
-        turned = gravity - np.cross(self.tilt, gravity)
-        if time_s <= 0.0 or not hasattr(self, "upright"):
-            self.upright, self.turned = gravity, turned
+        if self.turned is None:
+            self.turned = gravity - np.cross(self.tilt, gravity)
         if not np.array_equal(gravity, self.turned):
-            plant.model.gravity.linear = turned
+            # The links may be another arm's as well, and a payload that is mounted brings new ones.
+            model = plant.model.copy()
+            model.gravity.linear = self.turned
+            plant.model = model

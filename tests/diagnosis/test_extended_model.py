@@ -6,16 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError
 from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
 from ident.model import DynamicModel
 from ident.model_file import read_model, write_model
+from lwr_driver.configuration import find
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig, load_configuration
 from sim_backend.model_arm import model_effects
-from sim_backend.truth import truth
+from sim_backend.plant import ElasticArm
+from sim_backend.rigid_body import chain
+from sim_backend.truth import robot_file, true_arm, truth
 
 HEALTHY = Path(__file__).parents[1] / "hidden_physics" / "reference.yaml"
 HOSE_NM_RAD, PULL_NM = 2.0, 0.7
@@ -88,6 +92,22 @@ def test_what_belongs_to_a_moment_acts_in_its_session_only(healthy: DynamicModel
     assert len(model_effects(model)) == 1
     assert len(model_effects(model, session=0)) == 1
     assert len(model_effects(model, session=1)) == 2
+
+
+def test_a_tilted_base_leans_once_however_often_it_is_simulated(healthy: DynamicModel) -> None:
+    lean = entry("base_tilt", "joint", [], tilt_x=(0.02, "rad"), tilt_y=(-0.01, "rad"))
+    extended = replace(healthy, effects=(lean,))
+    links = pin.Model(chain(find("lwr4plus.urdf")))
+    upright = np.array(links.gravity.linear)
+    drive = true_arm(load_configuration(), robot_file(load_configuration()))[1]
+    for _ in range(2):
+        # A replay begins before the session does, so its effects see time zero for a while.
+        arm = ElasticArm(links, drive, effects=model_effects(extended, begin_s=-0.01))
+        for _ in range(20):
+            arm.step(np.zeros(7))
+        leaning = np.array(arm.model.gravity.linear)
+        np.testing.assert_allclose(leaning, upright - np.cross([0.02, -0.01, 0.0], upright), atol=1e-12)
+    np.testing.assert_array_equal(links.gravity.linear, upright)
 
 
 def test_a_model_of_another_arm_is_refused(tmp_path: Path) -> None:
