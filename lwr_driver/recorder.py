@@ -151,8 +151,15 @@ class Recorder:
         self._path = request.path
 
     def add_phases(self, names: Sequence[str]) -> int:
-        """Add phase names to the open session; returns the number of the first, for the rows' `phase`."""
-        first: int = self._ask(_Phases(tuple(names)))
+        """Add phase names to the open session; returns the number of the first, for the rows' `phase`.
+
+        Raises what has ended the session, if something has.
+        """
+        try:
+            first: int = self._ask(_Phases(tuple(names)))
+        except LwrError:
+            self.check()
+            raise
         return first
 
     def close(

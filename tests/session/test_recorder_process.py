@@ -175,6 +175,8 @@ def test_death_of_the_loop_ends_the_session(tmp_path, ring, recorder):
     loop.stdout.readline()
     os.kill(loop.pid, signal.SIGKILL)  # not reaped: a zombie is dead, too
     message = failure(recorder)
+    with pytest.raises(DataError, match=r"the FRI loop .* died"):
+        recorder.add_phases(["too late"])
     recorded = recorder.close("success")
     loop.communicate()
     assert f"the FRI loop (process {loop.pid}) died" in message
