@@ -440,7 +440,7 @@ class Evidence:
         for side, rows in self.nominal.rows.items():
             keep = rows.valid & (rows.test if test else ~rows.test)[:, None]
             keep &= np.array([self.mask[side, j].any() for j in range(rows.target.shape[1])])
-            predicted = self._predict(side, self.full.values, np.ones(len(rows.time), dtype=bool))
+            predicted = self.predicted(side, self.full.values)
             found[side] = np.where(keep, rows.target - predicted, np.nan)
         return found
 
@@ -451,12 +451,13 @@ class Evidence:
             out = np.full(rows.target.shape, np.nan)
             for part, fit in zip(self.parts, self._held, strict=True):
                 mine = (part > 0.0)[self._place[side][0]]
-                out[mine] = rows.target[mine] - self._predict(side, fit.values, mine)
+                out[mine] = rows.target[mine] - self.predicted(side, fit.values, mine)
             found[side] = np.where(rows.valid & ~rows.test[:, None], out, np.nan)
         return found
 
-    def _predict(self, side: str, values: Floats, mine: NDArray[np.bool_]) -> Floats:
-        """Torques (rows, n) of chosen rows with the values (P,) of the present columns."""
+    def predicted(self, side: str, values: Floats, mine: NDArray[np.bool_] | None = None) -> Floats:
+        """Torques (rows, n) [Nm] of the rows `mine` (m,), default all, with values (P,) of the present columns."""
+        mine = np.ones(len(self.nominal.rows[side].time), dtype=bool) if mine is None else mine
         p = self.base_count
         predicted = np.einsum("jmp,p->mj", self.nominal.rows[side].matrix[:, mine], values[:p])
         place = p
