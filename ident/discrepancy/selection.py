@@ -20,7 +20,7 @@ from ident.discrepancy.evidence import Evidence, Rows, Score
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 
-__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "select"]
+__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
 
 log = logging.getLogger(__name__)
 
@@ -280,7 +280,7 @@ class _State:
         close = [self.dictionary.refine(t, self.choices(t)) for t in close]
         scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
         sure = confidence(_gain(again), [g for _, g in scores])
-        alike = tuple((c, g) for c, g in scores if _gain(again) - g < _reach(_gain(again)))
+        alike = tuple((c, g) for c, g in scores if _gain(again) - g < reach(_gain(again)))
         if here.candidate.effect.side == "sensor" and "motor" not in self.dictionary.nominal.rows:
             # Without a motor torque nothing but the shape tells a sensor's error from a torque of the arm.
             sure = min(sure, _SHAPE_ALONE)
@@ -300,7 +300,7 @@ _HOPE = 10.0
 _SHAPE_ALONE = 0.7
 
 
-def _reach(gain: float) -> float:
+def reach(gain: float) -> float:
     """Difference of gains within which two causes are not told apart."""
     return 12.0 + 0.1 * gain
 
