@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser, ViewportSize, sync_playwright
 
 from runner.preview import planned_motion, preview_html
 from runner.report.page import write_report
@@ -22,7 +22,7 @@ from runner.report.page import write_report
 HERE = Path(__file__).resolve().parent
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-SIZE = {"width": 1280, "height": 800}
+SIZE: ViewportSize = {"width": 1280, "height": 800}
 # What a browser without a graphics card says of itself has no place in a picture.
 CLEAN = ".mantine-Notification-root, .mantine-Notifications-root { display: none !important; }"
 
@@ -39,25 +39,27 @@ def main(arguments: list[str]) -> None:
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         preview = Path(place) / "preview.html"
         preview.write_text(preview_html(planned_motion(str(folder))), encoding="utf-8")
-        take(browser, write_report(folder), preview, HERE)
+        report = write_report(folder)
+        with sync_playwright() as playwright:
+            opened = playwright.chromium.launch(executable_path=browser, args=FLAGS)
+            take(opened, report, preview, HERE)
+            opened.close()
 
 
-def take(browser: str, report: Path, preview: Path, target: Path) -> None:
+def take(browser: Browser, report: Path, preview: Path, target: Path) -> None:
     """Open the pages and write the pictures into the folder `target`."""
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=browser, args=FLAGS)
-        page = opened.new_page(viewport=SIZE)
-        page.goto(report.resolve().as_uri())
-        page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=600_000)
-        page.screenshot(path=target / "report.png", timeout=600_000)
-        page.locator("#torque .panels").first.screenshot(path=target / "report_torque.png", timeout=600_000)
-        page.goto(preview.resolve().as_uri())
-        frame = page.frames[-1]
-        frame.wait_for_selector("canvas", timeout=600_000)
-        frame.add_style_tag(content=CLEAN)
-        page.wait_for_timeout(8_000)
-        page.screenshot(path=target / "preview.png", timeout=600_000)
-        opened.close()
+    page = browser.new_page(viewport=SIZE)
+    page.goto(report.resolve().as_uri())
+    page.wait_for_selector("html[data-ready=yes]", state="attached", timeout=600_000)
+    page.screenshot(path=target / "report.png", timeout=600_000)
+    page.locator("#torque .panels").first.screenshot(path=target / "report_torque.png", timeout=600_000)
+    page.goto(preview.resolve().as_uri())
+    frame = page.frames[-1]
+    frame.wait_for_selector("canvas", timeout=600_000)
+    frame.add_style_tag(content=CLEAN)
+    page.wait_for_timeout(8_000)
+    page.screenshot(path=target / "preview.png", timeout=600_000)
+    page.close()
 
 
 if __name__ == "__main__":

@@ -7,11 +7,12 @@ import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from PIL import Image
-from view_rig import chromium
+from playwright.sync_api import Browser
 
 ROOT = Path(__file__).parents[2]
 
@@ -40,19 +41,20 @@ def test_without_a_folder_the_default_experiment_is_run(
     monkeypatch.setattr(take.shutil, "which", lambda name: name)
     monkeypatch.setattr(take, "preview_html", lambda planned: planned.title)
     monkeypatch.setattr(take, "take", lambda *arguments: taken.append(arguments))
+    monkeypatch.setattr(take, "sync_playwright", lambda: MagicMock())
     take.main([])
     assert commands == [[sys.executable, "-m", "runner.cli", "experiment", "--yes", "--out", commands[0][-1]]]
-    browser, report, _, target = taken[0]
-    assert (browser, report.name, target) == ("chromium", "report.html", ROOT / "docs/images")
+    _, report, _, target = taken[0]
+    assert (report.name, target) == ("report.html", ROOT / "docs/images")
 
 
 @pytest.mark.slow
-def test_the_pictures_are_not_blank(take: ModuleType, finished: Path, tmp_path: Path) -> None:
-    if chromium() is None:
-        pytest.skip("no chromium on this computer; install the system's package `chromium`")
+def test_the_pictures_are_not_blank(
+    take: ModuleType, finished: Path, chrome: Browser, tmp_path: Path
+) -> None:
     preview = tmp_path / "preview.html"
     preview.write_text(take.preview_html(take.planned_motion(str(finished))), encoding="utf-8")
-    take.take(chromium(), finished / "report.html", preview, tmp_path)
+    take.take(chrome, finished / "report.html", preview, tmp_path)
     for name in ("report.png", "report_torque.png", "preview.png"):
         pixels = np.asarray(Image.open(tmp_path / name).convert("RGB")).reshape(-1, 3)
         assert len(np.unique(pixels, axis=0)) > 100, name
