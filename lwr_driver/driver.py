@@ -487,6 +487,7 @@ class Driver:
             wall = timeout_s if state.sequence < 0 or not self.link.lock_step else np.inf
             if waiting.since_s > wall:
                 raise self._with_rows(failure(str(self._describe(waiting, advice))))
+        self._report_notes()
         result = self._need(self._control).result
         if result is Result.DONE:
             return

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import socket
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +57,26 @@ def _sockets_once(pids: list[int]) -> list[tuple[str, str, int]]:
     return found
 
 
+@contextlib.contextmanager
+def _said(name: str) -> Iterator[list[str]]:
+    """What is told to the logger `name` meanwhile."""
+    messages: list[str] = []
+
+    class Ear(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            messages.append(record.getMessage())
+
+    logger, ear = logging.getLogger(name), Ear()
+    logger.addHandler(ear)
+    try:
+        yield messages
+    finally:
+        logger.removeHandler(ear)
+
+
 def campaign(ledger: Ledger, options: Any) -> None:
     """All of it on the running processes."""
-    with Lab() as lab:
+    with _said("lwr_driver.driver") as said, Lab() as lab:
         driver = lab.driver
         loop = driver._need(driver._loop).pid
         recorder = driver._need(driver._recorder).pid
@@ -90,6 +110,8 @@ def campaign(ledger: Ledger, options: Any) -> None:
         note = driver._need(driver._control).text(Text.NOTE)
         if "127.0.0.9" not in note:
             bad.append(f"the stranger is not named: {note!r}")
+        if not any("127.0.0.9" in message for message in said):
+            bad.append(f"the driver has said nothing of the stranger, but {said}")
         line.count(bad)
 
         line = ledger.line("network", "a second client on the port is refused")

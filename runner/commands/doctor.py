@@ -71,9 +71,11 @@ def command(
         raise ConfigurationError("--period-ms is for the emulator; a controller chooses its cycle in friOpen")
     here = address if address is not None else experiment.link.address
     status = StatusLine()
-    # What the driver would warn of is among the findings.
-    logging.getLogger("lwr_driver.driver").addFilter(lambda record: record.levelno > logging.WARNING)
     with ExitStack() as stack:
+        # What the driver would warn of is among the findings.
+        driver_log = logging.getLogger("lwr_driver.driver")
+        driver_log.addFilter(_is_error)
+        stack.callback(driver_log.removeFilter, _is_error)
         place = port if port is not None else experiment.link.port
         if emulated:
             place = free_port(here) if port is None else port
@@ -93,6 +95,10 @@ def command(
         status.clear()
     click.echo(to_json(found.to_dict()) if as_json else str(found))
     sys.exit(found.exit_code)
+
+
+def _is_error(record: logging.LogRecord) -> bool:
+    return record.levelno > logging.WARNING
 
 
 def _counter(experiment: Experiment) -> int | None:

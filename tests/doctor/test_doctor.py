@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import socket
 import threading
 from collections import Counter
@@ -86,6 +87,12 @@ def test_without_a_controller_it_says_what_is_awaited_seen_since_when_and_what_t
     assert "At the pendant: select and start the KRL program (`lwr_identification`)" in words
     assert f"the host must be 127.0.0.1 and the port {port}" in words
     assert text.rstrip().endswith("Not ready: packets.")
+
+
+def test_the_driver_is_heard_again_after_an_examination(caplog: pytest.LogCaptureFixture) -> None:
+    doctor()
+    logging.getLogger("lwr_driver.driver").warning("a stranger speaks")
+    assert "a stranger speaks" in caplog.text
 
 
 def test_this_computer_alone(tmp_path: Path) -> None:
