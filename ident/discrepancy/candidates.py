@@ -62,7 +62,7 @@ class Dictionary:
     def __init__(self, nominal: Nominal, evidence: Evidence, causes: Sequence[str] | None = None) -> None:
         self.nominal = nominal
         self.evidence = evidence
-        self.setting = _setting(nominal)
+        self.setting = _setting(nominal, compared=evidence.prior is not None and evidence.compared)
         wanted = list(EFFECTS) if causes is None else list(causes)
         motor = "motor" in nominal.rows
         # A low-pass of another hand may have shifted a channel, and the arm is not to blame.
@@ -137,7 +137,7 @@ class Dictionary:
             for edge in np.sort(starts)[1:]:
                 if not _STEP_ROOM_S <= edge <= self.setting.durations_s[session] - _STEP_ROOM_S:
                     continue
-                on = np.zeros(evidence.blocks)
+                on = (evidence.block_session > session).astype(float)
                 on[mine[starts >= edge]] = 1.0
                 score = evidence.event_score(
                     evidence.score_products(whole.only(on), list(padded)), evidence.blocks
@@ -269,7 +269,7 @@ def _neighbours(values: Sequence[float], here: float, *, signed: bool) -> tuple[
     return low, high
 
 
-def _setting(nominal: Nominal) -> Setting:
+def _setting(nominal: Nominal, *, compared: bool) -> Setting:
     motions: list[Motion] = nominal.motions
     q = np.concatenate([m.q for m in motions])
     positive = np.mean(np.concatenate([m.joint_torque for m in motions]) > 0.0, axis=0)
@@ -285,4 +285,5 @@ def _setting(nominal: Nominal) -> Setting:
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
         encoder=nominal.arm.encoder if nominal.arm.encoder_known else None,
         reach=nominal.arm.reach,
+        compared=compared,
     )

@@ -72,7 +72,7 @@ class Setting:
         largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad]. torque_turns :
         (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic
         joints that publishes the positions, None where unknown. reach : (n,) of the presliding that the model has
-        already [rad], None where unknown.
+        already [rad], None where unknown. compared : whether the sessions are held against a reference.
     """
 
     sessions: int
@@ -84,6 +84,7 @@ class Setting:
     position_range: Floats
     encoder: Literal["link", "motor"] | None = None
     reach: Floats | None = None
+    compared: bool = False
 
 
 def encoder_sides(setting: Setting) -> tuple[float, ...]:

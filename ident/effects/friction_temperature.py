@@ -9,13 +9,14 @@ import numpy as np
 
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
 from ident.effects.motion import Motion
+from ident.effects.sessions import shares_of_session, steps_between
 
 
 class FrictionTemperature(Effect):
     """Drive friction times `1 + change w`, with w running from 0 to 1 as the drive warms up.
 
-    Within a session w = 1 - exp(-t / time_constant) and starts anew in each; between sessions w is 1 in all
-    sessions after the first; against a reference it is 1 in all sessions.
+    Within a session w = 1 - exp(-t / time_constant) and starts anew in each; between sessions w is 1 from the
+    session number `since` on, beside a `level` that all sessions share; against a reference it is 1 in all.
     """
 
     cause = "friction_temperature"
@@ -24,12 +25,17 @@ class FrictionTemperature(Effect):
     source = "Bittencourt, Wernholt, Sander-Tavallaey and Brogardh, IROS 2010; Simoni et al., Robotica 2017"
     parameters = (
         Parameter("change", "1", "relative change of the friction, cold to warm", low=-0.9, high=2.0),
+        Parameter("level", "1", "relative change in all sessions, against the reference", low=-0.9, high=2.0),
         Parameter(
             "time_constant",
             "s",
             "of the warming up within a session; 0: between the sessions, -1: since the reference",
             shape=True,
         ),
+        Parameter(
+            "since", "1", "number of the first session after a change between the sessions", shape=True
+        ),
+        Parameter("own", "1", "1: the sessions before it have a level of their own too", shape=True),
     )
     tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
 
@@ -37,8 +43,7 @@ class FrictionTemperature(Effect):
         """From a fifth of the session to a steady drift, and between sessions where there are several."""
         longest = max(setting.durations_s)
         within = [{"time_constant": share * longest} for share in (0.15, 0.4, 1.0, 5.0)]
-        between = [{"time_constant": 0.0}] if setting.sessions > 1 else []
-        return [*within, *between, {"time_constant": -1.0}]
+        return [*within, *steps_between(setting), {"time_constant": -1.0}]
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
         """The time constant, where it is one."""
@@ -54,18 +59,20 @@ class FrictionTemperature(Effect):
         constant = shape["time_constant"]
         if constant > 0.0:
             return (Column(motor=friction * (1.0 - np.exp(-motion.time / constant))),)
-        return (Column(motor=friction * float(constant < 0.0 or motion.session > 0)),)
+        return tuple(Column(motor=share * friction) for share in shares_of_session(motion.session, shape))
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Scales the friction of the drive."""
-        return _Warm(joint, float(parameters["change"]), float(parameters.get("time_constant", 0.0)))
+        change, constant = float(parameters["change"]), float(parameters.get("time_constant", 0.0))
+        return _Warm(joint, change, constant, float(parameters.get("level", 0.0)))
 
 
 class _Warm(Simulated):
-    def __init__(self, joint: int, change: float, constant: float) -> None:
-        self.joint, self.change, self.constant = joint, change, constant
+    def __init__(self, joint: int, change: float, constant: float, level: float) -> None:
+        self.joint, self.change, self.constant, self.level = joint, change, constant, level
 
     def load(self, time_s: float, plant: Any, loads: Any) -> None:
         warm = 1.0 - np.exp(-time_s / self.constant) if self.constant > 0.0 else 1.0
-        loads.Fcm[self.joint] *= 1.0 + self.change * warm
-        loads.Fvm[self.joint] *= 1.0 + self.change * warm
+        factor = 1.0 + self.change * warm + self.level
+        loads.Fcm[self.joint] *= factor
+        loads.Fvm[self.joint] *= factor
