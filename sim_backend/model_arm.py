@@ -164,10 +164,10 @@ def model_effects(
         own = round(values.get("session", 0.0)) - 1
         if effect.event and own != session:
             continue
-        if values.get("time_constant") == 0.0 and session is not None:
+        before = session is not None and session + 1 < values.get("since", 2.0)
+        if before and values.get("time_constant") == 0.0:
             # What changed between the sessions was not there in the first ones.
-            if session + 1 < values.get("since", 2.0):
-                values = {**values, effect.linear[0].name: 0.0}
+            values = {**values, effect.linear[0].name: 0.0}
         for joint in entry["joints"] or [1]:
             found.append(ModelEffect(effect.simulate(int(joint) - 1, values), begin_s))
     return tuple(found)
