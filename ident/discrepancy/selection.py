@@ -141,9 +141,7 @@ class _State:
             if side == "motor":
                 found.append(("motor delay", rows, 1e-3, limit))
                 continue
-            # Each torque sensor has electronics of its own.
-            for key in sorted(rows):
-                found.append((f"joint delay {key[1] + 1}", {key: rows[key]}, 1e-3, 2.0 * limit))
+            found += self._joint_delays(rows, limit)
         if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
             for joint in range(nominal.arm.chain.n):
                 candidate = Candidate(EFFECTS["joint_elasticity"], joint)
@@ -152,6 +150,27 @@ class _State:
                     size = self.settings.compliance_tolerance * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
         self._tolerances = found
+        return found
+
+    def _joint_delays(self, rows: Rows, limit: float) -> list[tuple[str, Rows, float, float]]:
+        """Tolerated delays of the torque sensors: one that all share, and what each differs from it by.
+
+        Each sensor has electronics of its own, so each may be late by itself. A delay of the whole channel is the
+        mean of them, weighted by what the rows say of each: seven sensors say it much better than one, and where
+        a healthy arm told what it was, a smaller one is a finding.
+        """
+        evidence, keys = self.evidence, sorted(rows)
+        told = self.dictionary.nominal.arm.encoder_known
+        weight = {
+            key: float(np.sum(part**2)) / float(evidence.sigma[key[0]][key[1]] ** 2)
+            for key, part in evidence.padded(rows).items()
+        }
+        best = max(keys, key=lambda key: weight[key])
+        found = [("joint delay", rows, 1e-3, (_TOLD_DELAY if told else 2.0) * limit)]
+        for key in keys:
+            if key != best and weight[best] > 0.0:
+                apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
+                found.append((f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
         return found
 
     def tolerate(self, accepted: Sequence[Trial]) -> None:
@@ -296,6 +315,8 @@ class _State:
 
 # Gain from which on it is worth seeing what a candidate leaves.
 _HOPE = 10.0
+# Share of the tolerance for a whole channel's delay that is left where a healthy arm told what it is.
+_TOLD_DELAY = 0.4
 # Confidence in a sensor's error where only the joint torque was recorded.
 _SHAPE_ALONE = 0.7
 

@@ -27,8 +27,8 @@ class JointTorqueDelay(Effect):
     tell_apart = "a 1 to 15 Hz chirp of one joint"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """From two to thirty milliseconds, late and early."""
-        return [{"delay": sign * d} for d in (0.003, 0.01, 0.03) for sign in (1.0, -1.0)]
+        """From half a millisecond to forty, late and early."""
+        return [{"delay": sign * d} for d in (0.001, 0.003, 0.01, 0.03) for sign in (1.0, -1.0)]
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Predicted torque of before less that of now, without the jumps at reversals, in all joint rows."""

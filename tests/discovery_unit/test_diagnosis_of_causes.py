@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.discrepancy import Diagnosis, commission, diagnose
+from ident.discrepancy import Diagnosis, Reference, commission, diagnose
 from ident.kinematics import Chain
 from ident.model_file import model_text, read_model
 from lwr_driver.session import Session
@@ -149,9 +149,40 @@ def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bo
     assert found.findings[0].cause == "payload_error"
 
 
-def test_reference_alone_claims_nothing(make: Make, chain: Chain) -> None:
-    reference = commission([pair(make, seed=1), pair(make, seed=3)], chain)
+@pytest.fixture(scope="module")
+def reference(make: Make, chain: Chain) -> Reference:
+    return commission([pair(make, seed=1), pair(make, seed=3)], chain)
+
+
+def test_reference_alone_claims_nothing(make: Make, chain: Chain, reference: Reference) -> None:
     assert diagnose(pair(make, seed=5), chain, reference=reference).findings == ()
+
+
+def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, reference: Reference) -> None:
+    def late(s: Signals) -> None:
+        s["joint"][:] = np.column_stack([np.interp(s["time"] - 0.0013, s["time"], c) for c in s["joint"].T])
+
+    sessions = pair(make, late, seed=5)
+    (found,) = diagnose(sessions, chain, reference=reference).findings
+    assert found.cause == "joint_torque_delay"
+    assert found.parameters["delay"].value == pytest.approx(0.0013, abs=3e-4)
+    assert diagnose(sessions, chain).findings == ()
+
+
+def test_zero_of_each_session_is_no_function_of_the_angle(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def low(s: Signals) -> None:
+        s["joint"][:, 1] -= 0.12
+
+    def high(s: Signals) -> None:
+        s["joint"][:, 1] += 0.05
+
+    sessions = [make("a.mcap", 5, low), make("b.mcap", 6, high, 1)]
+    (found,) = diagnose(sessions, chain, reference=reference).findings
+    assert (found.cause, found.joints, found.mode) == ("sensor_offset_drift", (2,), "between")
+    assert found.parameters["drift"].value == pytest.approx(0.17, abs=0.02)
+    assert found.parameters["zero"].value == pytest.approx(-0.12, abs=0.02)
 
 
 def test_unknown_physics_is_not_named_with_confidence(make: Make, chain: Chain) -> None:
