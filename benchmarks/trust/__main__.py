@@ -50,6 +50,7 @@ class Options:
     runs: int | None
     seconds: float | None
     only: int | None
+    lines: str
     periods_ms: tuple[int, ...]
     say: Callable[[str], None]
 
@@ -61,6 +62,7 @@ class Options:
 @click.option("--seconds", type=float, help="Duration of soak and of each real-time measurement.")
 @click.option("--periods-ms", default="1,2,5,10", show_default=True, help="FRI cycles of `realtime`.")
 @click.option("--only", type=int, help="One run of `wire` by its number.")
+@click.option("--lines", default="", help="Only lines of `computer` whose name has this in it.")
 @click.option("--anew", is_flag=True, help="Forget what the file holds of these sections.")
 @click.option("--join", multiple=True, type=click.Path(path_type=Path, exists=True), help="For `table`.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("trust.json"), show_default=True)
@@ -71,6 +73,7 @@ def main(
     seconds: float | None,
     periods_ms: str,
     only: int | None,
+    lines: str,
     anew: bool,
     join: tuple[Path, ...],
     out: Path,
@@ -84,7 +87,7 @@ def main(
         click.echo(ledger.markdown(tuple(SECTIONS)))
         sys.exit(1 if ledger.failed else 0)
     periods = tuple(int(text) for text in periods_ms.split(","))
-    options = Options(seed, runs, seconds, only, periods, click.echo)
+    options = Options(seed, runs, seconds, only, lines, periods, click.echo)
     for section in sections or tuple(SECTIONS):
         if anew:
             ledger.forget(section)

@@ -95,10 +95,13 @@ class Ledger:
         self.lines = {key: line for key, line in self.lines.items() if key[0] != section}
 
     def join(self, other: Ledger) -> None:
-        """Take over the sections of another ledger of the same seed that this one lacks."""
-        ours = {section for section, _ in self.lines}
-        self.lines |= {key: line for key, line in other.lines.items() if key[0] not in ours}
-        self.done |= {section: done for section, done in other.done.items() if section not in ours}
+        """Take over the lines of another ledger of the same seed, none of which may be here already."""
+        twice = [" ".join(key) for key in other.lines if key in self.lines]
+        if twice:
+            raise SystemExit(f"{', '.join(twice)}: in {self.path} and in {other.path}; join one of them only")
+        self.lines |= other.lines
+        for section, done in other.done.items():
+            self.done[section] = [*self.done.get(section, []), *done]
 
     def save(self) -> None:
         """Write the file, whole or not at all."""

@@ -17,6 +17,7 @@ class Options:
     runs: int | None = 1
     seconds: float | None = 5.0
     only: int | None = None
+    lines: str = ""
     periods_ms: tuple[int, ...] = (5,)
     say: object = print
 
@@ -50,6 +51,13 @@ def test_a_broken_off_campaign_goes_on(tmp_path):
     assert not again.has("wire", "200+200")
     assert (again.line("wire", "loss").runs, again.failed) == (1, 1)
     assert "loss" in again.table("wire")
+    other = Ledger(None, 1)
+    other.line("computer", "Ctrl-C").count([])
+    other.finish("computer", "Ctrl-C 0")
+    again.join(other)
+    assert again.has("computer", "Ctrl-C 0")
+    with pytest.raises(SystemExit, match="computer Ctrl-C"):
+        again.join(other)
     again.forget("wire")
     assert not again.has("wire", "0+200")
     with pytest.raises(SystemExit, match="seed 1"):
