@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fri.errors import ConfigurationError, NetworkError
-from fri.packets import JOINT_NAMES, JOINTS, Fault, MsrBuffer, new_cmd
+from fri.packets import CMD_OFFSETS, JOINT_NAMES, JOINTS, Fault, MsrBuffer, new_cmd
 from fri.sequence import Arrival, SequenceTracker
 from fri.states import FLAGS, Control, State
 
@@ -40,6 +40,7 @@ __all__ = ["DEFAULT_PORT", "LinkEvent", "LinkEventKind", "RemoteEnd"]
 DEFAULT_PORT = 49938
 
 _CMD = int(State.CMD)
+_JNT_POS = slice(CMD_OFFSETS["jnt_pos"], CMD_OFFSETS["jnt_pos"] + 4 * JOINTS)
 # Another port of the controller's host is the controller started again only if the known port has been quiet
 # so long.
 _PORT_GRACE_S = 0.1
@@ -232,7 +233,43 @@ class RemoteEnd:
             "send_errors": self.send_errors,
         }
 
-    def receive(self, timeout_s: float) -> np.ndarray | None:
+    @property
+    def descriptor(self) -> int:
+        """File descriptor of the socket, for somebody who waits in place of ``receive``."""
+        return self._socket.fileno()
+
+    @property
+    def buffer(self) -> bytearray:
+        """Where datagrams are received."""
+        return self._msr.buffer
+
+    def foresee(self, jnt_pos: np.ndarray, out: memoryview) -> int | None:
+        """Write what ``answer(jnt_pos)`` will send if the next packet is the next one in command mode, still in
+        position control with drives on.
+
+        Parameters
+        ----------
+        jnt_pos : np.ndarray
+            (7,) float32, finite [rad].
+        out : memoryview
+            The 376 bytes of the answer.
+
+        Returns
+        -------
+        int or None
+            Counter that the packet must have; None if the answer depends on more than that.
+        """
+        expected = self._tracker.expected
+        if expected is None or self._torque_set or self._flags_control != Control.POSITION:
+            return None
+        out[:] = self._out
+        out[_JNT_POS] = jnt_pos.data.cast("B")
+        self._pack_sequence(out, 0, (self.send_seq + 1) & 0xFFFF, expected)
+        return expected
+
+    def receive(
+        self, timeout_s: float, arrived: tuple[int, tuple[str, int], int] | None = None
+    ) -> np.ndarray | None:
         """Wait for the next new packet of the controller.
 
         Repeated, late, malformed and foreign datagrams are counted and passed over within the same timeout.
@@ -241,6 +278,8 @@ class RemoteEnd:
         ----------
         timeout_s : float
             Longest wait [s]; 0 takes what is there. The kernel rounds it up to its tick, up to 10 ms.
+        arrived : tuple or None
+            Length, source and time [ns] of a datagram that has been received into ``buffer`` already.
 
         Returns
         -------
@@ -252,6 +291,8 @@ class RemoteEnd:
         flags = self._set_timeout(timeout_s)
         buffer = self._msr.buffer
         receive_into = self._socket.recvfrom_into
+        if arrived is not None and self._accept(*arrived):
+            return self.msr
         while True:
             try:
                 length, source = receive_into(buffer, 0, flags)
@@ -265,10 +306,6 @@ class RemoteEnd:
                 return None
             flags = self._set_timeout(remaining if timeout_s > 0.0 else 0.0)
 
-    def wait(self, timeout_s: float) -> bool:
-        """Sleep until a datagram is there, at most `timeout_s` [s], more finely than ``receive`` can."""
-        return bool(select.select((self._socket,), (), (), timeout_s)[0])
-
     def pending(self) -> bool:
         """Whether another datagram is waiting, which makes the one in hand a stale one."""
         return bool(self._poll.poll(0))
@@ -279,6 +316,7 @@ class RemoteEnd:
         add_jnt_trq: ArrayLike | None = None,
         *,
         insist: bool = False,
+        sent: bool = False,
     ) -> bool:
         """Answer the packet that ``receive`` returned; once.
 
@@ -292,6 +330,8 @@ class RemoteEnd:
         insist : bool
             Send the setpoint although the packet says that the arm does not follow: it may be damaged. A
             controller that does not follow ignores it.
+        sent : bool
+            The answer, as ``foresee`` wrote it, has left by another hand: only take it into account.
 
         Returns
         -------
@@ -339,7 +379,8 @@ class RemoteEnd:
         self._pack_sequence(self._out, 0, self.send_seq, msr.send_seq)
         assert self.controller is not None
         try:
-            self._socket.sendto(self._out, self.controller)
+            if not sent:
+                self._socket.sendto(self._out, self.controller)
         except OSError:
             self.send_errors += 1
             return False
@@ -399,7 +440,7 @@ class RemoteEnd:
             self._receive_timeout = timeout_s
         return 0
 
-    def _accept(self, length: int, source: tuple[str, int]) -> bool:
+    def _accept(self, length: int, source: tuple[str, int], received_ns: int | None = None) -> bool:
         """Judge the datagram in the buffer; True if it is a new packet of the controller."""
         new_source = False
         if source != self.controller:
@@ -420,7 +461,7 @@ class RemoteEnd:
                 self._count_foreign(source)
                 return False
             new_source = self._lock(source)
-        now_ns = monotonic_ns()
+        now_ns = monotonic_ns() if received_ns is None else received_ns
         self._heard_s = now_ns * 1e-9
         tracker = self._tracker
         losses = tracker.lost

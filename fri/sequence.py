@@ -78,6 +78,11 @@ class SequenceTracker:
         self._suspect = -1
         self._suspect_timestamp = 0.0
 
+    @property
+    def expected(self) -> int | None:
+        """Counter of the packet that is NEW whatever else it says; None before the first, and in doubt."""
+        return (self._last + 1) & 0xFFFF if self._last >= 0 > self._suspect else None
+
     def feed(self, send_seq: int, timestamp: float, sample_time: float, new_source: bool = False) -> Arrival:
         """Take in one packet's counter (0..65535), timestamp [s] and sample time [s].
 

@@ -117,21 +117,31 @@ class Commander:
                 f"limit {limit:.3f} rad {self.place()}; something holds the arm, or it does not follow",
             )
 
-    def rehearse(self, setpoint: NDArray[np.float32], q: NDArray[np.float32]) -> None:
-        """What the next value takes, without any effect, so that its code and data are at hand then."""
-        if self.mode is not Mode.MOTION:
-            return
-        np.abs(q - self.target).argmax()
-        np.abs(setpoint - self.target).max()
-        target = self._plan[min(self.index + 1, self._rows - 1)].astype(np.float32)
-        self._guard.check(target, self._since_sent + 1, remember=False)
+    def foresee(self, sequence: int, rows: int) -> tuple[NDArray[np.float32], float] | None:
+        """What `command` will give for packet number `sequence`, the next one, without any effect: the value
+        (7,), and how far arm and set point may be from the last value sent for it to hold [rad].
+
+        rows : of a motion that is to begin with that packet, 0 for none. None where the value is not known
+        beforehand, or does not pass the guard.
+        """
+        room = np.inf
+        if self.mode is Mode.MOTION:
+            row = self._plan[min(sequence - self._base, self._rows - 1)]
+            room = self._tracking_limit
+        elif self.mode is Mode.HOLD:
+            row = self._plan[0] if rows > 0 and self._begins_here() else self._hold
+        else:
+            return None
+        target = row.astype(np.float32)
+        violation = self._guard.check(target, self._since_sent + 1, remember=False)
+        return (target, room) if violation is None else None
 
     def begin(self, rows: int, sequence: int) -> None:
         """Begin the motion of `rows` rows that lies in the shared memory with packet number `sequence`."""
         self.ended = (Result.NONE, "")
         if self.mode is not Mode.HOLD:
             self.ended = (Result.REFUSED, f"a motion cannot begin {self.place()}")
-        elif not np.array_equal(self._plan[0].astype(np.float32), self.target):
+        elif not self._begins_here():
             self.ended = (Result.REFUSED, "the motion does not begin at the commanded position")
         else:
             self.mode, self._base, self._rows = Mode.MOTION, sequence, rows
@@ -193,6 +203,10 @@ class Commander:
             return f"in mode {self.mode.name.lower()}"
         row = max(self.index, 0)
         return f"at row {row} of {self._rows} (t = {row * self._period:.3f} s)"
+
+    def _begins_here(self) -> bool:
+        """Whether the motion in the shared memory begins at the value sent last."""
+        return np.array_equal(self._plan[0].astype(np.float32), self.target)
 
     def _next(self, sequence: int) -> NDArray[np.float32]:
         """Row of this cycle, as the mode wants it."""

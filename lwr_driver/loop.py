@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,11 @@ from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS, Limits
 from lwr_driver.commander import Commander
 from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
+from lwr_driver.rest import Rest
 from lwr_driver.ring import ROW, Ring
+
+if TYPE_CHECKING:
+    from lwr_driver.turnaround import Turnaround
 
 __all__ = ["Loop", "LoopSettings"]
 
@@ -33,8 +37,8 @@ _IDLE_S = 0.0005  # pause of a loop in lock step that has nothing to do
 _SLICE_S = 0.02  # longest wait for a packet before requests and silence are looked at
 _FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated
 _RING_PATIENCE_S = 5.0
-# A loop that looks out for the packet is awake, and through with its rehearsal, when it comes: so long before
-# it is due, at most this share of a cycle, and so long after.
+# A loop that looks out for the packet does not sleep so long before it is due, at most this share of a cycle,
+# and so long after.
 _LOOKOUT_S, _LOOKOUT_SHARE = 0.3e-3, 0.15
 _OVERDUE_S = 0.15e-3
 _REMIND_S = 1.0  # silence in lock step after which the other side is told that nothing came
@@ -82,15 +86,15 @@ class Loop:
 
     settings, limits : see there. control : the shared memory. ring : rows for the recorder, None keeps none.
 
-    looks_out : whether it polls for a packet that is due instead of sleeping until it comes, for the price of
-    up to 0.45 ms of its processor in each cycle, 0.3 ms at 1 kHz
+    turnaround : looks out for the packet that is due, with its answer ready, instead of sleeping until it
+    comes, for the price of up to 0.45 ms of a processor in each cycle, 0.3 ms at 1 kHz; None without
     """
 
     def __init__(
         self, settings: LoopSettings, limits: Limits, control: Control, ring: Ring | None = None
     ) -> None:
         self._settings, self._control, self._ring = settings, control, ring
-        self.looks_out = False
+        self.turnaround: Turnaround | None = None
         self._handshake = find_handshake(settings.handshake)
         self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
         self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
@@ -114,9 +118,10 @@ class Loop:
 
         self._request = int(self._words[Word.REQUEST])
         self._job = Job.NONE
+        self._a = self._b = self._limit = 0  # its arguments
         self._job_cycles = self._run_length = 0
         self._begun = False
-        self._rest = _Rest(self.remote)
+        self._rest = Rest(self.remote)
         self._row: NDArray[Any] = np.zeros(1, dtype=ROW) if ring is None else ring.row
         self._row_bytes = _bytes(self._row)
         self._fields = {name: self._row[name] for name in ROW.names or () if name not in ("msr", "cmd")}
@@ -151,25 +156,31 @@ class Loop:
 
     def cycle(self, timeout_s: float) -> bool:
         """Handle the next packet; False if none came within `timeout_s` [s]."""
-        remote = self.remote
-        if remote.receive(timeout_s) is None:
+        remote, turnaround = self.remote, self.turnaround
+        if turnaround is None:
+            came, sent = remote.receive(timeout_s) is not None, False
+        else:
+            came, sent = self._look_out(turnaround, timeout_s), turnaround.sent
+        if not came:
+            if sent:
+                self._disagree()
             self._no_packet()
             return False
         elapsed = remote.sequence - self._sequence if self._sequence >= 0 else 1
-        target = self._decide(remote.sequence, elapsed)
+        target = self._decide(remote.sequence, elapsed, sent)
         self._sequence = remote.sequence
         answered = self._commander.mode is not Mode.SILENT and not self._held_back
         if answered:
-            remote.answer(target, insist=self._doubted)
-        self._answered = answered
-        self._write_row(answered)
+            remote.answer(target, insist=self._doubted, sent=sent)
+        if turnaround is not None and sent and turnaround.answer_bytes != self._cmd_bytes:
+            self._disagree()
+        self._answered = answered or sent
+        self._write_row(self._answered, turnaround.sent_ns if turnaround is not None and sent else None)
         self._advance_job(elapsed)
         return True
 
     def _serve(self) -> None:
         if not self._settings.lock_step:
-            if self.looks_out:
-                self._look_out()
             self.cycle(_SLICE_S)
             return
         self._take_request()
@@ -184,20 +195,43 @@ class Loop:
         if self._ring is not None:
             self._ring.beat(time.monotonic_ns())
 
-    def _look_out(self) -> None:
-        """Real time, with a processor of its own: sleep until shortly before the packet is due, then look for
-        it without sleeping, so that waking up is over when it comes.
-        """
-        due = self._heard_s + self._period
-        early = due - min(_LOOKOUT_S, _LOOKOUT_SHARE * self._period) - time.monotonic()
-        if not 0.0 < early < self._period:
+    def _look_out(self, turnaround: Turnaround, timeout_s: float) -> bool:
+        """Wait for a packet with the answer ready; False if none came. A new request is taken up at once."""
+        remote = self.remote
+        while True:
+            self._make_ready(turnaround)
+            due = remote.received_ns * 1e-9 + self._period - time.monotonic()
+            early = due - min(_LOOKOUT_S, _LOOKOUT_SHARE * self._period)
+            window = round(1e9 * early), round(1e9 * (due + _OVERDUE_S))
+            if not turnaround.wait(*window, round(1e9 * timeout_s)):
+                break
+        if not turnaround.arrived:
+            return False
+        return remote.receive(0.0, (turnaround.length, turnaround.source, turnaround.received_ns)) is not None
+
+    def _make_ready(self, turnaround: Turnaround) -> None:
+        """Have the answer ready that the next packet gets if it is a regular one, as far as it is known now."""
+        seen, remote, commander = turnaround.disarm(), self.remote, self._commander
+        self._take_request()
+        asked = self._job is Job.MOTION
+        begins = asked and not self._begun
+        stops = not asked or int(seen[Word.STOP]) != self._b
+        if (
+            self._doubted
+            or remote.controller is None
+            or (stops and (begins or commander.mode is Mode.MOTION))
+        ):
             return
-        if self.remote.wait(early):
+        foreseen = commander.foresee(self._sequence + 1, self._a if begins else 0)
+        if foreseen is None:
             return
-        self._commander.rehearse(self._krl + self._offset, self._q)
-        late = due + _OVERDUE_S
-        while not self.remote.pending() and time.monotonic() < late:
-            continue
+        counter = remote.foresee(foreseen[0], turnaround.answer_bytes)
+        if counter is not None:
+            turnaround.arm(remote.controller, counter, self._sample_time, commander.target, foreseen[1])
+
+    def _disagree(self) -> None:
+        """What was sent is not what the loop decides: cannot be, and if it is, nothing is certain any more."""
+        self._commander.fall_silent(Result.GUARD, "an answer was sent that the loop would not have given")
 
     def remind(self) -> None:
         """Lock step: after a while without a packet, say that all that came has been answered.
@@ -221,8 +255,10 @@ class Loop:
 
     # -- what to answer --------------------------------------------------------------------------------------
 
-    def _decide(self, sequence: int, elapsed: int) -> NDArray[np.float32] | None:
+    def _decide(self, sequence: int, elapsed: int, sent: bool) -> NDArray[np.float32] | None:
         """The position to send, or None for the mirror, or for nothing where the answer is held back.
+
+        sent : the answer has left already; what is asked for since then is for the next packet
 
         In command mode the mirror of a set point in motion would stop the arm at once. Without an answer the
         controller brakes it.
@@ -252,7 +288,8 @@ class Loop:
             other_cycle, ready = False, True
         if other_cycle:
             self._set_period(remote.sample_time_s)
-        self._take_request()
+        if not sent:
+            self._take_request()
         misses = int(remote.msr["miss_counter"])
         if misses != self._misses:
             self._misses, self._missed_at = misses, sequence
@@ -275,9 +312,9 @@ class Loop:
         commander.watch(elapsed, setpoint, self._q)
         if self._job is Job.MOTION and not self._begun:
             self._begun = True
-            commander.begin(int(self._words[Word.A]), sequence)
-        if commander.mode is Mode.MOTION:
-            if int(self._words[Word.STOP]) != int(self._words[Word.B]):
+            commander.begin(self._a, sequence)
+        if commander.mode is Mode.MOTION and not sent:
+            if int(self._words[Word.STOP]) != self._b:
                 commander.stop(Result.ABORTED, f"stop requested {commander.place()}")
             elif self._job is not Job.MOTION:
                 commander.stop(Result.ABORTED, f"stopped by the driver {commander.place()}")
@@ -392,6 +429,7 @@ class Loop:
         request = int(words[Word.REQUEST])
         if request != self._request:
             self._request, self._job = request, Job(int(words[Word.JOB]))
+            self._a, self._b, self._limit = (int(words[place]) for place in (Word.A, Word.B, Word.LIMIT))
             self._job_cycles = self._run_length = 0
             self._begun = False
             if self._job is Job.MOTION:
@@ -399,18 +437,18 @@ class Loop:
 
     def _advance_job(self, elapsed: int) -> None:
         """See whether what was asked for has come about."""
-        job, words, remote = self._job, self._words, self.remote
+        job, remote = self._job, self.remote
         if job is Job.NONE:
             return
         commander, handshake = self._commander, self._handshake
         self._job_cycles += elapsed
         done = False
         if job is Job.CYCLES:
-            done = self._rest.add(first=self._run_length == 0) >= int(words[Word.A])
+            done = self._rest.add(first=self._run_length == 0) >= self._a
             self._run_length += 1
         elif job is Job.QUALITY:
-            self._run_length = self._run_length + 1 if remote.quality >= int(words[Word.B]) else 0
-            done = self._run_length >= int(words[Word.A])
+            self._run_length = self._run_length + 1 if remote.quality >= self._b else 0
+            done = self._run_length >= self._a
         elif job is Job.START:
             # After a fallback, seen or not, the program wants its stop acknowledged before it takes a start.
             self._begun = self._begun and not handshake.fallen(remote.msr)
@@ -437,7 +475,7 @@ class Loop:
             return
         if done:
             self._finish(Result.DONE, "")
-        elif 0 < int(words[Word.LIMIT]) < self._job_cycles:
+        elif 0 < self._limit < self._job_cycles:
             if job is Job.START:
                 handshake.request_stop(remote.command, remote.msr)
             self._finish(Result.TIMEOUT, "")
@@ -452,9 +490,11 @@ class Loop:
 
     # -- rows ------------------------------------------------------------------------------------------------
 
-    def _write_row(self, answered: bool) -> None:
+    def _write_row(self, answered: bool, sent_ns: int | None) -> None:
+        """The row of this cycle; sent_ns : when the answer was sent, None for just now [ns]."""
         remote, words, fields, control = self.remote, self._words, self._fields, self._control
-        received_ns, sent_ns = remote.received_ns, time.monotonic_ns()
+        received_ns = remote.received_ns
+        sent_ns = time.monotonic_ns() if sent_ns is None else sent_ns
         words[Word.HEARD_NS] = received_ns
         if answered:
             control.latency[min((sent_ns - received_ns) // BIN_NS, len(control.latency) - 1)] += 1
@@ -491,44 +531,6 @@ class Loop:
             self._last_event = remote.events[-1]
             self._control.write_text(Text.NOTE, f"{self._last_event.kind.value}: {self._last_event.text}")
             words[Word.NOTES] += 1
-
-
-class _Rest:
-    """Means over some cycles; deviations from the first one are summed, so nothing is lost to rounding."""
-
-    def __init__(self, remote: RemoteEnd) -> None:
-        msr = remote.msr
-        self._values = (
-            msr["msr_jnt_pos"],
-            msr["msr_jnt_trq"],
-            msr["est_ext_jnt_trq"],
-            remote.command["jnt_pos"],
-        )
-        self._count = 0
-        self._first = np.zeros((4, JOINTS))
-        self._sum, self._squares = np.zeros((4, JOINTS)), np.zeros((4, JOINTS))
-
-    def add(self, *, first: bool) -> int:
-        """Take the present cycle in, beginning anew with the `first`; returns how many there are."""
-        if first:
-            self._count = 0
-            self._sum[:] = self._squares[:] = 0.0
-            for place, value in enumerate(self._values):
-                self._first[place] = value
-        for place, value in enumerate(self._values):
-            deviation = value - self._first[place]
-            self._sum[place] += deviation
-            self._squares[place] += deviation * deviation
-        self._count += 1
-        return self._count
-
-    def write(self, measured: NDArray[np.float64]) -> None:
-        """Fill (6, 7): mean q, std q, mean tau, std tau, mean external tau, mean command."""
-        mean = self._sum / self._count
-        std = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
-        mean += self._first
-        measured[0], measured[1], measured[2], measured[3] = mean[0], std[0], mean[1], std[1]
-        measured[4], measured[5] = mean[2], mean[3]
 
 
 def _bytes(array: NDArray[Any]) -> memoryview:

@@ -1,8 +1,8 @@
 """The FRI loop in a process of its own: the handle that starts and ends it, and its entry.
 
-The process is a fresh interpreter that imports numpy, ruckig and `fri` only. It inherits the shared memory
-and a pipe for one line, in which it says that it is ready or why not. It ignores Ctrl-C, and ends when its
-parent is gone.
+The process is a fresh interpreter that imports numpy, ruckig and `fri` only, and with real-time rights the
+compiled `lwr_driver.turnaround`. It inherits the shared memory and a pipe for one line, in which it says that
+it is ready or why not. It ignores Ctrl-C, and ends when its parent is gone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -168,10 +168,9 @@ def main(arguments: Sequence[str]) -> None:
         limits = Limits(**{name: np.array(value) for name, value in order["limits"].items()})
         control = Control(*order["control"])
         loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]))
-        rights = realtime.set_up(scheduling.priority, scheduling.cpu) if scheduling.apply else Rights()
+        rights = _become_real_time(loop, control, scheduling) if scheduling.apply else Rights()
         if scheduling.required:
             rights.enforce()
-        loop.looks_out = scheduling.apply and rights.ok and rights.processor is not None
     except LwrError as error:
         _say({"error": str(error), "kind": type(error).__name__})
         return
@@ -189,6 +188,24 @@ def main(arguments: Sequence[str]) -> None:
         }
     )
     loop.run(order["parent"])
+
+
+def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> Rights:
+    """Take the rights that are granted; with all of them, and a processor of its own, the loop looks out."""
+    turnaround, advice = None, []
+    if realtime.assess(scheduling.priority).ok:
+        # Before the rights: a compiler wants the processor for long, and all that it touches would be locked.
+        try:
+            from lwr_driver.turnaround import Turnaround
+
+            turnaround = Turnaround(loop.remote.descriptor, loop.remote.buffer, control.words)
+        except Exception as error:  # whatever keeps a compiler from working, the loop does without
+            remedy = f"answers take longer; see that numba works and may write its cache ({error})"
+            advice.append(Shortage("the code that answers at once cannot be compiled", remedy))
+    rights = realtime.set_up(scheduling.priority, scheduling.cpu)
+    if rights.ok and rights.processor is not None:
+        loop.turnaround = turnaround
+    return replace(rights, advice=(*rights.advice, *advice))
 
 
 def _say(answer: dict[str, Any]) -> None:

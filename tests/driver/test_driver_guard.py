@@ -147,3 +147,13 @@ def test_row_that_does_not_belong_is_refused(row, joint, error, sign):
     wrong[joint] += np.float32(sign * error)
     assert watch.check(wrong, 1) is not None
     assert watch.check(motion.q[row + 1].astype(np.float32), 2) is None
+
+
+def test_a_check_that_is_not_remembered_finds_the_same_and_leaves_no_trace():
+    guard = Guard(arm().limits, 1e-3)
+    q = START.astype(np.float32)
+    guard.reset(q)
+    far = q + np.float32(0.01)
+    assert guard.check(far, 1, remember=False) is not None
+    assert guard.check(q, 1, remember=False) is None
+    assert guard.check(q, 1) is None
