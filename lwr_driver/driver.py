@@ -505,13 +505,9 @@ class Driver:
         return Waiting(waiting.awaited, state.summary, waiting.since_s, advice(state))
 
     def _obey(self, awaited: str) -> None:
-        words = self._need(self._control).words
-        if words[Word.DROP]:
-            raise self._with_rows(
-                OperatorError(f"the link was dropped on request while waiting for {awaited}")
-            )
-        if int(words[Word.STOP]) != self._stops_seen:
-            self._stops_seen = int(words[Word.STOP])
+        stops = int(self._need(self._control).words[Word.STOP])
+        if stops != self._stops_seen:
+            self._stops_seen = stops
             raise self._with_rows(OperatorError(f"stop requested while waiting for {awaited}"))
 
     def _check_executable(self, motion: Motion, state: LinkState) -> None:
