@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["GroupedCommand", "json_option", "number_or"]
+__all__ = ["GroupedCommand", "coupling_option", "gear_ratio_option", "json_option", "number_or"]
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
@@ -15,6 +15,24 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 def json_option(command: Decorated) -> Decorated:
     """The option --json, the same for every command that reports."""
     option = click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+    return option(command)
+
+
+def coupling_option(command: Decorated) -> Decorated:
+    """The option --coupling, the same for every command that fits a model."""
+    option = click.option(
+        "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
+    )
+    return option(command)
+
+
+def gear_ratio_option(command: Decorated) -> Decorated:
+    """The option --gear-ratio, for arms without an arm file."""
+    option = click.option(
+        "--gear-ratio",
+        metavar="N[,N...]",
+        help="Motor turns for a turn of the joint, for all joints or one a joint; default: of the arm file.",
+    )
     return option(command)
 
 

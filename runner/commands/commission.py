@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.options import json_option
+from runner.options import coupling_option, gear_ratio_option, json_option
 from runner.plain import as_json as to_json
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ _LOUDEST = 5
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
 )
+@coupling_option
+@gear_ratio_option
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
 @click.option(
     "--allow-non-realtime", is_flag=True, help="Command the real arm without real-time rights; may stutter."
@@ -47,6 +49,8 @@ def command(
     out: Path,
     arm: str | None,
     urdf: Path | None,
+    coupling: tuple[str, ...],
+    gear_ratio: str | None,
     yes: bool,
     allow_non_realtime: bool,
     as_json: bool,
@@ -84,7 +88,7 @@ def command(
         paths = _recorded(file, out, sets or _RECORDED_SETS, yes, allow_non_realtime)
     parts = [[read_session(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
-    found = commission(parts, chain, arm=arm_data(known_arm(arm, chain)))
+    found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
     write_model(replace(found.model, provenance={**found.model.provenance, **found.stored()}), out)
     if as_json:
         click.echo(to_json(_content(found, paths, out)))
@@ -125,7 +129,9 @@ def _text(found: Reference, sets: int, sessions: int, names: tuple[str, ...]) ->
     listed = ", ".join(
         f"{cause}{f' {names[joint]}' if joint >= 0 else ''} {gain:.0f}" for (cause, joint), gain in loudest
     )
-    lines.append(f"  what chance alone seems to explain, at most (fall of chi-square): {listed}")
+    lines.append(
+        f"  what chance alone seems to explain, in the mean of the sets (fall of chi-square): {listed}"
+    )
     if sets < _RECORDED_SETS:
         lines.append(
             f"  {sets} set{'s say' if sets > 1 else ' says'} little about what changes from day to day; with "

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from runner.options import json_option
+from runner.options import coupling_option, gear_ratio_option, json_option
 
 __all__ = ["command"]
 
@@ -32,6 +32,15 @@ __all__ = ["command"]
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
 )
+@coupling_option
+@gear_ratio_option
+@click.option(
+    "--compare",
+    nargs=2,
+    multiple=True,
+    metavar="CAUSE:JOINT CAUSE:JOINT",
+    help="Put two causes side by side and say what tells them apart (repeatable).",
+)
 @click.option("--no-simulation", is_flag=True, help="Leave out the replay of the sessions.")
 @json_option
 def command(
@@ -42,6 +51,9 @@ def command(
     out: Path,
     arm: str | None,
     urdf: Path | None,
+    coupling: tuple[str, ...],
+    gear_ratio: str | None,
+    compare: tuple[tuple[str, str], ...],
     no_simulation: bool,
     as_json: bool,
 ) -> None:
@@ -54,24 +66,38 @@ def command(
     lwr-run diagnose unloaded.mcap loaded.mcap --out diagnosis
     lwr-run diagnose a.mcap b.mcap --test c.mcap --reference commissioned.yaml --out diagnosis
     """
+    from fri.errors import ConfigurationError
     from ident.model_file import read_model
     from lwr_driver.session import read_session
-    from runner.diagnosis import chain_of, known_arm, study
+    from runner.diagnosis import arm_data, chain_of, known_arm, study
     from runner.diagnosis.deciding import offers_of_sessions
+    from runner.diagnosis.look_alikes import asked
+    from runner.diagnosis.study import replaceable
+    from runner.report.diagnosis_page import write_diagnosis_report
 
+    replaceable(out)
     logs = [read_session(path) for path in sessions]
     held = [read_session(path) for path in test]
     chain = chain_of(logs, urdf)
+    known = known_arm(arm, chain)
+    pairs = [(asked(a, chain.joint_names), asked(b, chain.joint_names)) for a, b in compare]
     found = study(
         logs,
         chain,
         test=held,
-        arm=known_arm(arm, chain),
+        arm=known,
+        data=arm_data(known, chain, coupling, gear_ratio),
         model=None if model is None else read_model(model),
         reference=None if reference is None else read_model(reference),
         simulate=not no_simulation,
+        compare=pairs,
     )
     found = found.with_offers(offers_of_sessions(found.diagnosis, logs))
     found.write(out)
-    click.echo(json.dumps(found.diagnosis.to_dict(), indent=1, allow_nan=False) if as_json else str(found))
+    content = {**found.diagnosis.to_dict(), "look_alikes": [pair.to_dict() for pair in found.pairs]}
+    click.echo(json.dumps(content, indent=1, allow_nan=False) if as_json else str(found))
+    try:
+        click.echo(str(write_diagnosis_report(out)), err=as_json)
+    except ConfigurationError as error:
+        click.echo(f"no report.html: {error}", err=True)
     click.echo(str(out), err=as_json)

@@ -20,7 +20,7 @@ from ident.validation import validate
 from lwr_driver.session import read_session
 from runner.estimation import EstimatorChoice, announced, coulomb, couplings
 from runner.log_results import new_folder, write_log_results
-from runner.options import GroupedCommand, json_option, number_or
+from runner.options import GroupedCommand, coupling_option, json_option, number_or
 from runner.plain import as_json as to_json
 from runner.versions import software
 
@@ -88,9 +88,7 @@ def _signal(name: str, text: str, **named: Any) -> Any:
 @click.option(
     "--without", multiple=True, metavar="NAME", help="Leave out a parameter (offm3) or a kind (Fvl)."
 )
-@click.option(
-    "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
-)
+@coupling_option
 @click.option(
     "--coulomb",
     "coulomb_text",

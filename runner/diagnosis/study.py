@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ident.discrepancy import Diagnosis, Reference, diagnose
+from fri.errors import ConfigurationError
+from ident.discrepancy import ArmData, Diagnosis, Reference, diagnose
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.model_file import write_model
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session
+from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
+from runner.diagnosis.look_alikes import LookAlikes, Place, look_alikes, write_look_alikes
 from runner.diagnosis.measures import Moved, RowGain, moved_parameters, row_gains
 from runner.diagnosis.residuals import FILE, Residuals
 from runner.diagnosis.sources import arm_data
@@ -25,7 +28,7 @@ from runner.replay import Replay
 if TYPE_CHECKING:
     from runner.diagnosis.deciding import Deciding
 
-__all__ = ["DETAILS", "DIAGNOSIS", "EXTENDED", "TEXT", "Study", "study"]
+__all__ = ["DETAILS", "DIAGNOSIS", "EXTENDED", "TEXT", "Study", "replaceable", "study"]
 
 DIAGNOSIS = "diagnosis.json"
 DETAILS = "details.json"
@@ -38,6 +41,7 @@ class Study:
     """A diagnosis, what it gained, what could not be seen, and the motions that would decide what is open.
 
     sessions : names in the order in which they were run. referenced : whether a healthy reference was at hand.
+    pairs : causes that look alike, side by side.
     """
 
     diagnosis: Diagnosis
@@ -47,6 +51,7 @@ class Study:
     residuals: Residuals
     sessions: tuple[str, ...]
     referenced: bool
+    pairs: tuple[LookAlikes, ...] = ()
     offers: tuple[Deciding, ...] = field(default=())
 
     def __str__(self) -> str:
@@ -61,18 +66,23 @@ class Study:
         return {
             "schema_version": 1,
             "sessions": list(self.sessions),
+            "joints": list(self.residuals.joint_names),
             "reference": self.referenced,
             "rows": [gain.to_dict() for gain in self.gains],
             "base_parameters": [moved.to_dict() for moved in self.moved],
             "notes": list(self.notes),
+            "look_alikes": [pair.to_dict() for pair in self.pairs],
             "deciding_motions": [offer.to_dict() for offer in self.offers],
         }
 
     def write(self, folder: Path) -> None:
         """Write everything into `folder`: numbers, model, text, plots, residuals, deciding motions."""
+        from runner.report.look_alike_figures import look_alike_figure
         from runner.report.residual_figures import residual_figures
 
         folder.mkdir(parents=True, exist_ok=True)
+        for stale in (*folder.glob("residual-*.svg"), *folder.glob("look-alike-*.svg")):
+            stale.unlink()
         _write_json(self.diagnosis.to_dict(), folder / DIAGNOSIS)
         _write_json(self.details(), folder / DETAILS)
         write_model(self.diagnosis.extended_model, folder / EXTENDED)
@@ -81,8 +91,22 @@ class Study:
         for side in self.residuals.sides:
             for figure in residual_figures(self.residuals, side):
                 figure.save(folder / f"{figure.name}.svg")
+        write_look_alikes(self.pairs, folder / LOOK_ALIKES)
+        for pair in self.pairs:
+            figure = look_alike_figure(pair, self.residuals.joint_names)
+            figure.save(folder / f"{figure.name}.svg")
         for offer in self.offers:
             offer.plan.save(folder / offer.file)
+
+
+def replaceable(folder: Path) -> None:
+    """Whether a diagnosis may be written there. ConfigurationError where the folder holds anything else than one."""
+    if folder.exists() and not folder.is_dir():
+        raise ConfigurationError(f"{folder} is a file; name a folder with --out")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / DIAGNOSIS).is_file():
+        raise ConfigurationError(
+            f"{folder} holds other files than a diagnosis; choose another folder with --out"
+        )
 
 
 def study(
@@ -91,17 +115,22 @@ def study(
     *,
     test: Sequence[Session] = (),
     arm: Arm | None = None,
+    data: ArmData | None = None,
     model: DynamicModel | None = None,
     reference: DynamicModel | None = None,
     simulate: bool = True,
+    compare: Sequence[tuple[Place, Place]] = (),
 ) -> Study:
     """Diagnose `sessions` and measure what it is worth.
 
     arm : description of the arm, for stiffness, gear ratios and the simulation; without it nothing is replayed.
+    data : what is known of its drives; default: what the description says.
     model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
+    compare : causes to put side by side besides those that a finding is in doubt between.
     Raises DataError for sessions that cannot be used.
     """
     healthy = None if reference is None else Reference.of(reference)
+    data = arm_data(arm, chain) if data is None else data
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     replay = None
     if simulate and arm is not None:
@@ -110,7 +139,7 @@ def study(
         list(sessions),
         chain,
         test=list(test),
-        arm=arm_data(arm),
+        arm=data,
         model=model,
         reference=healthy,
         simulate=replay,
@@ -122,16 +151,18 @@ def study(
         notes.append(
             "no simulation: the arm is not one that the emulator has; name its description with --arm"
         )
+    pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
+    notes += unshown
     names = tuple(session.path.name for session in everything)
-    ratio = None if arm is None else arm.gear_ratio.astype(float)
     return Study(
         found,
         row_gains(found),
         moved_parameters(found),
         tuple(notes),
-        Residuals.of(found, names, ratio),
+        Residuals.of(found, names, data.gear_ratio),
         names,
         healthy is not None,
+        pairs,
     )
 
 

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from ident.discrepancy import Diagnosis, Finding, SimulationError
 from runner.diagnosis.measures import Moved, RowGain
-from runner.diagnosis.words import CAUSES, joints_text, quantity_text
+from runner.diagnosis.phrases import described
+from runner.diagnosis.words import CAUSES, joints_text, named, quantity_text
 
 if TYPE_CHECKING:
+    from runner.diagnosis.look_alikes import LookAlikes
     from runner.diagnosis.study import Study
 
 __all__ = ["study_text"]
@@ -32,6 +34,7 @@ def study_text(study: Study) -> str:
     lines += _headline(study)
     for number, finding in enumerate(diagnosis.findings, start=1):
         lines += _finding(number, finding, names)
+        lines += [line for pair in study.pairs if pair.finding == number for line in _beside(pair, names)]
     for u in diagnosis.unexplained[:_MOST_UNEXPLAINED]:
         lines.append(
             f"  seen but unnamed: {u.side} torque of {names[u.joint - 1]} depends on {', '.join(u.depends_on)} "
@@ -40,6 +43,10 @@ def study_text(study: Study) -> str:
     more = len(diagnosis.unexplained) - _MOST_UNEXPLAINED
     if more > 0:
         lines.append(f"  ... and {more} more of that kind, in diagnosis.json")
+    for pair in study.pairs:
+        if not pair.finding:
+            lines.append(f"Side by side: {pair.title(names)}")
+            lines += _beside(pair, names, decides=True)
     lines += _table(study.gains, names, bool(diagnosis.findings))
     lines += _simulated(diagnosis, names)
     lines += _moved(study.moved)
@@ -77,10 +84,7 @@ def _finding(number: int, finding: Finding, names: Sequence[str]) -> list[str]:
     if finding.cause == "lost_samples" and finding.mode:
         lines.append(f"     {finding.mode}")
     else:
-        values = ", ".join(
-            f"{name} {quantity_text(v.value, v.std, v.unit)}" for name, v in finding.parameters.items()
-        )
-        lines += _wrapped(values, "     ", "     ")
+        lines += _wrapped(described(finding.cause, finding.parameters, names), "     ", "     ")
         e = finding.evidence
         low, high = e.gain_interval_95
         lines.append(
@@ -88,15 +92,22 @@ def _finding(number: int, finding: Finding, names: Sequence[str]) -> list[str]:
             "(95 %)"
         )
     if finding.confidence < _SURE and finding.alternatives:
-        rivals = ", ".join(
-            f"{cause} {joints_text(joints, names) if joints else ''}".strip()
+        rivals = "; ".join(
+            ", ".join([cause, joints_text(joints, names)] if joints else [cause])
             for cause, joints, _ in finding.alternatives[:3]
         )
-        lines += _wrapped(f"{rivals}. What would decide: {finding.tell_apart}", "     or ", "        ")
+        decides = named(finding.tell_apart, names)
+        lines += _wrapped(f"{rivals}. What would decide: {decides}", "     or ", "        ")
     return lines
 
 
-def _table(gains: Sequence[RowGain], names: Sequence[str], named: bool) -> list[str]:
+def _beside(pair: LookAlikes, names: Sequence[str], *, decides: bool = False) -> list[str]:
+    said, motion = pair.sentences(names)
+    lines = _wrapped(said, "     ", "        ")
+    return lines + _wrapped(f"what would decide: {motion}", "     ", "        ") if decides else lines
+
+
+def _table(gains: Sequence[RowGain], names: Sequence[str], found: bool) -> list[str]:
     if not gains:
         return []
     lines = ["Torque error on what was not fitted [Nm]", " " * 18 + "".join(f"{name:>11}" for name in names)]
@@ -110,11 +121,14 @@ def _table(gains: Sequence[RowGain], names: Sequence[str], named: bool) -> list[
 
         lines.append(row(f"{side}, noise", {j: f"{g.noise:.4f}" for j, g in mine.items()}))
         lines.append(row("  base model", {j: f"{g.base:.4f}" for j, g in mine.items()}))
-        if named:
+        if found:
             lines.append(row("  extended", {j: f"{g.extended:.4f}" for j, g in mine.items()}))
             lines.append(row("  gain, 95 % from", {j: f"{g.interval_95[0]:+.4f}" for j, g in mine.items()}))
             lines.append(row("              to", {j: f"{g.interval_95[1]:+.4f}" for j, g in mine.items()}))
         lines.append(row("  avoidable", {j: f"{100 * g.avoidable_share:.0f} %" for j, g in mine.items()}))
+    worse = [f"{names[g.joint - 1]} ({g.side})" for g in gains if g.interval_95[1] < 0.0]
+    if worse and found:
+        lines.append(f"  worse than the base model by more than chance: {', '.join(worse)}")
     return lines
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
-__all__ = ["CAUSES", "joints_text", "quantity_text"]
+__all__ = ["CAUSES", "joints_text", "named", "one_joint", "quantity_text", "variable_of"]
 
 CAUSES = {
     "stribeck": "friction rises as the velocity falls towards zero",
@@ -36,13 +37,66 @@ CAUSES = {
     "lost_samples": "dropped, repeated or held samples",
 }
 
+_VARIABLES = {
+    "velocity": (
+        "stribeck",
+        "viscous_nonlinear",
+        "friction_asymmetry",
+        "presliding_hysteresis",
+        "motor_torque_delay",
+        "joint_torque_delay",
+    ),
+    "load": (
+        "friction_load",
+        "motor_torque_gain",
+        "backlash",
+        "joint_elasticity",
+        "sensor_gain",
+        "sensor_crosstalk",
+        "sensor_hysteresis",
+        "sensor_saturation",
+    ),
+    "position": (
+        "friction_position",
+        "cable_spring",
+        "base_tilt",
+        "payload_error",
+        "joint_zero_offset",
+        "sensor_ripple",
+    ),
+    "time": ("friction_temperature", "sensor_offset_drift", "payload_change", "contact", "lost_samples"),
+    "motor angle": ("gear_ripple",),
+}
+
+
+def variable_of(cause: str, ratio: float = 1.0) -> str:
+    """What a cause depends on: velocity, load, position, time or motor angle.
+
+    ratio : turns of what a ripple repeats with for a turn of the joint.
+    """
+    if cause == "sensor_ripple" and ratio > 1.5:
+        return "motor angle"
+    return next((name for name, causes in _VARIABLES.items() if cause in causes), "time")
+
 
 def joints_text(joints: Sequence[int], names: Sequence[str]) -> str:
     """Joints (from 1) as `joint A2` or `joints A2, E1`, `whole arm` for none."""
     if not joints:
         return "whole arm"
-    known = [names[j - 1] if 0 < j <= len(names) else str(j) for j in joints]
-    return ("joint " if len(known) == 1 else "joints ") + ", ".join(known)
+    if len(joints) == 1:
+        return one_joint(joints[0], names)
+    return "joints " + ", ".join(names[j - 1] if 0 < j <= len(names) else str(j) for j in joints)
+
+
+def one_joint(joint: int, names: Sequence[str]) -> str:
+    """A joint (from 1) as `joint A2`; its name alone where that says joint already."""
+    name = names[joint - 1] if 0 < joint <= len(names) else str(joint)
+    return name if "joint" in name.lower() else f"joint {name}"
+
+
+def named(text: str, names: Sequence[str]) -> str:
+    """A sentence with the names of joints in place of their numbers."""
+    return re.sub(r"\bjoint (\d+)\b", lambda match: one_joint(int(match.group(1)), names), text)
 
 
 def quantity_text(value: float, std: float, unit: str) -> str:

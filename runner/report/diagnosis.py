@@ -1,28 +1,35 @@
-"""What the diagnosis of a run found, with its evidence, as a part of the report."""
+"""What a diagnosis found, with its evidence, as a part of the report of a run or as a page of its own."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
-from runner.diagnosis.residuals import FILE as RESIDUALS
-from runner.diagnosis.residuals import Residuals
-from runner.diagnosis.words import CAUSES, joints_text, quantity_text
+from runner.diagnosis.look_alikes import LookAlikes
+from runner.diagnosis.phrases import described, parameter_rows
+from runner.diagnosis.words import CAUSES, joints_text, named
+from runner.report.diagnosis_folder import DiagnosisFolder
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
+from runner.report.look_alike_figures import look_alike_figure
 from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
-from runner.report.residual_figures import residual_figures
+from runner.report.residual_figures import finding_figure, residual_figures
 from runner.report.verdicts import extension_gain
 
-__all__ = ["diagnosis_section"]
+__all__ = ["diagnosis_parts", "diagnosis_section"]
+
+_SURE = 0.8
+_SEEN = {
+    "motor": "Seen in the motor torque only.",
+    "joint": "Acts on the links, so both torques see it.",
+    "sensor": "An error of the joint torque sensor.",
+}
 
 
 def diagnosis_section(results: ResultFolder) -> str:
-    """Findings with their evidence, what stays unexplained, the gain of the extended model, residual plots."""
-    diagnosis = results.diagnosis
+    """The diagnosis as a part of the report of a run."""
+    diagnosis = DiagnosisFolder.of(results)
     if diagnosis is None:
         return section(
             "diagnosis",
@@ -31,51 +38,115 @@ def diagnosis_section(results: ResultFolder) -> str:
             f"{escape(results.path.name)}/diagnosis</code> looks for what the model lacks, and the next "
             "<code>lwr-run report</code> shows it here.</p>",
         )
-    names = results.joint_names
-    findings: Sequence[Mapping[str, Any]] = diagnosis.get("findings", [])
-    details = _json(results.diagnosis_folder / "details.json")
-    decision = _json(results.diagnosis_folder / "decision.json")
-    parts = [paragraph(_answer(answer, names)) for answer in decision.get("answers", [])]
-    parts += [_finding(one, names) for one in findings]
-    if not findings:
-        parts.append(paragraph("Nothing found: the data carry no claim about a cause."))
-    if diagnosis.get("unexplained"):
-        parts.append(_unexplained(diagnosis["unexplained"], names))
-    parts.append(_gain(diagnosis, details, names))
-    parts.append(_simulated(diagnosis, names))
-    parts.append(_absorbed(details))
-    parts += [paragraph(str(note[:1]).upper() + str(note[1:]) + ".") for note in details.get("notes", [])]
-    parts.append(_offers(details, results))
-    parts.append(_plots(results))
+    parts = (
+        html if anchor == "findings" else f"<h3>{title}</h3>{html}"
+        for anchor, title, html in diagnosis_parts(diagnosis)
+    )
     return section("diagnosis", "Diagnosis", *parts)
 
 
-def _finding(finding: Mapping[str, Any], names: Sequence[str]) -> str:
-    cause = str(finding["cause"])
-    where = joints_text(finding.get("joints", []), names)
+def diagnosis_parts(diagnosis: DiagnosisFolder) -> list[tuple[str, str, str]]:
+    """Anchor, title and HTML of each part that there is: findings, what would decide, gains, limits, residuals."""
+    names = diagnosis.joint_names
+    answers = "".join(paragraph(_answer(answer, names)) for answer in diagnosis.answers)
+    found = "".join(_finding(diagnosis, number) for number in range(1, len(diagnosis.findings) + 1))
+    if not diagnosis.findings:
+        found = paragraph("Nothing found: the data carry no claim about a cause.")
+    parts = [
+        ("findings", "Findings", answers + found),
+        ("side-by-side", "Side by side", _asked(diagnosis)),
+        ("deciding", "Motions that would decide", _offers(diagnosis)),
+        ("unexplained", "Seen, but without a name", _unexplained(diagnosis.unexplained, names)),
+        ("gain", "Gain", _gain(diagnosis)),
+        ("replay", "Replay in simulation", _simulated(diagnosis.content, names)),
+        ("absorbed", "What the base parameters had absorbed", _absorbed(diagnosis)),
+        ("limits", "What these data cannot show", _notes(diagnosis)),
+        ("residuals-held-out", "Held-out residuals", _plots(diagnosis)),
+    ]
+    return [part for part in parts if part[2]]
+
+
+def _finding(diagnosis: DiagnosisFolder, number: int) -> str:
+    finding, names = diagnosis.findings[number - 1], diagnosis.joint_names
+    cause, joints = str(finding["cause"]), finding.get("joints", [])
+    side, parameters = str(finding.get("side", "")), finding.get("parameters") or {}
     confidence = finding.get("confidence")
-    sure = "" if confidence is None else f", confidence {100 * confidence:.0f} %"
+    open_ = confidence is not None and confidence < _SURE and finding.get("alternatives")
+    sure = (
+        "" if confidence is None else f"Confidence {100 * confidence:.0f} %" + (", open." if open_ else ".")
+    )
+    title = f"{_words(cause).capitalize()}, {joints_text(joints, names)}"
+    intro = (
+        f"{CAUSES.get(cause, '').capitalize()}: {described(cause, parameters, names)}." if parameters else ""
+    )
+    seen = _SEEN.get(side, "")
+    parts = [f"<h3>{escape(title)}</h3>", paragraph(" ".join(part for part in (intro, seen, sure) if part))]
     rows: list[list[Cell]] = []
-    for name, value in (finding.get("parameters") or {}).items():
-        rows.append([name, _quantity(value)])
     evidence = finding.get("evidence") or {}
     before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
-    if before is not None and after is not None:
+    if before is not None and after is not None and before > 0.0:
         interval = evidence.get("gain_interval_95")
-        gain = f"; 95 % interval of the gain {interval[0]:.3g} to {interval[1]:.3g} Nm" if interval else ""
-        rows.append(["error on unseen motions", f"{before:.3g} Nm without, {after:.3g} Nm with it{gain}"])
-    for key, label in (("delta_bic", "change of the Bayesian information criterion"), ("p_value", "p-value")):
+        gain = f"; less by {interval[0]:.3g} to {interval[1]:.3g} Nm (95 %)" if interval else ""
+        rows.append(["error on unseen motions", f"{before:.3g} Nm without it, {after:.3g} Nm with it{gain}"])
+    for other in finding.get("alternatives") or []:
+        place = f", {joints_text(other['joints'], names)}" if other.get("joints") else ""
+        rows.append(
+            [
+                "could also be",
+                f"{_words(other['cause'])}{place}",
+            ]
+        )
+    if finding.get("tell_apart") and finding.get("alternatives"):
+        rows.append(["what would decide", named(str(finding["tell_apart"]), names)])
+    parts.append(table(("", ""), rows, f"Evidence: {title}", classes="facts"))
+    if diagnosis.residuals is not None and side != "timing":
+        ratio = float((parameters.get("ratio") or {}).get("value", 1.0))
+        others = [
+            j for k, one in enumerate(diagnosis.findings) if k + 1 != number for j in one.get("joints", [])
+        ]
+        figure = finding_figure(diagnosis.residuals, cause, side, joints, ratio, others)
+        if figure is not None:
+            parts.append(figure_html(figure))
+    parts += [_beside(pair, names) for pair in diagnosis.look_alikes if pair.finding == number]
+    parts.append(
+        fold(
+            "Parameters and statistics",
+            table(("", ""), _statistics(finding), f"Statistics: {title}", classes="facts"),
+        )
+    )
+    return "".join(parts)
+
+
+def _statistics(finding: Mapping[str, Any]) -> list[list[Cell]]:
+    """Parameters with their meaning, and what the claim rests on."""
+    evidence = finding.get("evidence") or {}
+    rows: list[list[Cell]] = [
+        [name.replace("_", " "), f"{value} ({meaning.replace('`', '')})" if meaning else value]
+        for name, value, meaning in parameter_rows(str(finding["cause"]), finding.get("parameters") or {})
+    ]
+    for key, label in (("delta_bic", "ΔBIC"), ("p_value", "p-value")):
         if evidence.get(key) is not None:
             rows.append([label, f"{evidence[key]:.3g}"])
     for other in finding.get("alternatives") or []:
-        rows.append(
-            ["could also be", f"{_words(other['cause'])} (ΔBIC {other.get('delta_bic', float('nan')):.3g})"]
-        )
-    if finding.get("tell_apart") and finding.get("alternatives"):
-        rows.append(["what would decide", str(finding["tell_apart"])])
-    title = f"{_words(cause).capitalize()}, {where}"
-    explained = f"{CAUSES.get(cause, '')} ({finding.get('side', 'no')} side{sure})".strip()
-    return f"<h3>{escape(title)}</h3>{paragraph(explained)}{table(('', ''), rows, f'Evidence: {title}')}"
+        if other.get("delta_bic") is not None:
+            rows.append([f"ΔBIC with {_words(other['cause'])} instead", f"{other['delta_bic']:.3g}"])
+    return rows
+
+
+def _beside(pair: LookAlikes, names: Sequence[str]) -> str:
+    """Two causes side by side, what it means, and the motion that decides."""
+    said, motion = pair.sentences(names)
+    figure = look_alike_figure(pair, names)
+    return (
+        f"<h4>Side by side: {escape(_words(pair.title(names)))}</h4>"
+        f"{paragraph(_words(said[:1].upper() + said[1:]) + '.')}{paragraph(f'What would decide: {motion}.')}"
+        f"{figure_html(figure)}"
+    )
+
+
+def _asked(diagnosis: DiagnosisFolder) -> str:
+    pairs = [pair for pair in diagnosis.look_alikes if not pair.finding]
+    return "".join(_beside(pair, diagnosis.joint_names) for pair in pairs)
 
 
 def _unexplained(entries: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
@@ -88,11 +159,14 @@ def _unexplained(entries: Sequence[Mapping[str, Any]], names: Sequence[str]) -> 
         ]
         for entry in entries
     ]
+    if not rows:
+        return ""
     head = ("where", "depends on", "error on unseen motions [Nm]", "noise floor [Nm]")
-    return f"<h3>Seen, but without a name</h3>{table(head, rows, 'Unexplained residuals')}"
+    return table(head, rows, "Unexplained residuals")
 
 
-def _gain(diagnosis: Mapping[str, Any], details: Mapping[str, Any], names: Sequence[str]) -> str:
+def _gain(folder: DiagnosisFolder) -> str:
+    diagnosis, details, names = folder.content, folder.details, folder.joint_names
     gain = diagnosis.get("gain") or {}
     base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
     floor = (diagnosis.get("baseline") or {}).get("noise_floor") or {}
@@ -123,10 +197,17 @@ def _gain(diagnosis: Mapping[str, Any], details: Mapping[str, Any], names: Seque
         return ""
     whole = extension_gain(diagnosis)
     text = "" if whole is None else paragraph(f"Mean over joints and sides: {100 * whole:.0f} % less error.")
+    worse = [one for one in details.get("rows", []) if named and one["gain_interval_95"][1] < 0.0]
+    if worse:
+        places = ", ".join(f"{one['side']} torque of {joints_text([one['joint']], names)}" for one in worse)
+        text += paragraph(f"Worse than the base model there, by more than chance: {places}.")
+    sessions = (diagnosis.get("sessions") or {}).get("test") or []
+    unseen = ", ".join(sessions) or "each part of the motion, predicted from the others"
+    text = paragraph(f"Root mean square errors on what was not fitted: {unseen}.", "soft") + text
     middle = ("extended [Nm]", "change %", "gain [Nm], 95 % interval") if named else ()
     head = ("joint", "noise floor [Nm]", "base model [Nm]", *middle, "avoidable % of its power")
     title = "Gain of the extended model on unseen motions" if named else "Error on unseen motions"
-    return f"<h3>{title}</h3>{text}{table(head, rows, title)}"
+    return text + table(head, rows, title)
 
 
 def _span(interval: Sequence[float]) -> str:
@@ -154,16 +235,16 @@ def _simulated(diagnosis: Mapping[str, Any], names: Sequence[str]) -> str:
         return ""
     title = "Replay in simulation"
     text = paragraph("The same commands to the simulated arm: measured less simulated, root mean square.")
-    return f"<h3>{title}</h3>{text}{table(('', *names), rows, title)}"
+    return text + table(("", *names), rows, title)
 
 
 def _scaled(values: Sequence[float | None], scale: float) -> list[Cell]:
     return [Number(None if value is None else scale * value, ".3f") for value in values]
 
 
-def _absorbed(details: Mapping[str, Any]) -> str:
+def _absorbed(diagnosis: DiagnosisFolder) -> str:
     """Base parameters that were wrong because they had taken up what the findings now say."""
-    entries = details.get("base_parameters") or []
+    entries = diagnosis.details.get("base_parameters") or []
     if not entries:
         return ""
     rows: list[list[Cell]] = [
@@ -179,12 +260,21 @@ def _absorbed(details: Mapping[str, Any]) -> str:
     ]
     head = ("parameter", "base model", "extended", "std", "change [std]", "unit")
     title = "What the base parameters had absorbed"
-    return f"<h3>{title}</h3>{table(head, rows, title)}"
+    text = paragraph(
+        "Wrong in the base model, because they stood for what is now in the model by name.", "soft"
+    )
+    return text + table(head, rows, title)
 
 
-def _offers(details: Mapping[str, Any], results: ResultFolder) -> str:
+def _notes(diagnosis: DiagnosisFolder) -> str:
+    notes = [str(note) for note in diagnosis.details.get("notes", [])]
+    items = "".join(f"<li>{escape(note[:1].upper() + note[1:])}.</li>" for note in notes)
+    return f"<ul>{items}</ul>" if notes else ""
+
+
+def _offers(diagnosis: DiagnosisFolder) -> str:
     """The motions that would decide, as files that can be run."""
-    offers = details.get("deciding_motions") or []
+    offers = diagnosis.details.get("deciding_motions") or []
     if not offers:
         return ""
     parts = [
@@ -194,22 +284,28 @@ def _offers(details: Mapping[str, Any], results: ResultFolder) -> str:
         )
         for offer in offers
     ]
-    run = paragraph(f"`lwr-run experiment --resume {results.path.name} --decide` runs them and concludes.")
-    return f"<h3>Motions that would decide</h3>{''.join(parts)}{run}"
+    if diagnosis.experiment is not None:
+        name = diagnosis.experiment.name
+        run = f"`lwr-run experiment --resume {name} --decide` runs them and concludes."
+    else:
+        run = (
+            "Each is a plan that has passed every check: name it in an experiment file, `excitation: {plan: FILE}`, "
+            "run it, and give its session to `lwr-run diagnose` beside these."
+        )
+    return "".join([*parts, paragraph(run)])
 
 
-def _plots(results: ResultFolder) -> str:
+def _plots(diagnosis: DiagnosisFolder) -> str:
     """Residuals against everything, folded."""
-    file = results.diagnosis_folder / RESIDUALS
-    if not file.is_file():
+    residuals = diagnosis.residuals
+    if residuals is None:
         return ""
-    residuals = Residuals.load(file)
     parts = [
         fold(figure.caption, figure_html(figure))
         for side in residuals.sides
         for figure in residual_figures(residuals, side)
     ]
-    return f"<h3>Held-out residuals</h3>{''.join(parts)}"
+    return "".join(parts)
 
 
 def _answer(answer: Mapping[str, Any], names: Sequence[str]) -> str:
@@ -225,23 +321,5 @@ def _answer(answer: Mapping[str, Any], names: Sequence[str]) -> str:
     return f"Deciding motions: none of {asked}; found instead: {said}."
 
 
-def _json(path: Path) -> Mapping[str, Any]:
-    """Content of a file that may be missing."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
 def _words(cause: str) -> str:
     return cause.replace("_", " ")
-
-
-def _quantity(value: Any) -> str:
-    if not isinstance(value, Mapping):
-        return f"{value:.4g}" if isinstance(value, float) else str(value)
-    number = value.get("value")
-    if not isinstance(number, (int, float)):
-        return str(number)
-    return quantity_text(float(number), float(value.get("std") or 0.0), str(value.get("unit", "1")))

@@ -23,7 +23,7 @@ from runner.report.sections import (
 )
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 
-__all__ = ["REPORT", "report_html", "write_report"]
+__all__ = ["REPORT", "page_html", "report_html", "write_page", "write_report"]
 
 REPORT = "report.html"
 
@@ -49,16 +49,20 @@ def write_report(folder: str | Path) -> Path:
     ConfigurationError where the folder holds no results or the extra `view` is not installed.
     """
     results = ResultFolder.load(folder)
-    target = results.path / REPORT
+    return write_page(report_html(results), results.path)
+
+
+def write_page(text: str, folder: Path) -> Path:
+    """Write the text of `report.html` into a folder, whole or not at all; returns its path."""
+    target = folder / REPORT
     draft = target.with_suffix(".html.part")
-    draft.write_text(report_html(results), encoding="utf-8")
+    draft.write_text(text, encoding="utf-8")
     draft.replace(target)
     return target
 
 
 def report_html(results: ResultFolder) -> str:
     """The text of the report."""
-    script = plotly_script()
     lines = verdicts(results)
     body = [session_section(results)]
     if results.summary.get("parameters"):
@@ -72,23 +76,46 @@ def report_html(results: ResultFolder) -> str:
         parameter_section(results),
         provenance_section(results),
     ]
-    content = "".join(body)
-    links = "".join(
-        f"<a href='#{anchor}'>{title}</a>" for anchor, title in _PARTS if f"<section id='{anchor}'" in content
-    )
     level, sentence = headline(lines)
-    name = escape(str(results.summary["experiment"]))
-    style = _asset("page.css")
-    software = escape(str(results.summary.get("versions", {}).get("software", "")))
+    return page_html(
+        str(results.summary["experiment"]),
+        _subtitle(results),
+        (level, sentence),
+        lines,
+        "".join(body),
+        _PARTS,
+        str(results.summary.get("versions", {}).get("software", "")),
+    )
+
+
+def page_html(
+    name: str,
+    subtitle: str,
+    verdict: tuple[Level, str],
+    lines: Sequence[Verdict],
+    content: str,
+    parts: Sequence[tuple[str, str]],
+    software: str,
+) -> str:
+    """A whole page: what it is about, the verdict with its table, links to its parts, and the parts.
+
+    subtitle, content : HTML. parts : anchor and title of what may be in the content.
+    """
+    script = plotly_script()
+    links = "".join(
+        f"<a href='#{anchor}'>{title}</a>" for anchor, title in parts if f"<section id='{anchor}'" in content
+    )
+    level, sentence = verdict
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
-        f"<title>{name}: {escape(sentence)}</title><link rel=icon href='data:,'><style>{style}</style></head>"
-        f"<body><header><h1>{_subtitle(results)}</h1><p class=verdict>{_badge(level)}"
+        f"<title>{escape(name)}: {escape(sentence)}</title><link rel=icon href='data:,'>"
+        f"<style>{_asset('page.css')}</style></head>"
+        f"<body><header><h1>{subtitle}</h1><p class=verdict>{_badge(level)}"
         f"<span>{escape(sentence)}</span></p>"
         f"{_verdict_table(lines)}<nav aria-label='Parts of the report'>{links}</nav></header>"
         f"<main>{content}</main>"
-        f"<footer>Written by {software}. This file needs no network; print it or keep it beside the logs."
+        f"<footer>Written by {escape(software)}. This file needs no network; print it or keep it beside the logs."
         "</footer>"
         f"<script>{script}</script><script>{_asset('page.js')}</script></body></html>\n"
     )

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.diagnosis.residuals import Residuals, SideResiduals
+from runner.diagnosis.words import variable_of
 from runner.report.figures import bin_means
 from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
 
-__all__ = ["AGAINST", "residual_figures"]
+__all__ = ["AGAINST", "LABELS", "finding_figure", "residual_figures"]
 
 Floats = NDArray[np.float64]
 
 AGAINST = ("time", "position", "velocity", "load", "motor angle", "run order")
 
-_LABELS = {
-    "time": "time, the sessions one after the other [s]",
+LABELS = {
+    "time": "time, sessions in turn [s]",
     "position": "position [rad]",
     "velocity": "velocity [rad/s]",
     "load": "predicted joint torque [Nm]",
@@ -26,6 +27,7 @@ _LABELS = {
     "run order": "block of the run",
 }
 _GAP_S = 2.0
+_PLACES = 2
 
 
 def residual_figures(residuals: Residuals, side: str) -> list[Figure]:
@@ -34,27 +36,68 @@ def residual_figures(residuals: Residuals, side: str) -> list[Figure]:
     return [_figure(residuals, rows, side, against) for against in AGAINST]
 
 
-def _figure(residuals: Residuals, rows: SideResiduals, side: str, against: str) -> Figure:
+def finding_figure(
+    residuals: Residuals,
+    cause: str,
+    side: str,
+    joints: Sequence[int],
+    ratio: float = 1.0,
+    others: Sequence[int] = (),
+) -> Figure | None:
+    """Held-out residual without and with the extension where a finding acts, over time and against its variable.
+
+    joints : from 1, none for the whole arm. ratio : of what a ripple repeats with. others : joints of other
+    findings, which show a cause of the whole arm less clearly. None where there is nothing to show.
+    """
+    seen = {"motor": ("motor",), "sensor": ("joint",)}.get(side, ("motor", "joint"))
+    if cause == "motor_torque_delay":
+        seen = ("motor",)
+    fall: dict[tuple[str, int], float] = {}
+    for name in seen:
+        rows = residuals.sides.get(name)
+        for joint in range(len(residuals.joint_names)) if rows is not None else ():
+            assert rows is not None
+            base, extended = rows.base[:, joint], rows.extended[:, joint]
+            if np.isfinite(base).any() and (not joints or joint + 1 in joints):
+                fall[name, joint] = 1.0 - float(np.nanmean(extended**2) / np.nanmean(base**2))
+    clear = {key: value for key, value in fall.items() if key[1] + 1 not in others}
+    if not joints and clear:
+        fall = clear
     panels = []
-    marks_of = _MARKS.get(against, _binned_marks)
-    for joint, name in enumerate(residuals.joint_names):
-        used = np.isfinite(rows.base[:, joint])
-        if not used.any():
-            continue
-        rms = [float(np.sqrt(np.nanmean(part[used, joint] ** 2))) for part in (rows.base, rows.extended)]
-        note = f"{rms[0]:.3g} Nm rms" + (f", extended {rms[1]:.3g}" if residuals.named else "")
-        panels.append(
-            Panel(
-                name,
-                _LABELS[against],
-                "residual [Nm]",
-                tuple(marks_of(residuals, rows, joint, against)),
-                f"Held-out residual of the {side} torque of {name} against {against}: {note}.",
-                note,
-            )
-        )
+    for name, joint in sorted(fall, key=lambda key: -fall[key])[:_PLACES]:
+        for against in dict.fromkeys((variable_of(cause, ratio), "time")):
+            panels.append(_panel(residuals, residuals.sides[name], name, joint, against, with_side=True))
+    where = "-".join(map(str, joints)) or "arm"
+    caption = f"Where {cause.replace('_', ' ')} shows"
+    return Figure(f"finding-{cause}-{where}", caption, tuple(panels)) if panels else None
+
+
+def _figure(residuals: Residuals, rows: SideResiduals, side: str, against: str) -> Figure:
+    panels = [
+        _panel(residuals, rows, side, joint, against)
+        for joint in range(len(residuals.joint_names))
+        if np.isfinite(rows.base[:, joint]).any()
+    ]
     caption = f"Held-out residual of the {side} torque against {against}"
     return Figure(f"residual-{side}-{against.replace(' ', '-')}", caption, tuple(panels))
+
+
+def _panel(
+    residuals: Residuals, rows: SideResiduals, side: str, joint: int, against: str, *, with_side: bool = False
+) -> Panel:
+    name = residuals.joint_names[joint]
+    used = np.isfinite(rows.base[:, joint])
+    rms = [float(np.sqrt(np.nanmean(part[used, joint] ** 2))) for part in (rows.base, rows.extended)]
+    note = f"{rms[0]:.3g} Nm rms" + (f", extended {rms[1]:.3g}" if residuals.named else "")
+    marks = _MARKS.get(against, _binned_marks)(residuals, rows, joint, against)
+    return Panel(
+        f"{name}, {side} torque" if with_side else name,
+        LABELS[against],
+        "residual [Nm]",
+        tuple(marks),
+        f"Held-out residual of the {side} torque of {name} against {against}: {note}.",
+        note,
+    )
 
 
 def _abscissa(residuals: Residuals, rows: SideResiduals, joint: int, against: str) -> Floats:

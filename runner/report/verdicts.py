@@ -235,8 +235,7 @@ def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
     ratios = [
         after / before
         for side in base
-        if side in extended
-        for before, after in zip(base[side], extended[side], strict=False)
+        for before, after in zip(base[side] or (), extended.get(side) or (), strict=False)
         if before and after is not None
     ]
     return 1.0 - float(np.mean(ratios)) if ratios and diagnosis.get("findings") else None
@@ -248,7 +247,7 @@ def largest_gain(diagnosis: Mapping[str, Any], names: Sequence[str]) -> tuple[st
     found = [
         (1.0 - after / before, f"{names[k] if k < len(names) else k + 1} {side}")
         for side in base
-        for k, (before, after) in enumerate(zip(base[side], extended.get(side, []), strict=False))
+        for k, (before, after) in enumerate(zip(base[side] or (), extended.get(side) or (), strict=False))
         if before and after is not None
     ]
     share, place = max(found)
