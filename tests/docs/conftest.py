@@ -39,13 +39,15 @@ def lwr_run(*arguments: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def laboratory(made_once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """Made once; tests work in copies of it (`workplace`)."""
-    folder = tmp_path_factory.mktemp("laboratory")
+    return made_once("laboratory", fill)
+
+
+def fill(folder: Path) -> None:
     (folder / "my_lab.yaml").write_text(yaml.safe_dump(SHORT))
     lwr_run("experiment", str(folder / "my_lab.yaml"), "--yes", "--out", str(folder / "results"))
     trace = {"name": "other", "motor_torque": {"source": "trace_file"}, "sessions": SHORT["sessions"][1:]}
-    (folder / "other.yaml").write_text(yaml.safe_dump({**SHORT, **trace}))
     other = folder / "other"
     seed = {"excitation": {**SHORT["excitation"], "seed": 4}}
     (folder / "other.yaml").write_text(yaml.safe_dump({**SHORT, **trace, **seed}))
@@ -59,7 +61,6 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(other / "model.yaml", folder / "another_model.yaml")
     content = (folder / "loaded.mcap").read_bytes()
     (folder / "broken.mcap").write_bytes(content[: len(content) * 2 // 3])
-    return folder
 
 
 @pytest.fixture

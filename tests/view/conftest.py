@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -29,14 +29,17 @@ sessions:
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a finished experiment."""
-    place = tmp_path_factory.mktemp("view")
-    (place / "short.yaml").write_text(EXPERIMENT)
-    out = place / "run"
-    done = CliRunner().invoke(main, ["experiment", str(place / "short.yaml"), "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    return out
+def finished(made_once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """Folder of a finished experiment; for reading."""
+
+    def experiment(place: Path) -> None:
+        (place / "short.yaml").write_text(EXPERIMENT)
+        done = CliRunner().invoke(
+            main, ["experiment", str(place / "short.yaml"), "--out", str(place / "run")]
+        )
+        assert done.exit_code == 0, done.output
+
+    return made_once("finished", experiment) / "run"
 
 
 @pytest.fixture(scope="session")
