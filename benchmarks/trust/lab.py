@@ -132,7 +132,7 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def gone(pids: list[int], patience_s: float = 15.0) -> list[int]:
+def gone(pids: list[int], patience_s: float = 60.0) -> list[int]:
     """Those of the processes that are still there after a while."""
     deadline = time.monotonic() + patience_s
     left = list(pids)
