@@ -72,6 +72,8 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             reference.encoder,
             encoder_known=True,
             reach=reference.reach,
+            far=reference.far,
+            far_share=reference.far_share,
             couplings=data.couplings,
         )
     return Arm(chain, compliance, ratio, couplings=data.couplings)

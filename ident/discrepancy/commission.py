@@ -14,7 +14,7 @@ from ident.base import BaseSet
 from ident.discrepancy.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.discrepancy.evidence import Floats
 from ident.discrepancy.nominal import Arm
-from ident.discrepancy.presliding import presliding_reach
+from ident.discrepancy.presliding import SlowTurns, presliding_reach, slow_turns, with_far_presliding
 from ident.discrepancy.recording import Recording, record
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.selection import gains, select
@@ -39,11 +39,15 @@ _LATEST_S = 0.02
 
 @dataclass(frozen=True, eq=False)
 class _Day:
-    """What one set says: base parameters (p,) and covariance (p, p), noise of a row by side."""
+    """What one set says: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of
+    the drives (n,) [Nm] and what of it turns slowly, see `presliding.slow_turns`.
+    """
 
     values: Floats
     covariance: Floats
     sigma: Mapping[str, Floats]
+    coulomb: Floats
+    slow_turns: SlowTurns
 
 
 def commission(
@@ -57,8 +61,8 @@ def commission(
     """The healthy arm from sets of sessions, each as a later diagnosis will get them.
 
     The side of the joints that the positions come from, stiffness and presliding come from the first sets;
-    parameters and noise from all, with what changed between them; the null, the largest gain of each
-    candidate, from each set against a reference made of the others. Raises DataError for sessions that cannot
+    parameters and noise from all, with what changed between them; the null, the mean gain of each candidate,
+    from each set against a reference made of the others. Raises DataError for sessions that cannot
     be used, and where the sets differ in their payloads or channels.
     """
     settings = settings or DiagnosisSettings()
@@ -80,6 +84,9 @@ def commission(
         several.append(_tuned(tuned, _recordings(part, chain, settings), settings, 1)[1])
     known = _middle(several)
     days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
+    known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
+    if known.far is not None:
+        days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
     null: dict[tuple[str, int], float] = {}
     for number, part in enumerate(parts):
         others = [day for k, day in enumerate(days) if k != number]
@@ -88,7 +95,7 @@ def commission(
             known, _recordings(part, chain, settings), settings, rest, None, fit_compliance=False
         )
         for key, gain in gains(bench.dictionary, bench.evidence, settings).items():
-            null[key] = max(null.get(key, 0.0), gain)
+            null[key] = null.get(key, 0.0) + gain / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))
     return _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
 
@@ -154,7 +161,13 @@ def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings,
     # Leaves the tolerated deviations beside the base.
     select(bench.dictionary, evidence, settings, None)
     p = evidence.base_count
-    return _Day(evidence.full.values[:p].copy(), evidence.covariance()[:p, :p], evidence.sigma)
+    return _Day(
+        evidence.full.values[:p].copy(),
+        evidence.covariance()[:p, :p],
+        evidence.sigma,
+        bench.nominal.motions[0].motor_coulomb,
+        slow_turns(bench.nominal, bench.evidence),
+    )
 
 
 def _reference(
@@ -196,6 +209,8 @@ def _reference(
         len(days),
         arm.encoder,
         arm.reach,
+        arm.far,
+        arm.far_share,
     )
 
 

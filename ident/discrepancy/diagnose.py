@@ -67,7 +67,7 @@ def diagnose(
     loss = sample_loss(list(sessions))
     known = nominal_arm(chain, arm, reference)
     bench = prepare_bench(known, recordings, settings, reference, causes, fit_compliance=reference is None)
-    null = reference.null if reference is not None else None
+    null = reference.limits() if reference is not None else None
     timing: list[Finding] = []
     selection = select(bench.dictionary, bench.evidence, settings, null)
     if not bench.told and not selection.claims:

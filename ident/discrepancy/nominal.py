@@ -63,6 +63,7 @@ class Arm:
 
     chain: Chain
     compliance: Floats
+    far, far_share : (n,) the share of it that turns within a longer distance, and that distance [rad].
     gear_ratio: Floats
     motor_delay_s: float = 0.0
     joint_delay_s: float = 0.0
@@ -72,13 +73,20 @@ class Arm:
     couplings: tuple[Coupling, ...] = ()
 
     def slip(self, speed: Floats, dt: float) -> Floats:
-        """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state."""
+        """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum
+        of two of them (Maxwell slip: asperities of several lengths side by side)."""
         found = np.sign(speed)
+    far: Floats | None = None
+    far_share: Floats | None = None
         if self.reach is not None:
             path = np.cumsum(speed, axis=0) * dt
             for joint in np.flatnonzero(self.reach > 0.0):
                 along = np.ascontiguousarray(path[:, joint])
-                found[:, joint] = dahl(along, float(self.reach[joint]), float(found[0, joint]))
+                start = float(found[0, joint])
+                found[:, joint] = dahl(along, float(self.reach[joint]), start)
+                if self.far is not None and self.far_share is not None and self.far_share[joint] != 0.0:
+                    slow = dahl(along, float(self.far[joint]), start)
+                    found[:, joint] += float(self.far_share[joint]) * (slow - found[:, joint])
         return found
 
 

@@ -1,20 +1,35 @@
-"""How far the drives of a healthy arm slide after a reversal before their Coulomb friction has turned."""
+"""How far the drives of a healthy arm slide after a reversal before their Coulomb friction has turned.
+
+Asperities have many lengths (Al-Bender, Lampaert and Swevers, IEEE Trans. Autom. Control 50 (2005)): one reach
+describes most of the friction, and a small share that turns within a longer distance the rest. That share is
+small beside the noise of one set, so it is a mean over all healthy sets.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from ident.discrepancy.nominal import Nominal
+from ident.discrepancy.evidence import Evidence
+from ident.discrepancy.nominal import Arm, Nominal
 from ident.effects.operators import dahl
 
-__all__ = ["presliding_reach"]
+__all__ = ["SlowTurns", "presliding_reach", "slow_turns", "with_far_presliding"]
 
 Floats = NDArray[np.float64]
 
 _GRID = np.geomspace(2e-5, 1e-2, 10)
 _SURE = 30.0
+# Longer distances to try, over the reach; the friction that turns within them, over its own standard error.
+_LONGER = (4.0, 12.0, 36.0)
+_CLEAR = 3.0
+
+SlowTurns = NDArray[np.float64]
+"""(2, longer distances, n): Coulomb friction that turns slowly [Nm], and its standard deviation."""
 
 
 def presliding_reach(nominal: Nominal, values: Floats) -> Floats:
@@ -70,3 +85,47 @@ def presliding_reach(nominal: Nominal, values: Floats) -> Floats:
         if misfit(None) - float(found.fun) > _SURE * noise:
             reach[joint] = float(np.exp(found.x))
     return reach
+
+
+def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
+    """Coulomb friction (2, distances, n) that turns within each of the longer distances, and its standard
+    deviation, beside all columns that the evidence holds; zero and infinite where nothing is known."""
+    n = nominal.arm.chain.n
+    found = np.zeros((2, len(_LONGER), n))
+    found[1] = np.inf
+    reach = nominal.arm.reach
+    if reach is None or "motor" not in nominal.rows:
+        return found
+    for joint in np.flatnonzero((reach > 0.0) & nominal.moving):
+        for k, longer in enumerate(_LONGER):
+            signals = []
+            for m in nominal.motions:
+                path = np.ascontiguousarray(np.cumsum(m.motor_speed[:, joint]) * m.dt)
+                state = dahl(path, longer * float(reach[joint]), float(np.sign(m.motor_speed[0, joint])))
+                signals.append(state - m.direction[:, joint])
+            rows = {("motor", int(joint)): nominal.reduce("motor", signals)[:, None]}
+            score = evidence.score(evidence.padded(rows))
+            if np.isfinite(score.gain):
+                found[:, k, joint] = score.coefficients[0], np.sqrt(score.covariance[0, 0])
+    return found
+
+
+def with_far_presliding(arm: Arm, days: Sequence[SlowTurns], coulomb: Sequence[Floats]) -> Arm:
+    """The arm with the share of friction that turns within a longer distance, where several healthy sets agree
+    on one: the mean of the sets over its standard error, from their scatter, is clear.
+
+    coulomb : (n,) of each set [Nm].
+    """
+    if arm.reach is None or len(days) < 3:
+        return arm
+    table = np.array(days)
+    weight = 1.0 / table[:, 1] ** 2
+    total = np.maximum(weight.sum(axis=0), 1e-300)
+    mean = np.sum(weight * table[:, 0], axis=0) / total
+    error = np.maximum(np.std(table[:, 0], axis=0, ddof=1) / np.sqrt(len(days)), total**-0.5)
+    clear = np.where(np.isfinite(weight).all(axis=0) & (mean > _CLEAR * error), mean**2 * total, 0.0)
+    best = np.argmax(clear, axis=0)
+    joints = np.arange(len(best))
+    level = np.maximum(np.mean(coulomb, axis=0), 1e-9)
+    share = np.where(clear[best, joints] > 0.0, mean[best, joints] / level, 0.0)
+    return replace(arm, far=np.array(_LONGER)[best] * arm.reach, far_share=np.minimum(share, 0.5))

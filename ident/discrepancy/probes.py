@@ -18,7 +18,7 @@ from ident.discrepancy.nominal import TRAVEL_RAD
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects.motion import Motion
 
-__all__ = ["Remainder", "find_remainders"]
+__all__ = ["Remainder", "find_remainders", "groups", "hats_of"]
 
 _HATS = 7
 _RIDGE = 1e-3
@@ -43,7 +43,7 @@ def find_remainders(
     """Remainders beside the columns that the evidence holds, largest first; at most two variables each."""
     fixed = list(evidence.extra)
     found = []
-    hats = _hats_of(dictionary)
+    hats = hats_of(dictionary)
     for side in evidence.nominal.rows:
         for joint in range(evidence.nominal.arm.chain.n):
             if evidence.mask[side, joint].sum() < 100:
@@ -65,14 +65,14 @@ def _one(
 ) -> Remainder | None:
     names: list[str] = []
     total = inflation = 0.0
-    groups = {}
-    for name, rows in _groups(dictionary, hats, side, joint).items():
+    prepared = {}
+    for name, rows in groups(dictionary, hats, side, joint).items():
         padded = evidence.padded(rows)
-        groups[name] = rows, padded, evidence.alone(padded)
+        prepared[name] = rows, padded, evidence.alone(padded)
     fixed = list(evidence.extra)
     for _ in range(2):
         best_name, best_gain, best_rows, best_inflation = "", 0.0, None, 0.0
-        for name, (rows, padded, known) in groups.items():
+        for name, (rows, padded, known) in prepared.items():
             score = evidence.score(padded, ridge=_RIDGE, known=known)
             least = settings.least_gain + 2.0 * _HATS
             if score.gain > max(least, best_gain) and score.inflation > _LEAST_INFLATION:
@@ -83,13 +83,13 @@ def _one(
         total += best_gain
         inflation += best_inflation
         names += [part for part in best_name.split(" ") if part not in names]
-        groups.pop(best_name)
+        prepared.pop(best_name)
         fixed = [*fixed, best_rows]
         evidence.replace(fixed)
     return Remainder(side, joint + 1, tuple(names), total, inflation) if names else None
 
 
-def _hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
+def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
     """Hat functions of every variable by its name, for each motion."""
     variables: dict[str, Callable[[Motion], Floats]] = {"time": lambda m: m.time}
     for k in range(dictionary.nominal.arm.chain.n):
@@ -106,7 +106,7 @@ def _hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
     return found
 
 
-def _groups(
+def groups(
     dictionary: Dictionary, hats: Mapping[str, Sequence[Floats]], side: str, joint: int
 ) -> dict[str, dict[Key, Floats]]:
     """Groups of columns by the names of their variables."""

@@ -2,8 +2,8 @@
 
 A reference ties the base parameters to their healthy values, within their uncertainty and a tolerance for
 what changes from day to day, so that causes show which the parameters would otherwise absorb. It also holds
-the noise, the delays and the stiffness of the healthy arm, and the largest gain that each candidate reached
-where nothing was wrong: what a claim must exceed.
+the noise, the delays and the stiffness of the healthy arm, and the gain that each candidate reached in the mean
+where nothing was wrong, from which follows what a claim must exceed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from scipy.stats import f as fisher
 
 from fri.errors import ConfigurationError
 from ident.base import BaseSet
@@ -25,6 +26,8 @@ _KEY = "commissioning"
 _WIDER = 1.5
 _DAY_TO_DAY = {"Fvl": 0.02, "Fcl": 0.02, "Fvm": 0.02, "Fcm": 0.02, "Ia": 0.005}
 _ELSE = 0.002
+_ONE_IN = 0.01
+_AS_SETS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +35,9 @@ class Reference:
     """A healthy arm.
 
     model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
-    noise : of a row [Nm] by side, (n,). null : largest gain of each candidate by (cause, joint from 0).
+    noise : of a row [Nm] by side, (n,). null : mean gain of each candidate by (cause, joint from 0).
     sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
-    reach : (n,) of presliding [rad], None where unknown.
+    reach : (n,) of presliding [rad], None where unknown. far, far_share : (n,) see `nominal.Arm`.
     """
 
     model: DynamicModel
@@ -46,6 +49,8 @@ class Reference:
     sets: int
     encoder: Literal["link", "motor"] = "link"
     reach: Floats | None = None
+    far: Floats | None = None
+    far_share: Floats | None = None
 
     @classmethod
     def of(cls, model: DynamicModel) -> Reference:
@@ -60,7 +65,10 @@ class Reference:
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
-            reach = np.array(stored["reach"], dtype=np.float64) if stored.get("reach") else None
+            reach, far, far_share = (
+                np.array(stored[name], dtype=np.float64) if stored.get(name) else None
+                for name in ("reach", "far", "far_share")
+            )
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
                 f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
@@ -70,7 +78,7 @@ class Reference:
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
         side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
-        return cls(model, compliance, *delays, noise, null, sets, side, reach)
+        return cls(model, compliance, *delays, noise, null, sets, side, reach, far, far_share)
 
     def stored(self) -> dict[str, Any]:
         """Content for the provenance of the model."""
@@ -85,9 +93,34 @@ class Reference:
                 },
                 "sets": self.sets,
                 "encoder": self.encoder,
-                "reach": None if self.reach is None else [float(v) for v in self.reach],
+                "reach": _listed(self.reach),
+                "far": _listed(self.far),
+                "far_share": _listed(self.far_share),
             }
         }
+
+    def limits(self) -> dict[tuple[str, int], float]:
+        """Gain of each candidate by (cause, joint from 0) that a healthy set stays below, but for one in a hundred.
+
+        How much a candidate finds in a healthy set differs from set to set: the arm is never quite the nominal
+        one. Taken as a deviation with a normal distribution over sets, whose square is the gain, a further set's
+        gain over the mean of `sets` of them has Fisher's distribution F(1, sets). Few sets know their own mean
+        badly, so that of the same cause in all joints counts as further sets.
+        """
+        if not self.sets:
+            return {}
+        by_cause: dict[str, list[float]] = {}
+        for (cause, _), gain in self.null.items():
+            by_cause.setdefault(cause, []).append(gain)
+        # What noise alone gives to a candidate has no such tail; the smallest gain of a claim sees to it.
+        noise = float(np.median(list(self.null.values()))) if self.null else 0.0
+        sets = self.sets + _AS_SETS
+        quantile = float(fisher.isf(_ONE_IN, 1, sets))
+        found = {}
+        for key, gain in self.null.items():
+            mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
+            found[key] = noise + quantile * max(mean - noise, 0.0)
+        return found
 
     def prior(self, base: BaseSet) -> tuple[Floats, Floats] | None:
         """Precision (p, p) and values (p,) of base parameters that mean the same in the reference.
@@ -115,6 +148,10 @@ class Reference:
         mean = np.zeros(len(base))
         mean[here] = values
         return precision, mean
+
+
+def _listed(values: Floats | None) -> list[float] | None:
+    return None if values is None else [float(v) for v in values]
 
 
 def _tolerance(name: str) -> float:

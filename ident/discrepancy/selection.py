@@ -17,6 +17,7 @@ from scipy.stats import norm
 
 from ident.discrepancy.candidates import Candidate, Dictionary, Trial
 from ident.discrepancy.evidence import Evidence, Rows, Score
+from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 
@@ -25,7 +26,7 @@ __all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reac
 log = logging.getLogger(__name__)
 
 Null = Mapping[tuple[str, int], float]
-"""Largest gain of each candidate in healthy sessions."""
+"""Gain of each candidate that a healthy set stays below."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +72,19 @@ def select(
     for _ in range(settings.rounds):
         found = state.contenders(accepted)
         first = first or {t.candidate.key: max(t.score.gain, 0.0) for t in found}
-        carried = [t for t in found if state.carried(t)]
-        if not carried:
+        best = state.next(accepted, [t for t in found if state.carried(t)])
+        if best is None:
             break
-        refined = [state.refined(t) for t in carried[:4]]
-        best = state.foremost(accepted, refined)
         log.info("%s: gain %.0f", best.candidate.key, best.score.gain)
         accepted = state.reconsider([*accepted, best])
         if best.candidate.key not in [t.candidate.key for t in accepted]:
             break
     claims = [state.claim(accepted, k) for k in range(len(accepted))]
-    while outdone := [k for k, claim in enumerate(claims) if claim.outdone]:
-        # What explains the same rows better is itself not carried by the data: neither is a claim.
-        accepted.pop(min(outdone, key=lambda k: claims[k].gain))
+    while doubtful := [
+        k for k, c in enumerate(claims) if c.outdone or state.leftover(c.trial, _others(claims, k))
+    ]:
+        # What explains the same rows better is itself not carried by the data, or it is what another leaves.
+        accepted.pop(min(doubtful, key=lambda k: claims[k].gain))
         claims = [state.claim(accepted, k) for k in range(len(accepted))]
     state.tolerate(accepted)
     claims.sort(key=lambda c: -c.gain)
@@ -110,6 +111,11 @@ def hopeful(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSetti
     if best is None or best.score.gain < _HOPE:
         return None
     return Selection([Claim(best, best.score)], state.nuisance, {}, state.nuisance_rows)
+
+
+def _others(claims: Sequence[Claim], k: int) -> list[Trial]:
+    """Trials of all claims but one."""
+    return [claim.trial for i, claim in enumerate(claims) if i != k]
 
 
 def _gain(trial: Trial) -> float:
@@ -199,9 +205,23 @@ class _State:
     def contenders(self, accepted: Sequence[Trial]) -> list[Trial]:
         """Best shapes of all candidates beside the accepted ones, best first."""
         self.tolerate(accepted)
-        taken = {t.candidate.key for t in accepted if not t.candidate.effect.event}
+        taken = {t.candidate.key for t in accepted if not t.candidate.effect.repeats}
         found = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
         return sorted(found, key=_gain, reverse=True)
+
+    def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
+        """The foremost of the trials that is not just what the accepted ones leave, None where there is none."""
+        refined: dict[tuple[str, int], Trial] = {}
+        while carried:
+            for trial in carried[:_CONTEST]:
+                if trial.candidate.key not in refined:
+                    refined[trial.candidate.key] = self.refined(trial)
+            best = self.foremost(accepted, [refined[t.candidate.key] for t in carried[:_CONTEST]])
+            if not self.leftover(best, accepted):
+                return best
+            self.tolerate(accepted)
+            carried = [t for t in carried if t.candidate.key != best.candidate.key]
+        return None
 
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, where that is still carried: a fit that held-back parts
@@ -234,7 +254,7 @@ class _State:
         settings = self.settings
         strict = trial.candidate.effect.scrutiny
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
-        known = (1.0 + settings.margin) * max(self.null.get(trial.candidate.key, 0.0), 0.0)
+        known = self.null.get(trial.candidate.key, 0.0)
         return (
             score.gain > max(least, known)
             and score.p_value < settings.alpha
@@ -258,7 +278,7 @@ class _State:
             while k < len(accepted) and len(accepted) > 1:
                 here = accepted[k]
                 rest = self.beside(accepted, k)
-                taken = {t.candidate.key for t in rest if not t.candidate.effect.event}
+                taken = {t.candidate.key for t in rest if not t.candidate.effect.repeats}
                 again = self.dictionary.trial(here.candidate, here.shape, self.choices(here))
                 rivals = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
                 rivals.sort(key=_gain, reverse=True)
@@ -281,11 +301,25 @@ class _State:
 
     # ---- claims ----
 
+    def leftover(self, trial: Trial, others: Sequence[Trial]) -> bool:
+        """Whether a trial beside others is no more carried once the stronger ones in its rows may be of any form."""
+        wide = []
+        for other in others:
+            if other.score.gain > trial.score.gain and set(trial.rows) & set(other.rows):
+                rows = beyond_law(self.dictionary, other)
+                wide += [] if rows is None else [rows]
+        if not wide:
+            return False
+        self.tolerate(others)
+        self.evidence.replace([*self.evidence.extra, *wide])
+        again = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial))
+        return again is None or not self.carried(again)
+
     def claim(self, accepted: Sequence[Trial], k: int) -> Claim:
         """The accepted trial number k with its look-alikes, given all others."""
         here = accepted[k]
         rest = self.beside(accepted, k)
-        taken = {t.candidate.key for t in rest if not t.candidate.effect.event}
+        taken = {t.candidate.key for t in rest if not t.candidate.effect.repeats}
         again = self.dictionary.trial(here.candidate, here.shape, self.choices(here)) or here
         rivals = sorted(
             (t for t in self.dictionary.trials() if t.candidate.key not in {*taken, here.candidate.key}),
@@ -313,6 +347,8 @@ class _State:
         return Claim(again, again.score, alike, sure, outdone)
 
 
+# Of so many that come first the shapes are refined before one is taken.
+_CONTEST = 4
 # Gain from which on it is worth seeing what a candidate leaves.
 _HOPE = 10.0
 # Share of the tolerance for a whole channel's delay that is left where a healthy arm told what it is.

@@ -28,7 +28,6 @@ class DiagnosisSettings:
     alpha : significance of a claim, each candidate by itself, from blocks.
     least_gain : fall of the held-back chi-square that a claim takes at least.
     least_inflation : smallest relative excess of the residual's power in the affected rows that matters.
-    margin : share of the null's largest gain that a candidate must exceed, times 1 + margin.
     rounds : largest number of effects.
     most_s : length of motion that is used; of longer sessions windows spread evenly.
     delay_tolerance_s : delays of a channel up to this are a property of the arm, and no finding.
@@ -47,7 +46,6 @@ class DiagnosisSettings:
     alpha: float = 1e-5
     least_gain: float = 30.0
     least_inflation: float = 0.005
-    margin: float = 0.5
     rounds: int = 8
     most_s: float = 240.0
     delay_tolerance_s: float = 1.0e-3

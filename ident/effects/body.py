@@ -11,7 +11,7 @@ from ident.effects.effect import Column, Simulated
 from ident.effects.motion import Floats, Motion
 from ident.kinematics import Chain
 
-__all__ = ["Body", "body_columns", "force_torque", "plant_jacobian"]
+__all__ = ["Body", "body_columns", "force_torque", "inertia_columns", "plant_jacobian"]
 
 # Places of M, MX, MY, MZ among the ten inertial parameters.
 _PLACES = (9, 6, 7, 8)
@@ -26,6 +26,16 @@ def body_columns(motion: Motion, count: int) -> tuple[Column, ...]:
         torque = motion.rigid_torque(motion.q, motion.qd, motion.qdd, bodies)
         columns.append(Column(motor=torque, joint=torque))
     return tuple(columns)
+
+
+def inertia_columns(motion: Motion) -> list[Floats]:
+    """Torque (N, n) of each unit moment and product of inertia of the last link about its origin."""
+    found = []
+    for place in range(6):
+        bodies = np.zeros_like(motion.bodies)
+        bodies[-1, place] = 1.0
+        found.append(motion.rigid_torque(motion.q, motion.qd, motion.qdd, bodies))
+    return found
 
 
 def force_torque(chain: Chain, q: Floats, axis: int, link: int) -> Floats:

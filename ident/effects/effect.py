@@ -148,6 +148,11 @@ class Effect(ABC):
 
     @property
     def linear(self) -> tuple[Parameter, ...]:
+    @property
+    def repeats(self) -> bool:
+        """Whether it may be claimed several times: contacts come and go, what comes to stay comes once."""
+        return self.event and not self.step
+
         """The parameters that are the coefficients of the columns."""
         return tuple(p for p in self.parameters if not p.shape)
 

@@ -16,7 +16,9 @@ _SLIP_KG_M = 1.4
 
 
 class PayloadChange(Effect):
-    """Mass and first moments of the last link jump at `time`, in the session number `session` from 1."""
+    """Mass and first moments of the last link jump at `time`, in the session number `session` from 1, and stay so in
+    the sessions after it: what came loose is still loose when the next session begins.
+    """
 
     cause = "payload_change"
     side = "joint"
@@ -54,8 +56,12 @@ class PayloadChange(Effect):
         return super().plausible(coefficients, shape) and bool(within_reach)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Torque of a unit mass and unit first moments in the last link after the time, in all rows."""
-        after = (motion.time >= shape["time"]) & (motion.session == round(shape["session"]) - 1)
+        """Torque of a unit mass and unit first moments in the last link after the time, in all rows of loaded
+        sessions."""
+        changed = round(shape["session"]) - 1
+        after = np.full(len(motion.time), motion.loaded and motion.session > changed)
+        if motion.session == changed:
+            after = motion.time >= shape["time"]
         return tuple(
             Column(motor=c.motor * after[:, None], joint=c.joint * after[:, None])
             for c in body_columns(motion, 4)

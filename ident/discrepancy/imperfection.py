@@ -1,0 +1,93 @@
+"""What a cause may look like beyond its law: so that what a strong one leaves is not taken for another.
+
+A law is an idealisation. A hose is no plain spring, friction falls with speed in its own way, a payload that is
+not the announced one has another inertia too. What the law of a strong cause leaves may exceed the noise by far,
+and then another cause that happens to resemble it is significant. It is a cause of its own only if it remains
+beside any function of the first one's own variable, acting on the same rows in the same proportion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ident.discrepancy.candidates import Dictionary, Trial
+from ident.discrepancy.evidence import Floats, Key, Rows
+from ident.discrepancy.probes import groups, hats_of
+from ident.effects.body import inertia_columns
+from ident.effects.operators import dahl
+
+__all__ = ["beyond_law"]
+
+# Variable of a law, and whether it scales what has the sign of the drive's direction.
+_OWN: Mapping[str, tuple[str, bool]] = {
+    "cable_spring": ("q", False),
+    "sensor_ripple": ("q", False),
+    "gear_ripple": ("q", False),
+    "friction_position": ("q", True),
+    "stribeck": ("qd", False),
+    "viscous_nonlinear": ("qd", False),
+    "friction_asymmetry": ("qd", False),
+    "friction_load": ("load", True),
+    "motor_torque_gain": ("load", False),
+    "sensor_gain": ("load", False),
+    "sensor_saturation": ("load", False),
+    "sensor_hysteresis": ("load", False),
+    "friction_temperature": ("time", True),
+    "sensor_offset_drift": ("time", False),
+}
+_BODIES = ("payload_error", "payload_change")
+# Distance in which a hose that rubs along the arm turns its friction [rad].
+_RUB_RAD = 0.1
+
+
+def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
+    """Columns of what the trial's cause may show beyond its law, None where nothing is known of it.
+
+    Hat functions of its own variable on the sides that it acts on, one coefficient for all of them; of a hose its
+    rubbing too; of a body that differs the rest of its inertial parameters.
+    """
+    cause, joint = trial.candidate.cause, trial.candidate.joint
+    if cause in _BODIES:
+        return _inertia(dictionary, trial)
+    if cause not in _OWN:
+        return None
+    variable, signed = _OWN[cause]
+    name = "time" if variable == "time" else f"{variable}{joint + 1}"
+    found: dict[Key, Floats] = {}
+    hats = {key: value for key, value in hats_of(dictionary).items() if key == name}
+    for side, at in trial.rows:
+        if at != joint or not hats:
+            continue
+        group = groups(dictionary, hats, side, joint)
+        wanted = f"{name} sign(qd{joint + 1})" if signed else name
+        # All hats together are a constant, which the base has.
+        columns = group[wanted][side, joint][:, 0 if signed else 1 :]
+        if cause == "cable_spring":
+            columns = np.column_stack([columns, _rubbing(dictionary, side, joint)])
+        found[side, joint] = columns
+    return found or None
+
+
+def _rubbing(dictionary: Dictionary, side: str, joint: int) -> Floats:
+    """Dahl's friction (m,) along the angle of a joint, in rows of a side."""
+    motions = dictionary.nominal.motions
+    states = [dahl(np.ascontiguousarray(m.q[:, joint]), _RUB_RAD, 0.0) for m in motions]
+    return dictionary.nominal.reduce(side, states)
+
+
+def _inertia(dictionary: Dictionary, trial: Trial) -> Rows:
+    """Torque of unit moments and products of inertia of the last link, where the trial acts."""
+    nominal = dictionary.nominal
+    by_motion = [inertia_columns(m) for m in nominal.motions]
+    found: dict[Key, Floats] = {}
+    for side, joint in trial.rows:
+        # What the trial's own columns are zero at is not loaded, or was before.
+        on = np.any(trial.rows[side, joint] != 0.0, axis=1)
+        parts = [
+            nominal.reduce(side, [columns[k][:, joint] for columns in by_motion])
+            for k in range(len(by_motion[0]))
+        ]
+        found[side, joint] = np.stack(parts, axis=1) * on[:, None]
+    return found
