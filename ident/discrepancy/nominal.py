@@ -58,26 +58,26 @@ class Arm:
     encoder_known : whether a healthy arm told it.
     reach : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
     unknown.
+    far, far_share : (n,) the share of it that turns within a longer distance, and that distance [rad].
     couplings : pairs of joints whose drives are coupled.
     """
 
     chain: Chain
     compliance: Floats
-    far, far_share : (n,) the share of it that turns within a longer distance, and that distance [rad].
     gear_ratio: Floats
     motor_delay_s: float = 0.0
     joint_delay_s: float = 0.0
     encoder: Literal["link", "motor"] = "link"
     encoder_known: bool = False
     reach: Floats | None = None
+    far: Floats | None = None
+    far_share: Floats | None = None
     couplings: tuple[Coupling, ...] = ()
 
     def slip(self, speed: Floats, dt: float) -> Floats:
         """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum
         of two of them (Maxwell slip: asperities of several lengths side by side)."""
         found = np.sign(speed)
-    far: Floats | None = None
-    far_share: Floats | None = None
         if self.reach is not None:
             path = np.cumsum(speed, axis=0) * dt
             for joint in np.flatnonzero(self.reach > 0.0):
