@@ -147,12 +147,12 @@ class Effect(ABC):
         """Columns for the joint (counted from 0) and the shape."""
 
     @property
-    def linear(self) -> tuple[Parameter, ...]:
-    @property
     def repeats(self) -> bool:
         """Whether it may be claimed several times: contacts come and go, what comes to stay comes once."""
         return self.event and not self.step
 
+    @property
+    def linear(self) -> tuple[Parameter, ...]:
         """The parameters that are the coefficients of the columns."""
         return tuple(p for p in self.parameters if not p.shape)
 
