@@ -38,8 +38,9 @@ _SLICE_S = 0.02  # longest wait for a packet before requests and silence are loo
 _FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated
 _RING_PATIENCE_S = 5.0
 # A loop that looks out for the packet does not sleep so long before it is due, at most this share of a cycle,
-# and so long after.
-_LOOKOUT_S, _LOOKOUT_SHARE = 0.3e-3, 0.15
+# and so long after. Waking up can take a millisecond where the kernel works for another program and is not
+# PREEMPT_RT; that must be over when the packet comes.
+_LOOKOUT_S, _LOOKOUT_SHARE = 1.2e-3, 0.4
 _OVERDUE_S = 0.15e-3
 _REMIND_S = 1.0  # silence in lock step after which the other side is told that nothing came
 _STILL_RAD = 1e-5  # a set point that moves by no more in a cycle rests
@@ -87,7 +88,7 @@ class Loop:
     settings, limits : see there. control : the shared memory. ring : rows for the recorder, None keeps none.
 
     turnaround : looks out for the packet that is due, with its answer ready, instead of sleeping until it
-    comes, for the price of up to 0.45 ms of a processor in each cycle, 0.3 ms at 1 kHz; None without
+    comes, for the price of up to 1.35 ms of a processor in each cycle, 0.55 ms at 1 kHz; None without
     """
 
     def __init__(

@@ -25,7 +25,7 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _PREFAULT_BYTES = 16 * 2**20
 _LIMITS_FILE = "/etc/security/limits.d/realtime.conf"
-_LOCK_BYTES = 512 * 2**20
+_LOCK_BYTES = 768 * 2**20  # a loop that has loaded the compiler takes some 500 MiB
 
 # Held open for the life of the process: closing it lets the processor sleep deeply again.
 _awake: list[int] = []

@@ -10,8 +10,8 @@ packet or a request of the driver, is left to the loop as if this module were no
 Afterwards the loop takes the packet through its ordinary code, which comes to the same answer from the same
 numbers; it compares the bytes and does not send again.
 
-Importing this module compiles it, or takes the compiled code from the cache; only a loop with real-time
-rights does.
+Importing this module compiles it, or takes the compiled code from the cache, and loads the compiler's 300 MB;
+only a loop with real-time rights does.
 """
 
 from __future__ import annotations

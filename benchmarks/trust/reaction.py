@@ -58,7 +58,9 @@ CAUSES: dict[str, Callable[[Stand], None]] = {
 def measure(cause: str, seed: int, ring: Ring, folder: Path) -> dict[str, Any]:
     """Cycles from the cause to: the last row of the motion sent, the result told, the arm at rest."""
     random = np.random.default_rng([seed, len(cause)])
-    with Stand(np.random.SeedSequence(seed), ring, folder, period_ms=10, lock_step=False) as stand:
+    with Stand(
+        np.random.SeedSequence(seed), ring, folder, period_ms=10, lock_step=False, ahead=seed % 2 == 0
+    ) as stand:
         while not stand.loop.remote.received:
             stand.cycle()
         stand.post(Job.START, limit=900)

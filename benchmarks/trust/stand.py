@@ -35,6 +35,7 @@ from lwr_driver.motion import Motion, check_motion, move_to
 from lwr_driver.recording import Recorded, Recording, SessionRequest
 from lwr_driver.ring import Ring
 from lwr_driver.session import session_metadata
+from lwr_driver.turnaround import Turnaround
 from runner.route import dwell
 from sim_backend.faults import FaultyWire, Parcel, WireFault
 from sim_backend.krl_program import krl_program
@@ -99,10 +100,29 @@ class Clock:
         self.now_ns += round(seconds * 1e9)
 
 
+class _TimedTurnaround(Turnaround):
+    """The loop's answers ahead, at the time of the stand."""
+
+    def __init__(self, loop: Loop, control: Control, clock: Clock) -> None:
+        super().__init__(loop.remote.descriptor, loop.remote.buffer, control.words)
+        self._clock = clock
+
+    @property
+    def received_ns(self) -> int:
+        """When the datagram came."""
+        return self._clock.now_ns
+
+    @property
+    def sent_ns(self) -> int:
+        """When its answer had been sent."""
+        return self._clock.now_ns
+
+
 class Stand:
     """One run. A context manager.
 
-    seed : of the wire. ring : reused from run to run, must be empty. folder : where the log goes
+    seed : of the wire. ring : reused from run to run, must be empty. folder : where the log goes. ahead : with
+    answers that are ready before their packet and leave from compiled code, as with real-time rights
     """
 
     def __init__(
@@ -114,6 +134,7 @@ class Stand:
         period_ms: int = 5,
         program: str = "stanford",
         lock_step: bool = True,
+        ahead: bool = False,
         first_sequence: int = 0,
         uptime_s: float = 0.0,
         policy: dict[str, Any] | None = None,
@@ -137,6 +158,8 @@ class Stand:
         ring.start_writing()
         self.settings = LoopSettings("127.0.0.1", 0, None, lock_step, program, 0.1, 0.2, arm.joint_names)
         self.loop = Loop(self.settings, arm.limits, self.control, ring)
+        if ahead:
+            self.loop.turnaround = _TimedTurnaround(self.loop, self.control, self.clock)
         self.end = ControllerEnd(self.loop.remote.address)
         self.monitor = CommandMonitor(arm, period_ms * 1e-3)
         self.path = folder / "run.mcap"

@@ -47,6 +47,7 @@ class Plan:
     lock_step: bool
     first_sequence: int
     uptime_s: float
+    ahead: bool
 
 
 @dataclass
@@ -77,7 +78,7 @@ def plan(seed: int, number: int) -> tuple[Plan, np.random.SeedSequence]:
     first = int(random.integers(0, 65536))
     if "wrap" in chosen:
         first = 65536 - int(random.integers(20, 140))
-    return Plan(
+    chosen_plan = Plan(
         number,
         faults,
         phase,
@@ -88,7 +89,9 @@ def plan(seed: int, number: int) -> tuple[Plan, np.random.SeedSequence]:
         bool(random.random() < 0.5),
         first,
         float(random.choice([0.0, 3600.0, 4e4])),
-    ), wire
+        bool(random.random() < 0.5),
+    )
+    return chosen_plan, wire
 
 
 def run(seed: int, number: int, ring: Ring, folder: Path) -> WireRun:
@@ -101,6 +104,7 @@ def run(seed: int, number: int, ring: Ring, folder: Path) -> WireRun:
         period_ms=chosen.period_ms,
         program=chosen.program,
         lock_step=chosen.lock_step,
+        ahead=chosen.ahead and not chosen.lock_step,
         first_sequence=chosen.first_sequence,
         uptime_s=chosen.uptime_s,
     ) as stand:
