@@ -100,6 +100,49 @@ def test_answer_carries_size_id_counters_and_the_mirror(end, controller):
     assert end.command.tobytes() == answer.tobytes()
 
 
+def test_answer_that_was_foreseen_is_the_one_that_would_be_sent(end, controller):
+    q = np.linspace(-1.0, 1.0, 7, dtype=np.float32)
+    ahead = bytearray(CMD_SIZE)
+    assert end.foresee(q, memoryview(ahead)) is None
+    exchange(end, controller)
+    end.krl_int[15] = 11
+    assert end.foresee(q, memoryview(ahead)) == 101
+    assert exchange(end, controller, q, state=State.CMD).tobytes() == bytes(ahead)
+
+
+def test_answer_that_has_left_is_taken_into_account_and_not_sent_again(end, controller):
+    exchange(end, controller)
+    q, ahead = np.linspace(-1.0, 1.0, 7, dtype=np.float32), bytearray(CMD_SIZE)
+    end.foresee(q, memoryview(ahead))
+    controller.send(state=State.CMD)
+    with socket.socket(fileno=socket.dup(end.descriptor)) as other_hand:
+        datagram, source = other_hand.recvfrom(2048)
+    end.buffer[: len(datagram)] = datagram
+    assert end.receive(0.0, (len(datagram), source, 123)) is not None
+    assert end.received_ns == 123
+    assert end.answer(q, sent=True)
+    assert controller.silent()
+    assert end.answered == 2
+    assert end.command.tobytes() == bytes(ahead)
+    assert int(exchange(end, controller)["send_seq"]) == 3
+
+
+@pytest.mark.parametrize("beforehand", ["torque", "control", "doubt"])
+def test_answer_that_depends_on_more_than_the_packet_is_not_foreseen(end, controller, beforehand):
+    q, ahead = np.zeros(7, dtype=np.float32), memoryview(bytearray(CMD_SIZE))
+    exchange(end, controller)
+    if beforehand == "torque":
+        controller.send(state=State.CMD)
+        assert end.receive(PATIENCE_S) is not None
+        end.answer(q, np.ones(7))
+    elif beforehand == "control":
+        exchange(end, controller, control=Control.JNT_IMP)
+    else:
+        controller.send(20_000, timestamp=5.0)
+        assert end.receive(0.0) is None
+    assert end.foresee(q, ahead) is None
+
+
 def test_each_packet_is_answered_once(end, controller):
     exchange(end, controller)
     with pytest.raises(RuntimeError, match="no packet to answer"):

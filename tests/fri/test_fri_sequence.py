@@ -170,3 +170,21 @@ def test_a_controller_without_a_clock_is_followed():
     for number in (1, 2, 5, 4, 6):
         tracker.feed(number, 0.0, T)
     assert (tracker.sequence, tracker.lost, tracker.reordered) == (6, 2, 1)
+
+
+@given(
+    history=st.lists(
+        st.tuples(st.integers(0, 0xFFFF), st.floats(0.0, 1e4, width=32)), min_size=1, max_size=20
+    ),
+    timestamp=st.floats(-1e9, 1e9, width=32),
+)
+def test_packet_that_is_expected_is_new_whatever_its_clock_says(history, timestamp):
+    tracker = SequenceTracker()
+    assert tracker.expected is None
+    for counter, clock in history:
+        arrival = tracker.feed(counter, clock, T)
+    assert (tracker.expected is None) == (arrival is Arrival.SUSPECT or tracker._suspect >= 0)
+    if tracker.expected is not None:
+        before = tracker.sequence
+        assert tracker.feed(tracker.expected, timestamp, T) is Arrival.NEW
+        assert tracker.sequence == before + 1
