@@ -7,12 +7,18 @@ from pathlib import Path
 
 import click
 
-from runner.options import coupling_option, gear_ratio_option, json_option
+from runner.options import GroupedCommand, coupling_option, gear_ratio_option, json_option
 
 __all__ = ["command"]
 
 
-@click.command("diagnose")
+_GROUPS = {
+    "Sessions": ("test", "model", "reference"),
+    "Arm": ("arm", "urdf", "coupling", "gear_ratio"),
+}
+
+
+@click.command("diagnose", cls=GroupedCommand, groups=_GROUPS)
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--test",
@@ -39,7 +45,7 @@ __all__ = ["command"]
     nargs=2,
     multiple=True,
     metavar="CAUSE:JOINT CAUSE:JOINT",
-    help="Put two causes side by side and say what tells them apart (repeatable).",
+    help="Put two causes side by side, say how far they overlap and what would decide (repeatable).",
 )
 @click.option("--no-simulation", is_flag=True, help="Leave out the replay of the sessions.")
 @json_option
@@ -59,12 +65,19 @@ def command(
 ) -> None:
     """Show what the model gets wrong in SESSIONS, name the causes, and extend the model.
 
-    Writes diagnosis.json, model_extended.yaml, plots and, where causes look alike, plans of the motions that
-    would decide into the folder of --out. Finding nothing is a result as well.
+    Writes report.html, diagnosis.json, model_extended.yaml, plots and, where causes look alike, plans of the motions
+    that would decide into the folder of --out. Finding nothing is a result as well.
+
+    One session is enough, but what repeats tells more: sessions without and with a payload, the same motion twice, a
+    --test session on another motion. Without a motor torque, without --reference, after somebody's low-pass less can
+    be claimed; the notes at the end say what.
 
     \b
     lwr-run diagnose unloaded.mcap loaded.mcap --out diagnosis
     lwr-run diagnose a.mcap b.mcap --test c.mcap --reference commissioned.yaml --out diagnosis
+    lwr-run diagnose a.mcap --compare cable_spring:A4 sensor_ripple:A4 --out diagnosis    can they be told apart?
+    lwr-run diagnose tx40.mcap --urdf tx40.urdf --coupling joint_5:joint_6 --out tx40     another arm
+    lwr-run diagnose a.mcap --no-simulation --json --out diagnosis    quicker, and for a program
     """
     from fri.errors import ConfigurationError
     from ident.model_file import read_model
