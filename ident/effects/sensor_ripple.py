@@ -29,9 +29,9 @@ class SensorRipple(Effect):
     tell_apart = "the same path of joint {joint} at two constant speeds below 0.1 rad/s and with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """One to three cycles a turn of the joint, one and two of the motor."""
+        """One to six cycles a turn of the joint (run-out, ellipse, spokes and bolts), one and two of the motor."""
         ratio = float(setting.gear_ratio[joint])
-        own = [{"cycles_per_turn": k, "ratio": 1.0} for k in (1.0, 2.0, 3.0, 4.0)]
+        own = [{"cycles_per_turn": k, "ratio": 1.0} for k in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
         return [*own, *({"cycles_per_turn": k, "ratio": ratio} for k in (1.0, 2.0) if ratio > 1.0)]
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:

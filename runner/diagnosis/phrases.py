@@ -80,6 +80,12 @@ def _cable(values: Values, names: Sequence[str]) -> list[str]:
     if abs(kind) == 2.0:
         where = f"taut {'above' if kind > 0 else 'below'} {_quantity(values['slack'])} and slack elsewhere"
         return [f"{_quantity(stiffness)}, {where}"]
+    if kind == 3.0:
+        return [f"{_quantity(stiffness)} and {_quantity(values['cubic'])}: it hardens with the angle"]
+    if kind == 4.0:
+        return [
+            f"{_quantity(stiffness)} beyond {_quantity(values['play'])} to either side of {_quantity(values['slack'])}"
+        ]
     return [_quantity(stiffness)]
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -215,3 +217,32 @@ def test_a_payload_does_not_come_loose_metres_from_the_flange() -> None:
     assert effect.plausible(np.array([0.0, 0.3, 0.0, 0.4]), shape)
     assert not effect.plausible(np.array([0.4, 3.2, 0.0, 1.2]), shape)
     assert not effect.plausible(np.array([-60.0, 0.0, 0.0, -9.0]), shape)
+
+
+@pytest.mark.parametrize(
+    ("stated", "pulls"),
+    [
+        ({"kind": 3.0, "stiffness": 2.0 + 3 * 0.7 * 0.09, "quadratic": -0.63, "cubic": 0.7}, "hardening"),
+        ({"kind": 4.0, "stiffness": 2.0, "slack": 0.1, "play": 0.2}, "play"),
+    ],
+)
+def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
+    motion: Motion, stated: dict[str, float], pulls: str
+) -> None:
+    """Hardening about 0.3 rad, less the torque at zero, which no motion tells from an offset; and play about 0.1."""
+    effect = EFFECTS["cable_spring"]
+    angle = motion.q[:, 1]
+    rest = 2.0 * (angle - 0.3) + 0.7 * (angle - 0.3) ** 3 + 0.6 + 0.7 * 0.027
+    wanted = (
+        rest
+        if pulls == "hardening"
+        else 2.0 * np.sign(angle - 0.1) * np.maximum(np.abs(angle - 0.1) - 0.2, 0)
+    )
+    motor, joint = effect.torque(motion, 1, {"slack": 0.0, **stated})
+    assert joint[:, 1] == pytest.approx(wanted, abs=1e-9)
+    assert motor[:, 1] == pytest.approx(wanted, abs=1e-9)
+    simulated = effect.simulate(1, {"slack": 0.0, **stated})
+    for row in (0, 300, 900):
+        loads = SimpleNamespace(link_torque=np.zeros(3))
+        simulated.load(0.0, SimpleNamespace(position=motion.q[row]), loads)
+        assert loads.link_torque[1] == pytest.approx(-wanted[row], abs=1e-9)
