@@ -31,6 +31,7 @@ from runner.diagnosis.words import joints_text, named, variable_of
 
 __all__ = [
     "FILE",
+    "Foreseen",
     "LookAlikes",
     "Place",
     "Trace",
@@ -74,6 +75,37 @@ class Trace:
     measured: Floats
 
 
+@dataclass(frozen=True)
+class Foreseen:
+    """Overlap and strength of `first` that are to be expected with a motion besides. file : of its plan."""
+
+    file: str
+    alike: float
+    strength: float
+
+    @property
+    def apart(self) -> float:
+        """What will be left of `first` beside `second`, in units of the noise."""
+        return self.strength * math.sqrt(max(0.0, 1.0 - self.alike**2))
+
+    @property
+    def needed(self) -> float:
+        """From how much on the two are told apart then."""
+        return math.sqrt(reach(self.strength**2))
+
+    def sentence(self) -> str:
+        """What to expect of the motion."""
+        verdict = "that decides" if self.apart > self.needed else "that may not decide either"
+        return (
+            f"with {self.file} recorded as well the overlap should be {self.alike:.3f} and {self.apart:.2g} times the "
+            f"noise between them, of {self.needed:.2g} needed: {verdict}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content."""
+        return {"file": self.file, "overlap": self.alike, "strength": self.strength, "apart": self.apart}
+
+
 @dataclass(frozen=True, eq=False)
 class LookAlikes:
     """Two causes in the same sessions.
@@ -82,7 +114,8 @@ class LookAlikes:
     `first` leaves that `second` can imitate, the cosine of the angle between the two; 1: not to be told apart.
     strength : of what each leaves, in units of the noise. variables : what each depends on. decides : the motion
     that tells them apart, for each. sessions : names in their order. shape_alone : whether a sensor's error and a
-    torque of the arm are compared in the joint torque alone.
+    torque of the arm are compared in the joint torque alone. parameters : of each, as they were compared.
+    foreseen : what the motion that decides is to bring, where there is a plan of it.
     """
 
     finding: int
@@ -94,6 +127,8 @@ class LookAlikes:
     decides: tuple[str, str]
     sessions: tuple[str, ...] = ()
     shape_alone: bool = False
+    parameters: tuple[Mapping[str, float], Mapping[str, float]] = ({}, {})
+    foreseen: Foreseen | None = None
     traces: tuple[Trace, ...] = field(default=(), repr=False)
 
     @property
@@ -155,6 +190,8 @@ class LookAlikes:
             "decides": list(self.decides),
             "sessions": list(self.sessions),
             "shape_alone": self.shape_alone,
+            "parameters": [dict(values) for values in self.parameters],
+            "foreseen": None if self.foreseen is None else self.foreseen.to_dict(),
         }
 
 
@@ -257,6 +294,8 @@ def _side_by_side(
         tuple(recording.name for recording in bench.nominal.recordings),
         "motor" not in bench.nominal.rows
         and "sensor" in {find_effect(cause).side for cause, _ in (first, second)},
+        (a.parameters, b.parameters),
+        None,
         _traces(bench, a, b),
     )
 
@@ -334,12 +373,18 @@ def read_look_alikes(path: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[
                         (entry["decides"][0], entry["decides"][1]),
                         tuple(entry["sessions"]),
                         bool(entry["shape_alone"]),
+                        (entry["parameters"][0], entry["parameters"][1]),
+                        _foreseen(entry["foreseen"]),
                         tuple(traces),
                     )
                 )
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise DataError(f"{path}: cannot be read: {error}; run the diagnosis again") from error
     return tuple(found)
+
+
+def _foreseen(entry: Mapping[str, Any] | None) -> Foreseen | None:
+    return None if entry is None else Foreseen(entry["file"], entry["overlap"], entry["strength"])
 
 
 def _said(place: Place, names: Sequence[str]) -> str:

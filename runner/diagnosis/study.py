@@ -37,11 +37,21 @@ TEXT = "diagnosis.txt"
 
 
 @dataclass(frozen=True, eq=False)
+class Material:
+    """The sessions that were fitted, and what is known of the arm."""
+
+    sessions: tuple[Session, ...]
+    chain: Chain
+    arm: ArmData
+    reference: Reference | None
+
+
+@dataclass(frozen=True, eq=False)
 class Study:
     """A diagnosis, what it gained, what could not be seen, and the motions that would decide what is open.
 
     sessions : names in the order in which they were run. referenced : whether a healthy reference was at hand.
-    pairs : causes that look alike, side by side.
+    pairs : causes that look alike, side by side. material : what it was made from.
     """
 
     diagnosis: Diagnosis
@@ -53,13 +63,27 @@ class Study:
     referenced: bool
     pairs: tuple[LookAlikes, ...] = ()
     offers: tuple[Deciding, ...] = field(default=())
+    material: Material | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
         return study_text(self)
 
     def with_offers(self, offers: Sequence[Deciding]) -> Study:
-        """The same with motions that would decide."""
-        return replace(self, offers=tuple(offers))
+        """The same with motions that would decide, and what is to be expected of them."""
+        from runner.diagnosis.foresight import foresee
+
+        pairs, given = self.pairs, self.material
+        if offers and pairs and given is not None:
+            pairs = foresee(
+                pairs,
+                self.diagnosis,
+                given.sessions,
+                given.chain,
+                offers,
+                arm=given.arm,
+                reference=given.reference,
+            )
+        return replace(self, offers=tuple(offers), pairs=pairs)
 
     def details(self) -> dict[str, Any]:
         """What the contract of diagnosis.json has no place for."""
@@ -163,6 +187,7 @@ def study(
         names,
         healthy is not None,
         pairs,
+        material=Material(tuple(sessions), chain, data, healthy),
     )
 
 

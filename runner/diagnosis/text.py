@@ -104,6 +104,8 @@ def _finding(number: int, finding: Finding, names: Sequence[str]) -> list[str]:
 def _beside(pair: LookAlikes, names: Sequence[str], *, decides: bool = False) -> list[str]:
     said, motion = pair.sentences(names)
     lines = _wrapped(said, "     ", "        ")
+    if pair.foreseen is not None:
+        lines += _wrapped(pair.foreseen.sentence(), "     ", "        ")
     return lines + _wrapped(f"what would decide: {motion}", "     ", "        ") if decides else lines
 
 

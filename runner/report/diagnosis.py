@@ -137,6 +137,7 @@ def _beside(pair: LookAlikes, names: Sequence[str]) -> str:
     """Two causes side by side, what it means, and the motion that decides."""
     said, motion = pair.sentences(names)
     figure = look_alike_figure(pair, names)
+    motion += "" if pair.foreseen is None else f"; {pair.foreseen.sentence()}"
     return (
         f"<h4>Side by side: {escape(_words(pair.title(names)))}</h4>"
         f"{paragraph(_words(said[:1].upper() + said[1:]) + '.')}{paragraph(f'What would decide: {motion}.')}"

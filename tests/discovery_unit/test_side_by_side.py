@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
+from ident.excitation import ExcitationPlan
+from ident.excitation.bspline import SplineMotion
 from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis import Study, study
+from runner.diagnosis.deciding import Deciding
 from runner.diagnosis.look_alikes import FILE, LookAlikes, asked, read_look_alikes
 from runner.diagnosis.study import replaceable
 from runner.report.diagnosis_folder import DiagnosisFolder
@@ -53,6 +56,24 @@ def test_a_doubt_is_shown_with_both_signatures(found: Study) -> None:
     said = str(found)
     assert f"overlap {pair.alike:.3f}" in said
     assert "Side by side: cable_spring (joint three) or joint_zero_offset (joint two)" in said
+
+
+def test_what_a_motion_will_tell_is_foreseen(found: Study) -> None:
+    pair = found.pairs[0]
+    share = np.linspace(0.0, 1.0, 120)
+    points = np.zeros((3, 120))
+    # Slowly over a wide range, which the session does not cover.
+    points[2] = 2.6 * np.sin(4.0 * np.pi * share) * np.minimum(1.0, 20.0 * np.minimum(share, 1.0 - share))
+    plan = ExcitationPlan(SplineMotion(24.0, points), NAMES, 1)
+    sweep = Deciding("slow_sweep_3", "slow sweep", 3, plan, (None,), (pair.first, pair.second))
+    again = found.with_offers([sweep]).pairs
+    seen = again[0].foreseen
+    assert seen is not None
+    assert seen.file == "slow_sweep_3.plan.yaml"
+    assert seen.apart > 1.5 * pair.apart
+    assert seen.alike < pair.alike
+    assert again[1].foreseen is None
+    assert f"{seen.apart:.2g} times the noise" in " ".join(str(found.with_offers([sweep])).split())
 
 
 def test_the_figure_shows_both_over_time_and_against_what_they_depend_on(found: Study) -> None:
