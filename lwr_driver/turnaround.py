@@ -63,7 +63,8 @@ _COMMANDING, _BEST, _DRIVES, _POSITION = (
 )
 # Each value within these keeps the norms within those that `fri.packets` allows.
 _TURN, _TORQUE = 2.0 * pi, 1000.0
-_REQUEST, _STOP, _DROP, _QUIT = int(Word.REQUEST), int(Word.STOP), int(Word.DROP), int(Word.QUIT)
+# An argument of the compiled code and no constant in it, since the cache would not notice that they moved.
+_WATCHED = np.array([Word.REQUEST, Word.STOP, Word.DROP, Word.QUIT], np.int64)
 
 _recvfrom: Any = types.ExternalFunction(
     "recvfrom", types.intp(types.int32, types.uintp, types.uintp, types.int32, types.uintp, types.uintp)
@@ -81,14 +82,12 @@ def _now(time: Any) -> Any:
     return time[0] * 1_000_000_000 + time[1]
 
 
-@njit("boolean(int64[::1], int64[::1])", cache=True)
-def _asked(words: Any, seen: Any) -> Any:
-    return (
-        words[_REQUEST] != seen[_REQUEST]
-        or words[_STOP] != seen[_STOP]
-        or words[_DROP] != seen[_DROP]
-        or words[_QUIT] != seen[_QUIT]
-    )
+@njit("boolean(int64[::1], int64[::1], int64[::1])", cache=True)
+def _asked(words: Any, seen: Any, watched: Any) -> Any:
+    new = False
+    for place in watched:
+        new = new or words[place] != seen[place]
+    return new
 
 
 @njit("boolean(uint16[::1], float32[::1], int64, float32, float32[::1], float32)", cache=True)
@@ -126,7 +125,7 @@ def _regular(shorts: Any, floats: Any, sequence: Any, sample_time: Any, sent: An
 
 @njit(
     "int64(int64, uint8[::1], uint16[::1], float32[::1], int64[::1], uint8[::1], boolean, int64, float32,"
-    "float32[::1], float32, int64[::1], int64[::1], int64[::1], int64[::1], int64, int64, int64)",
+    "float32[::1], float32, int64[::1], int64[::1], int64[::1], int64[::1], int64[::1], int64, int64, int64)",
     cache=True,
 )
 def _turn(
@@ -143,6 +142,7 @@ def _turn(
     room: Any,
     words: Any,
     seen: Any,
+    watched: Any,
     found: Any,
     scratch: Any,
     awake: Any,
@@ -169,7 +169,7 @@ def _turn(
         now = _now(time)
         if length >= 0:
             break
-        if _asked(words, seen):
+        if _asked(words, seen, watched):
             return _ASKED
         passed = now - start
         if passed >= patience:
@@ -189,7 +189,7 @@ def _turn(
         and length == MSR_SIZE
         and ends[0] == ends[2]
         and _regular(shorts, floats, sequence, sample_time, sent, room)
-        and not _asked(words, seen)
+        and not _asked(words, seen, watched)
         and _sendto(descriptor, answer.ctypes.data, CMD_SIZE, _DONTWAIT, ends[2:].ctypes.data, 16) == CMD_SIZE
     ):
         found[2] = _now(time)
@@ -268,6 +268,7 @@ class Turnaround:
             self._room,
             self._words,
             self._seen,
+            _WATCHED,
             self._found,
             self._scratch,
             awake_ns,
