@@ -172,7 +172,7 @@ def twins():
 
 
 @pytest.mark.parametrize("program", ["lwr_identification", "stanford", "ros_control"])
-@pytest.mark.parametrize("period_ms", [2, 10])
+@pytest.mark.parametrize("period_ms", [5, 10])
 def test_session_is_the_same_to_the_last_bit(twins, program, period_ms):
     t = twins(period_ms, program=program)
     t.enter()
