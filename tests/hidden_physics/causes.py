@@ -344,7 +344,9 @@ def _zero(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     def sized(size: float) -> Hidden:
         angle = sign * math.radians(ZERO_DEG[joint - 1] * size)
         setting = _trait(joint, zero=angle)
-        return Hidden("joint_zero_offset", "joint", (joint,), size, _everywhere(setting), {"offset": angle})
+        # The encoder shows the angle and its zero; a diagnosis states the true angle less the shown one.
+        truth = {"offset": -angle}
+        return Hidden("joint_zero_offset", "joint", (joint,), size, _everywhere(setting), truth)
 
     return sized
 
