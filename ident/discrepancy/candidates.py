@@ -16,6 +16,8 @@ from ident.effects.motion import Motion
 
 __all__ = ["Candidate", "Dictionary", "Trial"]
 
+# Gain that a further coefficient of the same cause must bring.
+_A_COEFFICIENT = 6.0
 # What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
 _STEP_ROOM_S = 1.0
 
@@ -181,7 +183,7 @@ class Dictionary:
             score = self.measure(candidate, padded, len(entries), known)
             if not candidate.effect.plausible(score.coefficients, shape):
                 continue
-            if best is None or score.gain > best.score.gain:
+            if best is None or _worth(score) > _worth(best.score):
                 best = Trial(candidate, shape, score, rows)
         return best
 
@@ -248,6 +250,11 @@ class Dictionary:
             found = self.best(candidate)
             if found is not None:
                 yield found
+
+
+def _worth(score: Score) -> float:
+    """Gain less what further coefficients would gain by chance."""
+    return score.gain - _A_COEFFICIENT * len(score.coefficients)
 
 
 def _alike(a: Shape, b: Shape, besides: str) -> bool:

@@ -13,6 +13,7 @@ from ident.discrepancy.candidates import Trial
 from ident.discrepancy.evidence import Floats, Rows
 from ident.discrepancy.gain import HeldOut, held_out, interval
 from ident.discrepancy.hygiene import SampleLoss
+from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.nominal import TRAVEL_RAD, Arm, Nominal
 from ident.discrepancy.probes import Remainder, find_remainders
 from ident.discrepancy.reference import Reference
@@ -73,7 +74,8 @@ def conclude(
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     after = held_out(evidence, [*(c.trial.rows for c in claims), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings)
-    findings = [_doubted(claim, finding, remainders, nominal.arm.chain.n) for claim, finding in kept]
+    doubts = _beyond(bench, claims, nuisance, remainders, settings)
+    findings = [_doubted(claim, finding, doubts, nominal.arm.chain.n) for claim, finding in kept]
     findings += timing
     if loss:
         findings.append(_loss_finding(loss))
@@ -239,6 +241,28 @@ def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
             found[parameter.name] = Value(
                 float(shape[parameter.name]), float(spread.get(parameter.name, 0.0)), parameter.unit
             )
+    return found
+
+
+def _beyond(
+    bench: Bench,
+    claims: Sequence[Claim],
+    nuisance: Sequence[Rows],
+    remainders: tuple[Remainder, ...],
+    settings: DiagnosisSettings,
+) -> tuple[Remainder, ...]:
+    """What is left beside the claims if each cause may also be of another form than its law.
+
+    A hose that is no plain spring leaves much, all of it a function of the joint's angle on both sides: that says
+    the law is coarse, not that the name is wrong.
+    """
+    wide = [rows for rows in (beyond_law(bench.dictionary, c.trial) for c in claims) if rows is not None]
+    if not remainders or not wide:
+        return remainders
+    fixed = [*(c.trial.rows for c in claims), *nuisance]
+    bench.evidence.replace([*fixed, *wide])
+    found = find_remainders(bench.dictionary, bench.evidence, settings)
+    bench.evidence.replace(fixed)
     return found
 
 

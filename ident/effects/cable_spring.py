@@ -38,11 +38,12 @@ class CableSpring(Effect):
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Linear, hardening and one-sided springs, and springs with play."""
+        """Linear, cubic, hardening and one-sided springs, and springs with play."""
         low, high = setting.position_range[joint]
         angles = [float(low + share * (high - low)) for share in (0.3, 0.5, 0.7)]
         return [
             {"kind": 0.0, "slack": 0.0},
+            {"kind": 1.0, "slack": 0.0},
             {"kind": 3.0, "slack": 0.0},
             *({"kind": kind, "slack": angle} for kind in (2.0, -2.0) for angle in angles),
             *(

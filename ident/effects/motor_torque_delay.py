@@ -10,6 +10,9 @@ import numpy as np
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
 from ident.effects.motion import Motion
 
+# Time in which friction turns after a reversal, about: a reach of 0.1 mrad at 5 rad/s^2.
+_TURN_S = 5e-3
+
 
 class MotorTorqueDelay(Effect):
     """The motor torque is `delay` older than the positions beside it."""
@@ -27,13 +30,18 @@ class MotorTorqueDelay(Effect):
     tell_apart = "a 1 to 15 Hz chirp of one joint"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """From half a millisecond to forty, late and early."""
-        return [{"delay": sign * d} for d in (0.001, 0.003, 0.01, 0.03) for sign in (1.0, -1.0)]
+        """From half a millisecond to forty, late and early, close enough that friction's turns overlap."""
+        grid = (0.001, 0.002, 0.004, 0.007, 0.011, 0.015, 0.021, 0.03)
+        return [{"delay": sign * d} for d in grid for sign in (1.0, -1.0)]
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Predicted torque of before less that of now, without the jumps at reversals, in all motor rows."""
+        """Predicted torque of before less that of now, in all motor rows.
+
+        Coulomb friction is in it where the delay is longer than it takes to turn after a reversal. A shorter delay
+        and another length of presliding look alike there.
+        """
         before = motion.time - shape["delay"]
-        torque = motion.smooth_torque("motor")
+        torque = motion.motor_torque if abs(shape["delay"]) > _TURN_S else motion.smooth_torque("motor")
         late = np.column_stack([np.interp(before, motion.time, column) for column in torque.T])
         return (Column(motor=late - torque),)
 
