@@ -1,0 +1,46 @@
+"""A strong cause whose law is coarse, and a claim that motions not fitted do not bear out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ident.discrepancy import diagnose
+from ident.kinematics import Chain
+from lwr_driver.session import Session
+
+Make = Callable[..., Session]
+Signals = dict[str, np.ndarray]
+
+
+def odd_hose(s: Signals) -> None:
+    """Pulls with a form that no law of a hose has, and rubs."""
+    angle = s["q"][:, 2]
+    pull = 0.25 * np.tanh(6.0 * (angle - 0.1)) + 0.12 * np.sin(7.0 * angle)
+    s["motor"][:, 2] += pull
+    s["joint"][:, 2] += pull
+
+
+def stribeck(s: Signals) -> None:
+    v = s["qd"][:, 1]
+    s["motor"][:, 1] += 0.3 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+
+
+def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain: Chain) -> None:
+    found = diagnose([make("a.mcap", 1, odd_hose), make("b.mcap", 2, odd_hose, 1)], chain)
+    assert {(f.cause, f.joints) for f in found.findings} == {("cable_spring", (3,))}
+    assert found.findings[0].confidence > 0.8
+    assert 3 in {u.joint for u in found.unexplained}
+
+
+@pytest.mark.slow
+def test_a_cause_is_claimed_only_where_a_motion_that_was_not_fitted_shows_it_too(
+    make: Make, chain: Chain
+) -> None:
+    train = [make("a.mcap", 1, stribeck), make("b.mcap", 2, stribeck, 1)]
+    same = diagnose(train, chain, test=[make("c.mcap", 3, stribeck, 2)])
+    assert [(f.cause, f.joints) for f in same.findings] == [("stribeck", (2,))]
+    gone = diagnose(train, chain, test=[make("c.mcap", 3, None, 2)])
+    assert not gone.findings

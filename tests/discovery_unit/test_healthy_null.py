@@ -1,0 +1,87 @@
+"""What healthy sets teach: lengths of presliding, and what a further healthy set stays below."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.base import numeric_base
+from ident.discrepancy.nominal import Arm
+from ident.discrepancy.presliding import with_far_presliding
+from ident.discrepancy.reference import Reference
+from ident.kinematics import Chain
+from ident.model import DynamicModel
+from ident.structure import ModelStructure
+
+
+def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:
+    return Reference(model, np.zeros(3), 0.0, 0.0, {}, null, sets)
+
+
+@pytest.fixture(scope="module")
+def model(chain: Chain) -> DynamicModel:
+    structure = ModelStructure(chain, 1)
+    base = numeric_base(structure)
+    return DynamicModel("arm", structure, base.names, np.ones(len(base)), None, base)
+
+
+@pytest.fixture
+def arm(chain: Chain) -> Arm:
+    return Arm(chain, np.zeros(3), np.ones(3), reach=np.full(3, 2e-4))
+
+
+def days(rng: np.random.Generator, mean: float, scatter: float, count: int) -> list[np.ndarray]:
+    """Friction that turns slowly (2, 3 distances, 3 joints), each day with a standard deviation of 0.02 Nm."""
+    return [
+        np.stack([mean + scatter * rng.standard_normal((3, 3)), np.full((3, 3), 0.02)]) for _ in range(count)
+    ]
+
+
+def test_slow_friction_that_the_sets_agree_on_belongs_to_the_arm(arm: Arm) -> None:
+    found = with_far_presliding(arm, days(np.random.default_rng(1), 0.1, 0.02, 8), [np.full(3, 4.0)] * 8)
+    assert found.far_share is not None
+    assert found.far is not None
+    assert found.far_share == pytest.approx(np.full(3, 0.1 / 4.0), rel=0.3)
+    assert np.all(found.far > 3.0 * 2e-4)
+
+
+def test_slow_friction_that_comes_and_goes_does_not(arm: Arm) -> None:
+    coulomb = [np.full(3, 4.0)] * 8
+    found = with_far_presliding(arm, days(np.random.default_rng(2), 0.0, 0.2, 8), coulomb)
+    against = with_far_presliding(arm, days(np.random.default_rng(2), -0.1, 0.02, 8), coulomb)
+    for other in (found, against):
+        assert other.far_share is not None
+        assert np.all(other.far_share == 0.0)
+    assert with_far_presliding(arm, days(np.random.default_rng(3), 0.1, 0.0, 2), coulomb[:2]) is arm
+
+
+def test_friction_turns_partly_within_the_longer_distance(arm: Arm) -> None:
+    both = replace(arm, far=np.full(3, 1e-2), far_share=np.full(3, 0.3))
+    speed = np.repeat(np.where(np.arange(2000) < 1000, 0.1, -0.1)[:, None], 3, axis=1)
+    slip = both.slip(speed, 1e-3)
+    # Five short reaches after the reversal the rest has turned, and of the slow share a tenth of the way.
+    after = 999 + round(1e-3 / 1e-4)
+    wanted = -0.7 * (1.0 - 2.0 * np.exp(-5.0)) + 0.3 * (-1.0 + 2.0 * np.exp(-0.1))
+    assert slip[after, 0] == pytest.approx(wanted, abs=0.01)
+
+
+def test_a_further_healthy_set_seldom_exceeds_its_limit(model: DynamicModel) -> None:
+    """Deviations that differ from set to set, squared: of the limits from eight sets one in a hundred is broken."""
+    rng = np.random.default_rng(4)
+    broken = 0
+    for _ in range(400):
+        gains = 20.0 * rng.standard_normal((9, 7)) ** 2
+        null = {("presliding_hysteresis", j): float(gains[:8, j].mean()) for j in range(7)}
+        null |= {("stribeck", j): 1.0 for j in range(10)}
+        limits = reference(model, null, 8).limits()
+        broken += sum(gains[8, j] > limits["presliding_hysteresis", j] for j in range(7))
+    assert broken / (400 * 7) < 0.02
+
+
+def test_few_sets_ask_for_more(model: DynamicModel) -> None:
+    null = {("stribeck", 0): 1.0, ("stribeck", 1): 1.0, ("backlash", 0): 12.0}
+    limits = [reference(model, null, sets).limits()["backlash", 0] for sets in (1, 4, 20)]
+    assert limits[0] > limits[1] > limits[2] > 12.0
+    assert reference(model, {}, 0).limits() == {}
