@@ -184,7 +184,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
         for load, rights in ((0, True), (0, False), (processors, True), (processors, False)):
             for period_ms in options.periods_ms:
                 piece = f"{period_ms} ms{'' if rights else ', no rights'}{', load' if load else ''}"
-                if not ledger.has("realtime", piece):
+                if options.lines in piece and not ledger.has("realtime", piece):
                     with _load(load):
                         _compare(ledger, program, period_ms, seconds, rights, piece)
                     ledger.finish("realtime", piece)
