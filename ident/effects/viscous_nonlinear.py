@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
-from ident.effects.motion import Motion
+from ident.effects.motion import Floats, Motion
 
 
 class ViscousNonlinear(Effect):
-    """Friction `coefficient |v|^exponent sign(v)` beside the linear viscous one."""
+    """Friction `coefficient |v|^exponent sign(v)` beside the linear viscous one.
+
+    It bends the course of the viscous friction; a friction that falls as the speed rises is Stribeck's.
+    """
 
     cause = "viscous_nonlinear"
     side = "motor"
@@ -32,6 +35,11 @@ class ViscousNonlinear(Effect):
         """sign(v) |v|^exponent in the motor torque."""
         speed = motion.motor_speed[:, joint]
         return (Column(motor=np.sign(speed) * np.abs(speed) ** shape["exponent"]),)
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether friction rises from standstill on."""
+        rises = shape["exponent"] > 1.0 or bool(coefficients[0] > 0.0)
+        return super().plausible(coefficients, shape) and rises
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """A resisting torque at the motor."""

@@ -37,6 +37,9 @@ _SWEEPS = (
 )
 """Share of the range and speed [rad/s], each there and back."""
 
+_SWINGS, _SWING_SPEED, _SWING_STEP_S = 8, 1.4, 0.1
+"""Number of the fast swings that follow, their highest speed [rad/s], and the time between points of their path."""
+
 _LADDER = ((0.01, 2.0, 6), (0.02, 1.2, 6), (0.05, 0.5, 4), (0.1, 0.25, 3), (0.3, 0.08, 1))
 """Amplitude [rad], frequency [Hz] and number of the cycles."""
 
@@ -50,6 +53,7 @@ _POSE_REST_S = 0.4
 def slow_sweep(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion:
     """Constant speeds of `joint` (from 0) from 0.6 down to 0.013 rad/s, there and back, over `reach` [rad].
 
+    Swings of up to 1.4 rad/s follow: what falls towards zero is told from what bends at high speed by both ends.
     The large sweeps are repeated with the next joint turned, so that what depends on the load is told from what
     depends on the angle.
     """
@@ -58,6 +62,7 @@ def slow_sweep(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion
     speeds: list[float] = []
     for share, speed in _SWEEPS:
         _there_and_back(points, speeds, joint, 0.5 * share * reach, speed)
+    _swing(arm, points, speeds, joint, 0.5 * reach)
     other = joint - 1 if joint > 0 else joint + 1
     turned = np.array(middle)
     turned[other] += 0.35 if turned[other] < 0.5 * (arm.q_low[other] + arm.q_high[other]) else -0.35
@@ -141,6 +146,20 @@ def _there_and_back(points: list[Floats], speeds: list[float], joint: int, half:
         point[joint] += offset
         points.append(point)
         speeds.append(speed)
+
+
+def _swing(arm: Arm, points: list[Floats], speeds: list[float], joint: int, half: float) -> None:
+    """Sinusoids about where the path is, as fast as speed and acceleration allow with ease."""
+    middle = np.array(points[-1])
+    fastest = min(_SWING_SPEED, 0.8 * float(arm.v_max[joint]), float(np.sqrt(0.5 * arm.a_max[joint] * half)))
+    count = max(8, round(2.0 * np.pi * half / fastest / _SWING_STEP_S))
+    for k in range(1, _SWINGS * count + 1):
+        point = np.array(middle)
+        # The first and the last swing grow and fade.
+        size = min(1.0, k / count, _SWINGS - k / count)
+        point[joint] += size * half * np.sin(2.0 * np.pi * k / count)
+        speeds.append(max(abs(float(point[joint] - points[-1][joint])) / _SWING_STEP_S, 1e-3))
+        points.append(point)
 
 
 def _along(points: Sequence[Floats], speeds: Sequence[float], rest_s: float) -> SplineMotion:

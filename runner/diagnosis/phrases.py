@@ -154,8 +154,18 @@ def _contact(values: Values, names: Sequence[str]) -> list[str]:
     return [f"force (x, y, z) {force}", f"{link}, {when} of session {values['session'][0]:.0f}"]
 
 
+def _viscous(values: Values, names: Sequence[str]) -> list[str]:
+    (coefficient, std, _), (exponent, spread, _) = values["coefficient"], values["exponent"]
+    slower = (coefficient > 0.0) == (exponent < 1.0)
+    law = f"the drag grows {'slower' if slower else 'faster'} than the speed"
+    power = quantity_text(exponent, spread, "1")
+    size = quantity_text(coefficient, std, "Nm")
+    return [law, f"beside the linear term {size} at 1 rad/s with the power {power} of the speed"]
+
+
 _SPECIAL: dict[str, Callable[[Values, Sequence[str]], list[str]]] = {
     "cable_spring": _cable,
+    "viscous_nonlinear": _viscous,
     "sensor_ripple": _sensor_ripple,
     "gear_ripple": _gear_ripple,
     "friction_position": _friction_position,

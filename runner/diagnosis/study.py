@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +17,7 @@ from ident.discrepancy import ArmData, Diagnosis, Reference, diagnose
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.model_file import write_model
-from lwr_driver.arm import Arm
+from lwr_driver.arm import JOINTS, Arm
 from lwr_driver.session import Session
 from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
 from runner.diagnosis.look_alikes import LookAlikes, Place, look_alikes, write_look_alikes
@@ -159,23 +161,22 @@ def study(
     replay = None
     if simulate and arm is not None:
         replay = Replay(_as_stiff(arm, healthy), everything)
-    found = diagnose(
-        list(sessions),
-        chain,
-        test=list(test),
-        arm=data,
-        model=model,
-        reference=healthy,
-        simulate=replay,
-    )
-    notes = list(found.notes)
+    with _unadvised():
+        found = diagnose(
+            list(sessions),
+            chain,
+            test=list(test),
+            arm=data,
+            model=model,
+            reference=healthy,
+            simulate=replay,
+        )
+        pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
+    notes = [*found.notes, *_little(found, everything)]
     if replay is not None:
         notes += replay.notes
     elif simulate:
-        notes.append(
-            "no simulation: the arm is not one that the emulator has; name its description with --arm"
-        )
-    pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
+        notes.append(_unsimulated(chain))
     notes += unshown
     names = tuple(session.path.name for session in everything)
     return Study(
@@ -189,6 +190,43 @@ def study(
         pairs,
         material=Material(tuple(sessions), chain, data, healthy),
     )
+
+
+def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:
+    """What cannot be claimed because little was recorded."""
+    notes = []
+    if "joint" not in diagnosis.rms_base:
+        notes.append(
+            "no joint torque: errors of its sensors cannot be seen, and what acts on the links is told from what acts "
+            "in the drives by its shape alone"
+        )
+    if len(sessions) == 1:
+        notes.append(
+            "one session: what changes from one session to the next (warm-up, a drifting zero, a payload) cannot be "
+            "seen, and errors are measured on parts of the one motion"
+        )
+    return notes
+
+
+def _unsimulated(chain: Chain) -> str:
+    if chain.n != JOINTS:
+        return f"no simulation: the emulator has a controller for {JOINTS} joints, this arm has {chain.n}"
+    return "no simulation: the arm is not one that the emulator has; name its description with --arm"
+
+
+@contextmanager
+def _unadvised() -> Iterator[None]:
+    """Without advice on settings of the signals, which a diagnosis chooses itself."""
+
+    def wanted(record: logging.LogRecord) -> bool:
+        return "raise `" not in record.getMessage()
+
+    logger = logging.getLogger("ident.signals.prepare")
+    logger.addFilter(wanted)
+    try:
+        yield
+    finally:
+        logger.removeFilter(wanted)
 
 
 def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:

@@ -246,3 +246,11 @@ def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
         loads = SimpleNamespace(link_torque=np.zeros(3))
         simulated.load(0.0, SimpleNamespace(position=motion.q[row]), loads)
         assert loads.link_torque[1] == pytest.approx(-wanted[row], abs=1e-9)
+
+
+def test_viscous_friction_rises_from_standstill_on() -> None:
+    thinning = EFFECTS["viscous_nonlinear"].plausible
+    assert thinning(np.array([2.0]), {"exponent": 0.4})
+    assert thinning(np.array([-1.5]), {"exponent": 1.6})
+    # A friction that falls as the speed rises is Stribeck's.
+    assert not thinning(np.array([-2.0]), {"exponent": 0.4})
