@@ -34,6 +34,9 @@ __all__ = [
 
 
 _SLOW_S = 0.1
+# Relative standard deviation of a stiffness that was read somewhere, and largest relative change in a step.
+_UNSURE, _LARGEST_STEP = 0.5, 0.35
+_FACTORS = (0.5, 0.7, 1.0, 1.4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +112,8 @@ def prepare_bench(
     fit_compliance: bool,
 ) -> Bench:
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
+    if fit_compliance and arm.encoder == "motor" and np.any(arm.compliance > 0.0):
+        arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)
     nominal = Nominal.of(arm, recordings, settings, structure, base)
     prior = reference.prior(base) if reference is not None else _drawn(base)
@@ -180,18 +185,69 @@ def _floors(nominal: Nominal, residual: Mapping[str, Floats]) -> dict[str, tuple
     return {side: noise_floor(nominal.rows[side], residual[side], periods) for side in nominal.rows}
 
 
+def _roughly_stiff(
+    arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, reference: Reference | None
+) -> Arm:
+    """The arm with its compliance times the factor that suits the motions best, for steps to begin with.
+
+    Links that ring with another period than the model's are out of phase with it after a few, and no derivative
+    knows which way to go.
+    """
+    tried = [replace(arm, compliance=factor * arm.compliance) for factor in _FACTORS]
+    misfits = [
+        prepare_bench(one, recordings, settings, reference, (), fit_compliance=False).evidence.chi_square
+        for one in tried
+    ]
+    return tried[int(np.argmin(misfits))]
+
+
 def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
-    """Gauss-Newton step (n,) of the joints' compliance from the motor rows."""
+    """Gauss-Newton step (n,) of the joints' compliance.
+
+    With the encoders at the links the twist of a joint shows in its own motor row alone; with the encoders at the
+    motors it moves all links.
+    """
+    if nominal.arm.encoder == "motor":
+        return _common_compliance_step(nominal, evidence, arm)
     step = np.zeros(nominal.arm.chain.n)
     dictionary = Dictionary(nominal, evidence, ["joint_elasticity"])
     for candidate in dictionary.candidates:
-        rows = dictionary.rows(candidate, {"encoder": float(nominal.arm.encoder == "motor")})
+        rows = dictionary.rows(candidate, {"encoder": 0.0})
         score = evidence.score(evidence.padded(rows))
         j = candidate.joint
         value, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
         if abs(value) > 3.0 * std:
             wanted = nominal.arm.compliance[j] + value
             step[j] = np.clip(wanted, 0.0, 3.0 * arm.compliance[j]) - nominal.arm.compliance[j]
+    return step
+
+
+def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
+    """Step (n,) of all joints' compliance at a time, beside the channels' delays, at most a third of each.
+
+    The description's stiffness counts as known to a factor of about two: it decides where a motion hardly bends a
+    joint, and nowhere else.
+    """
+    here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
+    dictionary = Dictionary(nominal, evidence, ["joint_elasticity", "motor_torque_delay", "joint_torque_delay"])
+    bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
+    late = [c for c in dictionary.candidates if c.joint < 0]
+    kept = list(evidence.extra)
+    evidence.replace(
+        [
+            *(dictionary.rows(c, {"delay": 1e-3}) for c in late),
+            *(dictionary.rows(c, {"encoder": 1.0}) for c in bent),
+        ]
+    )
+    place = evidence.base_count + len(late)
+    change, covariance = evidence.full.values[place:], evidence.covariance()[place:, place:]
+    evidence.replace(kept)
+    joints = [c.joint for c in bent]
+    doubt = np.diag((_UNSURE * arm.compliance[joints]) ** -2.0)
+    information = np.linalg.inv(covariance + np.diag(1e-12 * np.diag(covariance) + 1e-30))
+    pull = information @ change + doubt @ (arm.compliance[joints] - here[joints])
+    found = np.linalg.solve(information + doubt, pull)
+    step[joints] = np.clip(found, -_LARGEST_STEP * here[joints], _LARGEST_STEP * here[joints])
     return step
 
 

@@ -14,6 +14,7 @@ from ident.discrepancy.evidence import Floats, Rows
 from ident.discrepancy.gain import HeldOut, held_out, interval
 from ident.discrepancy.hygiene import SampleLoss
 from ident.discrepancy.imperfection import beyond_law
+from ident.discrepancy.intervals import estimated
 from ident.discrepancy.nominal import TRAVEL_RAD, Arm, Nominal
 from ident.discrepancy.probes import Remainder, find_remainders
 from ident.discrepancy.reference import Reference
@@ -205,43 +206,14 @@ def _relative(without: HeldOut, after: HeldOut, key: tuple[str, int]) -> float:
 
 
 def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
-    """Values with standard deviations; those of the shape from the columns' derivatives."""
-    evidence, dictionary = bench.evidence, bench.dictionary
-    effect, shape = trial.candidate.effect, dict(trial.shape)
-    joint_rows: dict[tuple[str, int], list[Floats]] = {key: [v] for key, v in trial.rows.items()}
-    moved = []
-    for name in effect.continuous(shape):
-        step = 0.02 * abs(shape[name]) or 0.02
-        upper = dictionary.rows(trial.candidate, {**shape, name: shape[name] + step})
-        lower = dictionary.rows(trial.candidate, {**shape, name: shape[name] - step})
-        derivative = {
-            key: ((upper.get(key, 0.0) - lower.get(key, 0.0)) / (2.0 * step) @ trial.score.coefficients)[
-                :, None
-            ]
-            for key in trial.rows
-        }
-        if any(np.any(v) for v in derivative.values()):
-            moved.append(name)
-            for key, column in derivative.items():
-                joint_rows[key].append(column)
-    rows: Rows = {key: np.concatenate(parts, axis=1) for key, parts in joint_rows.items()}
-    wide = evidence.score(evidence.padded(rows))
-    k = len(trial.score.coefficients)
-    if np.isfinite(wide.gain) and len(wide.coefficients) == k + len(moved):
-        std = np.sqrt(np.maximum(np.diag(wide.covariance), 0.0))
-    else:
-        std = np.append(np.sqrt(np.maximum(np.diag(trial.score.covariance), 0.0)), np.zeros(len(moved)))
-    found = {}
-    for parameter, value, s in zip(effect.linear, trial.score.coefficients, std[:k], strict=False):
-        if parameter.name not in effect.hidden:
-            found[parameter.name] = Value(float(value), float(s), parameter.unit)
-    spread = dict(zip(moved, std[k:], strict=True))
-    for parameter in effect.shape_parameters:
-        if parameter.name in shape:
-            found[parameter.name] = Value(
-                float(shape[parameter.name]), float(spread.get(parameter.name, 0.0)), parameter.unit
-            )
-    return found
+    """Values with standard deviations, see `intervals`."""
+    effect = trial.candidate.effect
+    values, deviations = estimated(bench.dictionary, bench.evidence, trial)
+    return {
+        p.name: Value(values[p.name], deviations[p.name], p.unit)
+        for p in effect.parameters
+        if p.name in values and p.name not in effect.hidden
+    }
 
 
 def _beyond(

@@ -7,16 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ident.effects.deflection import deflected
+from ident.effects.deflection import changed_springs, deflected
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated, encoder_sides
-from ident.effects.motion import Motion
+from ident.effects.motion import Floats, Motion
+
+# Lost motions to begin with [rad].
+_SIZES = (3e-4, 1e-3, 3e-3, 1e-2)
 
 
 class Backlash(Effect):
     """The link lags the motor by half the `gap`, to the side that the joint torque pulls it.
 
     encoder : 1 where the published position is the motor's, so that the links are elsewhere; 0 where it is
-    the link's, so that the motor moves across the gap.
+    the link's, so that the motor moves across the gap. In the first case the link crosses the gap almost free,
+    arrives, and rings on its spring: how, depends on the `size` of the gap.
     """
 
     cause = "backlash"
@@ -27,6 +31,7 @@ class Backlash(Effect):
         Parameter("gap", "rad", "lost motion", low=0.0, high=0.1),
         Parameter("encoder", "1", "1: positions of the motors, 0: of the links", shape=True),
         Parameter("width", "Nm", "torque over which the gap is crossed", shape=True),
+        Parameter("size", "rad", "gap that the links are let cross", shape=True, low=1e-5, high=0.1),
     )
     scrutiny = 2.0
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
@@ -36,22 +41,34 @@ class Backlash(Effect):
         if not setting.torque_turns[joint]:
             return []
         top = float(setting.torque_range[joint])
-        return [
-            {"encoder": e, "width": max(1e-3, w * top)} for e in encoder_sides(setting) for w in (0.01, 0.05)
-        ]
+        found = []
+        for encoder in encoder_sides(setting):
+            if encoder > 0.5 and setting.springs:
+                found += [{"encoder": 1.0, "width": 0.01 * top, "size": size} for size in _SIZES]
+            else:
+                found += [{"encoder": encoder, "width": max(1e-3, w * top)} for w in (0.01, 0.05)]
+        return found
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """The width, loosely."""
-        return ()
+        """The size."""
+        return ("size",) if "size" in shape else ()
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether the gap is about the size that the links were let cross."""
+        gap, size = float(coefficients[0]), shape.get("size")
+        return super().plausible(coefficients, shape) and (size is None or 0.5 * size < gap < 2.0 * size)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
+        size = shape.get("size", 0.0)
+        if motion.springs is not None and size > 0.0 and shape["encoder"] > 0.5:
+            return changed_springs(motion.springs, motion.springs.with_play(joint, size), size)
         half = 0.5 * np.tanh(motion.joint_torque[:, joint] / shape["width"])
         return deflected(motion, joint, half, bool(shape["encoder"] > 0.5), 1e-3)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Displaces the published position; with the link's encoder, pulls the motor across the gap."""
-        return _Gap(joint, *(float(parameters[p.name]) for p in self.parameters))
+        return _Gap(joint, *(float(parameters[name]) for name in ("gap", "encoder", "width")))
 
 
 class _Gap(Simulated):

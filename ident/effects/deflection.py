@@ -6,9 +6,10 @@ import numpy as np
 
 from ident.effects.effect import Column
 from ident.effects.motion import Floats, Motion
+from ident.effects.springs import Springs
 from ident.signals.filters import differentiate, low_pass
 
-__all__ = ["deflected"]
+__all__ = ["changed_springs", "deflected"]
 
 _LINK_HZ, _MOTOR_HZ = 8.0, 30.0
 
@@ -20,7 +21,7 @@ def deflected(
 
     With the encoder at the motor the link stands at q - twist, and all torques change. With the encoder at
     the link the motor moves by the twist beside it: drive inertia and drive friction see its derivatives.
-    scale : coefficient about which the columns are linearised.
+    scale : coefficient about which the columns are linearised. The links are taken to follow at once.
     """
     dt = motion.dt
     # The torque's own acceleration part is noisy, and two more derivatives amplify it: with the link's inertia
@@ -43,3 +44,13 @@ def deflected(
     friction -= motion.motor_coulomb[joint] * (np.sign(there) - np.sign(here))[:, joint]
     friction /= scale
     return (Column(motor=motion.inertia[joint] * second + friction),)
+
+
+def changed_springs(springs: Springs, changed: Springs, size: float) -> tuple[Column, ...]:
+    """Column of what a change of the springs behind the published motors does to all torques, over its `size`.
+
+    The links follow as the springs let them, and ring; that is not proportional to the size, so the column belongs
+    to one size, and its coefficient is that size where it suits the data.
+    """
+    change = (changed.torque - springs.torque) / size
+    return (Column(motor=change, joint=change),)

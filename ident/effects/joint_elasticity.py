@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ident.effects.deflection import deflected
+from ident.effects.deflection import changed_springs, deflected
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated, encoder_sides
-from ident.effects.motion import Motion
+from ident.effects.motion import Floats, Motion
+
+# Compliances to begin with [rad/Nm]: from a tenth of a gear's to a few times as much; and one for a derivative.
+_SIZES = (1.5e-5, 5e-5, 1.5e-4)
+_SMALL = 1e-6
 
 
 class JointElasticity(Effect):
@@ -26,20 +30,37 @@ class JointElasticity(Effect):
     parameters = (
         Parameter("compliance", "rad/Nm", "twist per torque beyond the model's", low=0.0, high=0.02),
         Parameter("encoder", "1", "1: positions of the motors, 0: of the links", shape=True),
+        Parameter(
+            "size", "rad/Nm", "compliance with which the links are let ring", shape=True, low=1e-7, high=0.02
+        ),
     )
     scrutiny = 2.0
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Places of the encoder."""
-        return [{"encoder": e} for e in encoder_sides(setting)]
+        """Places of the encoder; sizes where the links ring on springs that are known."""
+        found = []
+        for encoder in encoder_sides(setting):
+            if encoder > 0.5 and setting.springs:
+                found += [{"encoder": 1.0, "size": size} for size in _SIZES]
+            else:
+                found.append({"encoder": encoder})
+        return found
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Either or."""
-        return ()
+        """The size."""
+        return ("size",) if "size" in shape else ()
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether the compliance is about the size with which the links were let ring."""
+        more, size = float(coefficients[0]), shape.get("size")
+        return super().plausible(coefficients, shape) and (size is None or 0.4 * size < more < 2.5 * size)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
+        if motion.springs is not None and shape["encoder"] > 0.5:
+            size = shape.get("size", _SMALL)
+            return changed_springs(motion.springs, motion.springs.softer(joint, size), size)
         twist = motion.joint_torque[:, joint]
         return deflected(motion, joint, twist, bool(shape["encoder"] > 0.5), 1e-5)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident import regressor
+from ident.effects.springs import Springs
 from ident.kinematics import Chain
 
 __all__ = ["Floats", "Motion"]
@@ -33,6 +34,8 @@ class Motion:
     friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
     slip : (N, n) Coulomb friction of the drives over its level, which after a reversal goes from one sign to
         the other within the reach of presliding; None: at once.
+    springs : on which the links hang behind motors whose positions are published; None where the positions are
+        the links', or the stiffness is unknown.
     loaded : whether the payload hangs there, or the last link is what is spoken of.
     """
 
@@ -54,6 +57,7 @@ class Motion:
     motor_coulomb: Floats
     friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
     slip: Floats | None = None
+    springs: Springs | None = None
     loaded: bool = True
 
     @property

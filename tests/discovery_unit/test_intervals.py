@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ident.discrepancy.bench import Bench
+from ident.discrepancy.candidates import Candidate, Trial
+from ident.discrepancy.intervals import estimated, phases_of
+from ident.discrepancy.signatures import signature_bench
+from ident.effects import EFFECTS
+from ident.kinematics import Chain
+from lwr_driver.session import Session
+
+AMPLITUDE, VELOCITY = 0.4, 0.15
+
+
+@pytest.fixture(scope="module")
+def bench(make: Callable[..., Session], chain: Chain) -> Bench:
+    def stribeck(s: dict[str, np.ndarray]) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += AMPLITUDE * np.sign(v) * np.exp(-np.abs(v) / VELOCITY)
+
+    return signature_bench([make("a.mcap", 1, stribeck), make("b.mcap", 2, stribeck, 1)], chain)
+
+
+def trial(bench: Bench, velocity: float) -> Trial:
+    candidate = Candidate(EFFECTS["stribeck"], 1)
+    found = bench.dictionary.trial(candidate, {"velocity": velocity, "exponent": 1.0})
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("begin", [0.13, 0.17])
+def test_values_are_those_of_all_parameters_at_a_time(bench: Bench, begin: float) -> None:
+    before = list(bench.evidence.extra)
+    values, deviations = estimated(bench.dictionary, bench.evidence, trial(bench, begin))
+    assert abs(values["velocity"] - VELOCITY) < min(2.0 * deviations["velocity"], 0.04)
+    assert abs(values["amplitude"] - AMPLITUDE) < 3.0 * deviations["amplitude"]
+    assert 0.005 < deviations["velocity"] < 0.06
+    assert 0.01 < deviations["amplitude"] < 0.2
+    assert bench.evidence.extra == before
+
+
+def test_far_from_the_best_shape_no_step_is_made(bench: Bench) -> None:
+    values, _ = estimated(bench.dictionary, bench.evidence, trial(bench, 0.02))
+    assert values["velocity"] == 0.02
+
+
+def test_phases_repeat_with_the_motion(bench: Bench) -> None:
+    phases = phases_of(bench.evidence)
+    counts = np.bincount(phases)
+    assert len(counts) < 0.65 * len(phases)
+    assert np.median(counts) == 2
+    sessions = [set(phases[bench.evidence.block_session == k].tolist()) for k in (0, 1)]
+    assert not sessions[0] & sessions[1]
