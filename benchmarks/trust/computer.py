@@ -407,7 +407,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
             ("Ctrl-C twice", few, 2, signal.SIGINT),
         ):
             work.append((what, times, lambda random, c=count, n=sent: runner(random, c, n)))
-        work = [(what, count, one) for what, count, one in work if options.lines in what]
+        work = [(what, count, one) for what, count, one in work if re.search(options.lines, what)]
         for number in range(max(runs, few)):
             for what, count, one in work:
                 if number < count and not ledger.has("computer", f"{what} {number}"):
