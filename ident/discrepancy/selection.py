@@ -153,7 +153,10 @@ class _State:
                 candidate = Candidate(EFFECTS["joint_elasticity"], joint)
                 rows = self.dictionary.rows(candidate, {"encoder": float(nominal.arm.encoder == "motor")})
                 if rows:
-                    size = self.settings.compliance_tolerance * float(nominal.arm.compliance[joint])
+                    # Behind published motors the links' ringing tells a stiffness that a healthy arm told once.
+                    told = nominal.arm.encoder == "motor" and nominal.arm.encoder_known
+                    share = self.settings.compliance_tolerance * (_TOLD_COMPLIANCE if told else 1.0)
+                    size = share * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
         self._tolerances = found
         return found
@@ -255,12 +258,32 @@ class _State:
         strict = trial.candidate.effect.scrutiny
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
         known = self.null.get(trial.candidate.key, 0.0)
-        return (
-            score.gain > max(least, known)
-            and score.p_value < settings.alpha
-            # What lasts a moment is large then, and little of the whole session.
-            and (trial.candidate.effect.event or score.inflation > strict * settings.least_inflation)
-        )
+        least = max(least, known)
+        if score.gain <= least or score.p_value >= settings.alpha_rare:
+            return False
+        # What lasts a moment is large then, and little of the whole session.
+        size = np.inf if trial.candidate.effect.event else score.inflation * self.concentration(trial, score)
+        needed = strict * settings.least_inflation
+        # What acts in a few blocks only cannot be significant by blocks, however large; predicting parts that were
+        # held back then tells.
+        rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
+        return size > needed and score.p_value < (settings.alpha_rare if rare else settings.alpha)
+
+    def concentration(self, trial: Trial, score: Score) -> float:
+        """Rows that a trial acts on over the rows that it matters in: all over the effective number of them,
+        `(sum p)^2 / sum p^2` of the power p of its torque in the rows of each joint and side, in units of the noise.
+
+        A small turn of one joint's zero acts on every row, and shows in two or three.
+        """
+        if len(trial.rows) == 1:
+            return 1.0
+        power = []
+        for (side, joint), columns in trial.rows.items():
+            used = self.dictionary.nominal.rows[side].valid[:, joint]
+            torque = columns[used] @ score.coefficients / self.evidence.sigma[side][joint]
+            power.append(float(np.var(torque)) if used.any() else 0.0)
+        squares = float(np.sum(np.square(power)))
+        return len(power) * squares / float(np.sum(power)) ** 2 if squares > 0.0 else 1.0
 
     def beside(self, accepted: Sequence[Trial], without: int) -> list[Trial]:
         """All but one of the accepted, in the base."""
@@ -347,12 +370,16 @@ class _State:
         return Claim(again, again.score, alike, sure, outdone)
 
 
+# How many times the usual evidence is plain to see.
+_PLAIN = 10.0
 # Of so many that come first the shapes are refined before one is taken.
 _CONTEST = 4
 # Gain from which on it is worth seeing what a candidate leaves.
 _HOPE = 10.0
 # Share of the tolerance for a whole channel's delay that is left where a healthy arm told what it is.
 _TOLD_DELAY = 0.4
+# The same of a stiffness behind published motors.
+_TOLD_COMPLIANCE = 0.4
 # Confidence in a sensor's error where only the joint torque was recorded.
 _SHAPE_ALONE = 0.7
 

@@ -25,7 +25,8 @@ class DiagnosisSettings:
     guard_s : joint rows this close to a joint's standstill are left out too.
     block_s : length of the blocks that errors are taken to be independent between, and that are held back.
     folds : number of parts of the motion that are held back in turn.
-    alpha : significance of a claim, each candidate by itself, from blocks.
+    alpha : significance of a claim, each candidate by itself, from blocks. alpha_rare : of one that is plain to see
+    in what is held back, because a cause that acts in few blocks cannot be as significant.
     least_gain : fall of the held-back chi-square that a claim takes at least.
     least_inflation : smallest relative excess of the residual's power in the affected rows that matters.
     rounds : largest number of effects.
@@ -44,6 +45,7 @@ class DiagnosisSettings:
     block_s: float = 2.0
     folds: int = 5
     alpha: float = 1e-5
+    alpha_rare: float = 1e-3
     least_gain: float = 30.0
     least_inflation: float = 0.005
     rounds: int = 8
