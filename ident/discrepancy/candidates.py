@@ -293,5 +293,5 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         encoder=nominal.arm.encoder if nominal.arm.encoder_known else None,
         reach=nominal.arm.reach,
         compared=compared,
-        springs=all(m.springs is not None for m in motions),
+        compliance=nominal.arm.compliance if all(m.springs is not None for m in motions) else None,
     )

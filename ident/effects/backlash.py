@@ -43,7 +43,7 @@ class Backlash(Effect):
         top = float(setting.torque_range[joint])
         found = []
         for encoder in encoder_sides(setting):
-            if encoder > 0.5 and setting.springs:
+            if encoder > 0.5 and setting.compliance is not None:
                 found += [{"encoder": 1.0, "width": 0.01 * top, "size": size} for size in _SIZES]
             else:
                 found += [{"encoder": encoder, "width": max(1e-3, w * top)} for w in (0.01, 0.05)]

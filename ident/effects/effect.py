@@ -73,7 +73,8 @@ class Setting:
         (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic
         joints that publishes the positions, None where unknown. reach : (n,) of the presliding that the model has
         already [rad], None where unknown. compared : whether the sessions are held against a reference.
-        springs : whether the links' motion on their springs is known.
+        compliance : (n,) [rad/Nm] of the
+        springs that the links hang on behind published motors, None where the links' positions are published.
     """
 
     sessions: int
@@ -86,7 +87,7 @@ class Setting:
     encoder: Literal["link", "motor"] | None = None
     reach: Floats | None = None
     compared: bool = False
-    springs: bool = False
+    compliance: Floats | None = None
 
 
 def encoder_sides(setting: Setting) -> tuple[float, ...]:

@@ -9,8 +9,8 @@ from ident.effects.deflection import changed_springs, deflected
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated, encoder_sides
 from ident.effects.motion import Floats, Motion
 
-# Compliances to begin with [rad/Nm]: from a tenth of a gear's to a few times as much; and one for a derivative.
-_SIZES = (1.5e-5, 5e-5, 1.5e-4)
+# Compliances to begin with, over the joint's own: less is no other joint. And one [rad/Nm] for a derivative.
+_SHARES = (0.3, 0.45, 0.65, 1.0, 1.6)
 _SMALL = 1e-6
 
 
@@ -41,8 +41,10 @@ class JointElasticity(Effect):
         """Places of the encoder; sizes where the links ring on springs that are known."""
         found = []
         for encoder in encoder_sides(setting):
-            if encoder > 0.5 and setting.springs:
-                found += [{"encoder": 1.0, "size": size} for size in _SIZES]
+            if encoder > 0.5 and setting.compliance is not None:
+                found += [
+                    {"encoder": 1.0, "size": share * float(setting.compliance[joint])} for share in _SHARES
+                ]
             else:
                 found.append({"encoder": encoder})
         return found
@@ -54,7 +56,7 @@ class JointElasticity(Effect):
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
         """Whether the compliance is about the size with which the links were let ring."""
         more, size = float(coefficients[0]), shape.get("size")
-        return super().plausible(coefficients, shape) and (size is None or 0.4 * size < more < 2.5 * size)
+        return super().plausible(coefficients, shape) and (size is None or 0.6 * size < more < 1.7 * size)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
