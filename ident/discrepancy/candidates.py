@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -124,12 +125,21 @@ class Dictionary:
         The products of the whole session are made once; those after an edge are a part of their blocks.
         """
         evidence = self.evidence
-        best: tuple[Shape, Score] | None = None
-        for session in sorted(set(evidence.block_session.tolist())):
+        best: tuple[Shape, Score, tuple[str, int]] | None = None
+        kinds = {
+            tuple(v for k, v in s.items() if k not in ("time", "session")) for s in self._grid(candidate)
+        }
+        sessions = sorted(set(evidence.block_session.tolist()))
+        for number, (kind, session) in enumerate(product(sorted(kinds), sessions)):
             mine = np.flatnonzero(evidence.block_session == session)
             starts = evidence.block_start[mine]
-            shape = {"time": float(starts.min()) - 1.0, "session": float(session + 1)}
-            key = (candidate.cause, -2 - session)
+            names = [p.name for p in candidate.effect.shape_parameters if p.name not in ("time", "session")]
+            shape = {
+                "time": float(starts.min()) - 1.0,
+                "session": float(session + 1),
+                **dict(zip(names, kind, strict=True)),
+            }
+            key = (candidate.cause, -2 - number)
             if key not in self._kept:
                 rows = self.rows(candidate, shape)
                 padded = evidence.padded(rows)
@@ -145,14 +155,16 @@ class Dictionary:
                     evidence.score_products(whole.only(on), list(padded)), evidence.blocks
                 )
                 if best is None or score.gain > best[1].gain:
-                    best = ({**shape, "time": float(edge)}, score)
+                    best = ({**shape, "time": float(edge)}, score, key)
         if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
             return None
         # The rows themselves are made only where the step may matter.
         if best[1].gain < 10.0:
-            session = int(best[0]["session"]) - 1
-            return Trial(candidate, best[0], best[1], self._kept[candidate.cause, -2 - session][0][1])
+            return Trial(candidate, best[0], best[1], self._kept[best[2]][0][1])
         return Trial(candidate, best[0], best[1], self.rows(candidate, best[0]))
+
+    def _grid(self, candidate: Candidate) -> Sequence[Shape]:
+        return candidate.effect.shapes(self.setting, max(candidate.joint, 0))
 
     def _contacts(self, candidate: Candidate) -> Trial | None:
         """The best contact in a burst of the residual, on any link from the third on."""

@@ -11,10 +11,21 @@ from ident.effects.effect import Column, Simulated
 from ident.effects.motion import Floats, Motion
 from ident.kinematics import Chain
 
-__all__ = ["Body", "body_columns", "force_torque", "inertia_columns", "plant_jacobian"]
+__all__ = [
+    "Body",
+    "Sliding",
+    "body_columns",
+    "force_torque",
+    "inertia_columns",
+    "leaning",
+    "plant_jacobian",
+    "slide",
+]
 
 # Places of M, MX, MY, MZ among the ten inertial parameters.
 _PLACES = (9, 6, 7, 8)
+# Coefficient of friction below which a loose part slides.
+_FRICTION = 0.3
 
 
 def body_columns(motion: Motion, count: int) -> tuple[Column, ...]:
@@ -94,9 +105,53 @@ class Body(Simulated):
         model = plant.model.copy()
         for link in range(1, model.njoints):
             model.inertias[link] = pin.Inertia.Zero()
-        mass, *moments = self.values
+        mass, *moments = self.values * self.shares(plant)
         model.inertias[model.njoints - 1] = pin.Inertia.FromDynamicParameters(
             np.array([mass if abs(mass) > 1e-9 else 1e-9, *moments, 0, 0, 0, 0, 0, 0], dtype=float)
         )
         thrust = (self.speed - before) / plant.cycle_s
         loads.link_torque -= pin.rnea(model, model.createData(), plant.position, plant.velocity, thrust)
+
+    def shares(self, plant: Any) -> Floats:
+        """Factors (4,) of mass and first moments in the present pose."""
+        return np.ones(4)
+
+
+class Sliding(Body):
+    """The same of a body that slides along the last link's axes to where gravity pulls it."""
+
+    def shares(self, plant: Any) -> Floats:
+        """See `slide`."""
+        import pinocchio as pin
+
+        data = plant.model.createData()
+        pin.forwardKinematics(plant.model, data, plant.position)
+        down = np.array(plant.model.gravity.linear)
+        lean = data.oMi[plant.model.nv].rotation.T @ down / np.linalg.norm(down)
+        return np.append(1.0, slide(lean))
+
+
+def slide(lean: Floats) -> Floats:
+    """Place of a loose body along an axis, -1 to 1, for the component of the direction of gravity along it.
+
+    On a slope beyond that of friction it lies at the lower end; on a smaller one it may be anywhere between.
+    """
+    return np.tanh(lean / _FRICTION)
+
+
+def leaning(motion: Motion) -> Floats:
+    """Components (N, 3) of the direction of gravity along the axes of the last link."""
+    chain = motion.chain
+    turned = np.broadcast_to(
+        chain.base_placement[:3, :3].T @ (chain.gravity / np.linalg.norm(chain.gravity)),
+        (motion.q.shape[0], 3),
+    )
+    for joint in range(chain.n):
+        # Into the joint's frame before it turns, then against its turn.
+        fixed = turned @ chain.placement(joint)[:3, :3]
+        angle = np.zeros(len(motion.q)) if chain.prismatic[joint] else motion.q[:, joint]
+        c, s = np.cos(angle), np.sin(angle)
+        turned = np.column_stack(
+            [c * fixed[:, 0] + s * fixed[:, 1], c * fixed[:, 1] - s * fixed[:, 0], fixed[:, 2]]
+        )
+    return turned

@@ -7,6 +7,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.effects import EFFECTS, Motion, Setting, find_effect
+from ident.effects.body import leaning, slide
 from ident.effects.model_torque import check_entry
 from ident.effects.operators import dahl, play
 from ident.kinematics import Chain
@@ -254,3 +255,20 @@ def test_viscous_friction_rises_from_standstill_on() -> None:
     assert thinning(np.array([-1.5]), {"exponent": 1.6})
     # A friction that falls as the speed rises is Stribeck's.
     assert not thinning(np.array([-2.0]), {"exponent": 0.4})
+
+
+def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
+    lean = leaning(motion)
+    pose = motion.chain.forward(motion.q[7])[-1][:3, :3]
+    down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
+    np.testing.assert_allclose(lean[7], pose.T @ down, atol=1e-12)
+    shape = {"time": 1.0, "session": float(motion.session + 1), "loose": 1.0}
+    loose = EFFECTS["payload_change"].columns(motion, 0, shape)
+    firm = EFFECTS["payload_change"].columns(motion, 0, {**shape, "loose": 0.0})
+    assert (len(loose), len(firm)) == (3, 4)
+    after = motion.time >= 1.0
+    for axis, (one, other) in enumerate(zip(loose, firm, strict=False)):
+        assert one.joint is not None
+        assert other.joint is not None
+        assert not np.any(one.joint[~after])
+        np.testing.assert_allclose(one.joint, slide(lean)[:, axis, None] * other.joint)
