@@ -15,6 +15,7 @@ from fri.errors import DataError
 from ident.discrepancy import ArmData, Diagnosis, Reference
 from ident.discrepancy.signatures import overlap, signature_bench, signatures
 from ident.kinematics import Chain
+from ident.model import DynamicModel
 from lwr_driver.session import JointColumns, Phase, Session
 from runner.diagnosis.look_alikes import Foreseen, LookAlikes
 from runner.experiment_file import Payload
@@ -22,7 +23,7 @@ from runner.experiment_file import Payload
 if TYPE_CHECKING:
     from runner.diagnosis.deciding import Deciding
 
-__all__ = ["foresee"]
+__all__ = ["foresee", "made_up"]
 
 log = logging.getLogger(__name__)
 
@@ -54,12 +55,14 @@ def foresee(
         if not mine:
             continue
         last = max(int(session.joint.log_time[-1]) for session in sessions)
-        made_up = []
+        further: list[Session] = []
         for payload in motion.payloads:
-            made_up.append(_made_up(diagnosis, motion, payload, sessions, last + _PAUSE_NS))
-            last = int(made_up[-1].joint.log_time[-1])
+            further.append(
+                made_up(diagnosis, diagnosis.base_model, motion, payload, sessions, last + _PAUSE_NS)
+            )
+            last = int(further[-1].joint.log_time[-1])
         try:
-            bench = signature_bench([*sessions, *made_up], chain, arm=arm, reference=reference)
+            bench = signature_bench([*sessions, *further], chain, arm=arm, reference=reference)
             for k in mine:
                 pair = found[k]
                 a, b = signatures(bench, [pair.first, pair.second], parameters=pair.parameters)
@@ -71,11 +74,15 @@ def foresee(
     return tuple(found)
 
 
-def _made_up(
-    diagnosis: Diagnosis, motion: Deciding, payload: Payload | None, sessions: Sequence[Session], start: int
+def made_up(
+    diagnosis: Diagnosis,
+    model: DynamicModel,
+    motion: Deciding,
+    payload: Payload | None,
+    sessions: Sequence[Session],
+    start: int,
 ) -> Session:
-    """A session of a motion as the base model predicts it, from `start` [ns] on."""
-    model = diagnosis.base_model
+    """A session of a motion as a model predicts it, with the noise of a diagnosis, from `start` [ns] on."""
     names = model.structure.chain.joint_names
     name = "none" if payload is None else payload.name
     mounted = name if name in model.structure.payloads else None
@@ -92,7 +99,7 @@ def _made_up(
             continue
         floor = np.nan_to_num(np.asarray(diagnosis.noise_floor[side], dtype=float), nan=_LEAST_NM)
         noise = np.maximum(floor, _LEAST_NM) * np.sqrt(_ROW_S / _PERIOD_S)
-        torque = model.torque(state.q, state.qd, state.qdd, payload=mounted, side=side)
+        torque = model.torque(state.q, state.qd, state.qdd, payload=mounted, side=side, time=time)
         effort[side] = torque + noise * random.normal(size=torque.shape)
     joint = JointColumns(
         "/joint_states", names, stamps, stamps, sequence, state.q, empty, effort.get("joint", empty)
