@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -165,7 +166,6 @@ def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: Motion) -> 
 
 
 def test_tilt_column_is_gravity_of_a_tilted_base(motion: Motion) -> None:
-    from dataclasses import replace
 
     from ident.regressor import gravity_torque
 
@@ -272,3 +272,18 @@ def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
         assert other.joint is not None
         assert not np.any(one.joint[~after])
         np.testing.assert_allclose(one.joint, slide(lean)[:, axis, None] * other.joint)
+
+
+def test_drive_warms_up_by_the_power_of_its_friction(motion: Motion) -> None:
+    def at(speed: float, heat: float) -> np.ndarray:
+        steady = replace(motion, motor_speed=np.full_like(motion.q, speed), slip=None)
+        shape = {"time_constant": 1.5, "heat": heat}
+        (column,) = EFFECTS["friction_temperature"].columns(steady, 1, shape)
+        assert column.motor is not None
+        return column.motor / steady.drive_friction[:, 1]
+
+    expected = 1.0 - np.exp(-motion.time / 1.5)
+    np.testing.assert_allclose(at(1.0, 1.0), expected, atol=2e-3)
+    np.testing.assert_allclose(at(0.3, 0.0), expected)
+    assert at(2.0, 1.0)[-1] > 2.0 * at(1.0, 1.0)[-1] - 1e-9
+    assert at(0.3, 1.0)[-1] < 0.3 * expected[-1] + 1e-9
