@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from fri.errors import DataError
 from ident.discrepancy.bench import (
@@ -20,7 +22,8 @@ from ident.discrepancy.candidates import Dictionary
 from ident.discrepancy.conclusion import Simulate, conclude, timing_finding
 from ident.discrepancy.gain import held_out
 from ident.discrepancy.hygiene import sample_loss
-from ident.discrepancy.recording import record
+from ident.discrepancy.nominal import Arm
+from ident.discrepancy.recording import Recording, record
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.result import Diagnosis, Finding
 from ident.discrepancy.selection import Claim, Null, Selection, hopeful, select
@@ -69,6 +72,7 @@ def diagnose(
     bench = prepare_bench(known, recordings, settings, reference, causes, fit_compliance=reference is None)
     null = reference.limits() if reference is not None else None
     timing: list[Finding] = []
+    notes: list[str] = []
     selection = select(bench.dictionary, bench.evidence, settings, null)
     if not bench.told and not selection.claims:
         bench, selection = _with_hope(bench, selection, settings, causes, null)
@@ -97,7 +101,12 @@ def diagnose(
             fit_compliance=False,
         )
         again = select(bench.dictionary, bench.evidence, settings, null)
+        unknown = {c.trial.candidate.cause: _unknown_delay(known, recordings, c) for c in late}
         timing = [timing_finding(c, known, bench, again, before, settings) for c in late]
+        timing = [f for f in timing if abs(f.parameters["delay"].value) > unknown[f.cause]]
+        notes = [
+            _own_delay(c, unknown) for c in late if c.trial.candidate.cause not in [f.cause for f in timing]
+        ]
         again.claims = [c for c in again.claims if c.trial.candidate.effect.side != "timing"]
         selection = again
     for _ in range(_REPEATS):
@@ -107,7 +116,32 @@ def diagnose(
         bench = better
         selection = select(bench.dictionary, bench.evidence, settings, null)
         selection.claims = [c for c in selection.claims if c.trial.candidate.effect.side != "timing"]
-    return conclude(bench, selection, timing, loss, settings, reference, model, simulate, sessions, test)
+    found = conclude(bench, selection, timing, loss, settings, reference, model, simulate, sessions, test)
+    return replace(found, notes=(*found.notes, *notes)) if notes else found
+
+
+def _unknown_delay(known: Arm, recordings: Sequence[Recording], claim: Claim) -> float:
+    """Delay [s] up to which a late channel may be what the arm is like, 0 where a healthy arm told what it is.
+
+    A motor torque that is published by another clock than the positions waits for a tick of its own and for the
+    next packet: that much is a property of the controller's program, and no fault that could be told from it.
+    """
+    if known.encoder_known or claim.trial.candidate.cause != "motor_torque_delay":
+        return 0.0
+    stretches = [s for r in recordings for s in r.stretches if len(s.motor_time) > 1]
+    own = max(float(np.median(np.diff(s.motor_time))) for s in stretches)
+    positions = max(float(np.median(np.diff(s.time))) for s in stretches)
+    return own + positions if own > 1.5 * positions else 0.0
+
+
+def _own_delay(claim: Claim, unknown: Mapping[str, float]) -> str:
+    made = float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+    limit = unknown[claim.trial.candidate.cause]
+    return (
+        f"motor torques come {1e3 * made:.1f} ms after the positions, which was corrected; without a reference "
+        f"nobody knows how late they are when all is well, so less than {1e3 * limit:.0f} ms, a sample of each "
+        "channel, is no finding"
+    )
 
 
 def _with_hope(

@@ -169,6 +169,22 @@ def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, referen
     assert diagnose(sessions, chain).findings == ()
 
 
+def test_without_a_reference_the_tick_of_another_clock_is_no_delay(make: Make, chain: Chain) -> None:
+    from dataclasses import replace
+
+    sessions = []
+    for session in pair(make, late_motor):
+        motor = session.motor
+        assert motor is not None
+        columns = ("log_time", "publish_time", "position", "velocity", "effort")
+        thin = {name: getattr(motor, name)[::3] for name in columns}
+        thin["sequence"] = motor.sequence[: len(thin["effort"])]
+        sessions.append(replace(session, motor=replace(motor, **thin)))
+    found = diagnose(sessions, chain)
+    assert found.findings == ()
+    assert any("motor torques come" in note and "without a reference" in note for note in found.notes)
+
+
 def test_zero_of_each_session_is_no_function_of_the_angle(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
