@@ -59,6 +59,8 @@ def estimated(dictionary: Dictionary, evidence: Evidence, trial: Trial) -> Estim
             shape[name] = float(np.clip(shape[name] + step, limits.low, limits.high))
     deviations = dict(zip([*linear, *moved], (float(v) for v in deviation), strict=True))
     values.update({name: float(value) for name, value in shape.items()})
+    for name, law in effect.coarse(values).items():
+        deviations[name] = float(np.hypot(deviations.get(name, 0.0), law))
     return values, {name: deviations.get(name, 0.0) for name in values}
 
 

@@ -11,6 +11,9 @@ from ident.effects.body import force_torque, plant_jacobian
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
 from ident.effects.motion import Motion
 
+# Share of its duration by which the middle of a force of any course may differ from that of a half sine.
+_COURSE = 0.1
+
 
 class Contact(Effect):
     """A force [N] on a link, in axes of the base, half a sine of length `duration` around `time`."""
@@ -39,6 +42,10 @@ class Contact(Effect):
     def continuous(self, shape: Shape) -> tuple[str, ...]:
         """Middle and duration."""
         return ("time", "duration")
+
+    def coarse(self, parameters: Mapping[str, float]) -> Mapping[str, float]:
+        """Middle and duration: nobody pushes by half a sine, so these are known to a part of the duration."""
+        return {"time": _COURSE * parameters["duration"], "duration": 2.0 * _COURSE * parameters["duration"]}
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Less the Jacobian's transpose times the force's course, in all rows."""

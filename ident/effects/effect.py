@@ -172,6 +172,10 @@ class Effect(ABC):
         """Whether the coefficients lie in the ranges that make physical sense."""
         return all(p.low <= value <= p.high for p, value in zip(self.linear, coefficients, strict=False))
 
+    def coarse(self, parameters: Mapping[str, float]) -> Mapping[str, float]:
+        """Standard deviations of parameters that come from the law itself, which says less than what happens."""
+        return {}
+
     def mode(self, shape: Shape) -> str | None:
         """A word on the way the cause shows, where there are several."""
         return None

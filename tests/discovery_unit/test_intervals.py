@@ -55,3 +55,13 @@ def test_phases_repeat_with_the_motion(bench: Bench) -> None:
     assert np.median(counts) == 2
     sessions = [set(phases[bench.evidence.block_session == k].tolist()) for k in (0, 1)]
     assert not sessions[0] & sessions[1]
+
+
+def test_a_law_that_is_coarse_says_so(bench: Bench) -> None:
+    contact = EFFECTS["contact"]
+    shape = {"time": 8.0, "duration": 1.5, "session": 1.0, "link": 3.0}
+    found = bench.dictionary.trial(Candidate(contact, -1), shape)
+    assert found is not None
+    _, deviations = estimated(bench.dictionary, bench.evidence, found)
+    assert deviations["time"] >= contact.coarse({"duration": 1.5})["time"] > 0.1
+    assert not EFFECTS["stribeck"].coarse({"amplitude": 1.0})
