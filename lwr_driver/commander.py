@@ -34,7 +34,8 @@ class Commander:
     a motion is stopped [rad].
 
     mode : what is answered; index : row of the motion, -1 outside one; phase : number of the phase;
-    target : last value sent (7,) float32; ended : result and reason of the motion, (NONE, "") before its end
+    target : last value sent (7,) float32, not a number before the first
+    ended : result and reason of the motion, (NONE, "") before its end
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class Commander:
         self._plan, self._tracking_limit = control.plan, tracking_limit
         self.mode = Mode.MIRROR
         self.index, self.phase = -1, NO_PHASE
-        self.target = np.zeros(JOINTS, dtype=np.float32)
+        self.target = np.full(JOINTS, np.nan, dtype=np.float32)
         self.ended: tuple[Result, str] = (Result.NONE, "")
         self._period = 0.0
         self._guard: Guard
@@ -55,10 +56,12 @@ class Commander:
         self._base, self._rows = 0, 0
         self._next_phase = 0
         self._pending: tuple[Result, str] = (Result.NONE, "")  # why the stop under way was begun
+        self._stopping = False  # whether a stop was under way when command mode was lost
 
     def set_period(self, period_s: float) -> None:
         """Take the controller's cycle [s]; not in command mode."""
         self._period = period_s
+        self.target = np.full(JOINTS, np.nan, dtype=np.float32)
         self._guard = Guard(self._limits, period_s)
         self._stop = Stop(self._limits, period_s)
 
@@ -75,27 +78,39 @@ class Commander:
     ) -> NDArray[np.float32] | None:
         """Begin to command with the controller's own set point; the value to send.
 
-        step : of the set point per cycle (7,) [rad], None at rest. Command mode begins at rest; a set point
-        that moves is one that was lost in command mode and is brought to rest within the limits.
+        step : of the set point per cycle (7,) [rad], None at rest. A set point that moves is one that was lost
+        in command mode and is brought to rest within the limits: from the rows of the motion where it is the
+        value sent last, else from its present velocity.
         """
         moves = step is not None and bool(step.any())
+        self._guard.scale_velocity(safety_limits)
+        self.index, self.phase = -1, HOLD
+        self._control.tracking[:] = 0.0
+        self._control.write_text(Text.LEFT, "")
+        self.mode = Mode.HOLD
+        if step is not None and moves and self.follows(setpoint):
+            self._since_sent = 1
+            if self._stopping:
+                self._pending, self.mode = self.ended, Mode.STOP
+            else:
+                self.stop(*self.ended)
+            return self.command(0)
         self.target = setpoint.copy()
         self._hold = setpoint.astype(np.float64)
         self._past[:] = self._hold
         if step is not None and moves:
             self._past -= np.arange(3)[:, np.newaxis] * step
         self._guard.reset(setpoint, step / self._period if step is not None and moves else None)
-        self._guard.scale_velocity(safety_limits)
         self._since_sent = 0
-        self.index, self.phase = -1, HOLD
-        self._control.tracking[:] = 0.0
-        self._control.write_text(Text.LEFT, "")
-        self.mode = Mode.HOLD
         if not moves:
             return self.target
         self._since_sent = 1
         self.stop(*self.ended)
         return self.command(0)
+
+    def follows(self, setpoint: NDArray[np.float32]) -> bool:
+        """Whether the set point is the value sent last: the controller has missed nothing since."""
+        return bool(np.array_equal(setpoint, self.target))
 
     def watch(self, elapsed: int, setpoint: NDArray[np.float32], q: NDArray[np.float32]) -> None:
         """Count `elapsed` cycles, and stop if arm or set point are not where they were sent."""
@@ -181,6 +196,7 @@ class Commander:
         if self.mode in (Mode.MIRROR, Mode.SILENT):
             return
         reason = f"{reason}, {self.place()}"
+        self._stopping = self.mode is Mode.STOP
         if self.mode is Mode.MOTION:
             self.ended = (result, reason)
         elif self.mode is Mode.STOP:

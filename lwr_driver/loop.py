@@ -110,6 +110,7 @@ class Loop:
         self._past_setpoints = [(unknown, 1)] * 3  # newest first, and the cycles to the one before
         self._limits, self._fastest = limits, limits.v_max
         self._doubted = self._held_back = False
+        self._let_brake = 0  # cycles in which a set point in motion was left to the controller
         self._misses, self._misses_before, self._missed_at = 0, 0, -_FEWEST_CYCLES
         self._counted_before = self.remote.counters()
         self._heard_s = self._reminded_s = time.monotonic()
@@ -304,9 +305,10 @@ class Loop:
             return None
         if commander.mode is Mode.MIRROR:
             step = self._step()
-            self._held_back = step is None
-            if step is None:
+            if step is None or (step.any() and not self._may_stop(setpoint, elapsed)):
+                self._held_back = True
                 return None
+            self._let_brake = 0
             self._misses_before = misses
             self._counted_before = remote.counters()
             return commander.enter(setpoint, float(remote.msr["safety_limits"]), step)
@@ -336,6 +338,16 @@ class Loop:
         room = self._limits.a_max * self._period**2 * (cycles + cycles_before) / 2.0 + _STILL_RAD
         # Also false for what is no number.
         return step if np.all(change <= room) and np.all(np.abs(step) <= self._fastest) else None
+
+    def _may_stop(self, setpoint: NDArray[np.float32], elapsed: int) -> bool:
+        """Whether a set point that moves after command mode was lost is to be stopped by commands.
+
+        It is if it does what was sent last. What a controller does after missing answers, no command can take
+        up within the limits of the motion before; it is left to brake, unless it goes on as if nobody had to
+        answer.
+        """
+        self._let_brake += elapsed
+        return self._commander.follows(setpoint) or self._let_brake > _FEWEST_CYCLES
 
     def _doubtful(self) -> bool:
         """Whether a packet that would end command mode is the first of its kind and was not asked for.

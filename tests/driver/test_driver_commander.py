@@ -192,6 +192,34 @@ def test_leaving_command_mode_ends_the_motion_for_good(stopping):
     assert link.commander.mode is Mode.HOLD
 
 
+@pytest.mark.parametrize("period_s", [0.001, 0.02])
+@pytest.mark.parametrize("stopping", [False, True])
+def test_a_stop_goes_on_from_the_rows_of_a_motion_that_was_lost_by_the_clock_alone(
+    stopping: bool, period_s: float
+) -> None:
+    link, plan = Link(period_s), motion(period_s)
+    link.begin(plan)
+    for _ in range(len(plan) // 10):
+        link.packet()
+    if stopping:
+        link.commander.stop(Result.ABORTED, "asked to")
+        link.packet()
+        link.packet()
+    link.commander.lose(Result.NETWORK, "no packet for 0.2 s")
+    ended = link.commander.ended
+    # The next packet shows that the controller has missed nothing.
+    step = np.subtract(link.sent[-1], link.sent[-2], dtype=float)
+    assert np.abs(step).max() > 1e-5
+    link.sequence += 1
+    link.sent.append(link.commander.enter(link.sent[-1], 1.0, step).copy())
+    link.times.append(link.sequence * period_s)
+    assert link.commander.mode is Mode.STOP
+    while link.commander.moving:
+        link.packet()
+    assert link.excesses() == []
+    assert link.commander.ended == ended
+
+
 @pytest.mark.parametrize("which", ["measured position", "set point of the controller"])
 def test_arm_that_does_not_follow_is_stopped(which):
     link, plan = Link(tracking_limit=0.05), motion()

@@ -261,6 +261,23 @@ def test_long_gap_ends_the_motion_even_if_the_controller_went_on(rig):
     assert r.session.last_event.kind is EventKind.STOPPED
 
 
+def test_what_a_controller_does_after_missing_answers_is_left_to_it_for_a_while(rig):
+    r = rig(policy={"bridged_cycles": 100_000, "hold_quality": Quality.UNACCEPTABLE})
+    in_motion(r, 400)
+    r.cycle(lose_answer=True)
+    r.loop._lose("the link is in doubt")
+    answers = len(r.arrived.rows)
+    r.cycles(10)
+    assert len(r.arrived.rows) == answers
+    # This one would go on for ever.
+    r.cycles(3)
+    assert r.mode is Mode.STOP
+    steps = np.abs(np.diff(r.arrived.rows[answers:], axis=0)).max(axis=1)
+    assert len(steps) >= 1
+    assert steps[0] > 1e-5
+    assert np.all(np.diff(steps) < 0.0)
+
+
 def test_repeated_packets_are_answered_once(rig):
     r = rig()
     in_motion(r, 50)
