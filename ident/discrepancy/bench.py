@@ -229,7 +229,9 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> F
     joint, and nowhere else.
     """
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
-    dictionary = Dictionary(nominal, evidence, ["joint_elasticity", "motor_torque_delay", "joint_torque_delay"])
+    dictionary = Dictionary(
+        nominal, evidence, ["joint_elasticity", "motor_torque_delay", "joint_torque_delay"]
+    )
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
     late = [c for c in dictionary.candidates if c.joint < 0]
     kept = list(evidence.extra)

@@ -10,8 +10,8 @@ import numpy as np
 
 from ident.discrepancy.bench import Bench, mean_delay
 from ident.discrepancy.candidates import Trial
-from ident.discrepancy.evidence import Floats, Rows
-from ident.discrepancy.gain import HeldOut, held_out, interval
+from ident.discrepancy.evidence import Floats, Key, Rows
+from ident.discrepancy.gain import HeldOut, fall, held_out, interval
 from ident.discrepancy.hygiene import SampleLoss
 from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.intervals import estimated
@@ -27,7 +27,7 @@ from ident.discrepancy.result import (
     Unexplained,
     Value,
 )
-from ident.discrepancy.selection import Claim, Selection
+from ident.discrepancy.selection import PLAIN, Claim, Selection
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 from ident.model import DynamicModel
@@ -73,8 +73,9 @@ def conclude(
         without = held_out(evidence, others)
         evidence.replace(others)
         finding = _finding(claim, bench, without, after, settings)
-        if _confirmed(claim, finding, bench):
-            kept.append((claim, finding))
+        most = _confirmed(claim, finding, bench, fall(without, after, _weights(claim, bench), settings.seed))
+        if most > 0.0:
+            kept.append((claim, replace(finding, confidence=min(finding.confidence, most))))
     claims = [claim for claim, _ in kept]
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     after = held_out(evidence, [*(c.trial.rows for c in claims), *nuisance])
@@ -124,19 +125,28 @@ def conclude(
     )
 
 
-def _confirmed(claim: Claim, finding: Finding, bench: Bench) -> bool:
-    """Whether motions that were not fitted bear a claim out: the interval of what it takes off their error excludes
-    nothing.
+def _weights(claim: Claim, bench: Bench) -> dict[Key, float]:
+    """Weight of a row's square [1/Nm^2] for the joints and sides that a claim acts on."""
+    return {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
+
+
+def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float, float]) -> float:
+    """Largest confidence that motions which were not fitted leave a claim: 1 where they bear it out, the interval of
+    what it takes off their chi-square excluding nothing; 0 where they do not.
 
     What the healthy arm is a little like, and what a stronger cause of another form than its law leaves behind,
     is significant in the rows fitted but makes no prediction. Where the held-out sessions hardly excite the cause,
     they need only not speak against it; of what was another in other sessions or lasted a moment they say nothing.
+    A cause that is plain to see in the rows fitted but whose law predicts poorly may be it or another.
     """
     effect = claim.trial.candidate.effect
-    if finding.mode == "between" or (effect.event and not effect.step):
-        return True
-    low, high = finding.evidence.gain_interval_95
-    return low > 0.0 or (high > 0.0 and _excitation(claim, bench) < _EXCITED)
+    if finding.mode == "between" or effect.repeats:
+        return 1.0
+    low, high = fallen
+    if low > 0.0 or (high > 0.0 and _excitation(claim, bench) < _EXCITED):
+        return 1.0
+    least = effect.scrutiny * bench.evidence.settings.least_gain
+    return _OPEN if low + high > 0.0 and claim.gain > PLAIN * least else 0.0
 
 
 def _excitation(claim: Claim, bench: Bench) -> float:

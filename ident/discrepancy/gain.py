@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ident.discrepancy.evidence import Evidence, Floats, Rows
+from ident.discrepancy.evidence import Evidence, Floats, Key, Rows
 
-__all__ = ["HeldOut", "held_out", "interval"]
+__all__ = ["HeldOut", "fall", "held_out", "interval"]
 
 _DRAWS = 1000
 
@@ -46,25 +46,16 @@ def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
 
 
 def interval(
-    before: HeldOut, after: HeldOut, keys: Sequence[tuple[str, int]], seed: int
+    before: HeldOut, after: HeldOut, keys: Sequence[Key], seed: int
 ) -> tuple[float, float, float, float]:
     """RMS before and after, pooled over the rows of `keys`, and the 95 % interval of their difference.
 
     From 1000 draws of blocks with replacement.
     """
-    blocks: dict[float, Floats] = {}
-    for side, joint in keys:
-        a, b = before.residual[side][:, joint], after.residual[side][:, joint]
-        ok = np.isfinite(a) & np.isfinite(b)
-        for block in np.unique(before.block[side][ok]):
-            mine = ok & (before.block[side] == block)
-            part = np.array([np.sum(a[mine] ** 2), np.sum(b[mine] ** 2), mine.sum()])
-            blocks[float(block)] = blocks.get(float(block), np.zeros(3)) + part
-    if not blocks:
+    table = _by_block(before, after, dict.fromkeys(keys, 1.0))
+    if not len(table):
         return 0.0, 0.0, 0.0, 0.0
-    table = np.array(list(blocks.values()))
-    rng = np.random.default_rng(seed)
-    drawn = table[rng.integers(0, len(table), (_DRAWS, len(table)))].sum(axis=1)
+    drawn = _drawn(table, seed)
     difference = np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2])
     total = table.sum(axis=0)
     low, high = np.quantile(difference, [0.025, 0.975])
@@ -74,3 +65,36 @@ def interval(
         float(low),
         float(high),
     )
+
+
+def fall(before: HeldOut, after: HeldOut, weights: Mapping[Key, float], seed: int) -> tuple[float, float]:
+    """95 % interval of the fall of the weighted sum of squares over the rows of all keys, from draws of blocks.
+
+    weights : of a row's square, by side and joint [1/Nm^2]. Zeros where there are no rows.
+    """
+    table = _by_block(before, after, weights)
+    if not len(table):
+        return 0.0, 0.0
+    drawn = _drawn(table, seed)
+    low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:
+    """Weighted sums of squares before and after, and number of rows, (blocks, 3)."""
+    blocks: dict[float, Floats] = {}
+    for (side, joint), weight in weights.items():
+        a, b = before.residual[side][:, joint], after.residual[side][:, joint]
+        ok = np.isfinite(a) & np.isfinite(b)
+        for block in np.unique(before.block[side][ok]):
+            mine = ok & (before.block[side] == block)
+            part = np.array([weight * np.sum(a[mine] ** 2), weight * np.sum(b[mine] ** 2), mine.sum()])
+            blocks[float(block)] = blocks.get(float(block), np.zeros(3)) + part
+    return np.array(list(blocks.values()))
+
+
+def _drawn(table: Floats, seed: int) -> Floats:
+    """Sums (draws, 3) over as many blocks as there are, drawn with replacement."""
+    rng = np.random.default_rng(seed)
+    drawn: Floats = table[rng.integers(0, len(table), (_DRAWS, len(table)))].sum(axis=1)
+    return drawn

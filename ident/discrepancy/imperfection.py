@@ -15,6 +15,7 @@ import numpy as np
 from ident.discrepancy.candidates import Dictionary, Trial
 from ident.discrepancy.evidence import Floats, Key, Rows
 from ident.discrepancy.probes import groups, hats_of
+from ident.effects import EFFECTS
 from ident.effects.body import inertia_columns
 from ident.effects.operators import dahl
 
@@ -38,6 +39,7 @@ _OWN: Mapping[str, tuple[str, bool]] = {
     "sensor_offset_drift": ("time", False),
 }
 _BODIES = ("payload_error", "payload_change")
+_TWISTS = ("joint_elasticity", "backlash")
 # Distance in which a hose that rubs along the arm turns its friction [rad].
 _RUB_RAD = 0.1
 
@@ -46,11 +48,14 @@ def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
     """Columns of what the trial's cause may show beyond its law, None where nothing is known of it.
 
     Hat functions of its own variable on the sides that it acts on, one coefficient for all of them; of a hose its
-    rubbing too; of a body that differs the rest of its inertial parameters.
+    rubbing too; of a body that differs the rest of its inertial parameters; of a joint that gives way any turn of
+    the link that depends on the load.
     """
     cause, joint = trial.candidate.cause, trial.candidate.joint
     if cause in _BODIES:
         return _inertia(dictionary, trial)
+    if cause in _TWISTS:
+        return _twist(dictionary, joint)
     if cause not in _OWN:
         return None
     variable, signed = _OWN[cause]
@@ -68,6 +73,26 @@ def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
             columns = np.column_stack([columns, _rubbing(dictionary, side, joint)])
         found[side, joint] = columns
     return found or None
+
+
+def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
+    """What a turn of the joint by each hat function of its load does to all torques."""
+    nominal = dictionary.nominal
+    hats = hats_of(dictionary).get(f"load{joint + 1}")
+    if hats is None:
+        return None
+    turns = [EFFECTS["joint_zero_offset"].columns(m, joint, {})[0] for m in nominal.motions]
+    found: dict[Key, Floats] = {}
+    for side in nominal.rows:
+        parts = [
+            turn.wide(joint, m.n)[side == "joint"] for turn, m in zip(turns, nominal.motions, strict=True)
+        ]
+        for k in range(nominal.arm.chain.n):
+            signals = [p[:, k : k + 1] * h for p, h in zip(parts, hats, strict=True) if p is not None]
+            columns = nominal.reduce(side, signals)
+            if np.any(columns):
+                found[side, k] = columns
+    return found
 
 
 def _rubbing(dictionary: Dictionary, side: str, joint: int) -> Floats:

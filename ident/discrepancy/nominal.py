@@ -234,7 +234,12 @@ class Nominal:
             else:
                 speed, thrust = speed + first, thrust + second
         springs = None
-        if bodies is not None and drive is not None and self.arm.encoder == "motor" and np.any(self.arm.compliance):
+        if (
+            bodies is not None
+            and drive is not None
+            and self.arm.encoder == "motor"
+            and np.any(self.arm.compliance)
+        ):
             q, qd, qdd, springs = self._hanging(stretch, (q, qd), bodies, drive)
             link_torque = self._link_torque(q, qd, qdd, bodies, drive)
         zero = np.zeros(n)

@@ -21,7 +21,7 @@ from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 
-__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
+__all__ = ["PLAIN", "Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
 
 log = logging.getLogger(__name__)
 
@@ -266,7 +266,7 @@ class _State:
         needed = strict * settings.least_inflation
         # What acts in a few blocks only cannot be significant by blocks, however large; predicting parts that were
         # held back then tells.
-        rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
+        rare = score.gain > PLAIN * least and PLAIN * needed < size < np.inf
         return size > needed and score.p_value < (settings.alpha_rare if rare else settings.alpha)
 
     def concentration(self, trial: Trial, score: Score) -> float:
@@ -370,8 +370,9 @@ class _State:
         return Claim(again, again.score, alike, sure, outdone)
 
 
-# How many times the usual evidence is plain to see.
-_PLAIN = 10.0
+PLAIN = 10.0
+"""How many times the usual evidence is plain to see."""
+
 # Of so many that come first the shapes are refined before one is taken.
 _CONTEST = 4
 # Gain from which on it is worth seeing what a candidate leaves.
