@@ -131,20 +131,28 @@ class ModelEffect(Effect):
 class Cause(ModelEffect):
     """An effect of the dictionary as a plug-in of the emulator's configuration: something to be found.
 
-    cause : its name. joint : from 1; of no meaning for the whole arm. parameters : all values by name, SI units.
-    Raises ConfigurationError for an unknown cause and where a parameter is missing or foreign.
+    cause : its name. joint : from 1; of no meaning for the whole arm. parameters : all values by name, SI units; those
+    of other forms of the effect may be left out. Raises ConfigurationError for an unknown cause and where a parameter
+    is missing or foreign.
     """
 
     def __init__(self, cause: str, parameters: Mapping[str, float], joint: int = 1) -> None:
         effect = find_effect(cause)
         known = [p.name for p in effect.parameters if p.name not in effect.hidden]
-        wrong = sorted(set(known) ^ set(parameters))
+        wrong = sorted((set(known) ^ set(parameters)) - (set(effect.optional) - set(parameters)))
         if wrong:
             raise ConfigurationError(
                 f"effect {cause}: `parameters` must be exactly {', '.join(known)}; look at {wrong[0]!r}"
             )
         super().__init__(
-            effect.simulate(joint - 1, {name: float(value) for name, value in parameters.items()})
+            effect.simulate(
+                joint - 1,
+                {
+                    name: float(parameters.get(name, 0.0))
+                    for name in known
+                    if name in parameters or name in effect.optional
+                },
+            )
         )
 
 

@@ -131,6 +131,8 @@ def _signature(bench: Bench, cause: Cause, values: Mapping[str, float] | None) -
         rows = bench.dictionary.rows(candidate, shape)
     if not any(np.any(part) for part in rows.values()):
         raise DataError(f"{name} leaves no torque in these sessions, so it has no signature")
+    # An effect of several forms has no more columns than the form has coefficients.
+    coefficients = coefficients[: next(iter(rows.values())).shape[1]]
     evidence = bench.evidence
     padded = evidence.padded(rows)
     cross = evidence.products(padded).base.sum(axis=0)

@@ -34,6 +34,7 @@ class Backlash(Effect):
         Parameter("size", "rad", "gap that the links are let cross", shape=True, low=1e-5, high=0.1),
     )
     scrutiny = 2.0
+    optional = ("size",)
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

@@ -35,6 +35,7 @@ class CableSpring(Effect):
         ),
         Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
     )
+    optional = ("quadratic", "cubic", "play")
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

@@ -123,6 +123,7 @@ class Effect(ABC):
     only, found by
         a search over times. step : it sets in at its `time` and stays.
     hidden : linear parameters that are 1 by the physics, left free in the search and not reported.
+    optional : parameters that belong to some forms of the effect only, 0 for the others.
     scrutiny : how many times the usual evidence it takes, where the nominal arm itself is a little like it.
     tell_apart : the motion that decides between this cause and those that it is mistaken for;
     `{joint}` stands
@@ -138,6 +139,7 @@ class Effect(ABC):
     event: ClassVar[bool] = False
     step: ClassVar[bool] = False
     hidden: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
     scrutiny: ClassVar[float] = 1.0
     tell_apart: ClassVar[str] = "repeat the motion at half the speed and with another payload"
 

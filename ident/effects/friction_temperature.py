@@ -46,6 +46,7 @@ class FrictionTemperature(Effect):
             shape=True,
         ),
     )
+    optional = ("heat",)
     tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

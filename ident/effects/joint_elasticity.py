@@ -35,6 +35,7 @@ class JointElasticity(Effect):
         ),
     )
     scrutiny = 2.0
+    optional = ("size",)
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

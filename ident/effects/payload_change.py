@@ -39,6 +39,7 @@ class PayloadChange(Effect):
     whole_arm = True
     event = True
     step = True
+    optional = ("loose",)
     tell_apart = "hold one static pose for a minute at the start, in the middle and at the end of the session"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:

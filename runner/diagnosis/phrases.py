@@ -24,9 +24,18 @@ def described(cause: str, parameters: Mapping[str, Any], names: Sequence[str]) -
     """
     values = {name: _triple(value) for name, value in parameters.items()}
     special = _SPECIAL.get(cause)
-    if special is not None and values:
-        return "; ".join(part for part in special(values, names) if part)
-    return ", ".join(f"{name.replace('_', ' ')} {_quantity(v, name)}" for name, v in values.items())
+    if special is not None:
+        try:
+            return "; ".join(part for part in special(values, names) if part)
+        except KeyError:
+            # Of another form than the words know: its parameters speak for themselves.
+            pass
+    shown = {name: v for name, v in values.items() if not (name in _optional(cause) and v[0] == 0.0)}
+    return ", ".join(f"{name.replace('_', ' ')} {_quantity(v, name)}" for name, v in shown.items())
+
+
+def _optional(cause: str) -> tuple[str, ...]:
+    return EFFECTS[cause].optional if cause in EFFECTS else ()
 
 
 def parameter_rows(cause: str, parameters: Mapping[str, Any]) -> list[tuple[str, str, str]]:
@@ -77,6 +86,15 @@ def _cable(values: Values, names: Sequence[str]) -> list[str]:
     stiffness = values["stiffness"]
     if kind == 1.0:
         return [f"grows with the cube of the angle, {quantity_text(*stiffness[:2], 'Nm/rad³')}"]
+    if kind == 3.0:
+        bent = ", ".join(
+            f"{name} {_quantity(values[name])}" for name in ("quadratic", "cubic") if name in values
+        )
+        return [f"{_quantity(stiffness)}, hardening: {bent}"]
+    if kind == 4.0:
+        return [
+            f"{_quantity(stiffness)}, with no pull within {_quantity(values['play'])} of {_quantity(values['slack'])}"
+        ]
     if abs(kind) == 2.0:
         where = f"taut {'above' if kind > 0 else 'below'} {_quantity(values['slack'])} and slack elsewhere"
         return [f"{_quantity(stiffness)}, {where}"]
@@ -107,6 +125,8 @@ def _drift(values: Values, names: Sequence[str]) -> list[str]:
     name = "change" if "change" in values else "drift"
     size = f"{name} {_quantity(values[name], name)}"
     constant = values["time_constant"]
+    if values.get("heat", (0.0,))[0] > 0.5:
+        return [f"{size} with the heat of its own friction, with a time constant of {_quantity(constant)}"]
     if constant[0] > 0.0:
         return [f"{size} while a session lasts, with a time constant of {_quantity(constant)}"]
     if constant[0] < 0.0:
@@ -139,12 +159,14 @@ def _encoder(name: str) -> Callable[[Values, Sequence[str]], list[str]]:
 
 def _moment(values: Values) -> str:
     axes = ", ".join(quantity_text(*values[f"moment_{axis}"]) for axis in "xyz")
-    return f"mass {_quantity(values['mass'])}, mass times lever (x, y, z) {axes}"
+    mass = f"mass {_quantity(values['mass'])}, " if "mass" in values else ""
+    return f"{mass}mass times lever (x, y, z) {axes}"
 
 
 def _payload_change(values: Values, names: Sequence[str]) -> list[str]:
     when = f"at {_quantity(values['time'])} of session {values['session'][0]:.0f}"
-    return [_moment(values), when]
+    loose = "it slides back and forth" if values.get("loose", (0.0,))[0] > 0.5 else ""
+    return [_moment(values), loose, f"{'from ' * bool(loose)}{when}"]
 
 
 def _contact(values: Values, names: Sequence[str]) -> list[str]:
@@ -163,6 +185,13 @@ def _viscous(values: Values, names: Sequence[str]) -> list[str]:
     return [law, f"beside the linear term {size} at 1 rad/s with the power {power} of the speed"]
 
 
+def _gain(values: Values, names: Sequence[str]) -> list[str]:
+    error, std, _ = values["error"]
+    return [
+        f"reads {quantity_text(100.0 * abs(error), 100.0 * std, '1')} % too {'much' if error > 0.0 else 'little'}"
+    ]
+
+
 _SPECIAL: dict[str, Callable[[Values, Sequence[str]], list[str]]] = {
     "cable_spring": _cable,
     "viscous_nonlinear": _viscous,
@@ -175,6 +204,8 @@ _SPECIAL: dict[str, Callable[[Values, Sequence[str]], list[str]]] = {
     "sensor_crosstalk": _crosstalk,
     "joint_elasticity": _encoder("compliance"),
     "backlash": _encoder("gap"),
+    "sensor_gain": _gain,
+    "motor_torque_gain": _gain,
     "payload_error": lambda values, names: [_moment(values)],
     "payload_change": _payload_change,
     "contact": _contact,

@@ -135,12 +135,19 @@ def _statistics(finding: Mapping[str, Any]) -> list[list[Cell]]:
 
 def _beside(pair: LookAlikes, names: Sequence[str]) -> str:
     """Two causes side by side, what it means, and the motion that decides."""
+
+    def plain(text: str) -> str:
+        """With causes in words, and the names of joints as they are."""
+        for cause, _ in (pair.first, pair.second):
+            text = text.replace(cause, _words(cause))
+        return text
+
     said, motion = pair.sentences(names)
     figure = look_alike_figure(pair, names)
     motion += "" if pair.foreseen is None else f"; {pair.foreseen.sentence()}"
     return (
-        f"<h4>Side by side: {escape(_words(pair.title(names)))}</h4>"
-        f"{paragraph(_words(said[:1].upper() + said[1:]) + '.')}{paragraph(f'What would decide: {motion}.')}"
+        f"<h4>Side by side: {escape(plain(pair.title(names)))}</h4>"
+        f"{paragraph(plain(said[:1].upper() + said[1:]) + '.')}{paragraph(f'What would decide: {motion}.')}"
         f"{figure_html(figure)}"
     )
 

@@ -16,7 +16,7 @@ from ident.model_file import read_model, write_model
 from lwr_driver.configuration import find
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig, load_configuration
-from sim_backend.model_arm import model_effects
+from sim_backend.model_arm import Cause, model_effects
 from sim_backend.plant import ElasticArm
 from sim_backend.rigid_body import chain
 from sim_backend.truth import robot_file, true_arm, truth
@@ -108,6 +108,14 @@ def test_a_tilted_base_leans_once_however_often_it_is_simulated(healthy: Dynamic
         leaning = np.array(arm.model.gravity.linear)
         np.testing.assert_allclose(leaning, upright - np.cross([0.02, -0.01, 0.0], upright), atol=1e-12)
     np.testing.assert_array_equal(links.gravity.linear, upright)
+
+
+def test_a_hidden_cause_needs_the_parameters_of_its_form_only() -> None:
+    Cause("cable_spring", {"stiffness": 1.0, "kind": 0.0, "slack": 0.0}, joint=4)
+    with pytest.raises(ConfigurationError, match="look at 'slack'"):
+        Cause("cable_spring", {"stiffness": 1.0, "kind": 0.0}, joint=4)
+    with pytest.raises(ConfigurationError, match="look at 'length'"):
+        Cause("cable_spring", {"stiffness": 1.0, "kind": 0.0, "slack": 0.0, "length": 1.0}, joint=4)
 
 
 def test_a_model_of_another_arm_is_refused(tmp_path: Path) -> None:
