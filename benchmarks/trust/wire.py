@@ -223,7 +223,7 @@ class _Course:
                 self.complaints.append("in motion after the end")
                 break
         # Command mode that was lost and comes again may have a set point to bring to rest.
-        if stand.loop.mode is Mode.STOP:
+        if stand.loop.mode is Mode.STOP and stand.done:
             self.complaints.append(f"still stopping {_AFTERMATH} cycles after the end")
         stand.post(Job.LEAVE, limit=200)
         stand.until_done(80)
