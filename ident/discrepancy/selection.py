@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm
 
 from ident.discrepancy.candidates import Candidate, Dictionary, Trial
-from ident.discrepancy.evidence import Evidence, Rows, Score
+from ident.discrepancy.evidence import Evidence, Key, Rows, Score
 from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
@@ -277,13 +277,18 @@ class _State:
         """
         if len(trial.rows) == 1:
             return 1.0
-        power = []
+        power = np.array(list(self.powers(trial, score).values()))
+        squares = float(np.sum(np.square(power)))
+        return len(power) * squares / float(np.sum(power)) ** 2 if squares > 0.0 else 1.0
+
+    def powers(self, trial: Trial, score: Score) -> dict[Key, float]:
+        """Power of a trial's torque in the rows of each joint and side, in units of the noise."""
+        found = {}
         for (side, joint), columns in trial.rows.items():
             used = self.dictionary.nominal.rows[side].valid[:, joint]
             torque = columns[used] @ score.coefficients / self.evidence.sigma[side][joint]
-            power.append(float(np.var(torque)) if used.any() else 0.0)
-        squares = float(np.sum(np.square(power)))
-        return len(power) * squares / float(np.sum(power)) ** 2 if squares > 0.0 else 1.0
+            found[side, joint] = float(np.var(torque)) if used.any() else 0.0
+        return found
 
     def beside(self, accepted: Sequence[Trial], without: int) -> list[Trial]:
         """All but one of the accepted, in the base."""
@@ -349,9 +354,10 @@ class _State:
             key=_gain,
             reverse=True,
         )
-        # What acts on other rows explains something else.
-        mine = set(again.rows)
-        rivals = [t for t in rivals if mine & set(t.rows)]
+        # What acts on other rows, or where this one hardly does, explains something else.
+        mine = self.powers(again, again.score)
+        least = _SAME_ROWS * sum(mine.values())
+        rivals = [t for t in rivals if sum(mine.get(key, 0.0) for key in t.rows) > least]
         close = [t for t in rivals[:6] if _gain(t) > 0.6 * _gain(again)]
         close = [self.dictionary.refine(t, self.choices(t)) for t in close]
         scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
@@ -375,6 +381,8 @@ PLAIN = 10.0
 
 # Of so many that come first the shapes are refined before one is taken.
 _CONTEST = 4
+# Share of a claim's power in the rows of a rival from which on both speak of the same.
+_SAME_ROWS = 0.2
 # Gain from which on it is worth seeing what a candidate leaves.
 _HOPE = 10.0
 # Share of the tolerance for a whole channel's delay that is left where a healthy arm told what it is.
