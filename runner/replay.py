@@ -51,7 +51,7 @@ class Replayed:
 
     delay_s : how much later than logged the commands acted, as the positions tell.
     commanded : whether the log has commands; otherwise the measured positions were commanded. exact : whether
-    the model itself was simulated, or the nearest one of an arm that can exist.
+    the model itself was simulated, or the nearest one of an arm that can exist. duration_s : of what was simulated.
     """
 
     position: Floats
@@ -60,6 +60,7 @@ class Replayed:
     delay_s: float
     commanded: bool
     exact: bool
+    duration_s: float
 
 
 class Replay:
@@ -67,7 +68,7 @@ class Replay:
 
     sessions : all of the diagnosis, so that each has its number in their order. longest_s : of each session
     that is simulated, where no effect belongs to a later moment. config : emulator whose controller holds the
-    arm.
+    arm. first : of each call, the first session that could be replayed, and its replay.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class Replay:
         self._stood_in: dict[str, None] = {}
         self._order = sorted(session.start for session in sessions)
         self._delays: dict[int, float] = {}
+        self.first: list[tuple[str, Replayed]] = []
 
     def __call__(self, model: DynamicModel, sessions: Sequence[Session]) -> SimulationError | None:
         """Error over all sessions; None where none can be simulated."""
@@ -107,6 +109,8 @@ class Replay:
                 self._failed.setdefault(str(error), {})[name] = None
                 continue
             self._delays.setdefault(session.start, done.delay_s)
+            if not count[0]:
+                self.first.append((name, done))
             if not done.commanded:
                 self._uncommanded[name] = None
             if not done.exact:
@@ -190,7 +194,15 @@ def replay(
     if joint.effort.shape[1]:
         joint_error = _binned(_resampled(joint.log_time, joint.effort, grid) - link)
     commanded = source is not None
-    return Replayed(_binned(measured - position), motor_error, joint_error, delay, commanded, bench.exact)
+    return Replayed(
+        _binned(measured - position),
+        motor_error,
+        joint_error,
+        delay,
+        commanded,
+        bench.exact,
+        len(grid) * CYCLE_S,
+    )
 
 
 class _Bench:

@@ -146,6 +146,11 @@ class LookAlikes:
         """Whether these sessions can tell them apart."""
         return self.apart > self.needed
 
+    @property
+    def open(self) -> bool:
+        """Whether another motion has to decide."""
+        return not self.told_apart or self.shape_alone
+
     def about(self, places: Sequence[Place]) -> bool:
         """Whether these are two of `places`."""
         return self.first in places and self.second in places

@@ -22,6 +22,8 @@ from lwr_driver.session import Session
 from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
 from runner.diagnosis.look_alikes import LookAlikes, Place, look_alikes, write_look_alikes
 from runner.diagnosis.measures import Moved, RowGain, moved_parameters, row_gains
+from runner.diagnosis.replayed import FILE as REPLAYED
+from runner.diagnosis.replayed import ReplayErrors
 from runner.diagnosis.residuals import FILE, Residuals
 from runner.diagnosis.sources import arm_data
 from runner.diagnosis.text import study_text
@@ -53,7 +55,8 @@ class Study:
     """A diagnosis, what it gained, what could not be seen, and the motions that would decide what is open.
 
     sessions : names in the order in which they were run. referenced : whether a healthy reference was at hand.
-    pairs : causes that look alike, side by side. material : what it was made from.
+    pairs : causes that look alike, side by side. replayed : errors of the simulation over time. material : what it
+    was made from.
     """
 
     diagnosis: Diagnosis
@@ -64,6 +67,7 @@ class Study:
     sessions: tuple[str, ...]
     referenced: bool
     pairs: tuple[LookAlikes, ...] = ()
+    replayed: ReplayErrors | None = None
     offers: tuple[Deciding, ...] = field(default=())
     material: Material | None = field(default=None, repr=False)
 
@@ -104,10 +108,12 @@ class Study:
     def write(self, folder: Path) -> None:
         """Write everything into `folder`: numbers, model, text, plots, residuals, deciding motions."""
         from runner.report.look_alike_figures import look_alike_figure
+        from runner.report.replay_figures import replay_figures
         from runner.report.residual_figures import residual_figures
 
         folder.mkdir(parents=True, exist_ok=True)
-        for stale in (*folder.glob("residual-*.svg"), *folder.glob("look-alike-*.svg")):
+        kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAYED)
+        for stale in (path for kind in kinds for path in folder.glob(kind)):
             stale.unlink()
         _write_json(self.diagnosis.to_dict(), folder / DIAGNOSIS)
         _write_json(self.details(), folder / DETAILS)
@@ -121,6 +127,10 @@ class Study:
         for pair in self.pairs:
             figure = look_alike_figure(pair, self.residuals.joint_names)
             figure.save(folder / f"{figure.name}.svg")
+        if self.replayed is not None:
+            self.replayed.save(folder / REPLAYED)
+            for figure in replay_figures(self.replayed, self.residuals.joint_names):
+                figure.save(folder / f"{figure.name}.svg")
         for offer in self.offers:
             offer.plan.save(folder / offer.file)
 
@@ -188,8 +198,17 @@ def study(
         names,
         healthy is not None,
         pairs,
+        _first_replay(replay),
         material=Material(tuple(sessions), chain, data, healthy),
     )
+
+
+def _first_replay(replay: Replay | None) -> ReplayErrors | None:
+    """Errors over the session that was replayed first, with both models where both could be."""
+    if replay is None or not replay.first:
+        return None
+    name = replay.first[0][0]
+    return ReplayErrors.of(name, [done for session, done in replay.first if session == name])
 
 
 def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:

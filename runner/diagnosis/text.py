@@ -106,7 +106,11 @@ def _beside(pair: LookAlikes, names: Sequence[str], *, decides: bool = False) ->
     lines = _wrapped(said, "     ", "        ")
     if pair.foreseen is not None:
         lines += _wrapped(pair.foreseen.sentence(), "     ", "        ")
-    return lines + _wrapped(f"what would decide: {motion}", "     ", "        ") if decides else lines
+    return (
+        lines + _wrapped(f"what would decide: {motion}", "     ", "        ")
+        if decides and pair.open
+        else lines
+    )
 
 
 def _table(gains: Sequence[RowGain], names: Sequence[str], found: bool) -> list[str]:

@@ -14,6 +14,7 @@ from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.look_alike_figures import look_alike_figure
 from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
+from runner.report.replay_figures import replay_figures
 from runner.report.residual_figures import finding_figure, residual_figures
 from runner.report.verdicts import extension_gain
 
@@ -58,7 +59,7 @@ def diagnosis_parts(diagnosis: DiagnosisFolder) -> list[tuple[str, str, str]]:
         ("deciding", "Motions that would decide", _offers(diagnosis)),
         ("unexplained", "Seen, but without a name", _unexplained(diagnosis.unexplained, names)),
         ("gain", "Gain", _gain(diagnosis)),
-        ("replay", "Replay in simulation", _simulated(diagnosis.content, names)),
+        ("replay", "Replay in simulation", _simulated(diagnosis)),
         ("absorbed", "What the base parameters had absorbed", _absorbed(diagnosis)),
         ("limits", "What these data cannot show", _notes(diagnosis)),
         ("residuals-held-out", "Held-out residuals", _plots(diagnosis)),
@@ -147,7 +148,8 @@ def _beside(pair: LookAlikes, names: Sequence[str]) -> str:
     motion += "" if pair.foreseen is None else f"; {pair.foreseen.sentence()}"
     return (
         f"<h4>Side by side: {escape(plain(pair.title(names)))}</h4>"
-        f"{paragraph(plain(said[:1].upper() + said[1:]) + '.')}{paragraph(f'What would decide: {motion}.')}"
+        f"{paragraph(plain(said[:1].upper() + said[1:]) + '.')}"
+        f"{paragraph(f'What would decide: {motion}.') if pair.open else ''}"
         f"{figure_html(figure)}"
     )
 
@@ -223,8 +225,9 @@ def _span(interval: Sequence[float]) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def _simulated(diagnosis: Mapping[str, Any], names: Sequence[str]) -> str:
+def _simulated(folder: DiagnosisFolder) -> str:
     """Error of the replay with the same commands, before and after."""
+    diagnosis, names = folder.content, folder.joint_names
     gain = diagnosis.get("gain") or {}
     before, after = gain.get("simulation_error_base") or {}, gain.get("simulation_error_extended") or {}
     named = bool(diagnosis.get("findings"))
@@ -243,7 +246,9 @@ def _simulated(diagnosis: Mapping[str, Any], names: Sequence[str]) -> str:
         return ""
     title = "Replay in simulation"
     text = paragraph("The same commands to the simulated arm: measured less simulated, root mean square.")
-    return text + table(("", *names), rows, title)
+    figures = [] if folder.replayed is None else replay_figures(folder.replayed, names)
+    plots = "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
+    return text + table(("", *names), rows, title) + plots
 
 
 def _scaled(values: Sequence[float | None], scale: float) -> list[Cell]:

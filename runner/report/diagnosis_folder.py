@@ -12,6 +12,8 @@ from typing import Any
 from fri.errors import ConfigurationError, DataError
 from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
 from runner.diagnosis.look_alikes import LookAlikes, read_look_alikes
+from runner.diagnosis.replayed import FILE as REPLAYED
+from runner.diagnosis.replayed import ReplayErrors
 from runner.diagnosis.residuals import FILE as RESIDUALS
 from runner.diagnosis.residuals import Residuals
 from runner.report.folder import ResultFolder
@@ -84,6 +86,12 @@ class DiagnosisFolder:
         """Held-out residuals, None without their file."""
         file = self.path / RESIDUALS
         return Residuals.load(file) if file.is_file() else None
+
+    @cached_property
+    def replayed(self) -> ReplayErrors | None:
+        """Errors of the simulation over time, None without their file."""
+        file = self.path / REPLAYED
+        return ReplayErrors.load(file) if file.is_file() else None
 
     @cached_property
     def look_alikes(self) -> tuple[LookAlikes, ...]:

@@ -23,6 +23,7 @@ from runner.cli import main
 from runner.commissioning import record_sets
 from runner.diagnosis import Study, after_run
 from runner.diagnosis.after_run import conclude_run
+from runner.diagnosis.replayed import QUANTITIES, ReplayErrors
 from runner.diagnosis.residuals import Residuals
 from runner.experiment_file import Experiment
 from runner.planning import Excitations
@@ -134,6 +135,25 @@ def test_the_replay_finds_when_commands_act_and_lives_without_them(done: Done) -
     assert error is not None
     assert np.all(error.position < 0.01)
     assert any("no commands in the log" in note for note in follower.notes)
+
+
+def test_errors_of_the_replay_are_kept_over_time_and_drawn(done: Done) -> None:
+    folder = done.folder / "diagnosis"
+    replayed = ReplayErrors.load(folder / "replay.npz")
+    assert replayed.session == "unloaded.mcap"
+    assert replayed.duration_s == pytest.approx(12.0, abs=0.5)
+    error = content(done, "diagnosis.json")["gain"]["simulation_error_extended"]
+    for quantity in QUANTITIES:
+        # One session was replayed, so what is drawn has the error that is told.
+        rms = np.sqrt(np.nanmean(replayed.errors["extended", quantity] ** 2, axis=0))
+        np.testing.assert_allclose(rms, error[quantity], rtol=1e-3)
+    text = (folder / "replay-position.svg").read_text()
+    assert text.count("Measured less simulated position of") == 7
+    assert "mrad rms, extended" in text
+    broken = done.folder / "broken_replay.npz"
+    broken.write_bytes(b"PK")
+    with pytest.raises(DataError, match="run the diagnosis again"):
+        ReplayErrors.load(broken)
 
 
 def test_gains_have_intervals_beside_the_noise_floor(done: Done) -> None:
