@@ -118,6 +118,15 @@ def _others(claims: Sequence[Claim], k: int) -> list[Trial]:
     return [claim.trial for i, claim in enumerate(claims) if i != k]
 
 
+def _same_moment(trial: Trial, other: Trial) -> bool:
+    """Whether two trials are one cause at one time: what a push leaves while it lasts is its own course."""
+    one, two = trial.shape, other.shape
+    if trial.candidate.key != other.candidate.key or not {"duration", "session"} <= set(one):
+        return False
+    apart = abs(one["time"] - two["time"]) - 0.5 * (one["duration"] + two["duration"])
+    return one["session"] == two["session"] and apart < _PAUSE_S
+
+
 def _gain(trial: Trial) -> float:
     """Gain by which candidates are ordered: of two that explain the same, the one with less freedom."""
     return trial.score.gain - 2.0 * len(trial.shape)
@@ -210,6 +219,7 @@ class _State:
         self.tolerate(accepted)
         taken = {t.candidate.key for t in accepted if not t.candidate.effect.repeats}
         found = [t for t in self.dictionary.trials() if t.candidate.key not in taken]
+        found = [t for t in found if not any(_same_moment(t, other) for other in accepted)]
         return sorted(found, key=_gain, reverse=True)
 
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
@@ -383,6 +393,8 @@ PLAIN = 10.0
 _CONTEST = 4
 # Share of a claim's power in the rows of a rival from which on both speak of the same.
 _SAME_ROWS = 0.2
+# Least time between two pushes that are told from one [s].
+_PAUSE_S = 0.2
 # Gain from which on it is worth seeing what a candidate leaves.
 _HOPE = 10.0
 # Share of the tolerance for a whole channel's delay that is left where a healthy arm told what it is.
