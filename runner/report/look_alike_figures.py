@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from runner.diagnosis.look_alikes import LookAlikes, Trace
 from runner.diagnosis.words import joints_text
@@ -20,6 +21,7 @@ Floats = NDArray[np.float64]
 
 _WINDOW_S = 8.0
 _POINTS = 500
+_MEAN_S = 0.25
 _FEW = 60
 _BOTH_WAYS = 0.15
 
@@ -58,15 +60,25 @@ def _over_time(pair: LookAlikes, trace: Trace, labels: Sequence[str], names: Seq
     session, begin = _busiest(trace)
     inside = (trace.session == session) & (trace.time >= begin) & (trace.time <= begin + _WINDOW_S)
     x = trace.time[inside]
+    # Noise of single rows would hide what is to be compared.
+    rows = max(1, round(_MEAN_S / float(np.median(np.diff(x))))) if len(x) > 2 else 1
+    smooth = uniform_filter1d(trace.measured[inside], rows)
     marks: tuple[Mark, ...] = (
-        Line("error", "measured, less the model without either", *thin(x, trace.measured[inside], _POINTS)),
+        Line("error", "measured, less the model without either", *thin(x, smooth, _POINTS)),
         Line("forward", labels[0], *thin(x, trace.first[inside], _POINTS)),
         Line("backward", labels[1], *thin(x, trace.second[inside], _POINTS)),
     )
     number = int(session)
     where = pair.sessions[number] if number < len(pair.sessions) else f"session {number + 1}"
     alt = f"{_shares(pair, trace, labels)} Over {_WINDOW_S:.0f} s of {where}, {_place(trace, names)}."
-    return Panel(_place(trace, names), "time [s]", "left by each [Nm]", marks, alt, where)
+    return Panel(
+        _place(trace, names),
+        "time [s]" if rows == 1 else f"time [s], measured as means of {_MEAN_S} s",
+        "left by each [Nm]",
+        marks,
+        alt,
+        where,
+    )
 
 
 def _busiest(trace: Trace) -> tuple[float, float]:

@@ -78,7 +78,10 @@ def test_what_a_motion_will_tell_is_foreseen(found: Study) -> None:
 
 def test_the_figure_shows_both_over_time_and_against_what_they_depend_on(found: Study) -> None:
     figure = look_alike_figure(found.pairs[0], NAMES)
-    assert {panel.x_label for panel in figure.panels} >= {"time [s]", "position of three [rad]"}
+    assert {panel.x_label for panel in figure.panels} >= {
+        "time [s], measured as means of 0.25 s",
+        "position of three [rad]",
+    }
     for panel in figure.panels:
         assert len(panel.marks) == 3
         assert "overlap" in panel.alt
