@@ -22,6 +22,9 @@ __all__ = ["Lab", "descendants", "gone"]
 HOME = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
 HOP = np.array([0.3, 0.2, 0.3, 0.4, 0.5, 0.2, 0.6])
 
+# A busy computer may take long to start a process.
+_START_S = 300.0
+
 
 class Lab:
     """A laboratory of processes. A context manager.
@@ -60,6 +63,7 @@ class Lab:
         """New processes."""
         self.close()
         self.emulator = EmulatorProcess(
+            start_s=_START_S,
             lock_step=self._lock_step,
             fri_port=free_port("127.0.0.1"),
             period_ms=self._period_ms,
