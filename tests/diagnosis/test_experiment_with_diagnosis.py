@@ -281,6 +281,23 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
 
 
 @pytest.mark.slow
+def test_a_doubt_that_comes_by_itself_is_settled_by_the_slow_sweep(tmp_path: Path) -> None:
+    """The Stribeck effect and friction that bends with speed look alike in one short session."""
+    parameters = {"amplitude": 0.6, "velocity": 0.08, "exponent": 1.0}
+    options = {"cause": "stribeck", "joint": 4, "parameters": parameters}
+    hidden = {"type": "sim_backend.model_arm:Cause", "options": options}
+    out = tmp_path / "out"
+    file = experiment_file(tmp_path, [hidden], diagnosis={"sure": 0.9})
+    lwr_run("experiment", str(file), "--yes", "--decide", "--out", str(out))
+    before = json.loads((out / "diagnosis" / "before_deciding.json").read_text())["findings"][0]
+    assert before["confidence"] < 0.9
+    assert {before["cause"], before["alternatives"][0]["cause"]} == {"stribeck", "viscous_nonlinear"}
+    (answer,) = json.loads((out / "diagnosis" / "decision.json").read_text())["answers"]
+    assert answer["outcome"] == "decided"
+    assert answer["named"] == {"cause": "stribeck", "joints": [4]}
+
+
+@pytest.mark.slow
 def test_commission_records_sets_with_their_own_noise_and_goes_on_where_it_was(tmp_path: Path) -> None:
     experiment = Experiment.load(experiment_file(tmp_path, [], sessions=[*SHORT["sessions"], LOADED]))
     logs = record_sets(experiment, tmp_path / "sets", 2, assume_yes=True)
