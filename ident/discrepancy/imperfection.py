@@ -92,7 +92,8 @@ def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
             columns = nominal.reduce(side, signals)
             if np.any(columns):
                 found[side, k] = columns
-    return found
+    # A turn about an axis along gravity changes no torque.
+    return found or None
 
 
 def _rubbing(dictionary: Dictionary, side: str, joint: int) -> Floats:

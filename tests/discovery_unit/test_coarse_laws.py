@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ident.discrepancy import diagnose
+from ident.discrepancy.evidence import Rows
+from ident.discrepancy.imperfection import beyond_law
+from ident.discrepancy.signatures import signature_bench
 from ident.kinematics import Chain
 from lwr_driver.session import Session
 
@@ -33,6 +37,17 @@ def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain
     assert {(f.cause, f.joints) for f in found.findings} == {("cable_spring", (3,))}
     assert found.findings[0].confidence > 0.8
     assert 3 in {u.joint for u in found.unexplained}
+
+
+@pytest.mark.parametrize("cause", ["joint_elasticity", "backlash"])
+def test_a_turn_about_the_vertical_is_nothing_beyond_its_law(make: Make, chain: Chain, cause: str) -> None:
+    dictionary = signature_bench([make("a.mcap", 1)], chain).dictionary
+
+    def beyond(joint: int) -> Rows | None:
+        return beyond_law(dictionary, SimpleNamespace(candidate=SimpleNamespace(cause=cause, joint=joint)))
+
+    assert beyond(0) is None
+    assert beyond(1)
 
 
 @pytest.mark.slow
