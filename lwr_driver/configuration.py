@@ -19,6 +19,8 @@ __all__ = ["CONFIGS", "find", "parse", "read_mapping", "read_yaml"]
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
+_LONGEST_SHOWN = 80
+
 T = TypeVar("T")
 
 
@@ -28,17 +30,31 @@ def find(name: str | Path, *, beside: Path | None = None) -> Path:
     Looked for as given (relative to the working directory), then in the folder of the file that names it
     (`beside`), then in the project's `configs/`. Raises ConfigurationError with the places tried.
     """
-    wanted = Path(name).expanduser()
+    try:
+        wanted = Path(name).expanduser()
+    except RuntimeError as error:
+        raise ConfigurationError(f"file {_shown(name)!r} cannot be looked for: {error}") from error
     places = [wanted] if wanted.is_absolute() else [Path.cwd() / wanted]
     if not wanted.is_absolute():
         if beside is not None:
             places.append(beside / wanted)
         places.append(CONFIGS / wanted)
     for place in places:
-        if place.is_file():
-            return place.resolve()
+        try:
+            if place.is_file():
+                return place.resolve()
+        except OSError as error:
+            raise ConfigurationError(
+                f"file {_shown(name)!r} cannot be looked for: {error.strerror}"
+            ) from error
     tried = ", ".join(str(place) for place in places)
     raise ConfigurationError(f"file {str(name)!r} not found; tried {tried}")
+
+
+def _shown(name: str | Path) -> str:
+    """The name as far as it fits into a message."""
+    text = str(name)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 def read_yaml(path: Path) -> Any:

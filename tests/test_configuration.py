@@ -73,3 +73,12 @@ def test_syntax_errors_name_file_and_line(tmp_path: Path) -> None:
     broken.write_text("a: [1, 2\nb: 3\n")
     with pytest.raises(ConfigurationError, match=r"broken\.yaml: not valid YAML(.|\n)*line 2"):
         read_mapping(broken)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("a" * 5000, "File name too long"), ("~nobody_of_this_name/arm.yaml", "home")]
+)
+def test_a_name_that_no_file_can_have_is_refused_in_short(name: str, words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        find(name)
+    assert len(str(caught.value)) < 250
