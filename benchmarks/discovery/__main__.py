@@ -26,7 +26,7 @@ for folder in (str(_HERE), _TESTS):
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(_HERE), _TESTS, os.environ.get("PYTHONPATH"))))
 
 import click  # noqa: E402
-from campaign import Plan, run  # noqa: E402
+from campaign import KINDS, Plan, run  # noqa: E402
 from tally import read_results, summary, tables  # noqa: E402
 
 
@@ -38,6 +38,7 @@ from tally import read_results, summary, tables  # noqa: E402
 @click.option("--days", default=12, show_default=True, help="Healthy days that the reference rests on.")
 @click.option("--without-reference", is_flag=True, help="Diagnose as if the arm had never been commissioned.")
 @click.option("--cause", "causes", multiple=True, help="Hide only these, one at a time.")
+@click.option("--kind", "kinds", multiple=True, type=click.Choice(KINDS), help="Draw only such cases.")
 @click.option("--again", is_flag=True, help="Diagnose cases once more that have a result.")
 @click.option("--recommission", is_flag=True, help="Make the references of the healthy arm anew.")
 @click.option("--discard", is_flag=True, help="Delete the logs of a case once it is judged.")
@@ -57,6 +58,7 @@ def main(
     days: int,
     without_reference: bool,
     causes: tuple[str, ...],
+    kinds: tuple[str, ...],
     again: bool,
     recommission: bool,
     discard: bool,
@@ -65,7 +67,7 @@ def main(
     out: Path,
 ) -> None:
     """Hide physics in simulated sessions, have them diagnosed, and count what is found."""
-    plan = Plan(out, cases, seed, days, not without_reference, causes, discard, members, skip)
+    plan = Plan(out, cases, seed, days, not without_reference, causes, kinds, discard, members, skip)
     if not report:
         if recommission:
             plan.forget_references()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from hidden_physics.cases import Case, Store, draw, twin
+from hidden_physics.cases import KINDS, Case, Store, draw, twin
 from hidden_physics.causes import CAUSES, OUTSIDE
 from hidden_physics.engine import commissioned, diagnosed
 from hidden_physics.inflation import inflation
@@ -21,7 +21,7 @@ from hidden_physics.robots import Encoder
 from hidden_physics.verdict import error_rows, judge
 from joblib import Parallel, delayed
 
-__all__ = ["Plan", "run"]
+__all__ = ["KINDS", "Plan", "run"]
 
 # Out of twenty cases; the order spreads the kinds evenly.
 _KINDS = (
@@ -34,7 +34,10 @@ _MOTOR_SIDE = 4
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run, see the command's help. out : folder of everything."""
+    """What to run, see the command's help.
+
+    out : folder of everything. kinds : of cases, in turn; by default as `_KINDS` mixes them
+    """
 
     out: Path
     cases: int
@@ -42,6 +45,7 @@ class Plan:
     days: int
     reference: bool = True
     causes: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
     discard: bool = False
     members: bool = True
     skip: int = 0
@@ -64,7 +68,7 @@ class Plan:
 
     def wanted(self) -> Iterator[tuple[int, str, str | None, Encoder]]:
         """Seed, kind, cause (None: drawn) and encoder of each case."""
-        names, singles, healthy = list(CAUSES), 0, 0
+        names, singles, healthy, mix = list(CAUSES), 0, 0, self.kinds or _KINDS
         for number in range(self.cases):
             seed, left_out = self.seed + number, number < self.skip
             if self.causes:
@@ -73,7 +77,7 @@ class Plan:
                     continue
                 yield seed, "outside" if name in OUTSIDE else "single", name, "link"
                 continue
-            kind = _KINDS[number % len(_KINDS)]
+            kind = mix[number % len(mix)]
             cause, encoder = None, cast(Encoder, "link")
             if kind == "single":
                 # Every cause in turn.
