@@ -23,7 +23,6 @@ from lwr_driver.arm import Arm
 from sim_backend.configuration import EmulatorConfig, LoadData, Plugin
 from sim_backend.controller import ControllerModel, PositionController
 from sim_backend.krl_program import OWN_PROGRAM, krl_program
-from sim_backend.model_arm import model_effects
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
 from sim_backend.recording import ControllerTrace, KrlReals
@@ -103,7 +102,11 @@ class Cabinet:
         payload = self.file.payload(robot.payload)
         own, others = seed.spawn(2)
         identified = robot_model(self.config)
-        own_effects = () if identified is None else model_effects(identified)
+        own_effects: tuple[Effect, ...] = ()
+        if identified is not None:
+            from sim_backend.model_arm import model_effects
+
+            own_effects = model_effects(identified)
         self.effects: tuple[Effect, ...] = (*own_effects, *(_load(effect) for effect in robot.effects))
         if robot.plant is not None:
             plant = _load(robot.plant, model, drive, np.random.default_rng(own))

@@ -7,18 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fri.errors import ConfigurationError, DataError
-from ident.model import DynamicModel
-from ident.model_file import read_model
 from lwr_driver.configuration import parse, read_mapping
 from sim_backend.configuration import JOINTS, EmulatorConfig, RobotConfig, load_configuration
-from sim_backend.model_arm import model_parameters, model_payloads
 from sim_backend.plant import Drive
 from sim_backend.rigid_body import BODY_PARAMETERS, Payload, chain, with_inertias
+
+if TYPE_CHECKING:
+    from ident.model import DynamicModel
 
 __all__ = ["DRIVE_PARAMETERS", "RobotFile", "robot_file", "robot_model", "true_arm", "truth"]
 
@@ -62,6 +63,8 @@ def robot_file(config: EmulatorConfig) -> RobotFile:
     model = robot_model(config)
     if model is None:
         return parse(RobotFile, read_mapping(path), str(path))
+    from sim_backend.model_arm import model_parameters, model_payloads
+
     try:
         payloads = {name: Payload(**values) for name, values in model_payloads(model).items()}
         return RobotFile(model_parameters(model), payloads)
@@ -75,6 +78,9 @@ def robot_model(config: EmulatorConfig) -> DynamicModel | None:
     content = read_mapping(path)
     if "chain" not in content:
         return None
+    # An arm by its parameters needs nothing of the estimation, and is there in half the time.
+    from ident.model_file import read_model
+
     model = read_model(content)
     if model.structure.chain.n != JOINTS:
         raise ConfigurationError(

@@ -78,6 +78,7 @@ def figures(results: Sequence[Result]) -> dict[str, Any]:
         "nothing hidden, no finding": _rate([r["verdict"]["silent"] for r in healthy]),
         "pairs exactly right": _rate([r["verdict"]["exact"] for r in pairs]),
         "pairs, at least one right": _rate([any(r["verdict"]["named"]) for r in pairs]),
+        "the same, rho >= 1.1": _rate([any(r["verdict"]["named"]) for r in pairs if r["rho"] >= _VISIBLE]),
         "outside, rho >= 1.2, flagged": _rate(
             [r["verdict"]["flagged"] for r in outside if r["rho"] >= _OUTSIDE_VISIBLE]
         ),

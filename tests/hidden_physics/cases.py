@@ -128,10 +128,12 @@ class Store:
     def scene(self, schedule: str, day: Day) -> Scene:
         """What the healthy twin shows."""
         sessions = self.sessions(twin(schedule, day))
-        peaks = np.zeros(7)
-        for path in (*sessions.train, *sessions.test):
-            peaks = np.maximum(peaks, np.abs(read_session(path).joint.effort).max(axis=0))
-        return Scene(tuple(float(peak) for peak in peaks), _begin_s())
+        learnt, held = (
+            np.max([np.abs(read_session(path).joint.effort).max(axis=0) for path in paths], axis=0)
+            for paths in (sessions.train, sessions.test)
+        )
+        peaks, reached = np.maximum(learnt, held).tolist(), np.minimum(learnt, held).tolist()
+        return Scene(tuple(peaks), tuple(reached), _begin_s())
 
 
 @cache

@@ -34,10 +34,12 @@ Settings = tuple[Setting, ...]
 class Scene:
     """What a cause may depend on besides chance.
 
-    peaks : (7,) largest joint torque of the healthy twin [Nm]. begin_s : cabinet's clock as motions begin [s]
+    peaks : (7,) largest joint torque of the healthy twin [Nm]. reached : (7,) the largest that both the sessions to
+    learn from and the one held out reach [Nm]. begin_s : cabinet's clock as motions begin [s]
     """
 
     peaks: tuple[float, ...]
+    reached: tuple[float, ...]
     begin_s: float
 
     def moment(self, random: Random, low: float = 0.2, high: float = 0.8) -> float:
@@ -423,8 +425,11 @@ def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 
 def _saturation(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    # A limit that only the held-out motion reaches is hidden from everybody.
+    reached = scene.reached[joint - 1]
+
     def sized(size: float) -> Hidden:
-        clip = scene.peaks[joint - 1] - min(0.7 * scene.peaks[joint - 1], 6.0 * JOINT_NOISE[joint - 1] * size)
+        clip = reached - min(0.7 * reached, 6.0 * JOINT_NOISE[joint - 1] * size)
         return Hidden(
             "sensor_saturation",
             "sensor",

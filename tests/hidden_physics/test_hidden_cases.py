@@ -43,7 +43,8 @@ CONTRACT = {
     "lost_samples": "timing",
 }
 
-SCENE = Scene((20.0, 60.0, 15.0, 40.0, 5.0, 12.0, 9.0), 1.0)
+PEAKS = (20.0, 60.0, 15.0, 40.0, 5.0, 12.0, 9.0)
+SCENE = Scene(PEAKS, PEAKS, 1.0)
 
 
 @pytest.fixture

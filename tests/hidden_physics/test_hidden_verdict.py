@@ -8,7 +8,8 @@ import pytest
 from hidden_physics.causes import CAUSES, OUTSIDE, Hidden, Scene
 from hidden_physics.verdict import judge
 
-SCENE = Scene((20.0, 60.0, 15.0, 40.0, 5.0, 12.0, 9.0), 1.0)
+PEAKS = (20.0, 60.0, 15.0, 40.0, 5.0, 12.0, 9.0)
+SCENE = Scene(PEAKS, PEAKS, 1.0)
 
 
 def hide(name: str, joint: int) -> Hidden:

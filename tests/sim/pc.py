@@ -45,7 +45,7 @@ class Pc:
     def __exit__(self, *error):
         self.end.close()
 
-    def run(self, cycles, silence_s=0.5):
+    def run(self, cycles, silence_s=3.0):
         """Answer until `cycles` packets were received; the number received, fewer if the link fell silent."""
         end = self.end
         for count in range(cycles):
