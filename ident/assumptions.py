@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f, norm, t
 
+from ident.distributions import chi_square_tail, fisher_tail, normal_tail, student_tail
 from ident.estimators.estimate import Estimate
 from ident.estimators.problem import Problem
 
@@ -142,7 +142,7 @@ def _mean(series: _Series) -> Check:
         float(np.mean(e) / (np.std(e) / np.sqrt(max(n, 2.0)) + 1e-300))
         for e, n in zip(series.residuals, series.n_eff, strict=True)
     ]
-    p_values = [2.0 * float(norm.sf(abs(score))) for score in scores]
+    p_values = [2.0 * normal_tail(abs(score)) for score in scores]
     index, p_value = _worst(series, p_values)
     return Check(
         "zero mean",
@@ -171,7 +171,7 @@ def _serial_correlation(series: _Series) -> Check:
             total += rho**2 / pairs
         statistic = len(e) * (len(e) + 2) * total
         statistics.append(statistic)
-        p_values.append(float(chi2.sf(statistic, lags)))
+        p_values.append(chi_square_tail(statistic, lags))
     index, p_value = _worst(series, p_values)
     share = [n / max(len(e), 1) for n, e in zip(series.n_eff, series.residuals, strict=True)]
     return Check(
@@ -198,7 +198,7 @@ def _equal_variance(series: _Series) -> Check:
         spread = float(np.sum((square - square.mean()) ** 2)) + 1e-300
         statistic = float(n_eff) * max(0.0, 1.0 - float(rest @ rest) / spread)
         statistics.append(statistic)
-        p_values.append(float(chi2.sf(statistic, 2)))
+        p_values.append(chi_square_tail(statistic, 2))
     index, p_value = _worst(series, p_values)
     return Check(
         "equal variance",
@@ -220,7 +220,7 @@ def _normality(series: _Series) -> Check:
         statistic = float(n_eff) / 6.0 * (skew**2 + excess**2 / 4.0)
         statistics.append(statistic)
         shapes.append((skew, excess))
-        p_values.append(float(chi2.sf(statistic, 2)))
+        p_values.append(chi_square_tail(statistic, 2))
     index, p_value = _worst(series, p_values)
     skew, excess = shapes[index]
     return Check(
@@ -257,7 +257,7 @@ def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
     scores = np.abs(shift) / np.sqrt(np.maximum(variance, 1e-300))
     index = int(np.argmax(scores))
     freedom = min(estimate.covariance.degrees_of_freedom, 1e6)
-    p_value = float(min(1.0, 2.0 * t.sf(scores[index], freedom) * len(scores)))
+    p_value = float(min(1.0, 2.0 * student_tail(scores[index], freedom) * len(scores)))
     return Check(
         "exogeneity",
         p_value > _LEVEL,
@@ -310,8 +310,8 @@ def repeatability(
         noise = pure / pure_freedom
         repeated = structured / max(phases - fit.parameters, 1.0)
         ratio = repeated / max(noise, 1e-300)
-        p_value = float(
-            f.sf(ratio, max(share * (phases - fit.parameters), 1.0), max(share * pure_freedom, 1.0))
+        p_value = fisher_tail(
+            ratio, max(share * (phases - fit.parameters), 1.0), max(share * pure_freedom, 1.0)
         )
         periods = (pure_freedom + phases) / max(phases, 1)
         model_error = np.sqrt(max(repeated - noise, 0.0) / periods)

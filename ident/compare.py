@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from fri.errors import ConfigurationError
+from ident.distributions import normal_tail
 from ident.model import DynamicModel
 
 __all__ = ["Comparison", "Difference", "compare"]
@@ -172,7 +172,7 @@ def compare(
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(known & (total > 0), (b - a) / total, np.nan)
         percent = np.where(a != 0, 100.0 * (b - a) / np.abs(a), np.inf)
-    p = 2.0 * norm.sf(np.abs(z))
+    p = 2.0 * normal_tail(np.abs(z))
     differences = tuple(
         Difference(
             name, unit, float(a[k]), float(b[k]), float(std_a[k]), float(std_b[k]), float(z[k]), float(p[k]),

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f
 
 from fri.errors import ConfigurationError
+from ident.distributions import fisher_limit
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate
 from ident.estimators.problem import Problem
@@ -142,7 +142,7 @@ def find_essential(
     plain = estimate.covariances["textbook"].matrix.copy()
     robust = estimate.covariance.matrix.copy()
     freedom = min(estimate.covariance.degrees_of_freedom, max(problem.rows - len(names), 1))
-    critical = float(f.isf(settings.significance, 1, freedom))
+    critical = fisher_limit(settings.significance, 1, freedom)
     # Weighted sum of squares of the full model: one per degree of freedom by the choice of the weights.
     base_square = max(problem.rows - len(names), 1)
     lost = 0.0

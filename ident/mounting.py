@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
 
 from fri.errors import ConfigurationError
 from ident.cad_prior import cad_prior
+from ident.distributions import fisher_tail
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance
 from ident.estimators.prior import MaximumAPosteriori, Prior
@@ -75,7 +75,7 @@ class Mounting:
         """Probability of so large a tilt on an upright base (Hotelling's T^2)."""
         square = float(self.tilt_rad @ np.linalg.solve(self.covariance.matrix, self.tilt_rad))
         freedom = max(self.covariance.degrees_of_freedom, 2.0)
-        return float(f_distribution.sf(square * (freedom - 1.0) / (2.0 * freedom), 2, freedom - 1.0))
+        return fisher_tail(square * (freedom - 1.0) / (2.0 * freedom), 2, freedom - 1.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""

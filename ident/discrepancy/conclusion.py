@@ -45,6 +45,8 @@ _DOUBT = 0.2
 _DAY_TO_DAY = 0.15
 # Confidence in what the rows fitted show plainly and others do not.
 _OPEN = 0.7
+# Share of a claim's gain that nameless functions of other variables may take over.
+_ENCOMPASSED = 0.8
 # Power of a cause in the held-out rows, over that in the rows fitted, from which on these must show it.
 _EXCITED = 0.1
 
@@ -81,7 +83,13 @@ def conclude(
     after = held_out(evidence, [*(c.trial.rows for c in claims), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings)
     doubts = _beyond(bench, claims, nuisance, remainders, settings)
-    findings = [_doubted(claim, finding, doubts, nominal.arm.chain.n) for claim, finding in kept]
+    findings = [
+        _doubted(
+            claim, finding, doubts, nominal.arm.chain.n, _encompassed(claim, claims, bench, nuisance, doubts)
+        )
+        for claim, finding in kept
+    ]
+    evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     findings += timing
     if loss:
         findings.append(_loss_finding(loss))
@@ -119,7 +127,7 @@ def conclude(
         nuisance=selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=_notes(bench, reference),
+        notes=(*_notes(bench, reference), *_lines(nominal, remainders)),
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
@@ -252,14 +260,40 @@ def _beyond(
     return found
 
 
-def _doubted(claim: Claim, finding: Finding, remainders: Sequence[Remainder], joints: int) -> Finding:
-    """Less confidence in a name that leaves much in the rows that it explains."""
+def _encompassed(
+    claim: Claim,
+    claims: Sequence[Claim],
+    bench: Bench,
+    nuisance: Sequence[Rows],
+    remainders: Sequence[Remainder],
+) -> float:
+    """Share of a claim's gain that is gone once all that has no name is in the base.
+
+    Friction that follows another joint's angle is another in every session, as if the drive had been warmer; what
+    is left beside that claim explains all that the claim does, and the claim is not needed with it.
+    """
+    if not remainders:
+        return 0.0
+    others = [c.trial.rows for c in claims if c is not claim]
+    bench.evidence.replace([*others, *nuisance, *(rows for r in remainders for rows in r.rows)])
+    again = bench.dictionary.trial(claim.trial.candidate, claim.trial.shape, 1)
+    return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain
+
+
+def _doubted(
+    claim: Claim, finding: Finding, remainders: Sequence[Remainder], joints: int, encompassed: float
+) -> Finding:
+    """Less confidence in a name that leaves much in the rows that it explains, or that what it leaves explains."""
+    if encompassed > _ENCOMPASSED:
+        finding = replace(finding, confidence=min(finding.confidence, _OPEN))
     mine = set(claim.trial.rows)
     left = sum(r.gain for r in remainders if (r.side, r.joint - 1) in mine)
     if len(mine) > joints:
         left /= 2.0
     if left > _DOUBT * claim.gain:
-        return replace(finding, confidence=min(finding.confidence, 0.75 * claim.gain / (claim.gain + left)))
+        return replace(
+            finding, confidence=min(finding.confidence, float(0.75 * claim.gain / (claim.gain + left)))
+        )
     return finding
 
 
@@ -366,6 +400,16 @@ def _entry(finding: Finding) -> dict[str, Any]:
             name: {"value": v.value, "std": v.std, "unit": v.unit} for name, v in finding.parameters.items()
         },
     }
+
+
+def _lines(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
+    names = nominal.arm.chain.joint_names
+    return [
+        f"the {r.side} torque of {names[r.joint - 1]} swings at {r.line_hz:.3g} Hz whatever the arm does: look "
+        "for what shakes the arm, or hums in the channel, at that frequency"
+        for r in remainders
+        if r.line_hz > 0.0
+    ]
 
 
 def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:

@@ -14,12 +14,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
 from fri.errors import DataError
 from ident.discrepancy.nominal import Nominal
 from ident.discrepancy.settings import DiagnosisSettings
+from ident.distributions import chi_square_tail, fisher_tail
 
 __all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
 
@@ -395,7 +394,7 @@ class Evidence:
         """
         k = len(score.coefficients)
         penalty = 2.0 * np.log(max(choices, 1)) + 4.0 * k
-        p = float(min(1.0, choices * chi2.sf(score.fitted, k)))
+        p = float(min(1.0, choices * chi_square_tail(score.fitted, k)))
         gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
         return replace(score, gain=gain, chance=p)
 
@@ -545,4 +544,4 @@ def _wald(coefficients: Floats, covariance: Floats, active: int) -> float:
         value = float(coefficients @ np.linalg.solve(covariance, coefficients))
     except np.linalg.LinAlgError:
         return 1.0
-    return float(fisher.sf(value / k, k, max(active - k, 1)))
+    return fisher_tail(value / k, k, max(active - k, 1))

@@ -14,7 +14,7 @@ import numpy as np
 
 from ident.discrepancy.candidates import Dictionary, Trial
 from ident.discrepancy.evidence import Floats, Key, Rows
-from ident.discrepancy.probes import groups, hats_of
+from ident.discrepancy.probes import groups, hats, hats_of
 from ident.effects import EFFECTS
 from ident.effects.body import inertia_columns
 from ident.effects.operators import dahl
@@ -61,11 +61,14 @@ def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
     variable, signed = _OWN[cause]
     name = "time" if variable == "time" else f"{variable}{joint + 1}"
     found: dict[Key, Floats] = {}
-    hats = {key: value for key, value in hats_of(dictionary).items() if key == name}
+    own = {key: value for key, value in hats_of(dictionary).items() if key == name}
     for side, at in trial.rows:
-        if at != joint or not hats:
+        if at != joint or not own:
             continue
-        group = groups(dictionary, hats, side, joint)
+        if variable == "qd":
+            found[side, joint] = _of_speed(dictionary, side, joint)
+            continue
+        group = groups(dictionary, own, side, joint)
         wanted = f"{name} sign(qd{joint + 1})" if signed else name
         # All hats together are a constant, which the base has.
         columns = group[wanted][side, joint][:, 0 if signed else 1 :]
@@ -75,11 +78,24 @@ def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
     return found or None
 
 
+def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
+    """Functions (m, k) of a drive's speed and of its direction, finer the slower it is: laws of friction differ most
+    there.
+    """
+    motions = dictionary.nominal.motions
+    roots = [np.sqrt(np.abs(m.motor_speed[:, joint])) for m in motions]
+    high = max(float(root.max()) for root in roots)
+    parts = [hats(root, 0.0, high)[:, 1:] for root in roots]
+    signed = [part * m.direction[:, joint : joint + 1] for part, m in zip(parts, motions, strict=True)]
+    both = [np.column_stack(pair) for pair in zip(parts, signed, strict=True)]
+    return dictionary.nominal.reduce(side, both)
+
+
 def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
     """What a turn of the joint by each hat function of its load does to all torques."""
     nominal = dictionary.nominal
-    hats = hats_of(dictionary).get(f"load{joint + 1}")
-    if hats is None:
+    loads = hats_of(dictionary).get(f"load{joint + 1}")
+    if loads is None:
         return None
     turns = [EFFECTS["joint_zero_offset"].columns(m, joint, {})[0] for m in nominal.motions]
     found: dict[Key, Floats] = {}
@@ -88,7 +104,7 @@ def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
             turn.wide(joint, m.n)[side == "joint"] for turn, m in zip(turns, nominal.motions, strict=True)
         ]
         for k in range(nominal.arm.chain.n):
-            signals = [p[:, k : k + 1] * h for p, h in zip(parts, hats, strict=True) if p is not None]
+            signals = [p[:, k : k + 1] * h for p, h in zip(parts, loads, strict=True) if p is not None]
             columns = nominal.reduce(side, signals)
             if np.any(columns):
                 found[side, k] = columns

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from ident.discrepancy.nominal import SideRows
 from ident.discrepancy.recording import Recording
@@ -107,6 +106,8 @@ def _same_motion(one: Recording, other: Recording) -> bool:
 
 def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
     """Size (n,) of the residual and the number (n,) of rows that count as one, from its autocorrelation."""
+    from scipy.signal import correlate
+
     n = residual.shape[1]
     sigma, dilution = np.ones(n), np.ones(n)
     for j in range(n):

@@ -1,8 +1,9 @@
 """What has no name: generic functions of the motion that still predict the residual on held-back parts.
 
 For each joint and side a group of hat functions of one variable (angle, speed or load of the joint, angle of
-another joint, time), plain and times the sign of the joint's speed, is scored like any candidate. What it
-finds is reported by its variables, and names that were given while much was left are doubted.
+another joint, time), plain and times the sign of the joint's speed, is scored like any candidate, and so is a line
+in the spectrum (`lines`). What it finds is reported by its variables, and names that were given while much was left
+are doubted.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.discrepancy.candidates import Dictionary
-from ident.discrepancy.evidence import Evidence, Floats, Key
+from ident.discrepancy.evidence import Evidence, Floats, Key, Rows
+from ident.discrepancy.lines import find_line
 from ident.discrepancy.nominal import TRAVEL_RAD
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects.motion import Motion
 
-__all__ = ["Remainder", "find_remainders", "groups", "hats_of"]
+__all__ = ["Remainder", "find_remainders", "groups", "hats", "hats_of"]
 
 _HATS = 7
 _RIDGE = 1e-3
@@ -28,13 +30,18 @@ _LEAST_INFLATION = 0.012
 
 @dataclass(frozen=True)
 class Remainder:
-    """Something left in the rows of a joint (from 1) and side that depends on the named variables."""
+    """Something left in the rows of a joint (from 1) and side that depends on the named variables.
+
+    rows : columns of the generic functions that it is made of. line_hz : frequency of a swing of its own, 0 without
+    """
 
     side: str
     joint: int
     depends_on: tuple[str, ...]
     gain: float
     inflation: float
+    rows: tuple[Rows, ...] = ()
+    line_hz: float = 0.0
 
 
 def find_remainders(
@@ -43,12 +50,12 @@ def find_remainders(
     """Remainders beside the columns that the evidence holds, largest first; at most two variables each."""
     fixed = list(evidence.extra)
     found = []
-    hats = hats_of(dictionary)
+    variables = hats_of(dictionary)
     for side in evidence.nominal.rows:
         for joint in range(evidence.nominal.arm.chain.n):
             if evidence.mask[side, joint].sum() < 100:
                 continue
-            remainder = _one(dictionary, evidence, settings, hats, side, joint)
+            remainder = _one(dictionary, evidence, settings, variables, side, joint)
             evidence.replace(fixed)
             if remainder is not None:
                 found.append(remainder)
@@ -59,17 +66,29 @@ def _one(
     dictionary: Dictionary,
     evidence: Evidence,
     settings: DiagnosisSettings,
-    hats: Mapping[str, Sequence[Floats]],
+    variables: Mapping[str, Sequence[Floats]],
     side: str,
     joint: int,
 ) -> Remainder | None:
     names: list[str] = []
     total = inflation = 0.0
     prepared = {}
-    for name, rows in groups(dictionary, hats, side, joint).items():
+    for name, rows in groups(dictionary, variables, side, joint).items():
         padded = evidence.padded(rows)
         prepared[name] = rows, padded, evidence.alone(padded)
     fixed = list(evidence.extra)
+    taken: list[Rows] = []
+    line_hz = 0.0
+    line = find_line(evidence, side, joint)
+    if line is not None:
+        frequency, waves, choices = line
+        score = evidence.score(evidence.padded(waves))
+        least = settings.least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
+        if score.gain > least and score.inflation > _LEAST_INFLATION:
+            total, inflation, line_hz = score.gain, score.inflation, frequency
+            names.append("time")
+            taken.append(waves)
+            evidence.replace([*fixed, *taken])
     for _ in range(2):
         best_name, best_gain, best_rows, best_inflation = "", 0.0, None, 0.0
         for name, (rows, padded, known) in prepared.items():
@@ -84,9 +103,11 @@ def _one(
         inflation += best_inflation
         names += [part for part in best_name.split(" ") if part not in names]
         prepared.pop(best_name)
-        fixed = [*fixed, best_rows]
-        evidence.replace(fixed)
-    return Remainder(side, joint + 1, tuple(names), total, inflation) if names else None
+        taken.append(best_rows)
+        evidence.replace([*fixed, *taken])
+    if not names:
+        return None
+    return Remainder(side, joint + 1, tuple(names), total, inflation, tuple(taken), line_hz)
 
 
 def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
@@ -102,17 +123,17 @@ def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
         low = min(float(v.min()) for v in values)
         high = max(float(v.max()) for v in values)
         if high - low >= (TRAVEL_RAD if name[1:].isdigit() else 1e-6):
-            found[name] = [_hats(v, low, high) for v in values]
+            found[name] = [hats(v, low, high) for v in values]
     return found
 
 
 def groups(
-    dictionary: Dictionary, hats: Mapping[str, Sequence[Floats]], side: str, joint: int
+    dictionary: Dictionary, variables: Mapping[str, Sequence[Floats]], side: str, joint: int
 ) -> dict[str, dict[Key, Floats]]:
     """Groups of columns by the names of their variables."""
     nominal, found = dictionary.nominal, {}
     signs = [m.direction[:, joint : joint + 1] for m in nominal.motions]
-    for name, parts in hats.items():
+    for name, parts in variables.items():
         if name.startswith("load") and name != f"load{joint + 1}":
             continue
         found[name] = {(side, joint): nominal.reduce(side, parts)}
@@ -122,7 +143,7 @@ def groups(
     return found
 
 
-def _hats(values: Floats, low: float, high: float) -> Floats:
+def hats(values: Floats, low: float, high: float) -> Floats:
     """Piecewise linear functions (N, 7) with knots evenly over the range."""
     place = (values - low) / (high - low) * (_HATS - 1)
     return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(_HATS)))

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.stats import f as fisher
 
 from fri.errors import ConfigurationError
 from ident.base import BaseSet
 from ident.discrepancy.evidence import Floats
+from ident.distributions import fisher_limit
 from ident.model import DynamicModel
 
 __all__ = ["Reference"]
@@ -115,7 +115,7 @@ class Reference:
         # What noise alone gives to a candidate has no such tail; the smallest gain of a claim sees to it.
         noise = float(np.median(list(self.null.values()))) if self.null else 0.0
         sets = self.sets + _AS_SETS
-        quantile = float(fisher.isf(_ONE_IN, 1, sets))
+        quantile = fisher_limit(_ONE_IN, 1, sets)
         found = {}
         for key, gain in self.null.items():
             mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets

@@ -13,12 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import norm
 
 from ident.discrepancy.candidates import Candidate, Dictionary, Trial
 from ident.discrepancy.evidence import Evidence, Key, Rows, Score
 from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.settings import DiagnosisSettings
+from ident.distributions import normal_tail
 from ident.effects import EFFECTS
 
 __all__ = ["PLAIN", "Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
@@ -418,7 +418,7 @@ def confidence(gain: float, rivals: Sequence[float]) -> float:
     """
     scale = 2.0 * (1.0 + 0.03 * gain)
     others = sum(float(np.exp(-max(gain - g, 0.0) / scale)) for g in rivals)
-    chance = float(2.0 * norm.sf(np.sqrt(max(gain, 0.0)))) * 500.0
+    chance = float(2.0 * normal_tail(np.sqrt(max(gain, 0.0)))) * 500.0
     return 1.0 / (1.0 + others + chance)
 
 

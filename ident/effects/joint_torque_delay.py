@@ -28,7 +28,9 @@ class JointTorqueDelay(Effect):
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """From half a millisecond to forty, late and early."""
-        return [{"delay": sign * d} for d in (0.001, 0.003, 0.01, 0.03) for sign in (1.0, -1.0)]
+        return [
+            {"delay": sign * d} for d in (0.001, 0.002, 0.004, 0.008, 0.016, 0.032) for sign in (1.0, -1.0)
+        ]
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Predicted torque of before less that of now, without the jumps at reversals, in all joint rows."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.stats import norm, t
 
+from ident.distributions import normal_quantile, student_quantile
 from ident.estimators.problem import FloatArray, Problem
 
 __all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
@@ -104,7 +104,7 @@ class Estimate:
         chosen = self.covariance if covariance is None else self.covariances[covariance]
         tail = 0.5 + level / 2.0
         finite = np.isfinite(chosen.degrees_of_freedom)
-        factor = t.ppf(tail, chosen.degrees_of_freedom) if finite else norm.ppf(tail)
+        factor = student_quantile(tail, chosen.degrees_of_freedom) if finite else normal_quantile(tail)
         half = chosen.inflation * factor * chosen.std
         return np.column_stack([self.values - half, self.values + half])
 

@@ -12,7 +12,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
-from scipy.signal import butter, kaiser_beta, sosfiltfilt
 
 from fri.errors import ConfigurationError
 
@@ -45,6 +44,9 @@ def low_pass(values: FloatArray, dt: float, cutoff_hz: float, order: int = 4) ->
         raise ConfigurationError(
             f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate, {nyquist:g} Hz; lower `cutoff_hz`"
         )
+    # Takes a second to import, and most filtering here is by kernels.
+    from scipy.signal import butter, sosfiltfilt
+
     sos = butter(order, cutoff_hz / nyquist, output="sos")
     pad = min(len(values) - 1, int(np.ceil(3.0 / (cutoff_hz * dt))))
     return sosfiltfilt(sos, values, axis=0, padlen=pad)
@@ -217,5 +219,7 @@ def half_width(cutoff_hz: float, attenuation_db: float) -> float:
 
 
 def _kaiser(position: FloatArray, attenuation_db: float) -> FloatArray:
-    beta = kaiser_beta(attenuation_db)
+    # Kaiser, Proc. IEEE ISCAS (1974), for attenuations above 50 dB and from 21 dB on
+    above = max(attenuation_db - 21.0, 0.0)
+    beta = 0.1102 * (attenuation_db - 8.7) if attenuation_db > 50.0 else 0.5842 * above**0.4 + 0.07886 * above
     return np.i0(beta * np.sqrt(np.maximum(1.0 - position**2, 0.0))) / np.i0(beta)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import welch
 
 from ident.signals.settings import SignalSettings
 
@@ -104,6 +103,8 @@ def advice(
 
 
 def _spectrum(signal: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    from scipy.signal import welch
+
     segment = min(len(signal), max(256, round(30.0 / dt)))
     frequency, power = welch(signal, fs=1.0 / dt, nperseg=segment, detrend="linear", window="blackmanharris")
     return frequency, power

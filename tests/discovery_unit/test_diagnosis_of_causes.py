@@ -210,6 +210,32 @@ def test_unknown_physics_is_not_named_with_confidence(make: Make, chain: Chain) 
     assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
 
 
+def test_no_name_is_sure_where_the_unknown_explains_the_same(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def strange(s: Signals) -> None:
+        # The base parameters share what the drive shows with the sensor's rows, and something fits it there.
+        s["motor"][:, 1] += 0.15 * np.sign(s["qd"][:, 1]) * np.cos(s["q"][:, 0] + 0.8)
+
+    found = diagnose(pair(make, strange), chain, reference=reference)
+    assert all(f.confidence < 0.8 for f in found.findings)
+    assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
+
+
+def test_what_shakes_the_arm_is_told_with_its_frequency(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def shaken(s: Signals) -> None:
+        s["motor"][:, 1] += 0.08 * np.sin(2.0 * np.pi * 1.37 * s["time"] + 0.4)
+
+    found = diagnose(pair(make, shaken), chain, reference=reference)
+    assert found.findings == ()
+    assert [(u.side, u.joint, u.depends_on) for u in found.unexplained] == [("motor", 2, ("time",))]
+    (note,) = [note for note in found.notes if "swings" in note]
+    assert "motor torque" in note
+    assert float(note.partition("swings at ")[2].split()[0]) == pytest.approx(1.37, abs=0.01)
+
+
 def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
     sessions = pair(make)
     effort = sessions[0].joint.effort.copy()

@@ -287,3 +287,15 @@ def test_drive_warms_up_by_the_power_of_its_friction(motion: Motion) -> None:
     np.testing.assert_allclose(at(0.3, 0.0), expected)
     assert at(2.0, 1.0)[-1] > 2.0 * at(1.0, 1.0)[-1] - 1e-9
     assert at(0.3, 1.0)[-1] < 0.3 * expected[-1] + 1e-9
+
+
+@pytest.mark.parametrize("cause", ["motor_torque_delay", "joint_torque_delay"])
+def test_no_delay_falls_between_the_shapes_that_are_tried(cause: str) -> None:
+    effect = EFFECTS[cause]
+    (share,) = effect.linear
+    setting = SimpleNamespace(compared=True)
+    tried = np.array([shape["delay"] for shape in effect.shapes(setting, 0)])  # type: ignore[arg-type]
+    for delay in np.linspace(0.0012, 0.04, 400):
+        for true in (delay, -delay):
+            found = true / tried
+            assert np.any((found > 1.1 * share.low) & (found < 0.95 * share.high)), true
