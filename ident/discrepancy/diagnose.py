@@ -13,6 +13,7 @@ from ident.discrepancy.bench import (
     ArmData,
     Bench,
     again_with,
+    mean_delay,
     nominal_arm,
     prepare_bench,
     slow_delay,
@@ -38,6 +39,10 @@ if TYPE_CHECKING:
 __all__ = ["diagnose"]
 
 _REPEATS = 1
+# How often at most a late channel is shifted and looked at again.
+_SHIFTS = 4
+# Share of the tolerance for delays within which a channel that was shifted is in its place.
+_IN_PLACE = 0.2
 
 
 def diagnose(
@@ -84,23 +89,21 @@ def diagnose(
         selection = select(bench.dictionary, bench.evidence, settings, null)
         late = [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
     if late:
-        shifted = known
-        for claim in late:
-            delay = float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
-            if claim.trial.candidate.cause == "motor_torque_delay":
-                shifted = replace(shifted, motor_delay_s=shifted.motor_delay_s + delay)
-            else:
-                shifted = replace(shifted, joint_delay_s=shifted.joint_delay_s + delay)
         before = held_out(bench.evidence, [])
-        bench = prepare_bench(
-            replace(shifted, compliance=bench.nominal.arm.compliance),
-            recordings,
-            settings,
-            reference,
-            causes,
-            fit_compliance=False,
-        )
-        again = select(bench.dictionary, bench.evidence, settings, null)
+        shifted, amounts = known, {c.trial.candidate.cause: _made(c) for c in late}
+        for _ in range(_SHIFTS):
+            shifted = _shifted(shifted, amounts)
+            present = replace(shifted, compliance=bench.nominal.arm.compliance)
+            bench = prepare_bench(present, recordings, settings, reference, causes, fit_compliance=False)
+            again = select(bench.dictionary, bench.evidence, settings, null)
+            # What spoilt the first estimate may be in the model now, and be itself in its place only now.
+            rest = {cause: mean_delay(again.nuisance, cause.partition("_")[0])[0] for cause in amounts}
+            more = {
+                c.trial.candidate.cause: _made(c) for c in again.claims if c.trial.candidate.cause in rest
+            }
+            amounts = {**rest, **more}
+            if max(map(abs, amounts.values())) < _IN_PLACE * settings.delay_tolerance_s:
+                break
         unknown = {c.trial.candidate.cause: _unknown_delay(known, recordings, c) for c in late}
         timing = [timing_finding(c, known, bench, again, before, settings) for c in late]
         timing = [f for f in timing if abs(f.parameters["delay"].value) > unknown[f.cause]]
@@ -120,6 +123,20 @@ def diagnose(
     return replace(found, notes=(*found.notes, *notes)) if notes else found
 
 
+def _made(claim: Claim) -> float:
+    """Delay [s] that a claim of a late channel means."""
+    return float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+
+
+def _shifted(arm: Arm, amounts: Mapping[str, float]) -> Arm:
+    """The arm with channels that are later by so much [s], by cause."""
+    return replace(
+        arm,
+        motor_delay_s=arm.motor_delay_s + amounts.get("motor_torque_delay", 0.0),
+        joint_delay_s=arm.joint_delay_s + amounts.get("joint_torque_delay", 0.0),
+    )
+
+
 def _unknown_delay(known: Arm, recordings: Sequence[Recording], claim: Claim) -> float:
     """Delay [s] up to which a late channel may be what the arm is like, 0 where a healthy arm told what it is.
 
@@ -135,7 +152,7 @@ def _unknown_delay(known: Arm, recordings: Sequence[Recording], claim: Claim) ->
 
 
 def _own_delay(claim: Claim, unknown: Mapping[str, float]) -> str:
-    made = float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+    made = _made(claim)
     limit = unknown[claim.trial.candidate.cause]
     return (
         f"motor torques come {1e3 * made:.1f} ms after the positions, which was corrected; without a reference "
@@ -163,6 +180,6 @@ def _with_hope(
 def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:
     """Whether the slow part of the motion confirms a late channel."""
     bench.evidence.replace([])
-    made = float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+    made = _made(claim)
     slow, std = slow_delay(bench, claim.trial)
     return abs(slow - made) < 0.3 * abs(made) + 4.0 * std and abs(slow) > 0.3 * abs(made)

@@ -15,6 +15,7 @@ import runner.experiment
 from lwr_driver.trace import TraceImport, import_trace
 from runner.cli import main
 
+LOAD = {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}
 SHORT: dict[str, Any] = {
     "name": "my_lab",
     "emulator_settings": {"fri.period_ms": 10},
@@ -23,7 +24,8 @@ SHORT: dict[str, Any] = {
     "diagnosis": {"run": False},
     "sessions": [
         {"name": "unloaded"},
-        {"name": "loaded", "payload": {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}},
+        {"name": "loaded", "payload": LOAD},
+        {"name": "unseen", "payload": LOAD, "validation": True},
     ],
 }
 
@@ -47,7 +49,7 @@ def laboratory(made_once: Callable[[str, Callable[[Path], None]], Path]) -> Path
 def fill(folder: Path) -> None:
     (folder / "my_lab.yaml").write_text(yaml.safe_dump(SHORT))
     lwr_run("experiment", str(folder / "my_lab.yaml"), "--yes", "--out", str(folder / "results"))
-    trace = {"name": "other", "motor_torque": {"source": "trace_file"}, "sessions": SHORT["sessions"][1:]}
+    trace = {"name": "other", "motor_torque": {"source": "trace_file"}, "sessions": SHORT["sessions"][1:2]}
     other = folder / "other"
     seed = {"excitation": {**SHORT["excitation"], "seed": 4}}
     (folder / "other.yaml").write_text(yaml.safe_dump({**SHORT, **trace, **seed}))

@@ -47,7 +47,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def verb(name: str) -> click.Command:
-    with click.Context(main) as context:
+    with click.Context(main, **main.context_settings) as context:
         command = main.get_command(context, name)
     assert command is not None
     return command
@@ -140,7 +140,7 @@ def test_the_help_of_every_command_has_an_example_that_it_understands(name: str)
         assert call in result.output
         words = shlex.split(call.partition(" >")[0])
         assert words[1] == name
-        with click.Context(main) as context:
+        with click.Context(main, **main.context_settings) as context:
             command.make_context(name, words[2:], parent=context)
 
 
