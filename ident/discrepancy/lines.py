@@ -18,6 +18,8 @@ _LOWEST_HZ = 0.3
 _BESIDE_HZ = 2.0
 # Power of a line over the spectrum beside it; of a thousand frequencies chance makes ten of one.
 _STANDS_OUT = 16.0
+# The same in every session: what shakes the arm does not stop for one, what a wrong load leaves is in its own only.
+_IN_EACH = 4.0
 # Zero padding of the spectrum, so that a line falls between no two of its frequencies.
 _PADDING = 4
 
@@ -39,19 +41,19 @@ def find_line(evidence: Evidence, side: str, joint: int) -> tuple[float, Rows, i
         return None
     step = max(dt for _, dt in even)
     size = _PADDING * max(len(values) for values, _ in even)
-    frequency = np.fft.rfftfreq(size, step)
-    power = np.zeros(len(frequency))
-    for values, dt in even:
-        spectrum = np.abs(np.fft.rfft(values, size)) ** 2 / max(float(np.sum(values**2)), 1e-300)
-        power += np.interp(frequency, np.fft.rfftfreq(size, dt), spectrum)
-    inside = (frequency >= _LOWEST_HZ) & (frequency <= 0.4 / step)
-    frequency, power = frequency[inside], power[inside]
+    frequency: Floats = np.fft.rfftfreq(size, step).astype(np.float64)
+    frequency = frequency[(frequency >= _LOWEST_HZ) & (frequency <= 0.4 / step)]
     if len(frequency) < 8 * _PADDING:
         return None
+    each = np.array([_spectrum(values, dt, size, frequency) for values, dt in even])
+    power = each.sum(axis=0)
     width = int(_BESIDE_HZ / (frequency[1] - frequency[0]))
-    beside = np.array([np.median(power[max(0, k - width) : k + width + 1]) for k in range(len(power))])
+    around = [slice(max(0, k - width), k + width + 1) for k in range(len(power))]
+    beside = np.array([np.median(power[near]) for near in around])
     best = int(np.argmax(power / np.maximum(beside, 1e-300)))
     if power[best] < _STANDS_OUT * beside[best]:
+        return None
+    if np.any(each[:, best] < _IN_EACH * np.median(each[:, around[best]], axis=1)):
         return None
     top = float(frequency[best])
     if 0 < best < len(power) - 1:
@@ -66,6 +68,12 @@ def find_line(evidence: Evidence, side: str, joint: int) -> tuple[float, Rows, i
     ]
     key: Key = (side, joint)
     return top, {key: np.column_stack(waves)}, len(frequency) // _PADDING
+
+
+def _spectrum(values: Floats, dt: float, size: int, frequency: Floats) -> Floats:
+    """Power of a session at the frequencies, over all its power."""
+    power = np.abs(np.fft.rfft(values, size)) ** 2 / max(float(np.sum(values**2)), 1e-300)
+    return np.interp(frequency, np.fft.rfftfreq(size, dt), power)
 
 
 def _not_repeating(
@@ -86,7 +94,7 @@ def _not_repeating(
     even[place], known[place] = values, True
     even[known] -= even[known].mean()
     period = round(recording.period_s / step)
-    if recording.repeats and 0 < period <= len(even) // 2:
+    if recording.repeats and 0 < period < len(even) / 1.5:
         phase = np.arange(len(even)) % period
         count = np.bincount(phase[known], minlength=period)
         mean = np.bincount(phase[known], even[known], minlength=period) / np.maximum(count, 1)
