@@ -31,6 +31,8 @@ Side = Literal["link", "motor"]
 
 log = logging.getLogger(__name__)
 
+# Rounds in which the channels' delays are settled.
+_SETTLING = 2
 _TUNING_SETS = 3
 _ROUNDS = 3
 _ENOUGH = 3
@@ -40,7 +42,8 @@ _LATEST_S = 0.02
 @dataclass(frozen=True, eq=False)
 class _Day:
     """What one set says: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of
-    the drives (n,) [Nm] and what of it turns slowly, see `presliding.slow_turns`.
+    the drives (n,) [Nm] and what of it turns slowly, see `presliding.slow_turns`; by how much the channels are later
+    than the arm says, by side [s].
     """
 
     values: Floats
@@ -48,6 +51,7 @@ class _Day:
     sigma: Mapping[str, Floats]
     coulomb: Floats
     slow_turns: SlowTurns
+    late: Mapping[str, float]
 
 
 def commission(
@@ -85,8 +89,16 @@ def commission(
     known = _middle(several)
     days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
-    if known.far is not None:
+    for _ in range(_SETTLING):
+        # How late a channel seems depends on how friction turns at reversals, so its delay is settled last.
         days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
+        late = {side: float(np.mean([day.late[side] for day in days])) for side in ("motor", "joint")}
+        known = replace(
+            known,
+            motor_delay_s=known.motor_delay_s + late["motor"],
+            joint_delay_s=known.joint_delay_s + late["joint"],
+        )
+    days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
     null: dict[tuple[str, int], float] = {}
     for number, part in enumerate(parts):
         others = [day for k, day in enumerate(days) if k != number]
@@ -159,7 +171,7 @@ def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings,
         )
     evidence = bench.evidence
     # Leaves the tolerated deviations beside the base.
-    select(bench.dictionary, evidence, settings, None)
+    nuisance = select(bench.dictionary, evidence, settings, None).nuisance
     p = evidence.base_count
     return _Day(
         evidence.full.values[:p].copy(),
@@ -167,6 +179,7 @@ def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings,
         evidence.sigma,
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
+        {side: mean_delay(nuisance, side)[0] for side in ("motor", "joint")},
     )
 
 

@@ -42,7 +42,7 @@ Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 
 _DOUBT = 0.2
 # Share of the tolerance for delays by which a healthy channel's delay differs from day to day.
-_DAY_TO_DAY = 0.15
+_DAY_TO_DAY = 0.2
 # Confidence in what the rows fitted show plainly and others do not.
 _OPEN = 0.7
 # Share of a claim's gain that nameless functions of other variables may take over.

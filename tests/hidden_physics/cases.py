@@ -28,6 +28,8 @@ KINDS = ("single", "none", "pair", "triple", "outside")
 _PAYLOAD, _PAYLOAD_KG = "paper_load", 3.34
 _TWIN_DAYS = 3
 _SIZES = (0.35, 4.0)
+# Share of a session's samples below a torque that it reaches often enough to show a limit there.
+_OFTEN = 0.98
 
 
 @dataclass(frozen=True)
@@ -128,12 +130,13 @@ class Store:
     def scene(self, schedule: str, day: Day) -> Scene:
         """What the healthy twin shows."""
         sessions = self.sessions(twin(schedule, day))
+        size = {path: np.abs(read_session(path).joint.effort) for path in (*sessions.train, *sessions.test)}
+        peaks = np.max([values.max(axis=0) for values in size.values()], axis=0)
+        often = {path: np.quantile(values, _OFTEN, axis=0) for path, values in size.items()}
         learnt, held = (
-            np.max([np.abs(read_session(path).joint.effort).max(axis=0) for path in paths], axis=0)
-            for paths in (sessions.train, sessions.test)
+            np.max([often[p] for p in paths], axis=0) for paths in (sessions.train, sessions.test)
         )
-        peaks, reached = np.maximum(learnt, held).tolist(), np.minimum(learnt, held).tolist()
-        return Scene(tuple(peaks), tuple(reached), _begin_s())
+        return Scene(tuple(peaks.tolist()), tuple(np.minimum(learnt, held).tolist()), _begin_s())
 
 
 @cache

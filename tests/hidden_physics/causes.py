@@ -34,8 +34,8 @@ Settings = tuple[Setting, ...]
 class Scene:
     """What a cause may depend on besides chance.
 
-    peaks : (7,) largest joint torque of the healthy twin [Nm]. reached : (7,) the largest that both the sessions to
-    learn from and the one held out reach [Nm]. begin_s : cabinet's clock as motions begin [s]
+    peaks : (7,) largest joint torque of the healthy twin [Nm]. reached : (7,) what both the sessions to learn
+    from and the one held out reach, and not for a moment only [Nm]. begin_s : cabinet's clock as motions begin [s]
     """
 
     peaks: tuple[float, ...]
