@@ -13,7 +13,7 @@ from ident.discrepancy.candidates import Trial
 from ident.discrepancy.evidence import Floats, Key, Rows
 from ident.discrepancy.gain import HeldOut, fall, held_out, interval
 from ident.discrepancy.hygiene import SampleLoss
-from ident.discrepancy.imperfection import beyond_law
+from ident.discrepancy.imperfection import beyond_law, turning
 from ident.discrepancy.intervals import estimated
 from ident.discrepancy.nominal import TRAVEL_RAD, Arm, Nominal
 from ident.discrepancy.probes import Remainder, find_remainders
@@ -228,9 +228,23 @@ def _relative(without: HeldOut, after: HeldOut, key: tuple[str, int]) -> float:
 
 
 def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
-    """Values with standard deviations, see `intervals`."""
-    effect = trial.candidate.effect
-    values, deviations = estimated(bench.dictionary, bench.evidence, trial)
+    """Values with standard deviations, see `intervals`.
+
+    What a value would be if friction also turned in another way after a reversal is part of its uncertainty.
+    """
+    effect, evidence = trial.candidate.effect, bench.evidence
+    values, deviations = estimated(bench.dictionary, evidence, trial)
+    columns = turning(bench.dictionary, trial)
+    if columns is not None:
+        kept = list(evidence.extra)
+        evidence.replace([*kept, columns])
+        again = bench.dictionary.trial(trial.candidate, trial.shape)
+        if again is not None:
+            others, _ = estimated(bench.dictionary, evidence, again)
+            deviations = {
+                name: float(np.hypot(d, others[name] - values[name])) for name, d in deviations.items()
+            }
+        evidence.replace(kept)
     return {
         p.name: Value(values[p.name], deviations[p.name], p.unit)
         for p in effect.parameters

@@ -13,13 +13,12 @@ from ident.discrepancy.bench import (
     ArmData,
     Bench,
     again_with,
-    mean_delay,
     nominal_arm,
     prepare_bench,
     slow_delay,
     some_joint_moves,
 )
-from ident.discrepancy.candidates import Dictionary
+from ident.discrepancy.candidates import Candidate, Dictionary
 from ident.discrepancy.conclusion import Simulate, conclude, timing_finding
 from ident.discrepancy.gain import held_out
 from ident.discrepancy.hygiene import sample_loss
@@ -40,7 +39,9 @@ __all__ = ["diagnose"]
 
 _REPEATS = 1
 # How often at most a late channel is shifted and looked at again.
-_SHIFTS = 4
+_SHIFTS = 5
+# Delay whose trace stands for what is left of a larger one [s].
+_UNIT_S = 1e-3
 # Share of the tolerance for delays within which a channel that was shifted is in its place.
 _IN_PLACE = 0.2
 
@@ -97,11 +98,7 @@ def diagnose(
             bench = prepare_bench(present, recordings, settings, reference, causes, fit_compliance=False)
             again = select(bench.dictionary, bench.evidence, settings, null)
             # What spoilt the first estimate may be in the model now, and be itself in its place only now.
-            rest = {cause: mean_delay(again.nuisance, cause.partition("_")[0])[0] for cause in amounts}
-            more = {
-                c.trial.candidate.cause: _made(c) for c in again.claims if c.trial.candidate.cause in rest
-            }
-            amounts = {**rest, **more}
+            amounts = {cause: _rest(bench, again, cause) for cause in amounts}
             if max(map(abs, amounts.values())) < _IN_PLACE * settings.delay_tolerance_s:
                 break
         unknown = {c.trial.candidate.cause: _unknown_delay(known, recordings, c) for c in late}
@@ -126,6 +123,21 @@ def diagnose(
 def _made(claim: Claim) -> float:
     """Delay [s] that a claim of a late channel means."""
     return float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+
+
+def _rest(bench: Bench, selection: Selection, cause: str) -> float:
+    """How much later a channel still is [s], beside all claims but slow turning, which a late motor resembles."""
+    side = cause.partition("_")[0]
+    alike = (cause, "presliding_hysteresis")
+    taken = [c.trial.rows for c in selection.claims if c.trial.candidate.cause not in alike]
+    tolerated = [
+        rows
+        for name, rows in zip(selection.nuisance, selection.nuisance_rows, strict=True)
+        if not name.startswith(f"{side} delay")
+    ]
+    bench.evidence.replace([*taken, *tolerated])
+    columns = bench.dictionary.rows(Candidate(EFFECTS[cause], -1), {"delay": _UNIT_S})
+    return _UNIT_S * float(bench.evidence.score(bench.evidence.padded(columns)).coefficients[0])
 
 
 def _shifted(arm: Arm, amounts: Mapping[str, float]) -> Arm:

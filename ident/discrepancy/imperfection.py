@@ -19,7 +19,7 @@ from ident.effects import EFFECTS
 from ident.effects.body import inertia_columns
 from ident.effects.operators import dahl
 
-__all__ = ["beyond_law"]
+__all__ = ["beyond_law", "turning"]
 
 # Variable of a law, and whether it scales what has the sign of the drive's direction.
 _OWN: Mapping[str, tuple[str, bool]] = {
@@ -66,7 +66,10 @@ def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
         if at != joint or not own:
             continue
         if variable == "qd":
-            found[side, joint] = _of_speed(dictionary, side, joint)
+            columns = _of_speed(dictionary, side, joint)
+            if cause == "stribeck":
+                columns = np.column_stack([columns, _turning(dictionary, side, joint)])
+            found[side, joint] = columns
             continue
         group = groups(dictionary, own, side, joint)
         wanted = f"{name} sign(qd{joint + 1})" if signed else name
@@ -76,6 +79,14 @@ def beyond_law(dictionary: Dictionary, trial: Trial) -> Rows | None:
             columns = np.column_stack([columns, _rubbing(dictionary, side, joint)])
         found[side, joint] = columns
     return found or None
+
+
+def turning(dictionary: Dictionary, trial: Trial) -> Rows | None:
+    """Columns of how the friction of a trial may turn after a reversal, None of what is no such friction."""
+    if trial.candidate.cause != "stribeck":
+        return None
+    joint = trial.candidate.joint
+    return {(side, at): _turning(dictionary, side, at) for side, at in trial.rows if at == joint}
 
 
 def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
@@ -89,6 +100,20 @@ def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
     signed = [part * m.direction[:, joint : joint + 1] for part, m in zip(parts, motions, strict=True)]
     both = [np.column_stack(pair) for pair in zip(parts, signed, strict=True)]
     return dictionary.nominal.reduce(side, both)
+
+
+def _turning(dictionary: Dictionary, side: str, joint: int) -> Floats:
+    """Friction (m, k) that turns over other ways after a reversal: bristles that carry more at low speed are no
+    stiffer, so they bend further before they slip.
+    """
+    effect, motions = EFFECTS["presliding_hysteresis"], dictionary.nominal.motions
+    found = []
+    for shape in effect.shapes(dictionary.setting, joint):
+        for columns in zip(*(effect.columns(m, joint, shape) for m in motions), strict=True):
+            parts = [part for part in (getattr(column, side) for column in columns) if part is not None]
+            if parts:
+                found.append(dictionary.nominal.reduce(side, parts))
+    return np.column_stack(found)
 
 
 def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
