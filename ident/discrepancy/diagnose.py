@@ -103,9 +103,15 @@ def diagnose(
                 break
         unknown = {c.trial.candidate.cause: _unknown_delay(known, recordings, c) for c in late}
         timing = [timing_finding(c, known, bench, again, before, settings) for c in late]
-        timing = [f for f in timing if abs(f.parameters["delay"].value) > unknown[f.cause]]
+        left = {f.cause: f.parameters["delay"] for f in timing}
         notes = [
-            _own_delay(c, unknown) for c in late if c.trial.candidate.cause not in [f.cause for f in timing]
+            _own_delay(c, unknown)
+            for c in late
+            if abs(left[c.trial.candidate.cause].value) <= unknown[c.trial.candidate.cause]
+        ]
+        # A claim of which nothing is left once all else is in the model was something else.
+        timing = [
+            f for f in timing if abs(left[f.cause].value) > max(unknown[f.cause], 3.0 * left[f.cause].std)
         ]
         again.claims = [c for c in again.claims if c.trial.candidate.effect.side != "timing"]
         selection = again
