@@ -42,6 +42,8 @@ _REPEATS = 1
 _SHIFTS = 5
 # Delay whose trace stands for what is left of a larger one [s].
 _UNIT_S = 1e-3
+# Joints from which on a delay must be seen in more than one.
+_MOST_ALONE = 3
 # Share of the tolerance for delays within which a channel that was shifted is in its place.
 _IN_PLACE = 0.2
 
@@ -83,7 +85,11 @@ def diagnose(
     if not bench.told and not selection.claims:
         bench, selection = _with_hope(bench, selection, settings, causes, null)
     late = [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
-    doubtful = [c.trial.candidate.cause for c in late if not _late_at_all_speeds(bench, c)]
+    doubtful = [
+        c.trial.candidate.cause
+        for c in late
+        if not (_late_at_all_speeds(bench, c) and _late_in_all_joints(bench, c))
+    ]
     if doubtful:
         causes = [cause for cause in causes or EFFECTS if cause not in doubtful]
         bench.dictionary = Dictionary(bench.nominal, bench.evidence, causes)
@@ -201,3 +207,20 @@ def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:
     made = _made(claim)
     slow, std = slow_delay(bench, claim.trial)
     return abs(slow - made) < 0.3 * abs(made) + 4.0 * std and abs(slow) > 0.3 * abs(made)
+
+
+def _late_in_all_joints(bench: Bench, claim: Claim) -> bool:
+    """Whether a channel is as late in the other joints as in the one that says most of it: drag that resembles a delay
+    is in one joint.
+    """
+    evidence = bench.evidence
+    evidence.replace([])
+    padded = evidence.padded(bench.dictionary.rows(claim.trial.candidate, {"delay": _UNIT_S}))
+    if len(padded) < _MOST_ALONE:
+        return True
+    loudest = max(padded, key=lambda key: evidence.score({key: padded[key]}).fitted)
+    score = evidence.score({key: columns for key, columns in padded.items() if key != loudest})
+    delay = _UNIT_S * float(score.coefficients[0])
+    std = _UNIT_S * float(np.sqrt(score.covariance[0, 0]))
+    made = _made(claim)
+    return abs(delay - made) < 0.5 * abs(made) + 4.0 * std
