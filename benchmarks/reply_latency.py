@@ -19,6 +19,7 @@ import platform
 import socket
 import tempfile
 import time
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -37,71 +38,119 @@ from lwr_driver.realtime import assess, set_up
 from lwr_driver.session import session_metadata
 
 START = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
+# Sleeping longer, the sender's processor would wake late.
+_NAP_S = 0.15e-3
+_READY_S = 0.5e-3  # before a packet is due, it is ready
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 
 
-def send(port: int, period_ms: int, results: Connection) -> None:
-    """The controller's side: a session that forgives every miss, on its own processor if there are two."""
-    arm = Arm.load()
+class _Link:
+    """One of those who answer, as the controller sees it: a session that forgives every miss."""
+
+    def __init__(self, port: int, period_ms: int) -> None:
+        arm = Arm.load()
+        limits = KrcLimits(arm.q_min, arm.q_max, 1e6 * arm.v_max, np.full(7, 1e3))
+        policy = KrcPolicy(
+            bridged_cycles=10**6,
+            hold_quality=Quality.UNACCEPTABLE,
+            perfect_latency=1e3,
+            perfect_rate=0.0,
+            ok_rate=0.0,
+            bad_rate=0.0,
+        )
+        self._period_ms = period_ms
+        self.session = KrcSession(limits, START, policy)
+        self._interpreter = Interpreter(self.session, PROGRAMS["stanford"](period_ms))
+        self._sample = Sample()
+        self._wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._wire.connect(("127.0.0.1", port))
+        self._wire.setblocking(False)
+        # When the packets left, and where their latency is told; an answer may come cycles later.
+        self._under_way: dict[bytes, tuple[float, int]] = {}
+        self._open: tuple[bytes, float] | None = None
+        self._packet = b""
+        self.latency: list[float] = []
+        self.lateness: list[float] = []
+
+    @property
+    def commanding(self) -> bool:
+        return int(self.session.state) == 2
+
+    @property
+    def awaited(self) -> bool:
+        """Whether the last packet is not answered yet."""
+        return self._open is not None
+
+    def prepare(self) -> None:
+        """End the cycle before, and have the packet of the next one ready."""
+        self._sample.msr_jnt_pos[:] = self.session.close_cycle().position
+        self._interpreter.advance(self._period_ms)
+        self._packet = self.session.packet(self._sample) if self.session.state else b""
+
+    def send(self, due: float, counts: bool) -> None:
+        """The packet of this cycle, which was `due` [s]; its latency is told where it `counts`."""
+        packet = self._packet
+        if not packet:
+            return
+        left = time.monotonic()
+        self._open = packet[:2], left
+        try:
+            self._wire.send(packet)
+        except ConnectionRefusedError:
+            self._open = None
+        if counts:
+            self._under_way[packet[:2]] = left, len(self.latency)
+            self.latency.append(np.inf)
+            self.lateness.append(left - due)
+
+    def look(self) -> None:
+        """Take an answer, if one is there."""
+        try:
+            answer = self._wire.recv(CMD_SIZE + 1)
+        except BlockingIOError:
+            return
+        except ConnectionRefusedError:
+            self._open = None
+            return
+        now = time.monotonic()
+        before, place = self._under_way.pop(answer[2:4], (now, -1))
+        if place >= 0:
+            self.latency[place] = now - before
+        if self._open is not None and answer[2:4] == self._open[0]:
+            self.session.receive(answer, min(now - self._open[1], self._period_ms * 0.999e-3))
+            self._open = None
+
+
+def send(ports: Sequence[int], period_ms: int, results: Connection) -> None:
+    """The controller's side, on its own processor if there are two: sends to each port in turn, at even distances
+    within a cycle, and counts what it sent while all were in command mode.
+
+    A stall of its own delays the cycles that follow, so that no burst of packets is blamed on who must answer it.
+    """
     processors = sorted(os.sched_getaffinity(0))
     set_up(90, processors[0] if len(processors) > 1 else None)
-    limits = KrcLimits(arm.q_min, arm.q_max, 1e6 * arm.v_max, np.full(7, 1e3))
-    policy = KrcPolicy(
-        bridged_cycles=10**6,
-        hold_quality=Quality.UNACCEPTABLE,
-        perfect_latency=1e3,
-        perfect_rate=0.0,
-        ok_rate=0.0,
-        bad_rate=0.0,
-    )
-    session = KrcSession(limits, START, policy)
-    interpreter = Interpreter(session, PROGRAMS["stanford"](period_ms))
-    sample = Sample()
-    wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    wire.connect(("127.0.0.1", port))
-    wire.setblocking(False)
-    latency: list[float] = []
-    lateness: list[float] = []
-    # When the packets left, and where their latency is told; an answer may come cycles later.
-    under_way: dict[bytes, tuple[float, int]] = {}
+    links = [_Link(port, period_ms) for port in ports]
+    step_s = period_ms * 1e-3 / len(links)
+
+    def look(until: float) -> None:
+        while (wait := until - time.monotonic()) > 0.0:
+            for link in links:
+                link.look()
+            if not any(link.awaited for link in links):
+                time.sleep(min(wait, _NAP_S))
+
     due = time.monotonic()
     while not results.poll(0):
-        interpreter.advance(period_ms)
-        if session.state == 0:
-            sample.msr_jnt_pos[:] = session.close_cycle().position
-            due = time.monotonic()
-            continue
-        due += period_ms * 1e-3
-        time.sleep(max(0.0, due - time.monotonic()))
-        packet = session.packet(sample)
-        left = time.monotonic()
-        sent = True
-        try:
-            wire.send(packet)
-        except ConnectionRefusedError:
-            sent = False
-        commanding = session.state == 2
-        if commanding:
-            under_way[packet[:2]] = left, len(latency)
-            latency.append(np.inf)
-            lateness.append(left - due)
-        arrived = None
-        while sent and arrived is None and time.monotonic() < due + period_ms * 1e-3:
-            try:
-                answer = wire.recv(CMD_SIZE + 1)
-            except BlockingIOError:
-                continue
-            except ConnectionRefusedError:
-                break
-            now = time.monotonic()
-            before, place = under_way.pop(answer[2:4], (left, -1))
-            if place >= 0:
-                latency[place] = now - before
-            if answer[2:4] == packet[:2]:
-                arrived = now - left
-                session.receive(answer, min(arrived, period_ms * 0.999e-3))
-        sample.msr_jnt_pos[:] = session.close_cycle().position
-    results.send((np.array(latency), np.array(lateness)))
+        for link in links:
+            due += step_s
+            look(due - min(_READY_S, 0.5 * step_s))
+            link.prepare()
+            look(due)
+            link.send(due, all(other.commanding for other in links))
+            late = time.monotonic() - due
+            if late > 0.5 * step_s:
+                due += late
+    results.send([(np.array(link.latency), np.array(link.lateness)) for link in links])
 
 
 def measure(period_ms: int, seconds: float) -> dict[str, object]:
@@ -112,7 +161,7 @@ def measure(period_ms: int, seconds: float) -> dict[str, object]:
         port = probe.getsockname()[1]
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe()
-    sender = context.Process(target=send, args=(port, period_ms, theirs), daemon=True)
+    sender = context.Process(target=send, args=([port], period_ms, theirs), daemon=True)
     link = LinkSettings(address="127.0.0.1", port=port, realtime="allow", link_timeout_s=5.0)
     sender.start()
     with tempfile.TemporaryDirectory() as folder, Driver(arm, link) as driver:
@@ -132,7 +181,7 @@ def measure(period_ms: int, seconds: float) -> dict[str, object]:
         mine.send("enough")
         if not mine.poll(30.0):
             raise TimeoutError("the sender did not hand over its measurements within 30 s")
-        latency, lateness = mine.recv()
+        [(latency, lateness)] = mine.recv()
         rights = driver.rights
     sender.join(10.0)
     assert rights is not None

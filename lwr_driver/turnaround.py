@@ -279,6 +279,12 @@ class Turnaround:
         self.arrived = self.sent or status == _ARRIVED
         return bool(status == _ASKED)
 
+    def take_waiting(self) -> bool:
+        """Take a datagram that waits already, with nothing ready; False if there is none."""
+        self.disarm()
+        self.wait(0, 0, 0)
+        return self.arrived
+
     @property
     def length(self) -> int:
         """Bytes of the datagram."""

@@ -1,6 +1,6 @@
 /* The smallest FRI client that does its duty: the yardstick for the driver's reply latency, and one of other
  * people's clients for the emulator. Mirrors outside command mode; in command mode it superposes or sends
- * absolute positions. Usage: client PORT REALTIME(0|1) CPU(-1: any) STYLE(hold|superpose|absolute)
+ * absolute positions. Usage: client PORT PRIORITY(0: none) CPU(-1: any) STYLE(hold|superpose|absolute)
  * HANDSHAKE(stanford|ros|none) PACKETS(0: until a second of silence). Prints: received commanded */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -51,7 +51,7 @@ int main(int argc, char **argv) {
     struct timeval patience = {1, 0};
     setsockopt(wire, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
     if (atoi(argv[2])) {
-        struct sched_param priority = {.sched_priority = 80};
+        struct sched_param priority = {.sched_priority = atoi(argv[2])};
         sched_setscheduler(0, SCHED_FIFO, &priority);
         mlockall(MCL_CURRENT | MCL_FUTURE);
     }

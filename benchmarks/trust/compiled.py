@@ -25,12 +25,12 @@ def start(
     program: Path,
     port: int,
     *,
-    realtime: bool = False,
+    priority: int = 0,
     cpu: int = -1,
     style: str = "hold",
     handshake: str = "stanford",
     packets: int = 0,
 ) -> subprocess.Popen[str]:
-    """Start it; its output is `received commanded`."""
-    command = [str(program), str(port), str(int(realtime)), str(cpu), style, handshake, str(packets)]
+    """Start it, with a priority of SCHED_FIFO or none (0); its output is `received commanded`."""
+    command = [str(program), str(port), str(priority), str(cpu), style, handshake, str(packets)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

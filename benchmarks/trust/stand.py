@@ -106,6 +106,11 @@ class _TimedTurnaround(Turnaround):
     def __init__(self, loop: Loop, control: Control, clock: Clock) -> None:
         super().__init__(loop.remote.descriptor, loop.remote.buffer, control.words)
         self._clock = clock
+        self.held_up = False
+
+    def take_waiting(self) -> bool:
+        """The first packet of a cycle comes while the loop looks out for it; more of them wait."""
+        return self.held_up and super().take_waiting()
 
     @property
     def received_ns(self) -> int:
@@ -304,9 +309,14 @@ class Stand:
 
     def _serve(self) -> None:
         """Let the loop handle all that waits for it, and look at its requests."""
+        ahead = self.loop.turnaround
         self.loop.cycle(0.0)
         while self.loop.remote.pending():
+            if isinstance(ahead, _TimedTurnaround):
+                ahead.held_up = True
             self.loop.cycle(0.0)
+        if isinstance(ahead, _TimedTurnaround):
+            ahead.held_up = False
 
     def _collect(self, packet: bytes) -> None:
         session, cycle = self.session, self.cycle_number

@@ -74,7 +74,8 @@ def commission(
     if not parts:
         raise DataError("no session given; name at least one healthy session")
     sides: tuple[Side, ...] = ("link", "motor") if np.any(_known(chain, arm).compliance > 0.0) else ("link",)
-    first = _recordings(parts[0], chain, settings)
+    recorded = [_recordings(part, chain, settings) for part in parts]
+    first = recorded[0]
     start = replace(_known(chain, arm), encoder_known=True)
     # Both sides in bins in which the links' ringing is not seen, or the one that rings would be at a loss.
     slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
@@ -84,28 +85,26 @@ def commission(
     log.info("positions of the %s", tuned.encoder)
     _, tuned, base = _tuned(tuned, first, settings, _ROUNDS)
     several = [tuned]
-    for part in parts[1:_TUNING_SETS]:
-        several.append(_tuned(tuned, _recordings(part, chain, settings), settings, 1)[1])
+    for recordings in recorded[1:_TUNING_SETS]:
+        several.append(_tuned(tuned, recordings, settings, 1)[1])
     known = _middle(several)
-    days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
+    days = [_day(known, recordings, settings, base) for recordings in recorded]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
         # How late a channel seems depends on how friction turns at reversals, so its delay is settled last.
-        days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
+        days = [_day(known, recordings, settings, base) for recordings in recorded]
         late = {side: float(np.mean([day.late[side] for day in days])) for side in ("motor", "joint")}
         known = replace(
             known,
             motor_delay_s=known.motor_delay_s + late["motor"],
             joint_delay_s=known.joint_delay_s + late["joint"],
         )
-    days = [_day(known, _recordings(part, chain, settings), settings, base) for part in parts]
+    days = [_day(known, recordings, settings, base) for recordings in recorded]
     null: dict[tuple[str, int], float] = {}
-    for number, part in enumerate(parts):
+    for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
         rest = _reference(others, base, known, robot, parts[0], {}) if len(others) >= _ENOUGH - 1 else None
-        bench = prepare_bench(
-            known, _recordings(part, chain, settings), settings, rest, None, fit_compliance=False
-        )
+        bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         for key, gain in gains(bench.dictionary, bench.evidence, settings).items():
             null[key] = null.get(key, 0.0) + gain / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))

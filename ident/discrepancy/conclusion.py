@@ -290,7 +290,7 @@ def _encompassed(
         return 0.0
     others = [c.trial.rows for c in claims if c is not claim]
     bench.evidence.replace([*others, *nuisance, *(rows for r in remainders for rows in r.rows)])
-    again = bench.dictionary.trial(claim.trial.candidate, claim.trial.shape, 1)
+    again = bench.dictionary.trial(claim.trial.candidate, claim.trial.shape)
     return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain
 
 

@@ -24,14 +24,14 @@ _IN_EACH = 4.0
 _PADDING = 4
 
 
-def find_line(evidence: Evidence, side: str, joint: int) -> tuple[float, Rows, int] | None:
+def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tuple[float, Rows, int] | None:
     """Frequency [Hz] of the strongest line in the rows of a joint (from 0) and side, its columns, and the number of
     frequencies that it was chosen from; None where none stands out.
 
+    residual : (m,) of these rows [Nm], NaN where a row is not used.
     Columns: a cosine and a sine for each session that is fitted, for nothing ties the phases of two together.
     """
     rows = evidence.nominal.rows[side]
-    residual = evidence.residuals()[side][:, joint]
     parts = [
         _not_repeating(evidence, side, residual, int(session))
         for session in np.unique(rows.session[~rows.test])

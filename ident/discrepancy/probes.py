@@ -50,12 +50,13 @@ def find_remainders(
     """Remainders beside the columns that the evidence holds, largest first; at most two variables each."""
     fixed = list(evidence.extra)
     found = []
-    variables = hats_of(dictionary)
+    variables, residuals = hats_of(dictionary), evidence.residuals()
     for side in evidence.nominal.rows:
         for joint in range(evidence.nominal.arm.chain.n):
             if evidence.mask[side, joint].sum() < 100:
                 continue
-            remainder = _one(dictionary, evidence, settings, variables, side, joint)
+            line = find_line(evidence, side, joint, residuals[side][:, joint])
+            remainder = _one(dictionary, evidence, settings, variables, line, side, joint)
             evidence.replace(fixed)
             if remainder is not None:
                 found.append(remainder)
@@ -67,6 +68,7 @@ def _one(
     evidence: Evidence,
     settings: DiagnosisSettings,
     variables: Mapping[str, Sequence[Floats]],
+    line: tuple[float, Rows, int] | None,
     side: str,
     joint: int,
 ) -> Remainder | None:
@@ -79,7 +81,6 @@ def _one(
     fixed = list(evidence.extra)
     taken: list[Rows] = []
     line_hz = 0.0
-    line = find_line(evidence, side, joint)
     if line is not None:
         frequency, waves, choices = line
         score = evidence.score(evidence.padded(waves))

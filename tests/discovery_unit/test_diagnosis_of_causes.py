@@ -201,23 +201,27 @@ def test_zero_of_each_session_is_no_function_of_the_angle(
     assert found.parameters["zero"].value == pytest.approx(-0.12, abs=0.02)
 
 
-def test_unknown_physics_is_not_named_with_confidence(make: Make, chain: Chain) -> None:
-    def strange(s: Signals) -> None:
-        s["motor"][:, 1] += 0.12 * np.sign(s["qd"][:, 1]) * np.sin(2.0 * s["q"][:, 0])
-
-    found = diagnose(pair(make, strange), chain)
-    assert all(f.confidence < 0.8 for f in found.findings)
-    assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
-
-
-def test_no_name_is_sure_where_the_unknown_explains_the_same(
-    make: Make, chain: Chain, reference: Reference
+@pytest.mark.parametrize(
+    ("size", "turns", "phase", "commissioned"),
+    [
+        (0.12, 2.0, -0.5 * np.pi, False),
+        # The base parameters share what the drive shows with the sensor's rows, and something fits it there.
+        (0.15, 1.0, 0.8, True),
+    ],
+)
+def test_unknown_physics_is_not_named_with_confidence(
+    make: Make,
+    chain: Chain,
+    reference: Reference,
+    size: float,
+    turns: float,
+    phase: float,
+    commissioned: bool,
 ) -> None:
     def strange(s: Signals) -> None:
-        # The base parameters share what the drive shows with the sensor's rows, and something fits it there.
-        s["motor"][:, 1] += 0.15 * np.sign(s["qd"][:, 1]) * np.cos(s["q"][:, 0] + 0.8)
+        s["motor"][:, 1] += size * np.sign(s["qd"][:, 1]) * np.cos(turns * s["q"][:, 0] + phase)
 
-    found = diagnose(pair(make, strange), chain, reference=reference)
+    found = diagnose(pair(make, strange), chain, reference=reference if commissioned else None)
     assert all(f.confidence < 0.8 for f in found.findings)
     assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
 
