@@ -69,6 +69,7 @@ class _Link:
         self._under_way: dict[bytes, tuple[float, int]] = {}
         self._open: tuple[bytes, float] | None = None
         self._packet = b""
+        self._looked = 0.0
         self.latency: list[float] = []
         self.lateness: list[float] = []
 
@@ -92,7 +93,7 @@ class _Link:
         packet = self._packet
         if not packet:
             return
-        left = time.monotonic()
+        left = self._looked = time.monotonic()
         self._open = packet[:2], left
         try:
             self._wire.send(packet)
@@ -104,7 +105,8 @@ class _Link:
             self.lateness.append(left - due)
 
     def look(self) -> None:
-        """Take an answer, if one is there."""
+        """Take an answer, if one is there. How long the sender did not look for it counts as late as well."""
+        before, self._looked = self._looked, time.monotonic()
         try:
             answer = self._wire.recv(CMD_SIZE + 1)
         except BlockingIOError:
@@ -113,9 +115,10 @@ class _Link:
             self._open = None
             return
         now = time.monotonic()
-        before, place = self._under_way.pop(answer[2:4], (now, -1))
+        left, place = self._under_way.pop(answer[2:4], (now, -1))
         if place >= 0:
-            self.latency[place] = now - before
+            self.latency[place] = now - left
+            self.lateness[place] = max(self.lateness[place], now - before)
         if self._open is not None and answer[2:4] == self._open[0]:
             self.session.receive(answer, min(now - self._open[1], self._period_ms * 0.999e-3))
             self._open = None
