@@ -243,9 +243,17 @@ class RemoteEnd:
         """Where datagrams are received."""
         return self._msr.buffer
 
-    def foresee(self, jnt_pos: np.ndarray, out: memoryview) -> int | None:
-        """Write what ``answer(jnt_pos)`` will send if the next packet is the next one in command mode, still in
-        position control with drives on.
+    @property
+    def foreseen(self) -> int | None:
+        """Counter of the next packet; None if the answer to it depends on more than its being the next one in
+        command mode, still in position control with drives on.
+        """
+        if self._torque_set or self._flags_control != Control.POSITION:
+            return None
+        return self._tracker.expected
+
+    def foresee(self, jnt_pos: np.ndarray, out: memoryview, ahead: int = 0) -> None:
+        """Write what ``answer(jnt_pos)`` will send to the packet that comes `ahead` packets after the next one.
 
         Parameters
         ----------
@@ -253,19 +261,20 @@ class RemoteEnd:
             (7,) float32, finite [rad].
         out : memoryview
             The 376 bytes of the answer.
+        ahead : int
+            How many packets come, and are answered, before it.
 
-        Returns
-        -------
-        int or None
-            Counter that the packet must have; None if the answer depends on more than that.
+        Raises
+        ------
+        RuntimeError
+            ``foreseen`` is None.
         """
-        expected = self._tracker.expected
-        if expected is None or self._torque_set or self._flags_control != Control.POSITION:
-            return None
+        expected = self.foreseen
+        if expected is None:
+            raise RuntimeError("no answer can be told beforehand: the next packet is not known")
         out[:] = self._out
         out[_JNT_POS] = jnt_pos.data.cast("B")
-        self._pack_sequence(out, 0, (self.send_seq + 1) & 0xFFFF, expected)
-        return expected
+        self._pack_sequence(out, 0, (self.send_seq + 1 + ahead) & 0xFFFF, (expected + ahead) & 0xFFFF)
 
     def receive(
         self, timeout_s: float, arrived: tuple[int, tuple[str, int], int] | None = None

@@ -9,6 +9,8 @@ is where it would have been. In between the controller extrapolates.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +20,55 @@ from lwr_driver.guard import Guard, Violation
 from lwr_driver.ring import NO_PHASE
 from lwr_driver.stop import Stop
 
-__all__ = ["BRAKE", "HOLD", "Commander"]
+__all__ = ["BRAKE", "HOLD", "Commander", "Foreseen"]
 
 HOLD, BRAKE = 0, 1
 """Numbers of the phases that the loop itself gives to rows: holding, and stopping before the end of a
 motion.
 """
+
+
+# Values that are foreseen anew in a cycle: one is used up, and it must not take long.
+_MORE = 3
+
+
+class Foreseen(NamedTuple):
+    """values : (7,) float32 each [rad], the last `new` of them not told before; room : how far arm and set point
+    may be from the value sent before for it to hold [rad]."""
+
+    values: list[NDArray[np.float32]]
+    new: int
+    room: float
+
+
+class _Ahead:
+    """Values of the packets from `sequence` on, passed by a guard that has seen those before.
+
+    sent : how many values have been sent altogether. state : in which they hold. cycles : from the last value
+    sent to the first of these
+    """
+
+    def __init__(self, sequence: int, sent: int, state: object, guard: Guard, cycles: int) -> None:
+        self._sequence, self._sent, self._state = sequence, sent, state
+        self._guard, self._cycles = guard, cycles
+        self.values: list[NDArray[np.float32]] = []
+
+    def advance(self, sequence: int, sent: int, state: object) -> bool:
+        """Drop what has been sent; False if anything else has happened than that each packet got its value."""
+        used = sent - self._sent
+        if state != self._state or used != sequence - self._sequence or used > len(self.values):
+            return False
+        del self.values[:used]
+        self._sequence, self._sent = sequence, sent
+        return True
+
+    def add(self, value: NDArray[np.float32]) -> bool:
+        """Append a value if the guard lets it pass."""
+        if self._guard.check(value, self._cycles) is not None:
+            return False
+        self._cycles = 1
+        self.values.append(value)
+        return True
 
 
 class Commander:
@@ -51,6 +96,8 @@ class Commander:
         self._guard: Guard
         self._stop: Stop
         self._since_sent = 0  # cycles since `target` was sent
+        self._sent = 0  # values, altogether
+        self._ahead: _Ahead | None = None
         self._past = np.zeros((3, JOINTS))  # rows commanded in that cycle and in the two before it
         self._hold = np.zeros(JOINTS)
         self._base, self._rows = 0, 0
@@ -132,24 +179,39 @@ class Commander:
                 f"limit {limit:.3f} rad {self.place()}; something holds the arm, or it does not follow",
             )
 
-    def foresee(self, sequence: int, rows: int) -> tuple[NDArray[np.float32], float] | None:
-        """What `command` will give for packet number `sequence`, the next one, without any effect: the value
-        (7,), and how far arm and set point may be from the last value sent for it to hold [rad].
+    def foresee(self, sequence: int, rows: int, most: int = 1) -> Foreseen | None:
+        """What `command` will give for packet number `sequence`, the next one, and up to `most` from there on, if
+        each of them comes and nothing new is asked for; without any effect.
 
         rows : of a motion that is to begin with that packet, 0 for none. None where the value is not known
         beforehand, or does not pass the guard.
         """
-        room = np.inf
+        room, begins = np.inf, False
         if self.mode is Mode.MOTION:
-            row = self._plan[min(sequence - self._base, self._rows - 1)]
             room = self._tracking_limit
+            most = max(1, min(most, self._base + self._rows - sequence))
         elif self.mode is Mode.HOLD:
-            row = self._plan[0] if rows > 0 and self._begins_here() else self._hold
+            begins = rows > 0 and self._begins_here()
+            most = 1 if begins else most
         else:
+            self._ahead = None
             return None
-        target = row.astype(np.float32)
-        violation = self._guard.check(target, self._since_sent + 1, remember=False)
-        return (target, room) if violation is None else None
+        ahead = self._ahead
+        state = (self.mode, self._base, self._rows, begins)
+        if ahead is None or not ahead.advance(sequence, self._sent, state) or len(ahead.values) > most:
+            ahead = self._ahead = _Ahead(
+                sequence, self._sent, state, self._guard.copy(), self._since_sent + 1
+            )
+        new = 0
+        while new < _MORE and len(ahead.values) < most:
+            if self.mode is Mode.MOTION:
+                row = self._plan[min(sequence + len(ahead.values) - self._base, self._rows - 1)]
+            else:
+                row = self._plan[0] if begins else self._hold
+            if not ahead.add(row.astype(np.float32)):
+                break
+            new += 1
+        return Foreseen(ahead.values, new, room) if ahead.values else None
 
     def begin(self, rows: int, sequence: int) -> None:
         """Begin the motion of `rows` rows that lies in the shared memory with packet number `sequence`."""
@@ -255,6 +317,7 @@ class Commander:
             past[:] = self._hold
         self.target = target
         self._since_sent = 0
+        self._sent += 1
 
     def _end(self, result: Result, reason: str) -> None:
         """A motion or a stop is over and the arm holds."""

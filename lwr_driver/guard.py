@@ -16,6 +16,7 @@ account for, and by nothing else.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,12 @@ class Guard:
         self._h1 = self._h2 = self._period
         np.maximum(self._half, np.abs(self._q - self._middle), out=self._bounds[0])
         self._outside = bool(np.any(self._bounds[0] > self._half))
+
+    def copy(self) -> Guard:
+        """Another guard that has seen the same values."""
+        twin = copy(self)
+        twin._bounds = self._bounds.copy()
+        return twin
 
     def scale_velocity(self, factor: float) -> None:
         """Shrink the velocity limit by the controller's `safety_limits`, where that is below 1."""

@@ -1,4 +1,4 @@
-"""The answer that is ready before its packet comes, and the compiled wait that sends it.
+"""Answers that are ready before their packets come, and the compiled wait that sends them.
 
 Between a packet and its answer the loop's own code takes some 50 us, and several times that when a long cycle
 has let the processor's caches go cold. So the loop decides in the quiet part of a cycle what the next packet
@@ -9,6 +9,10 @@ packet or a request of the driver, is left to the loop as if this module were no
 
 Afterwards the loop takes the packet through its ordinary code, which comes to the same answer from the same
 numbers; it compares the bytes and does not send again.
+
+A computer that stood still for some cycles finds their packets waiting. Where the answers to several packets are
+known beforehand, all that wait and are regular are answered one after the other, each as if it had come alone,
+before the loop's own code takes them in turn; it would stay late for much longer if they had to wait for that.
 
 Importing this module compiles it, or takes the compiled code from the cache, and loads the compiler's 300 MB;
 only a loop with real-time rights does.
@@ -32,7 +36,10 @@ from lwr_driver.control import Word
 
 __all__ = ["Turnaround"]
 
-_NOTHING, _ARRIVED, _SENT, _ASKED = 0, 1, 2, 3
+# A power of two, since counters wrap at 65536.
+_MOST = 16
+
+_NOTHING, _ARRIVED, _ASKED = 0, 1, 2
 # Asleep it looks at the requests so often: a motion that is asked for shortly before a packet is begun by it.
 _NAP_NS = 250_000
 _CLOCK_MONOTONIC, _DONTWAIT, _POLLIN = 1, int(socket.MSG_DONTWAIT), int(select.POLLIN)
@@ -123,19 +130,43 @@ def _regular(shorts: Any, floats: Any, sequence: Any, sample_time: Any, sent: An
     return good and shorts[_AT_SEQ] == sequence
 
 
+@njit("boolean(int64, uint8[::1], int64[::1], int64[::1], int64[::1])", cache=True)
+def _take(descriptor: Any, datagram: Any, end: Any, found: Any, scratch: Any) -> Any:
+    """Take a datagram if one waits: length and instant into `found`, the sender into `end`."""
+    scratch[3] = 16
+    length = _recvfrom(
+        descriptor, datagram.ctypes.data, datagram.size, _DONTWAIT, end.ctypes.data, scratch[3:].ctypes.data
+    )
+    found[0], found[1], found[2] = length, _now(scratch[1:3]), 0
+    return length >= 0
+
+
+@njit("boolean(int64, uint8[::1], int64[::1], int64[::1], int64[::1])", cache=True)
+def _answer(descriptor: Any, answer: Any, controller: Any, found: Any, scratch: Any) -> Any:
+    """Send an answer, the instant into `found`."""
+    length = _sendto(descriptor, answer.ctypes.data, CMD_SIZE, _DONTWAIT, controller.ctypes.data, 16)
+    if length != CMD_SIZE:
+        return False
+    found[2] = _now(scratch[1:3])
+    return True
+
+
 @njit(
-    "int64(int64, uint8[::1], uint16[::1], float32[::1], int64[::1], uint8[::1], boolean, int64, float32,"
-    "float32[::1], float32, int64[::1], int64[::1], int64[::1], int64[::1], int64[::1], int64, int64, int64)",
+    "UniTuple(int64, 2)(int64, uint8[:, ::1], uint16[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1],"
+    "uint8[:, ::1], float32[:, ::1], int64, int64, float32, float32[::1], float32, int64[::1], int64[::1],"
+    "int64[::1], int64[:, ::1], int64[::1], int64, int64, int64)",
     cache=True,
 )
 def _turn(
     descriptor: Any,
-    datagram: Any,
+    datagrams: Any,
     shorts: Any,
     floats: Any,
     ends: Any,
-    answer: Any,
-    armed: Any,
+    controller: Any,
+    answers: Any,
+    targets: Any,
+    ready: Any,
     sequence: Any,
     sample_time: Any,
     sent: Any,
@@ -149,122 +180,132 @@ def _turn(
     asleep: Any,
     patience: Any,
 ) -> Any:
-    """Wait, and answer a regular packet; see `Turnaround.wait`.
+    """Wait, and answer regular packets; see `Turnaround.wait`. How it ended, and how many datagrams were taken.
 
-    ends : sockaddr_in of the sender, then of the controller. found : length, instants of arrival and of the
-    answer [ns]. scratch : pollfd, time, length of an address. awake, asleep, patience : from now [ns]
+    ends : sockaddr_in of the senders. answers, targets : by counter modulo their number, `ready` of them from
+    `sequence` on. found : length, instants of arrival and of the answer [ns], for each datagram.
+    scratch : pollfd, time, length of an address. awake, asleep, patience : from now [ns]
     """
     time = scratch[1:3]
     start = _now(time)
-    while True:
-        scratch[3] = 16
-        length = _recvfrom(
-            descriptor,
-            datagram.ctypes.data,
-            datagram.size,
-            _DONTWAIT,
-            ends.ctypes.data,
-            scratch[3:].ctypes.data,
-        )
-        now = _now(time)
-        if length >= 0:
-            break
+    while not _take(descriptor, datagrams[0], ends[0], found[0], scratch):
         if _asked(words, seen, watched):
-            return _ASKED
-        passed = now - start
+            return _ASKED, 0
+        passed = found[0, 1] - start
         if passed >= patience:
-            return _NOTHING
+            return _NOTHING, 0
         if awake <= passed < asleep:
             # Of the packet before: what is found does not matter, only that the code and the data are at hand.
-            scratch[4] = _regular(shorts, floats, sequence, sample_time, sent, room)
+            scratch[4] = _regular(shorts[0], floats[0], sequence, sample_time, sent, room)
             continue
         nap = min(_NAP_NS, patience - passed)
         if passed < awake:
             nap = min(nap, awake - passed)
         time[0], time[1] = 0, nap
         _ppoll(scratch.ctypes.data, 1, time.ctypes.data, 0)
-    found[0], found[1] = length, now
-    if (
-        armed
-        and length == MSR_SIZE
-        and ends[0] == ends[2]
-        and _regular(shorts, floats, sequence, sample_time, sent, room)
-        and not _asked(words, seen, watched)
-        and _sendto(descriptor, answer.ctypes.data, CMD_SIZE, _DONTWAIT, ends[2:].ctypes.data, 16) == CMD_SIZE
-    ):
-        found[2] = _now(time)
-        return _SENT
-    return _ARRIVED
+    last = sent
+    taken = 1
+    for place in range(ready):
+        counter = (sequence + place) % 65536
+        slot = counter % len(answers)
+        if not (
+            answers[slot, 2] + 256 * answers[slot, 3] == counter
+            and found[place, 0] == MSR_SIZE
+            and ends[place, 0] == controller[0]
+            and _regular(shorts[place], floats[place], counter, sample_time, last, room)
+            and not _asked(words, seen, watched)
+            and _answer(descriptor, answers[slot], controller, found[place], scratch)
+        ):
+            break
+        last = targets[slot]
+        if place + 1 == ready or not _take(descriptor, datagrams[taken], ends[taken], found[taken], scratch):
+            break
+        taken += 1
+    return _ARRIVED, taken
 
 
 class Turnaround:
-    """Waits for a packet on the socket `descriptor`, into `buffer` [bytes], and answers a regular one.
+    """Waits for a packet on the socket `descriptor`, and answers regular ones; what comes is put into `buffer`
+    [bytes], one datagram after the other.
 
     words : shared words of `Control`; a request that is new keeps a packet from being answered here
 
-    arrived : whether `wait` has put a datagram into the buffer; sent : and has answered it
+    most : packets that answers may be ready for
+    arrived : whether there is a datagram in the buffer; sent : and it has been answered
     length, source : of the datagram; received_ns, sent_ns : CLOCK_MONOTONIC
     """
 
     def __init__(self, descriptor: int, buffer: bytearray, words: NDArray[np.int64]) -> None:
+        self.most = _MOST
         self._descriptor, self._words = descriptor, words
-        self._datagram = np.frombuffer(buffer, np.uint8)
-        self._shorts = np.frombuffer(buffer, np.uint16, MSR_SIZE // 2)
-        self._floats = np.frombuffer(buffer, np.float32, MSR_SIZE // 4)
-        self._ends, self._found = np.zeros(4, np.int64), np.zeros(3, np.int64)
-        self._scratch = np.zeros(5, np.int64)
+        self._buffer = np.frombuffer(buffer, np.uint8)
+        self._datagrams = np.zeros((self.most, -(-len(buffer) // 4) * 4), np.uint8)
+        self._shorts, self._floats = self._datagrams.view(np.uint16), self._datagrams.view(np.float32)
+        self._ends, self._found = np.zeros((self.most, 2), np.int64), np.zeros((self.most, 3), np.int64)
+        self._controller, self._scratch = np.zeros(2, np.int64), np.zeros(5, np.int64)
         self._scratch[0] = descriptor | _POLLIN << 32
         self._seen = words.copy()
-        self._target = np.zeros(JOINTS, np.float32)
-        self._armed, self._sequence, self._sample_time, self._room = False, 0, 0.0, 0.0
-        self.answer = np.zeros(CMD_SIZE, np.uint8)
-        self.answer_bytes = self.answer.data
+        self._last = np.zeros(JOINTS, np.float32)
+        self._ready, self._sequence, self._sample_time, self._room = 0, 0, 0.0, 0.0
+        self._place, self._taken = 0, 0
+        # By their counter modulo their number.
+        self._answers = np.zeros((self.most, CMD_SIZE), np.uint8)
+        self._targets = np.zeros((self.most, JOINTS), np.float32)
         self.arrived = self.sent = False
 
     def disarm(self) -> NDArray[np.int64]:
         """Have nothing ready; the words (64,) as they are now, to which requests are compared."""
-        self._armed = False
+        self._ready = 0
         self._seen[:] = self._words
         return self._seen
+
+    def slot(self, counter: int, target: NDArray[np.float32]) -> memoryview:
+        """Where the answer to the packet with that counter, with the value `target` (7,) [rad], is to be written."""
+        place = counter % self.most
+        self._targets[place] = target
+        return self._answers[place].data
 
     def arm(
         self,
         controller: tuple[str, int],
         sequence: int,
+        ready: int,
         sample_time_s: float,
-        target: NDArray[np.float32],
+        last: NDArray[np.float32],
         room: float,
     ) -> None:
-        """Have `answer` ready for the packet with the counter `sequence` from `controller`.
+        """Have answers ready for `ready` packets with the counters from `sequence` on, from `controller`.
 
-        sample_time_s : that the packet must name. target, room : value sent last (7,) [rad], and how far the
-        measured position and the set point may be from it
+        sample_time_s : that the packets must name. last, room : value sent last (7,) [rad], and how far the
+        measured position and the set point may be from the value sent before them
         """
         host, port = controller
         family = socket.AF_INET.to_bytes(2, "little")
         address = _SOCKADDR.pack(family, port, socket.inet_aton(host))
-        self._ends[2:] = np.frombuffer(address, np.int64)
+        self._controller[:] = np.frombuffer(address, np.int64)
         self._sequence, self._sample_time = sequence, sample_time_s
-        self._target[:] = target
+        self._last[:] = last
         # As float32, and no wider.
         self._room = float(np.nextafter(np.float32(room), np.float32(0.0)))
-        self._armed = True
+        self._ready = ready
 
     def wait(self, awake_ns: int, asleep_ns: int, patience_ns: int) -> bool:
         """Wait for a datagram for `patience_ns`, from `awake_ns` until `asleep_ns` without sleeping, all from
         now on; what came is in the attributes. True if a new request ended the waiting.
         """
-        status = _turn(
+        status, self._taken = _turn(
             self._descriptor,
-            self._datagram,
+            self._datagrams,
             self._shorts,
             self._floats,
             self._ends,
-            self.answer,
-            self._armed,
+            self._controller,
+            self._answers,
+            self._targets,
+            self._ready,
             self._sequence,
             self._sample_time,
-            self._target,
+            self._last,
             self._room,
             self._words,
             self._seen,
@@ -275,33 +316,46 @@ class Turnaround:
             asleep_ns,
             patience_ns,
         )
-        self.sent = status == _SENT
-        self.arrived = self.sent or status == _ARRIVED
+        self._place = -1
+        self.next()
         return bool(status == _ASKED)
 
-    def take_waiting(self) -> bool:
-        """Take a datagram that waits already, with nothing ready; False if there is none."""
-        self.disarm()
-        self.wait(0, 0, 0)
+    @property
+    def waiting(self) -> int:
+        """Datagrams that were taken and are still to be put into the buffer."""
+        return max(self._taken - self._place - 1, 0)
+
+    def next(self) -> bool:
+        """Put the next of the datagrams that were taken into the buffer; False if there is none."""
+        self._place += 1
+        self.arrived = self._place < self._taken
+        self.sent = self.arrived and self.sent_ns > 0
+        if self.arrived:
+            self._buffer[:] = self._datagrams[self._place, : len(self._buffer)]
         return self.arrived
+
+    @property
+    def answer_bytes(self) -> memoryview:
+        """The 376 bytes that the datagram in the buffer was answered with, if it was."""
+        return self._answers[(self._sequence + self._place) % self.most].data
 
     @property
     def length(self) -> int:
         """Bytes of the datagram."""
-        return int(self._found[0])
+        return int(self._found[self._place, 0])
 
     @property
     def source(self) -> tuple[str, int]:
         """Host and port that it came from."""
-        _, port, host = _SOCKADDR.unpack(self._ends[:2].tobytes())
+        _, port, host = _SOCKADDR.unpack(self._ends[self._place].tobytes())
         return socket.inet_ntoa(host), port
 
     @property
     def received_ns(self) -> int:
         """When it came."""
-        return int(self._found[1])
+        return int(self._found[self._place, 1])
 
     @property
     def sent_ns(self) -> int:
-        """When the answer had been sent."""
-        return int(self._found[2])
+        """When the answer had been sent, 0 for not at all."""
+        return int(self._found[self._place, 2])

@@ -106,11 +106,6 @@ class _TimedTurnaround(Turnaround):
     def __init__(self, loop: Loop, control: Control, clock: Clock) -> None:
         super().__init__(loop.remote.descriptor, loop.remote.buffer, control.words)
         self._clock = clock
-        self.held_up = False
-
-    def take_waiting(self) -> bool:
-        """The first packet of a cycle comes while the loop looks out for it; more of them wait."""
-        return self.held_up and super().take_waiting()
 
     @property
     def received_ns(self) -> int:
@@ -119,8 +114,8 @@ class _TimedTurnaround(Turnaround):
 
     @property
     def sent_ns(self) -> int:
-        """When its answer had been sent."""
-        return self._clock.now_ns
+        """When its answer had been sent, 0 for not at all."""
+        return self._clock.now_ns if super().sent_ns else 0
 
 
 class Stand:
@@ -311,12 +306,8 @@ class Stand:
         """Let the loop handle all that waits for it, and look at its requests."""
         ahead = self.loop.turnaround
         self.loop.cycle(0.0)
-        while self.loop.remote.pending():
-            if isinstance(ahead, _TimedTurnaround):
-                ahead.held_up = True
+        while self.loop.remote.pending() or (ahead is not None and ahead.waiting):
             self.loop.cycle(0.0)
-        if isinstance(ahead, _TimedTurnaround):
-            ahead.held_up = False
 
     def _collect(self, packet: bytes) -> None:
         session, cycle = self.session, self.cycle_number

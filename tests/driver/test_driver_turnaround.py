@@ -38,19 +38,16 @@ class Watched(Turnaround):
         remote = rig.loop.remote
         super().__init__(remote.descriptor, remote.buffer, rig.control.words)
         self.answered = 0
-        self.held_up = False
+        self.batches: list[int] = []
         self.before: Callable[[], None] | None = None
         self.after: Callable[[], None] | None = None
-
-    def take_waiting(self) -> bool:
-        # The packets of the rig are sent before the loop looks out for them.
-        return self.held_up and super().take_waiting()
 
     def wait(self, awake_ns: int, asleep_ns: int, patience_ns: int) -> bool:
         if self.before is not None:
             hook, self.before = self.before, None
             hook()
         asked = super().wait(awake_ns, asleep_ns, patience_ns)
+        self.batches.append(int(np.count_nonzero(self._found[: self._taken, 2])))
         self.answered += self.sent
         if self.after is not None:
             hook, self.after = self.after, None
@@ -226,17 +223,6 @@ def test_zero_below_nought_is_the_motions_and_not_the_holds(twins):
     t.check_same()
 
 
-def test_packet_that_waits_already_is_answered_without_preparations(twins):
-    t = twins()
-    motion = t.in_motion(10)
-    t.ahead.held_up = True
-    assert t.cycles(5) == 0
-    t.ahead.held_up = False
-    assert t.until_done() == len(motion) - 15
-    assert t.result is Result.DONE
-    t.check_same()
-
-
 def test_counters_wrap(twins):
     t = twins()
     # Their first packet has not been sent.
@@ -246,6 +232,117 @@ def test_counters_wrap(twins):
     assert t.cycles(60) == 60
     assert t.session.send_seq < 100
     assert t.loop.remote.send_seq < 100
+    t.check_same()
+
+
+# -- packets that wait, because the computer stood still --------------------------------------------------------
+
+
+def heap(t: Twins, count: int, alter: Callable[[int, bytes], bytes] = lambda n, packet: packet) -> int:
+    """So many packets come before either loop looks; how many answers left ahead. The controller bridges what it
+    missed, as if the answers came in time.
+    """
+    ahead = 0
+    for rig, heard in zip(t.rigs, t.heard, strict=True):
+        setpoints = []
+        for number in range(count):
+            rig.end.send(alter(number, rig.session.packet(rig.sample)))
+            setpoints.append(rig.session.close_cycle())
+            rig.interpreter.advance(rig.period_ms)
+            rig.cycle_number += 1
+        for _ in range(count):
+            rig.loop.cycle(0.0)
+            ahead += rig is t.rigs[0] and t.ahead.sent
+        while rig.end.receive(0.0) is not None:
+            pass
+        rig.sample.msr_jnt_pos[:] = setpoints[-1].position
+        assert len(heard) == len(t.heard[0])
+    assert t.heard[0] == t.heard[1]
+    return ahead
+
+
+BRIDGED = {
+    "policy": {"bridged_cycles": 100, "hold_quality": 0, "perfect_rate": 0.0, "ok_rate": 0.0, "bad_rate": 0.0}
+}
+
+
+@pytest.mark.parametrize("moving", [True, False], ids=["motion", "hold"])
+@pytest.mark.parametrize("count", [2, 7, 16, 21])
+def test_packets_that_wait_are_answered_at_once_as_one_by_one(twins, moving, count):
+    t = twins(1, **BRIDGED)
+    motion = t.in_motion()
+    if not moving:
+        t.until_done()
+        t.cycles(12)
+    t.ahead.batches.clear()
+    assert heap(t, count) == count
+    assert t.ahead.batches[0] == min(count, 16)
+    assert t.cycles(5) == 5
+    if moving:
+        assert t.until_done() == len(motion) - 20 - count - 5
+        assert t.result is Result.DONE
+    t.check_same()
+
+
+def test_end_of_a_motion_among_packets_that_wait(twins):
+    t = twins(**BRIDGED)
+    motion = t.in_motion()
+    t.cycles(len(motion) - 20 - 4)
+    t.ahead.batches.clear()
+    assert heap(t, 9) == 9
+    # What comes after the end is asked for anew.
+    assert t.ahead.batches[0] == 4
+    assert t.result is Result.DONE
+    assert t.mode is Mode.HOLD
+    t.check_same()
+
+
+@pytest.mark.parametrize("place", [1, 4])
+@pytest.mark.parametrize(
+    "what", ["drives off", "position impossible", "short", "counter far on", "timestamp"]
+)
+def test_spoilt_packet_among_those_that_wait(twins, what, place):
+    t = twins(**BRIDGED)
+    t.in_motion()
+    t.ahead.batches.clear()
+    heap(t, 8, lambda number, packet: SPOILT[what](packet) if number == place else packet)
+    assert t.ahead.batches[0] == place
+    t.cycles(60)
+    t.check_same()
+
+
+@pytest.mark.parametrize("name", ["msr_jnt_pos", "cmd_jnt_pos_fri_offset"])
+def test_arm_that_does_not_follow_among_packets_that_wait(twins, name):
+    t = twins(**BRIDGED)
+    t.in_motion()
+    spoil = put(name, "<f", 1.0)
+    assert heap(t, 8, lambda number, packet: spoil(packet) if number == 3 else packet) == 3
+    assert t.mode is Mode.STOP
+    t.until_done()
+    assert t.result is Result.ROBOT
+    t.check_same()
+
+
+@pytest.mark.parametrize("job", [Job.LEAVE, Job.HALT])
+def test_request_that_changes_the_answers_is_obeyed_between_packets_that_wait(twins, job):
+    t = twins(program="lwr_identification", **BRIDGED)
+    t.enter()
+    t.cycles(10)
+    t.both(lambda rig: rig.post(job, limit=200))
+    heap(t, 8)
+    assert t.loop.mode is not Mode.SILENT
+    t.until_done()
+    t.check_same()
+
+
+def test_stop_that_is_asked_for_while_packets_wait(twins):
+    t = twins(**BRIDGED)
+    t.in_motion()
+    t.ahead.before = lambda: ask(t.rigs[0], "stop")
+    ask(t.rigs[1], "stop")
+    assert heap(t, 6) == 0
+    assert t.mode is Mode.STOP
+    t.until_done()
     t.check_same()
 
 
@@ -517,7 +614,7 @@ def test_answer_that_is_not_the_loops_own_is_the_last_one(twins):
     rig = t.rigs[0]
 
     def spoil() -> None:
-        t.ahead.answer[150] ^= 1
+        t.ahead._answers[:, 150] ^= 1
 
     t.ahead.before = spoil
     rig.cycle()
@@ -532,7 +629,7 @@ def test_answer_that_is_not_the_loops_own_is_the_last_one(twins):
 def test_answer_that_cannot_leave_is_left_to_the_loop(twins):
     t = twins()
     t.in_motion()
-    t.ahead.before = lambda: t.ahead._ends.__setitem__(2, t.ahead._ends[2] + 1)
+    t.ahead.before = lambda: t.ahead._controller.__setitem__(0, t.ahead._controller[0] + 1)
     assert t.cycle() == 0
     assert t.cycles(3) == 3
     t.check_same()

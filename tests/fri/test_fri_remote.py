@@ -103,11 +103,15 @@ def test_answer_carries_size_id_counters_and_the_mirror(end, controller):
 def test_answer_that_was_foreseen_is_the_one_that_would_be_sent(end, controller):
     q = np.linspace(-1.0, 1.0, 7, dtype=np.float32)
     ahead = bytearray(CMD_SIZE)
-    assert end.foresee(q, memoryview(ahead)) is None
+    assert end.foreseen is None
     exchange(end, controller)
     end.krl_int[15] = 11
-    assert end.foresee(q, memoryview(ahead)) == 101
+    assert end.foreseen == 101
+    second = bytearray(CMD_SIZE)
+    end.foresee(q, memoryview(ahead))
+    end.foresee(-q, memoryview(second), 1)
     assert exchange(end, controller, q, state=State.CMD).tobytes() == bytes(ahead)
+    assert exchange(end, controller, -q, state=State.CMD).tobytes() == bytes(second)
 
 
 def test_answer_that_has_left_is_taken_into_account_and_not_sent_again(end, controller):
@@ -140,7 +144,9 @@ def test_answer_that_depends_on_more_than_the_packet_is_not_foreseen(end, contro
     else:
         controller.send(20_000, timestamp=5.0)
         assert end.receive(0.0) is None
-    assert end.foresee(q, ahead) is None
+    assert end.foreseen is None
+    with pytest.raises(RuntimeError, match="beforehand"):
+        end.foresee(q, ahead)
 
 
 def test_each_packet_is_answered_once(end, controller):
