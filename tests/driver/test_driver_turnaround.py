@@ -6,6 +6,7 @@ what arrived at their controllers against each other, byte for byte.
 
 from __future__ import annotations
 
+import os
 import socket
 import struct
 import subprocess
@@ -344,6 +345,23 @@ def test_stop_that_is_asked_for_while_packets_wait(twins):
     assert t.mode is Mode.STOP
     t.until_done()
     t.check_same()
+
+
+def test_end_of_the_loop_leaves_no_packet_out_that_was_answered(twins):
+    t = twins(1, **BRIDGED)
+    t.in_motion()
+    rig = t.rigs[0]
+    rows = len(t.rings[0].take())
+    for _ in range(6):
+        rig.end.send(rig.session.packet(rig.sample))
+        rig.session.close_cycle()
+    rig.loop.cycle(0.0)
+    assert t.ahead.waiting == 5
+    rig.control.words[Word.QUIT] = 1
+    rig.loop.run(os.getppid())
+    assert len(t.rings[0].take()) == rows + 6
+    assert "would not have given" not in rig.control.text(Text.LEFT)
+    assert "the driver ended" in rig.control.text(Text.LEFT) + rig.reason
 
 
 # -- packets that are not regular ------------------------------------------------------------------------------
