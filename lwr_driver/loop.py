@@ -99,6 +99,7 @@ class Loop:
     ) -> None:
         self._settings, self._control, self._ring = settings, control, ring
         self.turnaround: Turnaround | None = None
+        self._ready_in = Mode.MIRROR  # mode in which the answers that are ready hold
         self._handshake = find_handshake(settings.handshake)
         self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
         self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
@@ -207,7 +208,7 @@ class Loop:
     def _look_out(self, turnaround: Turnaround, timeout_s: float) -> bool:
         """Wait for a packet with the answer ready; False if none came. A new request is taken up at once."""
         remote = self.remote
-        again = not turnaround.next()
+        again = not turnaround.next(more=self._commander.mode is self._ready_in)
         while again:
             self._make_ready(turnaround)
             due = remote.received_ns * 1e-9 + self._period - time.monotonic()
@@ -244,6 +245,7 @@ class Loop:
             remote.foresee(
                 foreseen.values[ahead], turnaround.slot(counter + ahead, foreseen.values[ahead]), ahead
             )
+        self._ready_in = commander.mode
         turnaround.arm(remote.controller, counter, ready, self._sample_time, commander.target, foreseen.room)
 
     def _disagree(self) -> None:

@@ -152,9 +152,66 @@ def _answer(descriptor: Any, answer: Any, controller: Any, found: Any, scratch: 
 
 
 @njit(
+    "int64(int64, uint8[:, ::1], uint16[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], uint8[:, ::1],"
+    "float32[:, ::1], int64, int64, float32, float32[::1], float32, int64[::1], int64[::1], int64[::1],"
+    "int64[:, ::1], int64[::1], int64)",
+    cache=True,
+)
+def _reply(
+    descriptor: Any,
+    datagrams: Any,
+    shorts: Any,
+    floats: Any,
+    ends: Any,
+    controller: Any,
+    answers: Any,
+    targets: Any,
+    ready: Any,
+    sequence: Any,
+    sample_time: Any,
+    sent: Any,
+    room: Any,
+    words: Any,
+    seen: Any,
+    watched: Any,
+    found: Any,
+    scratch: Any,
+    taken: Any,
+) -> Any:
+    """Answer the last of `taken` datagrams, the others of which have their answers, and those that wait, as long as
+    they are regular and an answer is ready; how many are taken then.
+
+    ends : sockaddr_in of the senders. answers, targets : by counter modulo their number, `ready` of them from
+    `sequence` on. sent : value sent before them. found : length, instants of arrival and of the answer [ns], for
+    each datagram. scratch : pollfd, time, length of an address
+    """
+    last = sent
+    if taken > 1:
+        last = targets[(sequence + taken - 2) % len(answers)]
+    while taken <= ready:
+        place = taken - 1
+        counter = (sequence + place) % 65536
+        slot = counter % len(answers)
+        if not (
+            answers[slot, 2] + 256 * answers[slot, 3] == counter
+            and found[place, 0] == MSR_SIZE
+            and ends[place, 0] == controller[0]
+            and _regular(shorts[place], floats[place], counter, sample_time, last, room)
+            and not _asked(words, seen, watched)
+            and _answer(descriptor, answers[slot], controller, found[place], scratch)
+        ):
+            break
+        last = targets[slot]
+        if taken == ready or not _take(descriptor, datagrams[taken], ends[taken], found[taken], scratch):
+            break
+        taken += 1
+    return taken
+
+
+@njit(
     "UniTuple(int64, 2)(int64, uint8[:, ::1], uint16[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1],"
     "uint8[:, ::1], float32[:, ::1], int64, int64, float32, float32[::1], float32, int64[::1], int64[::1],"
-    "int64[::1], int64[:, ::1], int64[::1], int64, int64, int64)",
+    "int64[::1], int64[:, ::1], int64[::1], int64, int64, int64, int64)",
     cache=True,
 )
 def _turn(
@@ -176,24 +233,23 @@ def _turn(
     watched: Any,
     found: Any,
     scratch: Any,
+    taken: Any,
     awake: Any,
     asleep: Any,
     patience: Any,
 ) -> Any:
-    """Wait, and answer regular packets; see `Turnaround.wait`. How it ended, and how many datagrams were taken.
+    """Wait, and answer regular packets; see `Turnaround.wait`. How it ended, and how many datagrams are taken.
 
-    ends : sockaddr_in of the senders. answers, targets : by counter modulo their number, `ready` of them from
-    `sequence` on. found : length, instants of arrival and of the answer [ns], for each datagram.
-    scratch : pollfd, time, length of an address. awake, asleep, patience : from now [ns]
+    Arguments as of `_reply`, `taken` of which have been answered before. awake, asleep, patience : from now [ns]
     """
     time = scratch[1:3]
     start = _now(time)
-    while not _take(descriptor, datagrams[0], ends[0], found[0], scratch):
+    while not _take(descriptor, datagrams[taken], ends[taken], found[taken], scratch):
         if _asked(words, seen, watched):
-            return _ASKED, 0
-        passed = found[0, 1] - start
+            return _ASKED, taken
+        passed = found[taken, 1] - start
         if passed >= patience:
-            return _NOTHING, 0
+            return _NOTHING, taken
         if awake <= passed < asleep:
             # Of the packet before: what is found does not matter, only that the code and the data are at hand.
             scratch[4] = _regular(shorts[0], floats[0], sequence, sample_time, sent, room)
@@ -203,25 +259,27 @@ def _turn(
             nap = min(nap, awake - passed)
         time[0], time[1] = 0, nap
         _ppoll(scratch.ctypes.data, 1, time.ctypes.data, 0)
-    last = sent
-    taken = 1
-    for place in range(ready):
-        counter = (sequence + place) % 65536
-        slot = counter % len(answers)
-        if not (
-            answers[slot, 2] + 256 * answers[slot, 3] == counter
-            and found[place, 0] == MSR_SIZE
-            and ends[place, 0] == controller[0]
-            and _regular(shorts[place], floats[place], counter, sample_time, last, room)
-            and not _asked(words, seen, watched)
-            and _answer(descriptor, answers[slot], controller, found[place], scratch)
-        ):
-            break
-        last = targets[slot]
-        if place + 1 == ready or not _take(descriptor, datagrams[taken], ends[taken], found[taken], scratch):
-            break
-        taken += 1
-    return _ARRIVED, taken
+    return _ARRIVED, _reply(
+        descriptor,
+        datagrams,
+        shorts,
+        floats,
+        ends,
+        controller,
+        answers,
+        targets,
+        ready,
+        sequence,
+        sample_time,
+        sent,
+        room,
+        words,
+        seen,
+        watched,
+        found,
+        scratch,
+        taken + 1,
+    )
 
 
 class Turnaround:
@@ -293,6 +351,12 @@ class Turnaround:
         """Wait for a datagram for `patience_ns`, from `awake_ns` until `asleep_ns` without sleeping, all from
         now on; what came is in the attributes. True if a new request ended the waiting.
         """
+        self._taken, self._place = 0, -1
+        asked = self._run(awake_ns, asleep_ns, patience_ns)
+        self.next(more=False)
+        return asked
+
+    def _run(self, awake_ns: int, asleep_ns: int, patience_ns: int) -> bool:
         status, self._taken = _turn(
             self._descriptor,
             self._datagrams,
@@ -312,12 +376,11 @@ class Turnaround:
             _WATCHED,
             self._found,
             self._scratch,
+            self._taken,
             awake_ns,
             asleep_ns,
             patience_ns,
         )
-        self._place = -1
-        self.next()
         return bool(status == _ASKED)
 
     @property
@@ -325,8 +388,13 @@ class Turnaround:
         """Datagrams that were taken and are still to be put into the buffer."""
         return max(self._taken - self._place - 1, 0)
 
-    def next(self) -> bool:
-        """Put the next of the datagrams that were taken into the buffer; False if there is none."""
+    def next(self, *, more: bool) -> bool:
+        """Put the next of the datagrams that were taken into the buffer; False if there is none.
+
+        more : whether those that came meanwhile get the answers that are left; these must still hold
+        """
+        if more and 0 < self._taken < self._ready and self._found[self._taken - 1, 2] > 0:
+            self._run(0, 0, 0)
         self._place += 1
         self.arrived = self._place < self._taken
         self.sent = self.arrived and self.sent_ns > 0

@@ -106,6 +106,11 @@ class _TimedTurnaround(Turnaround):
     def __init__(self, loop: Loop, control: Control, clock: Clock) -> None:
         super().__init__(loop.remote.descriptor, loop.remote.buffer, control.words)
         self._clock = clock
+        self.meanwhile = False
+
+    def next(self, *, more: bool) -> bool:
+        """The first packet of a cycle comes while the loop looks out for it, any other one while it is busy."""
+        return super().next(more=more and self.meanwhile)
 
     @property
     def received_ns(self) -> int:
@@ -158,8 +163,8 @@ class Stand:
         ring.start_writing()
         self.settings = LoopSettings("127.0.0.1", 0, None, lock_step, program, 0.1, 0.2, arm.joint_names)
         self.loop = Loop(self.settings, arm.limits, self.control, ring)
-        if ahead:
-            self.loop.turnaround = _TimedTurnaround(self.loop, self.control, self.clock)
+        self.ahead = _TimedTurnaround(self.loop, self.control, self.clock) if ahead else None
+        self.loop.turnaround = self.ahead
         self.end = ControllerEnd(self.loop.remote.address)
         self.monitor = CommandMonitor(arm, period_ms * 1e-3)
         self.path = folder / "run.mcap"
@@ -304,10 +309,14 @@ class Stand:
 
     def _serve(self) -> None:
         """Let the loop handle all that waits for it, and look at its requests."""
-        ahead = self.loop.turnaround
+        ahead = self.ahead
         self.loop.cycle(0.0)
+        if ahead is not None:
+            ahead.meanwhile = True
         while self.loop.remote.pending() or (ahead is not None and ahead.waiting):
             self.loop.cycle(0.0)
+        if ahead is not None:
+            ahead.meanwhile = False
 
     def _collect(self, packet: bytes) -> None:
         session, cycle = self.session, self.cycle_number

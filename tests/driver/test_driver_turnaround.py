@@ -40,8 +40,13 @@ class Watched(Turnaround):
         super().__init__(remote.descriptor, remote.buffer, rig.control.words)
         self.answered = 0
         self.batches: list[int] = []
+        # The packets of the rig are sent before the loop looks; they are to come while it looks out.
+        self.meanwhile = False
         self.before: Callable[[], None] | None = None
         self.after: Callable[[], None] | None = None
+
+    def next(self, *, more: bool) -> bool:
+        return super().next(more=more and self.meanwhile)
 
     def wait(self, awake_ns: int, asleep_ns: int, patience_ns: int) -> bool:
         if self.before is not None:
@@ -282,6 +287,64 @@ def test_packets_that_wait_are_answered_at_once_as_one_by_one(twins, moving, cou
     if moving:
         assert t.until_done() == len(motion) - 20 - count - 5
         assert t.result is Result.DONE
+    t.check_same()
+
+
+@pytest.mark.parametrize("moving", [True, False], ids=["motion", "hold"])
+def test_packets_that_come_while_the_loop_is_busy_get_the_answers_that_are_left(twins, moving):
+    t = twins(1)
+    motion = t.in_motion()
+    if not moving:
+        t.until_done()
+        t.cycles(12)
+    t.ahead.batches.clear()
+    t.ahead.meanwhile = True
+    # Few were waited for: those that no answer was left for.
+    assert 3 <= t.cycles(40) <= 14
+    t.ahead.meanwhile = False
+    assert t.cycles(5) == 5
+    if moving:
+        assert t.until_done() == len(motion) - 20 - 40 - 5
+        assert t.result is Result.DONE
+    t.check_same()
+
+
+@pytest.mark.parametrize("what", ["stop", "drop", "request"])
+def test_request_is_obeyed_before_a_packet_that_comes_while_the_loop_is_busy(twins, what):
+    t = twins(1)
+    t.in_motion()
+    t.ahead.meanwhile = True
+    t.both(lambda rig: ask(rig, what))
+    t.cycle()
+    assert t.mode is (Mode.SILENT if what == "drop" else Mode.STOP)
+    t.cycles(60)
+    t.check_same()
+
+
+@pytest.mark.parametrize("what", ["drives off", "position impossible", "short", "id", "timestamp"])
+def test_spoilt_packet_that_comes_while_the_loop_is_busy(twins, what):
+    t = twins(1)
+    t.in_motion()
+    t.ahead.meanwhile = True
+    t.cycles(2)
+    t.alter = SPOILT[what]
+    t.cycle()
+    t.alter = None
+    t.cycles(60)
+    t.check_same()
+
+
+def test_answers_that_are_left_are_not_sent_once_the_motion_is_stopped(twins):
+    t = twins(1)
+    t.in_motion()
+    t.ahead.meanwhile = True
+    t.cycle()
+    t.both(lambda rig: rig.loop._commander.stop(Result.ABORTED, "the driver ended"))
+    t.cycles(3)
+    assert t.mode is Mode.STOP
+    t.ahead.meanwhile = False
+    t.cycles(60)
+    assert t.mode is Mode.HOLD
     t.check_same()
 
 
