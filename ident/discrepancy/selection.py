@@ -300,6 +300,11 @@ class _State:
             found[side, joint] = float(np.var(torque)) if used.any() else 0.0
         return found
 
+    def share_at(self, trial: Trial, joint: int) -> float:
+        """Share of a trial's power that is in the rows of a joint."""
+        powers = self.powers(trial, trial.score)
+        return sum(p for (_, at), p in powers.items() if at == joint) / max(sum(powers.values()), 1e-300)
+
     def beside(self, accepted: Sequence[Trial], without: int) -> list[Trial]:
         """All but one of the accepted, in the base."""
         rest = [t for k, t in enumerate(accepted) if k != without]
@@ -340,12 +345,19 @@ class _State:
     # ---- claims ----
 
     def leftover(self, trial: Trial, others: Sequence[Trial]) -> bool:
-        """Whether a trial beside others is no more carried once the stronger ones in its rows may be of any form."""
+        """Whether a trial beside others is no more carried once the stronger ones in its rows may be of any form, or
+        is so small beside one of them, in the rows of its joint, that the least error of its law explains it.
+        """
         wide = []
         for other in others:
             if other.score.gain > trial.score.gain and set(trial.rows) & set(other.rows):
                 rows = beyond_law(self.dictionary, other)
                 wide += [] if rows is None else [rows]
+                small = (
+                    trial.score.gain < _LAW_ERROR * other.score.gain and not other.candidate.effect.whole_arm
+                )
+                if small and self.share_at(trial, other.candidate.joint) > _MOSTLY:
+                    return True
         if not wide:
             return False
         self.tolerate(others)
@@ -393,6 +405,9 @@ PLAIN = 10.0
 _CONTEST = 4
 # Share of a claim's power in the rows of a rival from which on both speak of the same.
 _SAME_ROWS = 0.2
+# Share of what a law explains that it may leave, and share of a trial's power in the rows of that law's joint from
+# which on the trial may be just that.
+_LAW_ERROR, _MOSTLY = 0.1, 0.8
 # Least time between two pushes that are told from one [s].
 _PAUSE_S = 0.2
 # Gain from which on it is worth seeing what a candidate leaves.

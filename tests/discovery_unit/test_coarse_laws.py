@@ -39,6 +39,21 @@ def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain
     assert 3 in {u.joint for u in found.unexplained}
 
 
+@pytest.mark.parametrize(("joint", "named"), [(2, {2}), (3, {2, 3})], ids=["its own rows", "others"])
+def test_what_the_least_error_of_a_strong_law_explains_is_no_second_cause(
+    make: Make, chain: Chain, joint: int, named: set[int]
+) -> None:
+    def both(s: Signals) -> None:
+        for _ in range(8):
+            stribeck(s)
+        s["motor"][:, joint - 1] += 0.035 * np.sin(4.0 * s["q"][:, joint - 1]) * np.sign(s["qd"][:, joint - 1])
+
+    found = diagnose([make("a.mcap", 1, both), make("b.mcap", 2, both, 1)], chain)
+    assert {j for f in found.findings for j in f.joints} == named
+    assert len(found.findings) == len(named)
+    assert found.findings[0].cause == "stribeck"
+
+
 @pytest.mark.parametrize("cause", ["joint_elasticity", "backlash"])
 def test_a_turn_about_the_vertical_is_nothing_beyond_its_law(make: Make, chain: Chain, cause: str) -> None:
     dictionary = signature_bench([make("a.mcap", 1)], chain).dictionary
