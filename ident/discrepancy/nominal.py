@@ -48,6 +48,8 @@ _WINDOW_S = 10.0
 _RIGID = 1e-6
 # Damping over stiffness of the joints [s]: of a link that rings at 7 Hz it takes 4 % of the critical damping.
 _RELAXATION_S = 2e-3
+# Least eigenvalue of a mass matrix over its largest.
+_LEAST_MASS = 1e-3
 # A joint that stays within this range says nothing about its friction, gears and cables.
 TRAVEL_RAD = 0.1
 
@@ -56,8 +58,7 @@ TRAVEL_RAD = 0.1
 class Arm:
     """What is known of the arm beforehand.
 
-    compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio :
-    (n,), one where
+    compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio : (n,), one where
     unknown. motor_delay_s, joint_delay_s : of the healthy channels.
     encoder : `link` or `motor`, the side of the elastic joints whose positions are published;
     encoder_known : whether a healthy arm told it.
@@ -203,7 +204,7 @@ class Nominal:
         dt = float(stretch.time[1] - stretch.time[0])
         (q, qd), qdd = start, np.zeros_like(stretch.q)
         for _ in range(2):
-            mass = regressor.mass_matrix(self.arm.chain, q, bodies)
+            mass = _definite(regressor.mass_matrix(self.arm.chain, q, bodies))
             other = self._link_torque(q, qd, np.zeros_like(q), bodies, drive)
             springs = Springs(mass, other, stretch.q, stretch.qd, stiffness, _RELAXATION_S * stiffness, dt)
             q, qd, qdd = springs.links
@@ -532,3 +533,16 @@ def _binned(values: Floats, width: int) -> Floats:
         return values
     count = len(values) // width
     return values[: count * width].reshape(count, width, -1).mean(axis=1)
+
+
+def _definite(mass: Floats) -> Floats:
+    """Mass matrices (N, n, n); where some are none of any arm, as a fit that a strong effect spoils may give them, all
+    with their eigenvalues from a small one on, or no spring could carry them.
+    """
+    try:
+        np.linalg.cholesky(mass)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(mass)
+        least = _LEAST_MASS * np.abs(values).max(axis=1, keepdims=True)
+        return np.asarray((vectors * np.maximum(values, least)[:, None, :]) @ vectors.transpose(0, 2, 1))
+    return mass

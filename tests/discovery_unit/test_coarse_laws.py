@@ -46,7 +46,9 @@ def test_what_the_least_error_of_a_strong_law_explains_is_no_second_cause(
     def both(s: Signals) -> None:
         for _ in range(8):
             stribeck(s)
-        s["motor"][:, joint - 1] += 0.035 * np.sin(4.0 * s["q"][:, joint - 1]) * np.sign(s["qd"][:, joint - 1])
+        s["motor"][:, joint - 1] += (
+            0.035 * np.sin(4.0 * s["q"][:, joint - 1]) * np.sign(s["qd"][:, joint - 1])
+        )
 
     found = diagnose([make("a.mcap", 1, both), make("b.mcap", 2, both, 1)], chain)
     assert {j for f in found.findings for j in f.joints} == named

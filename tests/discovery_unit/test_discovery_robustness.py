@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from fri.errors import DataError
 from ident.discrepancy import Diagnosis, DiagnosisSettings, diagnose
+from ident.discrepancy.signatures import signature_bench
 from ident.kinematics import Chain
 from ident.regressor import torque
 from ident.signals.filters import low_pass
@@ -192,3 +194,14 @@ def test_of_a_long_session_windows_from_beginning_to_end_are_used() -> None:
     assert time[0] < 5.0
     assert time[-1] > 75.0
     assert found.findings[0].cause == "cable_spring"
+
+
+def test_a_fit_of_no_possible_arm_leaves_links_that_move_on_springs() -> None:
+    bench = signature_bench([session()], arm())
+    nominal = bench.nominal
+    nominal.arm = replace(nominal.arm, encoder="motor", compliance=np.full(2, 1e-4))
+    nominal.refine(-bench.evidence.full.values[: len(nominal.base)])
+    for motion in nominal.motions:
+        assert np.abs(motion.q).max() < 10.0
+    for rows in nominal.rows.values():
+        assert np.isfinite(rows.matrix[rows.valid.T]).all()
