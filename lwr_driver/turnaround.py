@@ -152,63 +152,6 @@ def _answer(descriptor: Any, answer: Any, controller: Any, found: Any, scratch: 
 
 
 @njit(
-    "int64(int64, uint8[:, ::1], uint16[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1], uint8[:, ::1],"
-    "float32[:, ::1], int64, int64, float32, float32[::1], float32, int64[::1], int64[::1], int64[::1],"
-    "int64[:, ::1], int64[::1], int64)",
-    cache=True,
-)
-def _reply(
-    descriptor: Any,
-    datagrams: Any,
-    shorts: Any,
-    floats: Any,
-    ends: Any,
-    controller: Any,
-    answers: Any,
-    targets: Any,
-    ready: Any,
-    sequence: Any,
-    sample_time: Any,
-    sent: Any,
-    room: Any,
-    words: Any,
-    seen: Any,
-    watched: Any,
-    found: Any,
-    scratch: Any,
-    taken: Any,
-) -> Any:
-    """Answer the last of `taken` datagrams, the others of which have their answers, and those that wait, as long as
-    they are regular and an answer is ready; how many are taken then.
-
-    ends : sockaddr_in of the senders. answers, targets : by counter modulo their number, `ready` of them from
-    `sequence` on. sent : value sent before them. found : length, instants of arrival and of the answer [ns], for
-    each datagram. scratch : pollfd, time, length of an address
-    """
-    last = sent
-    if taken > 1:
-        last = targets[(sequence + taken - 2) % len(answers)]
-    while taken <= ready:
-        place = taken - 1
-        counter = (sequence + place) % 65536
-        slot = counter % len(answers)
-        if not (
-            answers[slot, 2] + 256 * answers[slot, 3] == counter
-            and found[place, 0] == MSR_SIZE
-            and ends[place, 0] == controller[0]
-            and _regular(shorts[place], floats[place], counter, sample_time, last, room)
-            and not _asked(words, seen, watched)
-            and _answer(descriptor, answers[slot], controller, found[place], scratch)
-        ):
-            break
-        last = targets[slot]
-        if taken == ready or not _take(descriptor, datagrams[taken], ends[taken], found[taken], scratch):
-            break
-        taken += 1
-    return taken
-
-
-@njit(
     "UniTuple(int64, 2)(int64, uint8[:, ::1], uint16[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1],"
     "uint8[:, ::1], float32[:, ::1], int64, int64, float32, float32[::1], float32, int64[::1], int64[::1],"
     "int64[::1], int64[:, ::1], int64[::1], int64, int64, int64, int64)",
@@ -240,7 +183,12 @@ def _turn(
 ) -> Any:
     """Wait, and answer regular packets; see `Turnaround.wait`. How it ended, and how many datagrams are taken.
 
-    Arguments as of `_reply`, `taken` of which have been answered before. awake, asleep, patience : from now [ns]
+    The first `taken` of them have their answers. After the one that is waited for come those that wait, as long as
+    they are regular and an answer is ready.
+
+    ends : sockaddr_in of the senders. answers, targets : by counter modulo their number, `ready` of them from
+    `sequence` on. sent : value sent before them. found : length, instants of arrival and of the answer [ns], for
+    each datagram. scratch : pollfd, time, length of an address. awake, asleep, patience : from now [ns]
     """
     time = scratch[1:3]
     start = _now(time)
@@ -259,27 +207,28 @@ def _turn(
             nap = min(nap, awake - passed)
         time[0], time[1] = 0, nap
         _ppoll(scratch.ctypes.data, 1, time.ctypes.data, 0)
-    return _ARRIVED, _reply(
-        descriptor,
-        datagrams,
-        shorts,
-        floats,
-        ends,
-        controller,
-        answers,
-        targets,
-        ready,
-        sequence,
-        sample_time,
-        sent,
-        room,
-        words,
-        seen,
-        watched,
-        found,
-        scratch,
-        taken + 1,
-    )
+    taken += 1
+    last = sent
+    if taken > 1:
+        last = targets[(sequence + taken - 2) % len(answers)]
+    while taken <= ready:
+        place = taken - 1
+        counter = (sequence + place) % 65536
+        slot = counter % len(answers)
+        if not (
+            answers[slot, 2] + 256 * answers[slot, 3] == counter
+            and found[place, 0] == MSR_SIZE
+            and ends[place, 0] == controller[0]
+            and _regular(shorts[place], floats[place], counter, sample_time, last, room)
+            and not _asked(words, seen, watched)
+            and _answer(descriptor, answers[slot], controller, found[place], scratch)
+        ):
+            break
+        last = targets[slot]
+        if taken == ready or not _take(descriptor, datagrams[taken], ends[taken], found[taken], scratch):
+            break
+        taken += 1
+    return _ARRIVED, taken
 
 
 class Turnaround:

@@ -351,13 +351,13 @@ class _State:
         wide = []
         for other in others:
             if other.score.gain > trial.score.gain and set(trial.rows) & set(other.rows):
-                rows = beyond_law(self.dictionary, other)
-                wide += [] if rows is None else [rows]
                 small = (
                     trial.score.gain < _LAW_ERROR * other.score.gain and not other.candidate.effect.whole_arm
                 )
                 if small and self.share_at(trial, other.candidate.joint) > _MOSTLY:
                     return True
+                rows = beyond_law(self.dictionary, other)
+                wide += [] if rows is None else [rows]
         if not wide:
             return False
         self.tolerate(others)

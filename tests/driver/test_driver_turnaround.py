@@ -297,7 +297,6 @@ def test_packets_that_come_while_the_loop_is_busy_get_the_answers_that_are_left(
     if not moving:
         t.until_done()
         t.cycles(12)
-    t.ahead.batches.clear()
     t.ahead.meanwhile = True
     # Few were waited for: those that no answer was left for.
     assert 3 <= t.cycles(40) <= 14
