@@ -50,6 +50,11 @@ def _first(result: Result) -> bool:
     return bool(result["verdict"]["first"])
 
 
+def _passing(result: Result) -> bool:
+    """Whether what is hidden is another in each session, so that no model predicts it."""
+    return any(hidden["passing"] for hidden in result["truth"]["hidden"])
+
+
 def figures(results: Sequence[Result]) -> dict[str, Any]:
     """Every figure of the campaign, plain content."""
     singles, healthy = _kind(results, "single"), _kind(results, "none")
@@ -58,11 +63,11 @@ def figures(results: Sequence[Result]) -> dict[str, Any]:
     findings = sum(len(r["verdict"]["findings"]) for r in judged)
     false = sum(len(r["verdict"]["false"]) for r in judged if r["truth"]["kind"] != "outside")
     listed = sum(len(r["verdict"]["findings"]) for r in judged if r["truth"]["kind"] != "outside")
-    efficiency = [
-        r["verdict"]["efficiency"]
-        for r in _kind(results, "single")
-        if _first(r) and r["verdict"]["efficiency"] is not None
-    ]
+    gained = [r for r in singles if _first(r) and r["verdict"]["efficiency"] is not None]
+    efficiency = {
+        passing: [r["verdict"]["efficiency"] for r in gained if _passing(r) == passing]
+        for passing in (False, True)
+    }
     deviations = {
         f"{key}": value
         for r in judged
@@ -113,7 +118,8 @@ def figures(results: Sequence[Result]) -> dict[str, Any]:
         if healthy
         else None,
         "outside": _outside(outside),
-        "efficiency": _quantiles(efficiency),
+        "efficiency": _quantiles(efficiency[False]),
+        "efficiency_passing": _quantiles(efficiency[True]),
         "parameters": {
             name: {"n": len(values), "rms_sigmas": float(np.sqrt(np.mean(np.square(values))))}
             for name, values in sorted(by_parameter.items())
@@ -187,6 +193,7 @@ def tables(results: Sequence[Result]) -> str:
     lines.append(f"{'findings beyond the truth':<52}{_share(*f['false_findings']):>18}  goal at most 3 %")
     for name, key, unit, goal in (
         ("gain efficiency where the cause is right", "efficiency", "", "goal median 0.95"),
+        ("the same of what is another in each session", "efficiency_passing", "", "by luck only"),
         ("processor time of a diagnosis", "seconds", " s", "goal 60 s"),
     ):
         if f[key] is not None:

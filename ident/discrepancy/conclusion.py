@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from ident.model import DynamicModel
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["Simulate", "conclude", "timing_finding"]
+__all__ = ["Baseline", "Simulate", "conclude", "timing_finding"]
 
 Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 """Replays sessions with a model and says how far off it is; what the runner gives."""
@@ -51,6 +51,22 @@ _ENCOMPASSED = 0.8
 _EXCITED = 0.1
 
 
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """The base model alone: its residuals on held-out rows, its parameters (p,) and their covariance."""
+
+    held: HeldOut
+    values: Floats
+    covariance: Floats
+
+    @classmethod
+    def of(cls, bench: Bench, tolerated: Sequence[Rows]) -> Baseline:
+        """Fitted on a bench, beside deviations that are no finding."""
+        evidence = bench.evidence
+        held, p = held_out(evidence, tolerated), evidence.base_count
+        return cls(held, evidence.full.values[:p].copy(), evidence.covariance()[:p, :p])
+
+
 def conclude(
     bench: Bench,
     selection: Selection,
@@ -62,11 +78,16 @@ def conclude(
     simulate: Simulate | None,
     sessions: Sequence[Session],
     test: Sequence[Session],
+    baseline: Baseline | None = None,
 ) -> Diagnosis:
-    """The diagnosis from the claims of a selection, the timing findings and the lost samples."""
+    """The diagnosis from the claims of a selection, the timing findings and the lost samples.
+
+    baseline : before channels were put in time; None where none was late
+    """
     evidence, nominal = bench.evidence, bench.nominal
     nuisance = selection.nuisance_rows
-    before = held_out(evidence, nuisance)
+    baseline = baseline or Baseline.of(bench, nuisance)
+    before = baseline.held
     rows_of = [c.trial.rows for c in selection.claims]
     after = held_out(evidence, [*rows_of, *nuisance])
     kept: list[tuple[Claim, Finding]] = []
@@ -95,7 +116,7 @@ def conclude(
         findings.append(_loss_finding(loss))
     findings.sort(key=lambda f: -f.gain)
     extended_rms, base_rms = after.rms(), before.rms()
-    base_model, extended, changes = _models(bench, claims, nuisance, findings, sessions)
+    base_model, extended, changes = _models(bench, baseline, claims, nuisance, findings, sessions)
     unexplained = tuple(
         Unexplained(
             r.side,
@@ -327,9 +348,8 @@ def timing_finding(
     # The healthy channel itself is a little later on one day than on another.
     std = float(np.hypot(std, _DAY_TO_DAY * settings.delay_tolerance_s))
     now = held_out(bench.evidence, [*(c.trial.rows for c in after.claims), *after.nuisance_rows])
-    same = all(now.residual[s].shape == before.residual[s].shape for s in now.residual)
     keys = [(side, j) for j in range(bench.nominal.arm.chain.n)]
-    numbers = interval(before, now, keys, settings.seed) if same else (0.0, 0.0, 0.0, 0.0)
+    numbers = interval(before, now, keys, settings.seed)
     return Finding(
         candidate.cause,
         "timing",
@@ -365,6 +385,7 @@ def _loss_finding(loss: tuple[SampleLoss, ...]) -> Finding:
 
 def _models(
     bench: Bench,
+    baseline: Baseline,
     claims: Sequence[Claim],
     nuisance: Sequence[Rows],
     findings: Sequence[Finding],
@@ -378,29 +399,28 @@ def _models(
         "sessions": [r.name for r in nominal.recordings if not r.test],
         "estimator": "diagnosis",
     }
-    models = []
-    for rows, effects in (
-        ([], ()),
-        ([c.trial.rows for c in claims], tuple(_entry(f) for f in findings if f.cause != "lost_samples")),
-    ):
-        evidence.replace([*rows, *nuisance])
-        models.append(
-            DynamicModel(
-                robot,
-                nominal.structure,
-                nominal.base.names,
-                evidence.full.values[:p].copy(),
-                evidence.covariance()[:p, :p],
-                nominal.base,
-                provenance,
-                effects,
-            )
+    evidence.replace([*(c.trial.rows for c in claims), *nuisance])
+    effects = tuple(_entry(f) for f in findings if f.cause != "lost_samples")
+    base, extended = (
+        DynamicModel(
+            robot,
+            nominal.structure,
+            nominal.base.names,
+            values,
+            covariance,
+            nominal.base,
+            provenance,
+            entries,
         )
-    base, extended = models
+        for values, covariance, entries in (
+            (baseline.values, baseline.covariance, ()),
+            (evidence.full.values[:p].copy(), evidence.covariance()[:p, :p], effects),
+        )
+    )
     assert extended.std is not None
     shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
     order = np.argsort(-np.abs(shift))[:10]
-    changes = {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0} if claims else {}
+    changes = {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0} if effects else {}
     return base, extended, changes
 
 

@@ -19,8 +19,8 @@ from ident.discrepancy.bench import (
     some_joint_moves,
 )
 from ident.discrepancy.candidates import Candidate, Dictionary
-from ident.discrepancy.conclusion import Simulate, conclude, timing_finding
-from ident.discrepancy.gain import held_out
+from ident.discrepancy.conclusion import Baseline, Simulate, conclude, timing_finding
+from ident.discrepancy.evidence import Rows
 from ident.discrepancy.hygiene import sample_loss
 from ident.discrepancy.nominal import Arm
 from ident.discrepancy.recording import Recording, record
@@ -80,6 +80,7 @@ def diagnose(
     bench = prepare_bench(known, recordings, settings, reference, causes, fit_compliance=reference is None)
     null = reference.limits() if reference is not None else None
     timing: list[Finding] = []
+    baseline: Baseline | None = None
     notes: list[str] = []
     selection = select(bench.dictionary, bench.evidence, settings, null)
     if not bench.told and not selection.claims:
@@ -96,7 +97,7 @@ def diagnose(
         selection = select(bench.dictionary, bench.evidence, settings, null)
         late = [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
     if late:
-        before = held_out(bench.evidence, [])
+        baseline = Baseline.of(bench, _in_time(selection))
         shifted, amounts = known, {c.trial.candidate.cause: _made(c) for c in late}
         for _ in range(_SHIFTS):
             shifted = _shifted(shifted, amounts)
@@ -108,7 +109,7 @@ def diagnose(
             if max(map(abs, amounts.values())) < _IN_PLACE * settings.delay_tolerance_s:
                 break
         unknown = {c.trial.candidate.cause: _unknown_delay(known, recordings, c) for c in late}
-        timing = [timing_finding(c, known, bench, again, before, settings) for c in late]
+        timing = [timing_finding(c, known, bench, again, baseline.held, settings) for c in late]
         left = {f.cause: f.parameters["delay"] for f in timing}
         notes = [
             _own_delay(c, unknown)
@@ -128,13 +129,31 @@ def diagnose(
         bench = better
         selection = select(bench.dictionary, bench.evidence, settings, null)
         selection.claims = [c for c in selection.claims if c.trial.candidate.effect.side != "timing"]
-    found = conclude(bench, selection, timing, loss, settings, reference, model, simulate, sessions, test)
+    found = conclude(
+        bench,
+        selection,
+        timing,
+        loss,
+        settings,
+        reference,
+        model,
+        simulate,
+        sessions,
+        test,
+        baseline if timing else None,
+    )
     return replace(found, notes=(*found.notes, *notes)) if notes else found
 
 
 def _made(claim: Claim) -> float:
     """Delay [s] that a claim of a late channel means."""
     return float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
+
+
+def _in_time(selection: Selection) -> list[Rows]:
+    """Columns of the tolerated deviations but delays."""
+    named = zip(selection.nuisance, selection.nuisance_rows, strict=True)
+    return [rows for name, rows in named if "delay" not in name]
 
 
 def _rest(bench: Bench, selection: Selection, cause: str) -> float:

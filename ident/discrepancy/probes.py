@@ -1,9 +1,9 @@
 """What has no name: generic functions of the motion that still predict the residual on held-back parts.
 
-For each joint and side a group of hat functions of one variable (angle, speed or load of the joint, angle of
-another joint, time), plain and times the sign of the joint's speed, is scored like any candidate, and so is a line
-in the spectrum (`lines`). What it finds is reported by its variables, and names that were given while much was left
-are doubted.
+For each joint and side a group of hat functions of one variable (angle, speed, acceleration or load of the joint,
+angle or speed of another joint, time), plain and times the sign of the joint's speed, those of an angle times the
+joint's load too, is scored like any candidate, and so is a line in the spectrum (`lines`). What it finds is reported
+by its variables, and names that were given while much was left are doubted.
 """
 
 from __future__ import annotations
@@ -117,6 +117,7 @@ def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
     for k in range(dictionary.nominal.arm.chain.n):
         variables[f"q{k + 1}"] = lambda m, k=k: m.q[:, k]  # type: ignore[misc]
         variables[f"qd{k + 1}"] = lambda m, k=k: m.motor_speed[:, k]  # type: ignore[misc]
+        variables[f"qdd{k + 1}"] = lambda m, k=k: m.motor_acceleration[:, k]  # type: ignore[misc]
         variables[f"load{k + 1}"] = lambda m, k=k: m.joint_torque[:, k]  # type: ignore[misc]
     found = {}
     for name, variable in variables.items():
@@ -134,13 +135,18 @@ def groups(
     """Groups of columns by the names of their variables."""
     nominal, found = dictionary.nominal, {}
     signs = [m.direction[:, joint : joint + 1] for m in nominal.motions]
+    loads = [m.joint_torque[:, joint : joint + 1] for m in nominal.motions]
     for name, parts in variables.items():
-        if name.startswith("load") and name != f"load{joint + 1}":
+        of = name.rstrip("0123456789")
+        if of in ("load", "qdd") and name != f"{of}{joint + 1}":
             continue
         found[name] = {(side, joint): nominal.reduce(side, parts)}
-        if not name.startswith("qd"):
-            signed = [part * sign for part, sign in zip(parts, signs, strict=True)]
-            found[f"{name} sign(qd{joint + 1})"] = {(side, joint): nominal.reduce(side, signed)}
+        factors = {} if of == "qd" else {f"sign(qd{joint + 1})": signs}
+        if of == "q":
+            factors[f"load{joint + 1}"] = loads
+        for factor, values in factors.items():
+            scaled = [part * value for part, value in zip(parts, values, strict=True)]
+            found[f"{name} {factor}"] = {(side, joint): nominal.reduce(side, scaled)}
     return found
 
 

@@ -226,6 +226,29 @@ def test_unknown_physics_is_not_named_with_confidence(
     assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
 
 
+def test_scale_that_follows_another_angle_is_no_sure_gain(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def bent(s: Signals) -> None:
+        s["joint"][:, 1] *= 1.05 + 0.05 * np.sin(s["q"][:, 0] + 0.4)
+
+    found = diagnose(pair(make, bent), chain, reference=reference)
+    assert all(f.confidence < 0.8 for f in found.findings)
+    (left,) = [u for u in found.unexplained if u.joint == 2 and u.side == "joint"]
+    assert {"q1", "load2"} <= set(left.depends_on)
+
+
+def test_friction_that_follows_the_acceleration_is_not_named_with_confidence(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def inertial(s: Signals) -> None:
+        s["motor"][:, 1] += 0.1 * np.abs(np.gradient(s["qd"][:, 1], s["time"])) * np.sign(s["qd"][:, 1])
+
+    found = diagnose(pair(make, inertial), chain, reference=reference)
+    assert all(f.confidence < 0.8 for f in found.findings)
+    assert any(u.joint == 2 and u.side == "motor" and "qdd2" in u.depends_on for u in found.unexplained)
+
+
 def test_what_shakes_the_arm_is_told_with_its_frequency(
     make: Make, chain: Chain, reference: Reference
 ) -> None:

@@ -81,6 +81,7 @@ class Case:
                     "joints": list(hidden.joints),
                     "size": hidden.size,
                     "variant": hidden.variant,
+                    "passing": hidden.passing,
                     "parameters": dict(hidden.parameters),
                     "depends_on": list(hidden.depends_on),
                 }

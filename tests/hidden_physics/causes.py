@@ -54,6 +54,7 @@ class Hidden:
     cause : name in the catalogue, or of an effect that it does not have. joints : 1 to 7, empty for the arm
     settings : of each session. parameters : what a diagnosis may state, by its name; time in seconds from the
     first row of the motion. depends_on : variables, for causes outside the catalogue
+    passing : it is another in each session, so what was learnt of it predicts no other
     """
 
     cause: str
@@ -64,6 +65,7 @@ class Hidden:
     parameters: Mapping[str, float] = field(default_factory=dict)
     depends_on: tuple[str, ...] = ()
     variant: str = ""
+    passing: bool = False
 
     @property
     def listed(self) -> bool:
@@ -169,7 +171,13 @@ def _temperature(random: Random, joint: int, scene: Scene) -> Callable[[float], 
         if between:
             settings = tuple(_trait(joint, warmth=0.03 * share, start_warm=start) for start in warm)
             return Hidden(
-                "friction_temperature", "motor", (joint,), size, settings, variant="between sessions"
+                "friction_temperature",
+                "motor",
+                (joint,),
+                size,
+                settings,
+                variant="between sessions",
+                passing=True,
             )
         # A thin film that warms up within the session by 5 to 15 K.
         power = COULOMB[joint - 1] * 0.35
@@ -374,7 +382,14 @@ def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidd
             settings[session] = Setting(contacts=(episode,))
         truth = {"time": times[train] - scene.begin_s + 0.5 * length}
         return Hidden(
-            "contact", "joint", (), size, tuple(settings), truth, variant="drag" if drag else "push"
+            "contact",
+            "joint",
+            (),
+            size,
+            tuple(settings),
+            truth,
+            variant="drag" if drag else "push",
+            passing=True,
         )
 
     return sized
@@ -454,7 +469,10 @@ def _drift(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
             settings = _everywhere(_fault(joint, creep=2.0 * torque, creep_time=time_constant))
         elif kind == "between":
             settings = tuple(_fault(joint, zero=torque * float(zero)) for zero in zeros)
-        return Hidden("sensor_offset_drift", "sensor", (joint,), size, settings, variant=kind)
+        passing = kind == "between"
+        return Hidden(
+            "sensor_offset_drift", "sensor", (joint,), size, settings, variant=kind, passing=passing
+        )
 
     return sized
 
@@ -506,7 +524,8 @@ def _held(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     def sized(size: float) -> Hidden:
         length_s = min(0.2, (0.008 if what == "packet" else 0.02) * size)
         held = {"every_s": every_s, "length_s": length_s, "what": what}
-        return Hidden("lost_samples", "timing", (), size, _everywhere(Setting(held=held)), variant=what)
+        settings = _everywhere(Setting(held=held))
+        return Hidden("lost_samples", "timing", (), size, settings, variant=what, passing=True)
 
     return sized
 
