@@ -500,9 +500,16 @@ def _sensor_ripple(random: Random, joint: int, scene: Scene) -> Callable[[float]
     return sized
 
 
+def _whole(late_s: float) -> float:
+    """The lateness in whole samples of the chain, 1 to 40 ms: between two samples it reads a line, which has less
+    noise, and that would not be the lateness's own trace.
+    """
+    return 1e-3 * min(40, max(1, round(1e3 * late_s)))
+
+
 def _motor_late(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        late = min(0.04, 4e-3 * size)
+        late = _whole(4e-3 * size)
         setting = Setting(faults={"motor_late": every([late] * JOINTS)})
         return Hidden("motor_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
 
@@ -511,7 +518,7 @@ def _motor_late(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 def _joint_late(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
-        late = min(0.04, 2.5e-3 * size)
+        late = _whole(2.5e-3 * size)
         setting = Setting(faults={"late": every([late] * JOINTS)})
         return Hidden("joint_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
 
