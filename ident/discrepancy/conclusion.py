@@ -401,8 +401,9 @@ def _models(
     }
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     effects = tuple(_entry(f) for f in findings if f.cause != "lost_samples")
-    base, extended = (
-        DynamicModel(
+
+    def fitted(values: Floats, covariance: Floats, entries: tuple[dict[str, Any], ...]) -> DynamicModel:
+        return DynamicModel(
             robot,
             nominal.structure,
             nominal.base.names,
@@ -412,11 +413,9 @@ def _models(
             provenance,
             entries,
         )
-        for values, covariance, entries in (
-            (baseline.values, baseline.covariance, ()),
-            (evidence.full.values[:p].copy(), evidence.covariance()[:p, :p], effects),
-        )
-    )
+
+    base = fitted(baseline.values, baseline.covariance, ())
+    extended = fitted(evidence.full.values[:p].copy(), evidence.covariance()[:p, :p], effects)
     assert extended.std is not None
     shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
     order = np.argsort(-np.abs(shift))[:10]

@@ -169,6 +169,18 @@ def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, referen
     assert diagnose(sessions, chain).findings == ()
 
 
+def test_gain_of_a_late_channel_counts_from_before_it_was_put_in_time(make: Make, chain: Chain) -> None:
+    first, second = pair(make, late_motor)
+    found = diagnose([first], chain, test=[second])
+    (late,) = found.findings
+    base, extended = found.rms_base["motor"], found.rms_extended["motor"]
+    assert base[0] > 2.0 * extended[0]
+    assert late.evidence.test_rms_before > 2.0 * late.evidence.test_rms_after
+    # The drives' inertia had absorbed a part of it.
+    assert found.changes
+    assert np.any(found.base_model.values != found.extended_model.values)
+
+
 def test_without_a_reference_the_tick_of_another_clock_is_no_delay(make: Make, chain: Chain) -> None:
     from dataclasses import replace
 
