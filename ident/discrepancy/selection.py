@@ -394,8 +394,21 @@ class _State:
                 if t.candidate.joint == here.candidate.joint and t.candidate.effect.side == "joint"
             )
             alike = alike or tuple(physical)[:1]
+        play = self.uncrossed(here.candidate)
+        if play is not None:
+            sure, alike = min(sure, _EITHER), (*alike, (play, _gain(again)))
         outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in close)
         return Claim(again, again.score, alike, sure, outdone)
+
+    def uncrossed(self, candidate: Candidate) -> Candidate | None:
+        """The play that a zero which is off may as well be: behind the motor's encoder a gap that is never crossed,
+        for the torque keeps its sign, holds the link to one side.
+        """
+        nominal, turns = self.dictionary.nominal, self.dictionary.setting.torque_turns
+        if candidate.cause != "joint_zero_offset" or nominal.arm.encoder != "motor" or turns[candidate.joint]:
+            return None
+        plays = (c for c in self.dictionary.candidates if c.key == ("backlash", candidate.joint))
+        return next(plays, None)
 
 
 PLAIN = 10.0
@@ -418,6 +431,8 @@ _TOLD_DELAY = 0.4
 _TOLD_COMPLIANCE = 0.4
 # Confidence in a sensor's error where only the joint torque was recorded.
 _SHAPE_ALONE = 0.7
+# Confidence in one of two causes that these motions show alike.
+_EITHER = 0.5
 
 
 def reach(gain: float) -> float:

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from fri.errors import DataError
 from ident.discrepancy import Diagnosis, Reference, commission, diagnose
 from ident.kinematics import Chain
 from ident.model_file import model_text, read_model
+from ident.regressor import torque
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]
@@ -182,8 +185,6 @@ def test_gain_of_a_late_channel_counts_from_before_it_was_put_in_time(make: Make
 
 
 def test_without_a_reference_the_tick_of_another_clock_is_no_delay(make: Make, chain: Chain) -> None:
-    from dataclasses import replace
-
     sessions = []
     for session in pair(make, late_motor):
         motor = session.motor
@@ -195,6 +196,37 @@ def test_without_a_reference_the_tick_of_another_clock_is_no_delay(make: Make, c
     found = diagnose(sessions, chain)
     assert found.findings == ()
     assert any("motor torques come" in note and "without a reference" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("encoder", ["link", "motor"])
+def test_a_gap_that_is_never_crossed_may_be_a_zero_that_is_off(
+    make: Make, chain: Chain, bodies: np.ndarray, reference: Reference, encoder: Literal["link", "motor"]
+) -> None:
+    def turned(s: Signals) -> None:
+        # A smaller motion, in which the second link never stands upright; its drive has 0.4 kg m^2 and 2.5 Nm s/rad.
+        small = np.array([1.0, 0.3, 1.0])
+        q, qd = s["q"], s["qd"]
+        qdd = np.gradient(qd, s["time"], axis=0)
+        change = torque(chain, small * q, small * qd, small * qdd, bodies) - torque(chain, q, qd, qdd, bodies)
+        s["joint"] += change
+        s["motor"] += change
+        s["motor"][:, 1] -= 0.7 * (0.4 * qdd[:, 1] + 2.5 * qd[:, 1])
+        q *= small
+        qd *= small
+        s["q"][:, 1] += 0.02
+
+    sessions = pair(make, turned)
+    loads = np.concatenate([session.joint.effort[:, 1] for session in sessions])
+    assert np.all(loads > 0.0)
+    (found,) = diagnose(sessions, chain, reference=replace(reference, encoder=encoder)).findings
+    assert (found.cause, found.joints) == ("joint_zero_offset", (2,))
+    rivals = [(cause, joints) for cause, joints, _ in found.alternatives]
+    if encoder == "link":
+        assert found.confidence > 0.8
+        assert ("backlash", (2,)) not in rivals
+    else:
+        assert found.confidence < 0.8
+        assert rivals == [("backlash", (2,))]
 
 
 def test_zero_of_each_session_is_no_function_of_the_angle(
@@ -280,8 +312,6 @@ def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
     effort = sessions[0].joint.effort.copy()
     rows = np.arange(50, len(effort), 40)
     effort[rows] = effort[rows - 1]
-    from dataclasses import replace
-
     sessions[0] = replace(sessions[0], joint=replace(sessions[0].joint, effort=effort))
     found = diagnose(sessions, chain)
     lost = [f for f in found.findings if f.cause == "lost_samples"]
@@ -290,8 +320,6 @@ def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
 
 
 def test_one_session_without_motor_channel(make: Make, chain: Chain) -> None:
-    from dataclasses import replace
-
     found = diagnose([replace(make("a.mcap", 1), motor=None)], chain)
     assert found.findings == ()
     assert found.model_number == 1
