@@ -15,6 +15,8 @@ __all__ = ["SampleLoss", "held_times", "sample_loss"]
 
 _LEAST = 10
 _SHARE = 0.001
+# Third difference of a position that is a jolt, over the usual one, which is at least so many steps of the encoder.
+_JOLT, _STEPS = 16.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -49,11 +51,32 @@ def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
 
 
 def held_times(columns: JointColumns) -> NDArray[np.float64]:
-    """Times (k,) [s] from the first sample of samples that repeat the one before, where that matters."""
-    if not _channel("", "", columns).matters:
-        return np.zeros(0)
-    same = np.concatenate([[False], np.all(np.diff(columns.effort, axis=0) == 0.0, axis=1)])
-    return (columns.log_time[same] - columns.log_time[0]) * 1e-9
+    """Times (k,) [s] from the first sample of samples that are older than they say.
+
+    Where all joints repeat the torques of the sample before, and where all that move jolt at once, as positions do
+    that are a part of a sample old. A few of them are no finding, but derivatives of the positions are wrong there.
+    """
+    stale = _jolts(columns.position)
+    if _channel("", "", columns).repeated:
+        stale[1:] |= np.all(np.diff(columns.effort, axis=0) == 0.0, axis=1)
+    return (columns.log_time[stale] - columns.log_time[0]) * 1e-9
+
+
+def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Samples (N,) at which most of the joints that move differ from a smooth motion by far more than they usually
+    do, in the third difference of their positions.
+    """
+    found = np.zeros(len(position), dtype=bool)
+    moves = np.ptp(position, axis=0) > 0.0 if len(position) else np.zeros(0, dtype=bool)
+    if len(position) < _LEAST or moves.sum() < 2:
+        return found
+    q = position[:, moves]
+    third = np.abs(np.diff(q, 3, axis=0))
+    steps = np.abs(np.diff(q, axis=0))
+    step = np.min(np.where(steps > 0.0, steps, np.inf), axis=0)
+    usual = np.maximum(np.median(third, axis=0), _STEPS * step)
+    found[2:-1] = np.mean(third > _JOLT * usual, axis=1) > 0.5
+    return found
 
 
 def _channel(name: str, channel: str, columns: JointColumns) -> SampleLoss:

@@ -10,6 +10,7 @@ import pytest
 
 from fri.errors import DataError
 from ident.discrepancy import Diagnosis, Reference, commission, diagnose
+from ident.discrepancy.hygiene import held_times
 from ident.kinematics import Chain
 from ident.model_file import model_text, read_model
 from ident.regressor import torque
@@ -305,6 +306,24 @@ def test_what_shakes_the_arm_is_told_with_its_frequency(
     (note,) = [note for note in found.notes if "swings" in note]
     assert "motor torque" in note
     assert float(note.partition("swings at ")[2].split()[0]) == pytest.approx(1.37, abs=0.02)
+
+
+def test_samples_older_than_they_say_are_no_cause(make: Make, chain: Chain) -> None:
+    def stale(s: Signals) -> None:
+        rows = np.arange(300, len(s["time"]), 400)
+        for name in ("q", "joint"):
+            columns = [np.interp(s["time"][rows] - 0.003, s["time"], c) for c in s[name].T]
+            s[name][rows] = np.column_stack(columns)
+
+    (session, _), (healthy, _) = pair(make, stale), pair(make)
+    assert not len(held_times(healthy.joint))
+    times = held_times(session.joint)
+    apart = np.abs(times[:, None] - 4e-3 * np.arange(300, len(session.joint), 400))
+    assert apart.min(axis=0).max() < 0.005
+    assert apart.min(axis=1).max() < 0.01
+    found = diagnose(pair(make, stale), chain)
+    assert found.findings == ()
+    assert found.unexplained == ()
 
 
 def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
