@@ -377,9 +377,9 @@ def _loss_finding(loss: tuple[SampleLoss, ...]) -> Finding:
         0.99,
         (),
         effect.tell_apart,
-        float(worst.lost + worst.repeated),
-        mode=f"{worst.lost} lost and {worst.repeated} repeated of {count} {worst.channel} samples in "
-        f"{worst.session}",
+        float(worst.amiss),
+        mode=f"{worst.lost} lost, {worst.repeated} repeated and {worst.stale} stale of {count} {worst.channel} "
+        f"samples in {worst.session}",
     )
 
 

@@ -7,37 +7,46 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
 __all__ = ["SampleLoss", "held_times", "sample_loss"]
 
-_LEAST = 10
+_LEAST = 6
 _SHARE = 0.001
 # Third difference of a position that is a jolt, over the usual one, which is at least so many steps of the encoder.
 _JOLT, _STEPS = 16.0, 4.0
+# Samples by which a jolt is away from a repeated sample that makes it.
+_NEAR = 4
 
 
 @dataclass(frozen=True)
 class SampleLoss:
-    """Share of the samples of a channel of a session that are missing or repeat the one before."""
+    """Samples of a channel of a session that are missing, repeat the one before, or are older than they say."""
 
     session: str
     channel: str
     lost: int
     repeated: int
+    stale: int
     samples: int
 
     @property
+    def amiss(self) -> int:
+        """Lost, repeated and stale ones."""
+        return self.lost + self.repeated + self.stale
+
+    @property
     def share(self) -> float:
-        """Lost and repeated over all."""
-        return (self.lost + self.repeated) / max(self.samples + self.lost, 1)
+        """Of what was sent."""
+        return self.amiss / max(self.samples + self.lost, 1)
 
     @property
     def matters(self) -> bool:
         """More than a handful, and more than one in a thousand."""
-        return self.lost + self.repeated >= _LEAST and self.share > _SHARE
+        return self.amiss >= _LEAST and self.share > _SHARE
 
 
 def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
@@ -56,10 +65,10 @@ def held_times(columns: JointColumns) -> NDArray[np.float64]:
     Where all joints repeat the torques of the sample before, and where all that move jolt at once, as positions do
     that are a part of a sample old. A few of them are no finding, but derivatives of the positions are wrong there.
     """
-    stale = _jolts(columns.position)
-    if _channel("", "", columns).repeated:
-        stale[1:] |= np.all(np.diff(columns.effort, axis=0) == 0.0, axis=1)
-    return (columns.log_time[stale] - columns.log_time[0]) * 1e-9
+    old = _jolts(columns.position)
+    if _repeated(columns.effort):
+        old |= _same(columns.effort)
+    return (columns.log_time[old] - columns.log_time[0]) * 1e-9
 
 
 def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -80,12 +89,27 @@ def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _channel(name: str, channel: str, columns: JointColumns) -> SampleLoss:
-    effort = columns.effort
-    repeated = 0
-    if effort.shape[1] >= 2 and len(effort) > 2:
-        same = np.all(np.diff(effort, axis=0) == 0.0, axis=1)
-        # Smooth or coarse channels repeat by themselves; then equality of all joints at once means nothing.
-        each = np.mean(np.diff(effort, axis=0) == 0.0, axis=0)
-        expected = float(np.prod(np.maximum(each - same.mean(), 0.0))) * len(same)
-        repeated = max(0, int(same.sum() - np.ceil(expected + 3.0 * np.sqrt(expected))))
-    return SampleLoss(name, channel, columns.lost, repeated, len(columns))
+    repeated, jolts = _repeated(columns.effort), _jolts(columns.position)
+    if repeated:
+        # A repeated sample and the one after it jolt, too.
+        jolts &= ~binary_dilation(_same(columns.effort), iterations=_NEAR)
+    stale = int(np.count_nonzero(jolts[1:] & ~jolts[:-1])) if len(jolts) else 0
+    return SampleLoss(name, channel, columns.lost, repeated, stale, len(columns))
+
+
+def _same(effort: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Samples (N,) at which all joints have the torque of the one before."""
+    return np.concatenate([[False], np.all(np.diff(effort, axis=0) == 0.0, axis=1)])
+
+
+def _repeated(effort: NDArray[np.float64]) -> int:
+    """Number of repeated samples beyond what chance gives.
+
+    Smooth or coarse channels repeat by themselves; then equality of all joints at once means nothing.
+    """
+    if effort.shape[1] < 2 or len(effort) < 3:
+        return 0
+    same = _same(effort)[1:]
+    each = np.mean(np.diff(effort, axis=0) == 0.0, axis=0)
+    expected = float(np.prod(np.maximum(each - same.mean(), 0.0))) * len(same)
+    return max(0, int(same.sum() - np.ceil(expected + 3.0 * np.sqrt(expected))))

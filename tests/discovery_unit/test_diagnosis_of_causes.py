@@ -308,21 +308,24 @@ def test_what_shakes_the_arm_is_told_with_its_frequency(
     assert float(note.partition("swings at ")[2].split()[0]) == pytest.approx(1.37, abs=0.02)
 
 
-def test_samples_older_than_they_say_are_no_cause(make: Make, chain: Chain) -> None:
+@pytest.mark.parametrize(("every", "causes"), [(400, ["lost_samples"]), (1200, [])])
+def test_samples_older_than_they_say_are_left_out(
+    make: Make, chain: Chain, every: int, causes: list[str]
+) -> None:
     def stale(s: Signals) -> None:
-        rows = np.arange(300, len(s["time"]), 400)
+        rows = np.arange(300, len(s["time"]), every)
         for name in ("q", "joint"):
             columns = [np.interp(s["time"][rows] - 0.003, s["time"], c) for c in s[name].T]
             s[name][rows] = np.column_stack(columns)
 
-    (session, _), (healthy, _) = pair(make, stale), pair(make)
+    sessions, (healthy, _) = pair(make, stale), pair(make)
     assert not len(held_times(healthy.joint))
-    times = held_times(session.joint)
-    apart = np.abs(times[:, None] - 4e-3 * np.arange(300, len(session.joint), 400))
+    times = held_times(sessions[0].joint)
+    apart = np.abs(times[:, None] - 4e-3 * np.arange(300, len(sessions[0].joint), every))
     assert apart.min(axis=0).max() < 0.005
     assert apart.min(axis=1).max() < 0.01
-    found = diagnose(pair(make, stale), chain)
-    assert found.findings == ()
+    found = diagnose(sessions, chain)
+    assert [finding.cause for finding in found.findings] == causes
     assert found.unexplained == ()
 
 
