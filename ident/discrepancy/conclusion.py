@@ -27,7 +27,7 @@ from ident.discrepancy.result import (
     Unexplained,
     Value,
 )
-from ident.discrepancy.selection import PLAIN, Claim, Selection
+from ident.discrepancy.selection import Claim, Selection
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
 from ident.model import DynamicModel
@@ -43,8 +43,9 @@ Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 _DOUBT = 0.2
 # Share of the tolerance for delays by which a healthy channel's delay differs from day to day.
 _DAY_TO_DAY = 0.2
-# Confidence in what the rows fitted show plainly and others do not.
-_OPEN = 0.7
+# Confidence in what the rows fitted show and others bear out on the whole only, and gain over the least one from
+# which on that is said at all.
+_OPEN, _TO_SPARE = 0.7, 2.0
 # Share of a claim's gain that nameless functions of other variables may take over.
 _ENCOMPASSED = 0.8
 # Power of a cause in the held-out rows, over that in the rows fitted, from which on these must show it.
@@ -166,7 +167,8 @@ def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float
     What the healthy arm is a little like, and what a stronger cause of another form than its law leaves behind,
     is significant in the rows fitted but makes no prediction. Where the held-out sessions hardly excite the cause,
     they need only not speak against it; of what was another in other sessions or lasted a moment they say nothing.
-    A cause that is plain to see in the rows fitted but whose law predicts poorly may be it or another.
+    A cause that the rows fitted show with room to spare, and that the others bear out on the whole but not for sure,
+    may be it or another.
     """
     effect = claim.trial.candidate.effect
     if finding.mode == "between" or effect.repeats:
@@ -175,7 +177,7 @@ def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float
     if low > 0.0 or (high > 0.0 and _excitation(claim, bench) < _EXCITED):
         return 1.0
     least = effect.scrutiny * bench.evidence.settings.least_gain
-    return _OPEN if low + high > 0.0 and claim.gain > PLAIN * least else 0.0
+    return _OPEN if low + high > 0.0 and claim.gain > _TO_SPARE * least else 0.0
 
 
 def _excitation(claim: Claim, bench: Bench) -> float:

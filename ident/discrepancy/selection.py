@@ -21,7 +21,7 @@ from ident.discrepancy.settings import DiagnosisSettings
 from ident.distributions import normal_tail
 from ident.effects import EFFECTS
 
-__all__ = ["PLAIN", "Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
+__all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
 
 log = logging.getLogger(__name__)
 
@@ -276,7 +276,7 @@ class _State:
         needed = strict * settings.least_inflation
         # What acts in a few blocks only cannot be significant by blocks, however large; predicting parts that were
         # held back then tells.
-        rare = score.gain > PLAIN * least and PLAIN * needed < size < np.inf
+        rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
         return size > needed and score.p_value < (settings.alpha_rare if rare else settings.alpha)
 
     def concentration(self, trial: Trial, score: Score) -> float:
@@ -411,9 +411,8 @@ class _State:
         return next(plays, None)
 
 
-PLAIN = 10.0
-"""How many times the usual evidence is plain to see."""
-
+# How many times the usual evidence is plain to see.
+_PLAIN = 10.0
 # Of so many that come first the shapes are refined before one is taken.
 _CONTEST = 4
 # Share of a claim's power in the rows of a rival from which on both speak of the same.
