@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["SampleLoss", "held_times", "sample_loss"]
 
-_LEAST = 6
-_SHARE = 0.001
+# Number and share of samples amiss in a session from which on they are a finding.
+_LEAST, _SHARE = 6, 0.001
 # Third difference of a position that is a jolt, over the usual one, which is at least so many steps of the encoder.
 _JOLT, _STEPS = 16.0, 4.0
 # Samples by which a jolt is away from a repeated sample that makes it.
@@ -77,7 +77,7 @@ def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:
     """
     found = np.zeros(len(position), dtype=bool)
     moves = np.ptp(position, axis=0) > 0.0 if len(position) else np.zeros(0, dtype=bool)
-    if len(position) < _LEAST or moves.sum() < 2:
+    if len(position) < 4 or moves.sum() < 2:
         return found
     q = position[:, moves]
     third = np.abs(np.diff(q, 3, axis=0))
