@@ -88,7 +88,6 @@ def conclude(
     evidence, nominal = bench.evidence, bench.nominal
     nuisance = selection.nuisance_rows
     baseline = baseline or Baseline.of(bench, nuisance)
-    before = baseline.held
     rows_of = [c.trial.rows for c in selection.claims]
     after = held_out(evidence, [*rows_of, *nuisance])
     kept: list[tuple[Claim, Finding]] = []
@@ -116,6 +115,7 @@ def conclude(
     if loss:
         findings.append(_loss_finding(loss))
     findings.sort(key=lambda f: -f.gain)
+    before, after = baseline.held.where(after), after.where(baseline.held)
     extended_rms, base_rms = after.rms(), before.rms()
     base_model, extended, changes = _models(bench, baseline, claims, nuisance, findings, sessions)
     unexplained = tuple(

@@ -23,6 +23,14 @@ class HeldOut:
     residual: dict[str, Floats]
     block: dict[str, Floats]
 
+    def where(self, other: HeldOut) -> HeldOut:
+        """The same on the rows that `other` has too: a channel that is put in time is used in other rows."""
+        residual = {
+            side: np.where(np.isfinite(other.residual[side]), values, np.nan)
+            for side, values in self.residual.items()
+        }
+        return HeldOut(residual, self.block)
+
     def rms(self) -> dict[str, Floats]:
         """Root mean square (n,) by side."""
         found = {}
