@@ -46,6 +46,10 @@ _DAY_TO_DAY = 0.2
 # Confidence in what the rows fitted show and others bear out on the whole only, and gain over the least one from
 # which on that is said at all.
 _OPEN, _TO_SPARE = 0.7, 2.0
+# How far below nothing the interval of what a claim takes off the held-out chi-square may begin, over its end, where
+# it all but excludes nothing; or end, over the claim's gain, where held-out sessions that hardly excite the cause say
+# nothing.
+_ALL_BUT = 0.05
 # Share of a claim's gain that nameless functions of other variables may take over.
 _ENCOMPASSED = 0.8
 # Power of a cause in the held-out rows, over that in the rows fitted, from which on these must show it.
@@ -167,17 +171,22 @@ def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float
     What the healthy arm is a little like, and what a stronger cause of another form than its law leaves behind,
     is significant in the rows fitted but makes no prediction. Where the held-out sessions hardly excite the cause,
     they need only not speak against it; of what was another in other sessions or lasted a moment they say nothing.
-    A cause that the rows fitted show with room to spare, and that the others bear out on the whole but not for sure,
-    may be it or another.
+    A cause that the rows fitted show with room to spare, or that the others all but bear out for sure, may be it or
+    another. So may one that the rows fitted show faintly; that is said only where the others do bear it out.
     """
     effect = claim.trial.candidate.effect
     if finding.mode == "between" or effect.repeats:
         return 1.0
     low, high = fallen
-    if low > 0.0 or (high > 0.0 and _excitation(claim, bench) < _EXCITED):
+    if claim.faint:
+        return _OPEN if low > 0.0 else 0.0
+    hardly = _excitation(claim, bench) < _EXCITED
+    if low > 0.0 or (hardly and high > 0.0):
         return 1.0
     least = effect.scrutiny * bench.evidence.settings.least_gain
-    return _OPEN if low + high > 0.0 and claim.gain > _TO_SPARE * least else 0.0
+    shown = low + high > 0.0 and claim.gain > _TO_SPARE * least
+    silent = hardly and high > -_ALL_BUT * claim.gain
+    return _OPEN if shown or silent or low > -_ALL_BUT * high else 0.0
 
 
 def _excitation(claim: Claim, bench: Bench) -> float:

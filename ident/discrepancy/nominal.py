@@ -163,6 +163,11 @@ class Nominal:
         """Recording and stretch of each motion."""
         return [(r, s) for r in self.recordings for s in r.stretches]
 
+    @property
+    def held_out(self) -> bool:
+        """Whether there are recordings that are never fitted."""
+        return any(r.test for r in self.recordings)
+
     @cached_property
     def sides(self) -> tuple[str, ...]:
         """Sides that have rows."""

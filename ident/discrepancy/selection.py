@@ -33,7 +33,8 @@ Null = Mapping[tuple[str, int], float]
 class Claim:
     """An accepted trial: its score beside all other claims, and the candidates that do almost as well.
 
-    outdone : a rival that the data do not carry does better on the same rows.
+    outdone : a rival that the data do not carry does better on the same rows. faint : too little for a claim by
+    itself, and a finding only where held-out sessions bear it out.
     """
 
     trial: Trial
@@ -41,6 +42,7 @@ class Claim:
     alternatives: tuple[tuple[Candidate, float], ...] = ()
     confidence: float = 1.0
     outdone: bool = False
+    faint: bool = False
 
     @property
     def gain(self) -> float:
@@ -64,7 +66,9 @@ def select(
     settings: DiagnosisSettings,
     null: Null | None = None,
 ) -> Selection:
-    """Accept causes one after the other until the data carry no more."""
+    """Accept causes one after the other until the data carry no more; where they carry none, the one that comes
+    nearest, if there are held-out sessions that it can be held against and a healthy arm told what is usual.
+    """
     state = _State(dictionary, evidence, settings, null or {})
     state.tolerate([])
     first: dict[tuple[str, int], float] = {}
@@ -79,6 +83,8 @@ def select(
         accepted = state.reconsider([*accepted, best])
         if best.candidate.key not in [t.candidate.key for t in accepted]:
             break
+    if not accepted and null and dictionary.nominal.held_out:
+        accepted = state.faintly()
     claims = [state.claim(accepted, k) for k in range(len(accepted))]
     while doubtful := [
         k for k, c in enumerate(claims) if c.outdone or state.leftover(c.trial, _others(claims, k))
@@ -127,6 +133,12 @@ def _same_moment(trial: Trial, other: Trial) -> bool:
     return one["session"] == two["session"] and apart < _PAUSE_S
 
 
+def _lasting(trial: Trial) -> bool:
+    """Whether a trial says something about other motions: not what lasts a moment or is another in each session."""
+    effect = trial.candidate.effect
+    return not effect.event and effect.side != "timing" and effect.mode(trial.shape) != "between"
+
+
 def _gain(trial: Trial) -> float:
     """Gain by which candidates are ordered: of two that explain the same, the one with less freedom."""
     return trial.score.gain - 2.0 * len(trial.shape)
@@ -140,6 +152,7 @@ class _State:
     null: Null
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
+    faint: bool = False
     _tolerances: list[tuple[str, Rows, float, float]] | None = None
 
     # ---- tolerated deviations ----
@@ -236,6 +249,13 @@ class _State:
             carried = [t for t in carried if t.candidate.key != best.candidate.key]
         return None
 
+    def faintly(self) -> list[Trial]:
+        """The foremost of what takes less evidence because other motions can bear it out; none where there is none."""
+        self.faint = True
+        found = [t for t in self.contenders([]) if _lasting(t) and self.carried(t)]
+        best = self.next([], found)
+        return [] if best is None else [best]
+
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, where that is still carried: a fit that held-back parts
         contradict is none."""
@@ -265,7 +285,7 @@ class _State:
         """Whether the data carry the trial: gain, significance, and size."""
         score = trial.score if score is None else score
         settings = self.settings
-        strict = trial.candidate.effect.scrutiny
+        strict = trial.candidate.effect.scrutiny * (settings.faint if self.faint else 1.0)
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
         known = self.null.get(trial.candidate.key, 0.0)
         least = max(least, known)
@@ -277,7 +297,8 @@ class _State:
         # What acts in a few blocks only cannot be significant by blocks, however large; predicting parts that were
         # held back then tells.
         rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
-        return size > needed and score.p_value < (settings.alpha_rare if rare else settings.alpha)
+        eased = rare or self.faint
+        return size > needed and score.p_value < (settings.alpha_rare if eased else settings.alpha)
 
     def concentration(self, trial: Trial, score: Score) -> float:
         """Rows that a trial acts on over the rows that it matters in: all over the effective number of them,
@@ -397,8 +418,10 @@ class _State:
         play = self.uncrossed(here.candidate)
         if play is not None:
             sure, alike = min(sure, _EITHER), (*alike, (play, _gain(again)))
-        outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in close)
-        return Claim(again, again.score, alike, sure, outdone)
+        # Of moments many were tried, and one of them always suits somewhat.
+        lasting = (t for t in close if not t.candidate.effect.event)
+        outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
+        return Claim(again, again.score, alike, sure, outdone, self.faint)
 
     def uncrossed(self, candidate: Candidate) -> Candidate | None:
         """The play that a zero which is off may as well be: behind the motor's encoder a gap that is never crossed,

@@ -28,6 +28,8 @@ class DiagnosisSettings:
     alpha : significance of a claim, each candidate by itself, from blocks. alpha_rare : of one that is plain to see
     in what is held back, because a cause that acts in few blocks cannot be as significant.
     least_gain : fall of the held-back chi-square that a claim takes at least.
+    faint : share of it and of `least_inflation` that a cause takes where nothing else is claimed, provided that the
+    held-out sessions bear it out for sure.
     least_inflation : smallest relative excess of the residual's power in the affected rows that matters.
     rounds : largest number of effects.
     most_s : length of motion that is used; of longer sessions windows spread evenly.
@@ -47,6 +49,7 @@ class DiagnosisSettings:
     alpha: float = 1e-5
     alpha_rare: float = 1e-3
     least_gain: float = 30.0
+    faint: float = 0.4
     least_inflation: float = 0.005
     rounds: int = 8
     most_s: float = 240.0

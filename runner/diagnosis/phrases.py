@@ -118,6 +118,11 @@ def _gear_ripple(values: Values, names: Sequence[str]) -> list[str]:
 
 
 def _friction_position(values: Values, names: Sequence[str]) -> list[str]:
+    if values["cycles_per_turn"][0] == 0.0:
+        spot = f"{_quantity(values['reach'])} to either side of {_quantity(values['centre'])}"
+        size, std, unit = values["cosine"]
+        more = f"{quantity_text(abs(size), std, unit)} {'more' if size > 0.0 else 'less'}"
+        return [f"{more} in the middle of a spot that reaches {spot}"]
     return [f"{_wave(values)}, {_times(values['cycles_per_turn'][0])} a turn of the joint"]
 
 

@@ -39,6 +39,11 @@ def sensor_gain(s: Signals) -> None:
     s["joint"][:, 1] *= 1.03
 
 
+def rough_spot(s: Signals) -> None:
+    q, qd = s["q"][:, 1], s["qd"][:, 1]
+    s["motor"][:, 1] += 0.3 * np.sign(qd) * np.exp(-0.5 * ((q - 0.3) / 0.2) ** 2)
+
+
 def crosstalk(s: Signals) -> None:
     s["joint"][:, 0] += 0.02 * s["joint"][:, 1]
 
@@ -82,6 +87,7 @@ def test_base_model_alone_leaves_only_noise(healthy: Diagnosis) -> None:
     [
         (stribeck, "stribeck", (2,), "amplitude", 0.3),
         (load_friction, "friction_load", (2,), "factor", 0.03),
+        (rough_spot, "friction_position", (2,), "centre", 0.3),
         (cable, "cable_spring", (3,), "stiffness", 0.1),
         (sensor_gain, "sensor_gain", (2,), "error", 0.03),
         (crosstalk, "sensor_crosstalk", (1,), "factor", 0.02),
@@ -160,6 +166,23 @@ def reference(make: Make, chain: Chain) -> Reference:
 
 def test_reference_alone_claims_nothing(make: Make, chain: Chain, reference: Reference) -> None:
     assert diagnose(pair(make, seed=5), chain, reference=reference).findings == ()
+
+
+def test_what_shows_faintly_is_named_where_held_out_sessions_bear_it_out(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def faint(s: Signals) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += 0.035 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+
+    fitted, held = pair(make, faint, seed=5), [make(f"{k}.mcap", k, faint, k) for k in (10, 11, 12)]
+    (found,) = diagnose(fitted, chain, test=held, reference=reference).findings
+    assert (found.cause, found.joints) == ("stribeck", (2,))
+    assert found.confidence <= 0.7
+    without_it = [make(f"{k}.mcap", k, None, k) for k in (10, 11, 12)]
+    assert diagnose(fitted, chain, test=without_it, reference=reference).findings == ()
+    assert diagnose(fitted, chain, reference=reference).findings == ()
+    assert diagnose(fitted, chain, test=held).findings == ()
 
 
 def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, reference: Reference) -> None:

@@ -249,6 +249,27 @@ def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
         assert loads.link_torque[1] == pytest.approx(-wanted[row], abs=1e-9)
 
 
+def test_a_rough_spot_grips_in_the_rows_as_in_a_simulation(motion: Motion) -> None:
+    effect = EFFECTS["friction_position"]
+    spot = {"cosine": 0.6, "cycles_per_turn": 0.0, "centre": 0.2, "reach": 0.3}
+    grip = motion.direction[:, 1] * effect.torque(motion, 1, spot)[0][:, 1]
+    away = np.abs(motion.q[:, 1] - 0.2)
+    assert np.all(grip[away >= 0.3] == 0.0)
+    assert grip[np.argmin(away)] == pytest.approx(0.6, abs=1e-3)
+    half = np.argmin(np.abs(away - 0.15))
+    assert grip[half] == pytest.approx(0.3, abs=0.02)
+    simulated = effect.simulate(1, spot)
+    for row in (0, 300, int(half), int(np.argmin(away))):
+        loads = SimpleNamespace(Fcm=np.full(3, 1.5))
+        simulated.load(0.0, SimpleNamespace(motor_position=motion.q[row]), loads)
+        assert loads.Fcm == pytest.approx([1.5, 1.5 + grip[row], 1.5], abs=1e-9)
+
+
+def test_a_rough_spot_without_a_reach_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"`reach` is 0 rad; give how far"):
+        EFFECTS["friction_position"].simulate(1, {"cosine": 0.6, "cycles_per_turn": 0.0})
+
+
 def test_viscous_friction_rises_from_standstill_on() -> None:
     thinning = EFFECTS["viscous_nonlinear"].plausible
     assert thinning(np.array([2.0]), {"exponent": 0.4})
