@@ -19,6 +19,10 @@ __all__ = ["Candidate", "Dictionary", "Trial"]
 
 # Gain that a further coefficient of the same cause must bring.
 _A_COEFFICIENT = 6.0
+# Standard deviation of a coefficient that is 1 by the physics, in what is held against parts of the motion.
+_ABOUT_ONE = 0.3
+# Relative difference of the torques at which samples of several sessions stop, of one limit.
+_ONE_LIMIT = 1e-3
 # What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
 _STEP_ROOM_S = 1.0
 
@@ -207,7 +211,8 @@ class Dictionary:
         known: Products | None = None,
     ) -> Score:
         """Score of padded columns in the way that suits the candidate."""
-        score = self.evidence.score(padded, known=known)
+        pull = _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
+        score = self.evidence.score(padded, known=known, pull=pull)
         return self.evidence.event_score(score, choices) if candidate.effect.event else score
 
     def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
@@ -306,4 +311,17 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         reach=nominal.arm.reach,
         compared=compared,
         compliance=nominal.arm.compliance if all(m.springs is not None for m in motions) else None,
+        clipped=_clipped(nominal),
     )
+
+
+def _clipped(nominal: Nominal) -> Floats:
+    """Torque (n,) [Nm] at which the samples of each joint's sensor stop, the same in all sessions that are fitted and
+    show one, else NaN.
+    """
+    limits = np.array([r.clipped for r in nominal.recordings if not r.test and r.has_effort])
+    if not limits.size:
+        return np.full(nominal.arm.chain.n, np.nan)
+    low = np.min(np.where(np.isfinite(limits), limits, np.inf), axis=0)
+    high = np.max(np.where(np.isfinite(limits), limits, -np.inf), axis=0)
+    return np.where((high > 0.0) & (high - low <= _ONE_LIMIT * high), high, np.nan)

@@ -338,16 +338,25 @@ class Evidence:
     # ---- scores ----
 
     def score(
-        self, columns: Mapping[Key, Floats], *, ridge: float = 0.0, known: Products | None = None
+        self,
+        columns: Mapping[Key, Floats],
+        *,
+        ridge: float = 0.0,
+        pull: float = 0.0,
+        known: Products | None = None,
     ) -> Score:
         """Score of padded columns.
 
-        ridge : pull towards zero, in units of the columns' mean square, for groups of many columns.
-        known : their products with the base alone, to save time.
+        ridge : pull towards zero, in units of the columns' mean square, for groups of many columns. pull : precision
+        with which coefficients are known to be 1, for what is held against parts of the motion: what acts in a few
+        moments only is hardly there without one of them. known : their products with the base alone, to save time.
         """
-        return self.score_products(self.products(columns, known), list(columns), ridge=ridge)
+        products = self.products(columns, known)
+        return self.score_products(products, list(columns), ridge=ridge, pull=pull)
 
-    def score_products(self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0) -> Score:
+    def score_products(
+        self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0, pull: float = 0.0
+    ) -> Score:
         """Score of columns in the rows of `keys` from their products with all present columns."""
         base, own, target = products.sums
         whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
@@ -362,7 +371,8 @@ class Evidence:
             gain = 0.0
             for part, fit in enumerate(self._held):
                 mine = base[part], own[part], target[part]
-                rest = whole[0] - mine[0], whole[1] - mine[1], whole[2] - mine[2]
+                known = pull * np.eye(k)
+                rest = whole[0] - mine[0], whole[1] - mine[1] + known, whole[2] - mine[2] + pull
                 gain += self._held_gain(mine, rest, fit, part, ridge)
         rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
         if self.prior is not None and self.compared and fitted > _NOTHING:

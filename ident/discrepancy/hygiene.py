@@ -1,4 +1,4 @@
-"""Samples that were lost, repeated or held, seen in the channels themselves."""
+"""Samples that were lost, repeated, held or clipped, seen in the channels themselves."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from scipy.ndimage import binary_dilation
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["SampleLoss", "held_times", "sample_loss"]
+__all__ = ["SampleLoss", "clipped_at", "held_times", "sample_loss"]
 
 # Number and share of samples amiss in a session from which on they are a finding.
-_LEAST, _SHARE = 6, 0.001
+_LEAST, _SHARE = 3, 0.0005
 # Third difference of a position that is a jolt, over the usual one, which is at least so many steps of the encoder.
 _JOLT, _STEPS = 16.0, 4.0
 # Samples by which a jolt is away from a repeated sample that makes it.
 _NEAR = 4
+# Samples at the very largest torque that make a flat top, over those at the next smaller ones; a coarse channel
+# stays at its largest value about twice as long as at the next.
+_FLAT, _OVER_NEXT = 10, 10
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class SampleLoss:
 
     @property
     def matters(self) -> bool:
-        """More than a handful, and more than one in a thousand."""
+        """More than one by chance or two, and more than one in two thousand."""
         return self.amiss >= _LEAST and self.share > _SHARE
 
 
@@ -69,6 +72,28 @@ def held_times(columns: JointColumns) -> NDArray[np.float64]:
     if _repeated(columns.effort):
         old |= _same(columns.effort)
     return (columns.log_time[old] - columns.log_time[0]) * 1e-9
+
+
+def clipped_at(columns: JointColumns) -> NDArray[np.float64]:
+    """Torque (n,) [Nm] beyond which each joint's sensor says nothing, NaN where its samples show no such limit.
+
+    What moves and is noisy does not have the very same largest torque many times. What stands still may.
+    """
+    effort, n = columns.effort, columns.effort.shape[1]
+    found = np.full(n, np.nan)
+    if len(effort) < 2:
+        return found
+    moving = np.concatenate([[False], np.any(np.diff(columns.position, axis=0) != 0.0, axis=1)])
+    for joint in range(n):
+        values, counts = np.unique(effort[moving, joint], return_counts=True)
+        if len(values) < 3:
+            continue
+        # The two ends, each beside the two values next to it.
+        ends = ((values[0], counts[0], counts[1:3]), (values[-1], counts[-1], counts[-3:-1]))
+        flat = [abs(v) for v, count, next_ in ends if count >= _FLAT and count > _OVER_NEXT * next_.max()]
+        if flat:
+            found[joint] = max(flat)
+    return found
 
 
 def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:

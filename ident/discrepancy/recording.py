@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.discrepancy.bandwidth import passed_band
-from ident.discrepancy.hygiene import held_times
+from ident.discrepancy.hygiene import clipped_at, held_times
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 from ident.signals.prepare import PreparedSession, prepare
@@ -53,7 +53,8 @@ class Recording:
 
     number : in the order of the sessions' beginnings. payload : mounted, None for none.
     period_s : of the excitation, or the duration where it does not repeat; start_s : its beginning.
-    has_effort, has_motor : which channels exist.
+    has_effort, has_motor : which channels exist. clipped : (n,) torque [Nm] at which the samples of a joint's sensor
+    stop, NaN where they do not.
     joint_band_hz, motor_band_hz : upper edge of what a low-pass left of the torques, None where they are
     as measured.
     """
@@ -70,6 +71,7 @@ class Recording:
     test: bool
     joint_names: tuple[str, ...]
     warnings: tuple[str, ...]
+    clipped: Floats
     joint_band_hz: float | None = None
     motor_band_hz: float | None = None
 
@@ -118,6 +120,7 @@ def record(
         test=test,
         joint_names=prepared.joint_names,
         warnings=(),
+        clipped=clipped_at(chosen.joint),
         # Whoever filtered did it sample by sample, so the samples are looked at as they came.
         joint_band_hz=passed_band(chosen.joint.effort, chosen.joint.period_s),
         motor_band_hz=None if motor is None else passed_band(motor.effort, motor.period_s),

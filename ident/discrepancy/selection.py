@@ -289,6 +289,8 @@ class _State:
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
         known = self.null.get(trial.candidate.key, 0.0)
         least = max(least, known)
+        if trial.candidate.effect.witnessed(trial.shape):
+            return score.gain > least
         if score.gain <= least or score.p_value >= settings.alpha_rare:
             return False
         # What lasts a moment is large then, and little of the whole session.

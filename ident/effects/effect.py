@@ -75,6 +75,7 @@ class Setting:
         already [rad], None where unknown. compared : whether the sessions are held against a reference.
         compliance : (n,) [rad/Nm] of the
         springs that the links hang on behind published motors, None where the links' positions are published.
+        clipped : (n,) torque [Nm] at which the samples of a joint's sensor stop, NaN where they do not.
     """
 
     sessions: int
@@ -88,6 +89,7 @@ class Setting:
     reach: Floats | None = None
     compared: bool = False
     compliance: Floats | None = None
+    clipped: Floats | None = None
 
 
 def encoder_sides(setting: Setting) -> tuple[float, ...]:
@@ -173,6 +175,10 @@ class Effect(ABC):
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
         """Whether the coefficients lie in the ranges that make physical sense."""
         return all(p.low <= value <= p.high for p, value in zip(self.linear, coefficients, strict=False))
+
+    def witnessed(self, shape: Shape) -> bool:
+        """Whether the samples themselves show the cause, so that it need not be significant by blocks as well."""
+        return False
 
     def coarse(self, parameters: Mapping[str, float]) -> Mapping[str, float]:
         """Standard deviations of parameters that come from the law itself, which says less than what happens."""

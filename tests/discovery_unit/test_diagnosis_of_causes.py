@@ -10,7 +10,7 @@ import pytest
 
 from fri.errors import DataError
 from ident.discrepancy import Diagnosis, Reference, commission, diagnose
-from ident.discrepancy.hygiene import held_times
+from ident.discrepancy.hygiene import clipped_at, held_times
 from ident.kinematics import Chain
 from ident.model_file import model_text, read_model
 from ident.regressor import torque
@@ -331,7 +331,7 @@ def test_what_shakes_the_arm_is_told_with_its_frequency(
     assert float(note.partition("swings at ")[2].split()[0]) == pytest.approx(1.37, abs=0.02)
 
 
-@pytest.mark.parametrize(("every", "causes"), [(400, ["lost_samples"]), (1200, [])])
+@pytest.mark.parametrize(("every", "causes"), [(400, ["lost_samples"]), (1200, ["lost_samples"]), (3000, [])])
 def test_samples_older_than_they_say_are_left_out(
     make: Make, chain: Chain, every: int, causes: list[str]
 ) -> None:
@@ -350,6 +350,34 @@ def test_samples_older_than_they_say_are_left_out(
     found = diagnose(sessions, chain)
     assert [finding.cause for finding in found.findings] == causes
     assert found.unexplained == ()
+
+
+def test_a_sensor_that_clips_for_a_moment_is_no_contact(make: Make, chain: Chain) -> None:
+    """Too few blocks to be significant, and nothing that a push could do."""
+    sessions = pair(make)
+    limit = float(np.sort(np.concatenate([one.joint.effort[:, 1] for one in sessions]))[-60])
+    clipped = [
+        replace(one, joint=replace(one.joint, effort=np.minimum(one.joint.effort, [np.inf, limit, np.inf])))
+        for one in sessions
+    ]
+    limits = [clipped_at(one.joint) for one in (*sessions, *clipped)]
+    assert np.isnan(limits[0]).all()
+    assert np.isnan(limits[1]).all()
+    assert np.nanmax([one[1] for one in limits]) == limit
+    (found,) = diagnose(clipped, chain).findings
+    assert (found.cause, found.joints) == ("sensor_saturation", (2,))
+    assert found.parameters["limit"].value == pytest.approx(limit, abs=1e-9)
+
+
+def test_rest_and_coarse_samples_are_no_clipping(make: Make) -> None:
+    columns = make("a.mcap", 1).joint
+    coarse = replace(columns, effort=np.round(columns.effort))
+    assert np.isnan(clipped_at(coarse)).all()
+    still = columns.position.copy()
+    effort = columns.effort.copy()
+    top = int(np.argmax(effort[:, 1]))
+    still[top : top + 200], effort[top : top + 200] = still[top], effort[top]
+    assert np.isnan(clipped_at(replace(columns, position=still, effort=effort))).all()
 
 
 def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
