@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from ident.discrepancy.events import find_bursts
 from ident.discrepancy.evidence import Evidence, Floats, Key, Products, Rows, Score
@@ -23,6 +23,8 @@ _A_COEFFICIENT = 6.0
 _ABOUT_ONE = 0.3
 # Relative difference of the torques at which samples of several sessions stop, of one limit.
 _ONE_LIMIT = 1e-3
+# Fall of the chi-square from which on the parameters of a shape are sought together.
+_VALLEY = 30.0
 # What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
 _STEP_ROOM_S = 1.0
 
@@ -58,6 +60,25 @@ class Trial:
     shape: Shape
     score: Score
     rows: Rows = field(repr=False)
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Range of a shape parameter in the coordinate of a search: itself, or its logarithm."""
+
+    name: str
+    low: float
+    high: float
+    logarithmic: bool
+
+    def value(self, coordinate: float) -> float:
+        """The parameter."""
+        return float(np.exp(coordinate)) if self.logarithmic else float(coordinate)
+
+    def coordinate(self, shape: Shape) -> float:
+        """Where a shape is."""
+        here = float(shape[self.name])
+        return float(np.clip(np.log(here) if self.logarithmic else here, self.low, self.high))
 
 
 class Dictionary:
@@ -226,40 +247,61 @@ class Dictionary:
         return Trial(candidate, shape, score, rows)
 
     def refine(self, trial: Trial, choices: int = 1, evaluations: int = 12) -> Trial:
-        """The same with its continuous shape parameters at the best fit, one after the other."""
-        effect, best = trial.candidate.effect, trial
+        """The same with its continuous shape parameters at the best fit: one after the other, then together, for a
+        speed and an exponent make up for each other along a narrow valley.
+        """
+        best = trial
+
+        def loss(shape: Shape) -> float:
+            nonlocal best
+            tried = self.trial(trial.candidate, shape, choices)
+            if tried is None:
+                return 0.0
+            if tried.score.fitted > best.score.fitted:
+                best = tried
+            return -tried.score.fitted
+
+        for span in self._spans(trial):
+            minimize_scalar(
+                lambda x, span=span: loss({**best.shape, span.name: span.value(x)}),
+                bounds=(span.low, span.high),
+                method="bounded",
+                options={"maxiter": evaluations},
+            )
+        spans = [] if trial.candidate.effect.event else self._spans(best)
+        if len(spans) > 1 and best.score.fitted > _VALLEY:
+            begin = [span.coordinate(best.shape) for span in spans]
+            minimize(
+                lambda point: loss(
+                    {**best.shape, **{s.name: s.value(x) for s, x in zip(spans, point, strict=True)}}
+                ),
+                begin,
+                method="Nelder-Mead",
+                bounds=[(span.low, span.high) for span in spans],
+                options={"maxfev": 3 * evaluations * (len(spans) - 1), "fatol": 0.1, "xatol": 1e-3},
+            )
+        return best
+
+    def _spans(self, trial: Trial) -> list[_Span]:
+        """Where each continuous parameter of a trial's shape may be: between its neighbours in the grid."""
+        effect, found = trial.candidate.effect, []
         grid = effect.shapes(self.setting, max(trial.candidate.joint, 0))
         for name in effect.continuous(trial.shape):
             values = sorted({s[name] for s in grid if name in s and _alike(s, trial.shape, name)})
             limits = next(p for p in effect.shape_parameters if p.name == name)
-            low, high = _neighbours(values, float(trial.shape[name]), signed=limits.low < 0.0 < limits.high)
+            here = float(trial.shape[name])
+            low, high = _neighbours(values, here, signed=limits.low < 0.0 < limits.high)
             if effect.step:
                 last = self.setting.durations_s[int(trial.shape["session"]) - 1] - _STEP_ROOM_S
-                here = float(trial.shape[name])
                 low, high = max(here - 2.5, _STEP_ROOM_S), min(here + 2.5, last)
             elif effect.event:
-                here = float(trial.shape[name])
                 low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
             low, high = max(low, limits.low), min(high, limits.high)
-            if not low < high:
-                continue
-            logarithmic = low > 0.0 and not effect.event
-
-            def value(x: float, logarithmic: bool = logarithmic) -> float:
-                return float(np.exp(x)) if logarithmic else float(x)
-
-            def loss(x: float, name: str = name) -> float:
-                nonlocal best
-                tried = self.trial(trial.candidate, {**best.shape, name: value(x)}, choices)
-                if tried is None:
-                    return 0.0
-                if tried.score.fitted > best.score.fitted:
-                    best = tried
-                return -tried.score.fitted
-
-            bounds = (np.log(low), np.log(high)) if logarithmic else (low, high)
-            minimize_scalar(loss, bounds=bounds, method="bounded", options={"maxiter": evaluations})
-        return best
+            if low < high:
+                logarithmic = low > 0.0 and not effect.event
+                ends = (float(np.log(low)), float(np.log(high))) if logarithmic else (low, high)
+                found.append(_Span(name, *ends, logarithmic))
+        return found
 
     def trials(self) -> Iterator[Trial]:
         """The best shape of every candidate."""

@@ -117,6 +117,20 @@ def test_names_cause_and_joint_first(
     assert content["findings"][0]["cause"] == cause
 
 
+def test_speed_and_exponent_are_sought_together(make: Make, chain: Chain) -> None:
+    """They make up for each other: one after the other ends beside the best fit, with deviations that do not cover."""
+
+    def gaussian(s: Signals) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += 0.5 * np.sign(v) * np.exp(-((np.abs(v) / 0.2) ** 1.5))
+
+    (found,) = diagnose(pair(make, gaussian), chain, causes=["stribeck"]).findings
+    for name, true in (("amplitude", 0.5), ("velocity", 0.2), ("exponent", 1.5)):
+        value = found.parameters[name]
+        assert abs(value.value - true) < 2.5 * value.std, name
+        assert value.std < 0.3 * true, name
+
+
 def test_extended_model_is_an_ordinary_model(make: Make, chain: Chain) -> None:
     sessions = pair(make, stribeck)
     found = diagnose(sessions, chain)
