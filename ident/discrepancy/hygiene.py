@@ -77,15 +77,18 @@ def held_times(columns: JointColumns) -> NDArray[np.float64]:
 def clipped_at(columns: JointColumns) -> NDArray[np.float64]:
     """Torque (n,) [Nm] beyond which each joint's sensor says nothing, NaN where its samples show no such limit.
 
-    What moves and is noisy does not have the very same largest torque many times. What stands still may.
+    What moves and is noisy does not have the very same largest torque many times. What stands still may, and so may
+    all joints at once where samples are held.
     """
     effort, n = columns.effort, columns.effort.shape[1]
     found = np.full(n, np.nan)
     if len(effort) < 2:
         return found
-    moving = np.concatenate([[False], np.any(np.diff(columns.position, axis=0) != 0.0, axis=1)])
+    fresh = np.concatenate([[False], np.any(np.diff(columns.position, axis=0) != 0.0, axis=1)])
+    if n > 1:
+        fresh &= ~_same(effort)
     for joint in range(n):
-        values, counts = np.unique(effort[moving, joint], return_counts=True)
+        values, counts = np.unique(effort[fresh, joint], return_counts=True)
         if len(values) < 3:
             continue
         # The two ends, each beside the two values next to it.

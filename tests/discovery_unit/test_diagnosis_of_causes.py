@@ -383,14 +383,16 @@ def test_a_sensor_that_clips_for_a_moment_is_no_contact(make: Make, chain: Chain
     assert found.parameters["limit"].value == pytest.approx(limit, abs=1e-9)
 
 
-def test_rest_and_coarse_samples_are_no_clipping(make: Make) -> None:
+def test_rest_and_coarse_or_held_samples_are_no_clipping(make: Make) -> None:
     columns = make("a.mcap", 1).joint
     coarse = replace(columns, effort=np.round(columns.effort))
     assert np.isnan(clipped_at(coarse)).all()
-    still = columns.position.copy()
-    effort = columns.effort.copy()
+    still, effort = columns.position.copy(), columns.effort.copy()
     top = int(np.argmax(effort[:, 1]))
-    still[top : top + 200], effort[top : top + 200] = still[top], effort[top]
+    effort[top : top + 200] = effort[top]
+    assert np.isnan(clipped_at(replace(columns, effort=effort))).all()
+    still[top : top + 200] = still[top]
+    effort[top : top + 200, 0] += np.arange(200)
     assert np.isnan(clipped_at(replace(columns, position=still, effort=effort))).all()
 
 
