@@ -197,6 +197,14 @@ def _gain(values: Values, names: Sequence[str]) -> list[str]:
     ]
 
 
+def _saturation(values: Values, names: Sequence[str]) -> list[str]:
+    seen = values.get("seen", (0.0,))[0] > 0.5
+    return [
+        f"reads no more than {_quantity(values['limit'])}",
+        "its samples stop there" if seen else "",
+    ]
+
+
 _SPECIAL: dict[str, Callable[[Values, Sequence[str]], list[str]]] = {
     "cable_spring": _cable,
     "viscous_nonlinear": _viscous,
@@ -210,6 +218,7 @@ _SPECIAL: dict[str, Callable[[Values, Sequence[str]], list[str]]] = {
     "joint_elasticity": _encoder("compliance"),
     "backlash": _encoder("gap"),
     "sensor_gain": _gain,
+    "sensor_saturation": _saturation,
     "motor_torque_gain": _gain,
     "payload_error": lambda values, names: [_moment(values)],
     "payload_change": _payload_change,
