@@ -48,7 +48,7 @@ class SampleLoss:
 
     @property
     def matters(self) -> bool:
-        """More than one by chance or two, and more than one in two thousand."""
+        """More than one or two, and more than one in two thousand."""
         return self.amiss >= _LEAST and self.share > _SHARE
 
 
