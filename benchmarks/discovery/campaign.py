@@ -14,9 +14,10 @@ from typing import Any, cast
 
 import numpy as np
 from hidden_physics.cases import KINDS, Case, Store, draw, twin
-from hidden_physics.causes import CAUSES, OUTSIDE
+from hidden_physics.causes import CAUSES
 from hidden_physics.engine import commissioned, diagnosed
 from hidden_physics.inflation import inflation
+from hidden_physics.outside import OUTSIDE
 from hidden_physics.robots import Encoder
 from hidden_physics.verdict import error_rows, judge
 from joblib import Parallel, delayed

@@ -1,130 +1,49 @@
-"""What can be hidden: every cause of the catalogue, and some that no catalogue has.
-
-A cause is drawn once (its joint, its shape, when it happens) and then has a size that can be turned up and
-down. Size one is near what a person begins to see in a plot of the held-out error.
-"""
+"""What can be hidden: every cause of the catalogue. What no catalogue has is in `outside`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from hidden_physics.motions import PERIOD_S, PERIODS, REST_S
-from hidden_physics.robots import SESSIONS, Encoder, Setting
+from hidden_physics.hidden import (
+    COULOMB,
+    JOINT_NOISE,
+    MOTOR_NOISE,
+    Cause,
+    Hidden,
+    Random,
+    Scene,
+    either_sign,
+    everywhere,
+    fault,
+    log_uniform,
+    trait,
+)
+from hidden_physics.motions import PERIOD_S, PERIODS
+from hidden_physics.robots import SESSIONS, Setting
 from hidden_physics.traits import JOINTS, every
 
-__all__ = ["CATALOGUE", "CAUSES", "OUTSIDE", "Cause", "Hidden", "Scene"]
+__all__ = ["CAUSES"]
 
-COULOMB = (15.04, 16.48, 8.77, 9.96, 5.58, 4.41, 4.16)
 VISCOUS = (16.68, 19.09, 7.87, 11.63, 5.39, 3.64, 2.03)
 FULL_SCALE = (176.0, 176.0, 100.0, 100.0, 100.0, 38.0, 38.0)
-MOTOR_NOISE = (0.4, 0.42, 0.26, 0.25, 0.18, 0.085, 0.1)
 PLAY = (1.5e-4, 8e-4, 8e-4, 8e-4, 1.2e-3, 2e-3, 3e-3)
 ZERO_DEG = (0.2, 0.2, 0.3, 0.3, 0.8, 1.0, 1.5)
-JOINT_NOISE = (0.155, 0.16, 0.096, 0.105, 0.098, 0.037, 0.045)
-
-Random = np.random.Generator
-Settings = tuple[Setting, ...]
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What a cause may depend on besides chance.
-
-    peaks : (7,) largest joint torque of the healthy twin [Nm]. reached : (7,) what both the sessions to learn
-    from and the one held out reach, and not for a moment only [Nm]. begin_s : cabinet's clock as motions begin [s]
-    """
-
-    peaks: tuple[float, ...]
-    reached: tuple[float, ...]
-    begin_s: float
-
-    def moment(self, random: Random, low: float = 0.2, high: float = 0.8) -> float:
-        """A time within the periods, on the cabinet's clock [s]."""
-        return self.begin_s + REST_S + PERIODS * PERIOD_S * random.uniform(low, high)
-
-
-@dataclass(frozen=True)
-class Hidden:
-    """One hidden cause, of one size: the truth.
-
-    cause : name in the catalogue, or of an effect that it does not have. joints : 1 to 7, empty for the arm
-    settings : of each session. parameters : what a diagnosis may state, by its name; time in seconds from the
-    first row of the motion. depends_on : variables, for causes outside the catalogue
-    passing : it is another in each session, so what was learnt of it predicts no other
-    """
-
-    cause: str
-    side: str
-    joints: tuple[int, ...]
-    size: float
-    settings: Settings
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    depends_on: tuple[str, ...] = ()
-    variant: str = ""
-    passing: bool = False
-
-    @property
-    def listed(self) -> bool:
-        """Whether the catalogue has it."""
-        return self.cause in CATALOGUE
-
-
-Draw = Callable[[Random, int, Scene], Callable[[float], Hidden]]
-
-
-@dataclass(frozen=True)
-class Cause:
-    """A way to hide something.
-
-    joints : where it can be; (0,) for the whole arm. encoder : side that must be published, None for either
-    absorbed : the base parameters take most of it up, so that little shows without a reference
-    """
-
-    name: str
-    side: str
-    draw: Draw
-    joints: tuple[int, ...] = tuple(range(1, JOINTS + 1))
-    encoder: Encoder | None = None
-    absorbed: bool = False
-
-
-def _everywhere(setting: Setting) -> Settings:
-    return (setting,) * SESSIONS
-
-
-def _sign(random: Random) -> float:
-    return float(random.choice((-1.0, 1.0)))
-
-
-def _log(random: Random, low: float, high: float) -> float:
-    return float(np.exp(random.uniform(math.log(low), math.log(high))))
-
-
-def _trait(joint: int, **values: float) -> Setting:
-    return Setting(traits={name: {joint: value} for name, value in values.items()})
-
-
-def _fault(joint: int, **values: float) -> Setting:
-    return Setting(faults={name: {joint: value} for name, value in values.items()})
 
 
 # ---- friction ----
 
 
 def _stribeck(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    speed, shape = _log(random, 0.04, 0.25), random.uniform(0.8, 2.0)
+    speed, shape = log_uniform(random, 0.04, 0.25), random.uniform(0.8, 2.0)
 
     def sized(size: float) -> Hidden:
         rise = size * 7.0 * MOTOR_NOISE[joint - 1]
-        setting = _trait(
-            joint, stribeck=rise / COULOMB[joint - 1], stribeck_speed=speed, stribeck_shape=shape
-        )
+        setting = trait(joint, stribeck=rise / COULOMB[joint - 1], stribeck_speed=speed, stribeck_shape=shape)
         truth = {"amplitude": rise, "velocity": speed}
-        return Hidden("stribeck", "motor", (joint,), size, _everywhere(setting), truth)
+        return Hidden("stribeck", "motor", (joint,), size, everywhere(setting), truth)
 
     return sized
 
@@ -135,20 +54,20 @@ def _viscous(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidd
     def sized(size: float) -> Hidden:
         change = min(0.7, size * 6.0 * MOTOR_NOISE[joint - 1] / VISCOUS[joint - 1])
         power = 1.0 - change if falls else 1.0 + change
-        setting = _trait(joint, viscous_power=power, viscous_corner=corner)
-        return Hidden("viscous_nonlinear", "motor", (joint,), size, _everywhere(setting))
+        setting = trait(joint, viscous_power=power, viscous_corner=corner)
+        return Hidden("viscous_nonlinear", "motor", (joint,), size, everywhere(setting))
 
     return sized
 
 
 def _asymmetry(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    sign = _sign(random)
+    sign = either_sign(random)
 
     def sized(size: float) -> Hidden:
         coulomb = sign * min(0.4, size * 0.9 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         viscous = sign * min(0.6, size * 1.8 * MOTOR_NOISE[joint - 1] / VISCOUS[joint - 1])
-        setting = _trait(joint, forward_coulomb=coulomb, forward_viscous=viscous)
-        return Hidden("friction_asymmetry", "motor", (joint,), size, _everywhere(setting))
+        setting = trait(joint, forward_coulomb=coulomb, forward_viscous=viscous)
+        return Hidden("friction_asymmetry", "motor", (joint,), size, everywhere(setting))
 
     return sized
 
@@ -156,8 +75,8 @@ def _asymmetry(random: Random, joint: int, scene: Scene) -> Callable[[float], Hi
 def _load(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     def sized(size: float) -> Hidden:
         share = size * 2.4 * MOTOR_NOISE[joint - 1] / scene.peaks[joint - 1]
-        setting = _trait(joint, load_share=share)
-        return Hidden("friction_load", "motor", (joint,), size, _everywhere(setting), {"factor": share})
+        setting = trait(joint, load_share=share)
+        return Hidden("friction_load", "motor", (joint,), size, everywhere(setting), {"factor": share})
 
     return sized
 
@@ -169,7 +88,7 @@ def _temperature(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     def sized(size: float) -> Hidden:
         share = size * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1]
         if between:
-            settings = tuple(_trait(joint, warmth=0.03 * share, start_warm=start) for start in warm)
+            settings = tuple(trait(joint, warmth=0.03 * share, start_warm=start) for start in warm)
             return Hidden(
                 "friction_temperature",
                 "motor",
@@ -181,9 +100,9 @@ def _temperature(random: Random, joint: int, scene: Scene) -> Callable[[float], 
             )
         # A thin film that warms up within the session by 5 to 15 K.
         power = COULOMB[joint - 1] * 0.35
-        setting = _trait(joint, warmth=0.08 * share, film_capacity=power / 0.9, film_conductance=power / 12.0)
+        setting = trait(joint, warmth=0.08 * share, film_capacity=power / 0.9, film_conductance=power / 12.0)
         return Hidden(
-            "friction_temperature", "motor", (joint,), size, _everywhere(setting), variant="within a session"
+            "friction_temperature", "motor", (joint,), size, everywhere(setting), variant="within a session"
         )
 
     return sized
@@ -200,22 +119,22 @@ def _position(random: Random, joint: int, scene: Scene) -> Callable[[float], Hid
     def sized(size: float) -> Hidden:
         share = min(0.6, size * 1.4 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         if wave:
-            setting = _trait(joint, wave=share, wave_count=count, wave_phase=phase)
+            setting = trait(joint, wave=share, wave_count=count, wave_phase=phase)
         else:
-            setting = _trait(joint, bump=1.5 * share, bump_centre=centre, bump_width=width)
+            setting = trait(joint, bump=1.5 * share, bump_centre=centre, bump_width=width)
         variant = f"{count:.0f} waves" if wave else "bump"
-        return Hidden("friction_position", "motor", (joint,), size, _everywhere(setting), variant=variant)
+        return Hidden("friction_position", "motor", (joint,), size, everywhere(setting), variant=variant)
 
     return sized
 
 
 def _presliding(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    reach = _log(random, 5e-3, 4e-2)
+    reach = log_uniform(random, 5e-3, 4e-2)
 
     def sized(size: float) -> Hidden:
         share = min(0.9, size * 3.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
-        setting = _trait(joint, long_share=share, long_reach=reach)
-        return Hidden("presliding_hysteresis", "motor", (joint,), size, _everywhere(setting))
+        setting = trait(joint, long_share=share, long_reach=reach)
+        return Hidden("presliding_hysteresis", "motor", (joint,), size, everywhere(setting))
 
     return sized
 
@@ -230,25 +149,25 @@ def _gear_ripple(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     def sized(size: float) -> Hidden:
         amplitude = size * 1.5 * MOTOR_NOISE[joint - 1]
         name = "twice" if twice else "once"
-        setting = _trait(joint, **{f"ripple_{name}": amplitude, f"ripple_{name}_phase": phase})
+        setting = trait(joint, **{f"ripple_{name}": amplitude, f"ripple_{name}_phase": phase})
         truth = {"cycles_per_turn": turns * (2.0 if twice else 1.0), "amplitude": amplitude}
-        return Hidden("gear_ripple", "motor", (joint,), size, _everywhere(setting), truth, variant=name)
+        return Hidden("gear_ripple", "motor", (joint,), size, everywhere(setting), truth, variant=name)
 
     return sized
 
 
 def _motor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    sign = _sign(random)
+    sign = either_sign(random)
 
     def sized(size: float) -> Hidden:
         error = sign * min(0.3, size * 0.025)
-        setting = _trait(joint, motor_gain=1.0 + error)
+        setting = trait(joint, motor_gain=1.0 + error)
         return Hidden(
             "motor_torque_gain",
             "motor",
             (joint,),
             size,
-            _everywhere(setting),
+            everywhere(setting),
             {"error": 1.0 / (1.0 + error) - 1.0},
         )
 
@@ -260,8 +179,8 @@ def _backlash(random: Random, joint: int, scene: Scene) -> Callable[[float], Hid
 
     def sized(size: float) -> Hidden:
         play = size * PLAY[joint - 1]
-        setting = _trait(joint, play=play, play_softness=softness)
-        return Hidden("backlash", "joint", (joint,), size, _everywhere(setting), {"width": 2.0 * play})
+        setting = trait(joint, play=play, play_softness=softness)
+        return Hidden("backlash", "joint", (joint,), size, everywhere(setting), {"width": 2.0 * play})
 
     return sized
 
@@ -270,8 +189,8 @@ def _elasticity(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     hardening = random.uniform(0.0, 3e3)
 
     def sized(size: float) -> Hidden:
-        setting = _trait(joint, stiffness=1.0 / (1.0 + size), hardening=hardening)
-        return Hidden("joint_elasticity", "joint", (joint,), size, _everywhere(setting))
+        setting = trait(joint, stiffness=1.0 / (1.0 + size), hardening=hardening)
+        return Hidden("joint_elasticity", "joint", (joint,), size, everywhere(setting))
 
     return sized
 
@@ -286,11 +205,11 @@ def _cable(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
     def sized(size: float) -> Hidden:
         torque = size * 1.4 * JOINT_NOISE[joint - 1]
         if kind == "hardening":
-            setting = _trait(joint, cable=torque, cable_cubic=0.7 * torque, cable_centre=centre)
+            setting = trait(joint, cable=torque, cable_cubic=0.7 * torque, cable_centre=centre)
         elif kind == "slack":
-            setting = _trait(joint, cable=2.0 * torque, cable_centre=centre, cable_slack=slack)
+            setting = trait(joint, cable=2.0 * torque, cable_centre=centre, cable_slack=slack)
         else:
-            setting = _trait(
+            setting = trait(
                 joint,
                 cable=1.5 * torque,
                 cable_cubic=0.3 * torque,
@@ -298,7 +217,7 @@ def _cable(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
                 cable_rub=0.3 * torque,
                 cable_reach=0.15,
             )
-        return Hidden("cable_spring", "joint", (joint,), size, _everywhere(setting), variant=kind)
+        return Hidden("cable_spring", "joint", (joint,), size, everywhere(setting), variant=kind)
 
     return sized
 
@@ -310,7 +229,7 @@ def _tilt(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
         angle = math.radians(0.18 * size)
         rx, ry = angle * math.cos(direction), angle * math.sin(direction)
         truth = {"tilt_x": rx, "tilt_y": ry}
-        return Hidden("base_tilt", "joint", (), size, _everywhere(Setting(tilt=(rx, ry))), truth)
+        return Hidden("base_tilt", "joint", (), size, everywhere(Setting(tilt=(rx, ry))), truth)
 
     return sized
 
@@ -321,7 +240,7 @@ def _payload_error(random: Random, joint: int, scene: Scene) -> Callable[[float]
     def sized(size: float) -> Hidden:
         load = {"mass": size * mass, "moment": [float(v) for v in size * moment]}
         return Hidden(
-            "payload_error", "joint", (), size, _everywhere(Setting(load=load)), {"mass": size * mass}
+            "payload_error", "joint", (), size, everywhere(Setting(load=load)), {"mass": size * mass}
         )
 
     return sized
@@ -349,14 +268,14 @@ def _payload_change(random: Random, joint: int, scene: Scene) -> Callable[[float
 
 
 def _zero(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    sign = _sign(random)
+    sign = either_sign(random)
 
     def sized(size: float) -> Hidden:
         angle = sign * math.radians(ZERO_DEG[joint - 1] * size)
-        setting = _trait(joint, zero=angle)
+        setting = trait(joint, zero=angle)
         # The encoder shows the angle and its zero; a diagnosis states the true angle less the shown one.
         truth = {"offset": -angle}
-        return Hidden("joint_zero_offset", "joint", (joint,), size, _everywhere(setting), truth)
+        return Hidden("joint_zero_offset", "joint", (joint,), size, everywhere(setting), truth)
 
     return sized
 
@@ -399,7 +318,7 @@ def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidd
 
 
 def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    sign = _sign(random)
+    sign = either_sign(random)
 
     def sized(size: float) -> Hidden:
         gain = 1.0 + sign * min(0.3, 4.0 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1] * size)
@@ -408,7 +327,7 @@ def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], 
             "sensor",
             (joint,),
             size,
-            _everywhere(_fault(joint, gain=gain)),
+            everywhere(fault(joint, gain=gain)),
             {"error": gain - 1.0},
         )
 
@@ -417,13 +336,13 @@ def _sensor_gain(random: Random, joint: int, scene: Scene) -> Callable[[float], 
 
 def _crosstalk(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     others = [other for other in range(1, JOINTS + 1) if other != joint and scene.peaks[other - 1] > 8.0]
-    source, sign = int(random.choice(others)), _sign(random)
+    source, sign = int(random.choice(others)), either_sign(random)
 
     def sized(size: float) -> Hidden:
         share = sign * size * 1.8 * JOINT_NOISE[joint - 1] / scene.peaks[source - 1]
         setting = Setting(leak={joint: {source: share}})
         truth = {"source": float(source), "factor": share}
-        return Hidden("sensor_crosstalk", "sensor", (joint,), size, _everywhere(setting), truth)
+        return Hidden("sensor_crosstalk", "sensor", (joint,), size, everywhere(setting), truth)
 
     return sized
 
@@ -433,8 +352,8 @@ def _hysteresis(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
     def sized(size: float) -> Hidden:
         width = min(0.4 * scene.peaks[joint - 1], size * 1.2 * JOINT_NOISE[joint - 1])
-        setting = _fault(joint, play=width / share, play_share=share)
-        return Hidden("sensor_hysteresis", "sensor", (joint,), size, _everywhere(setting))
+        setting = fault(joint, play=width / share, play_share=share)
+        return Hidden("sensor_hysteresis", "sensor", (joint,), size, everywhere(setting))
 
     return sized
 
@@ -450,7 +369,7 @@ def _saturation(random: Random, joint: int, scene: Scene) -> Callable[[float], H
             "sensor",
             (joint,),
             size,
-            _everywhere(_fault(joint, clip=clip)),
+            everywhere(fault(joint, clip=clip)),
             {"limit": clip},
         )
 
@@ -458,17 +377,17 @@ def _saturation(random: Random, joint: int, scene: Scene) -> Callable[[float], H
 
 
 def _drift(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    kind, sign = str(random.choice(("drift", "creep", "between"))), _sign(random)
+    kind, sign = str(random.choice(("drift", "creep", "between"))), either_sign(random)
     zeros = random.permutation((-1.0, 0.2, 1.0))
     time_constant = random.uniform(4.0, 12.0)
 
     def sized(size: float) -> Hidden:
         torque = sign * size * 0.8 * JOINT_NOISE[joint - 1]
-        settings = _everywhere(_fault(joint, drift=2.0 * torque / (PERIODS * PERIOD_S)))
+        settings = everywhere(fault(joint, drift=2.0 * torque / (PERIODS * PERIOD_S)))
         if kind == "creep":
-            settings = _everywhere(_fault(joint, creep=2.0 * torque, creep_time=time_constant))
+            settings = everywhere(fault(joint, creep=2.0 * torque, creep_time=time_constant))
         elif kind == "between":
-            settings = tuple(_fault(joint, zero=torque * float(zero)) for zero in zeros)
+            settings = tuple(fault(joint, zero=torque * float(zero)) for zero in zeros)
         passing = kind == "between"
         return Hidden(
             "sensor_offset_drift", "sensor", (joint,), size, settings, variant=kind, passing=passing
@@ -485,14 +404,14 @@ def _sensor_ripple(random: Random, joint: int, scene: Scene) -> Callable[[float]
 
     def sized(size: float) -> Hidden:
         amplitude = size * 1.5 * JOINT_NOISE[joint - 1]
-        setting = _fault(joint, ripple=amplitude, ripple_count=count, ripple_phase=phase)
+        setting = fault(joint, ripple=amplitude, ripple_count=count, ripple_phase=phase)
         truth = {"cycles_per_turn": count, "amplitude": amplitude}
         return Hidden(
             "sensor_ripple",
             "sensor",
             (joint,),
             size,
-            _everywhere(setting),
+            everywhere(setting),
             truth,
             variant="motor angle" if geared else "joint angle",
         )
@@ -511,7 +430,7 @@ def _motor_late(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     def sized(size: float) -> Hidden:
         late = _whole(4e-3 * size)
         setting = Setting(faults={"motor_late": every([late] * JOINTS)})
-        return Hidden("motor_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
+        return Hidden("motor_torque_delay", "timing", (), size, everywhere(setting), {"delay": late})
 
     return sized
 
@@ -520,7 +439,7 @@ def _joint_late(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     def sized(size: float) -> Hidden:
         late = _whole(2.5e-3 * size)
         setting = Setting(faults={"late": every([late] * JOINTS)})
-        return Hidden("joint_torque_delay", "timing", (), size, _everywhere(setting), {"delay": late})
+        return Hidden("joint_torque_delay", "timing", (), size, everywhere(setting), {"delay": late})
 
     return sized
 
@@ -531,139 +450,13 @@ def _held(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     def sized(size: float) -> Hidden:
         length_s = min(0.2, (0.008 if what == "packet" else 0.02) * size)
         held = {"every_s": every_s, "length_s": length_s, "what": what}
-        settings = _everywhere(Setting(held=held))
+        settings = everywhere(Setting(held=held))
         return Hidden("lost_samples", "timing", (), size, settings, variant=what, passing=True)
 
     return sized
 
 
-# ---- outside the catalogue ----
-
-
-def _other(random: Random, joint: int) -> int:
-    return int(random.choice([other for other in range(1, JOINTS + 1) if other != joint]))
-
-
-def _other_friction(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    other, phase = _other(random, joint), random.uniform(-math.pi, math.pi)
-
-    def sized(size: float) -> Hidden:
-        share = min(0.6, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
-        setting = _trait(joint, other_friction=share, other=float(other), other_phase=phase)
-        depends = (f"qd{joint}", f"q{other}")
-        return Hidden(
-            "friction by a neighbour's angle",
-            "motor",
-            (joint,),
-            size,
-            _everywhere(setting),
-            depends_on=depends,
-        )
-
-    return sized
-
-
-def _other_drag(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    other, sign = _other(random, joint), _sign(random)
-
-    def sized(size: float) -> Hidden:
-        drag = sign * size * 1.2 * MOTOR_NOISE[joint - 1]
-        setting = _trait(joint, other_drag=drag, other=float(other))
-        return Hidden(
-            "drag by a neighbour's speed",
-            "motor",
-            (joint,),
-            size,
-            _everywhere(setting),
-            depends_on=(f"qd{other}",),
-        )
-
-    return sized
-
-
-def _memory(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    past_s, sign = random.uniform(0.5, 2.0), _sign(random)
-
-    def sized(size: float) -> Hidden:
-        drag = sign * size * 4.0 * MOTOR_NOISE[joint - 1]
-        setting = _trait(joint, memory=drag, memory_time=past_s)
-        return Hidden(
-            "drag by past speed",
-            "motor",
-            (joint,),
-            size,
-            _everywhere(setting),
-            depends_on=(f"qd{joint}", "history"),
-        )
-
-    return sized
-
-
-def _inertial(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    def sized(size: float) -> Hidden:
-        share = min(1.0, size * 1.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
-        setting = _trait(joint, inertial_friction=share)
-        return Hidden(
-            "friction by acceleration",
-            "motor",
-            (joint,),
-            size,
-            _everywhere(setting),
-            depends_on=(f"qd{joint}", f"qdd{joint}"),
-        )
-
-    return sized
-
-
-def _shake(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    # Not a multiple of the excitation's base frequency, so it differs from period to period.
-    rate = random.uniform(0.6, 4.0)
-
-    def sized(size: float) -> Hidden:
-        setting = _trait(joint, shake=size * 1.5 * MOTOR_NOISE[joint - 1], shake_hz=rate)
-        return Hidden(
-            "shaking from outside", "motor", (joint,), size, _everywhere(setting), depends_on=("time",)
-        )
-
-    return sized
-
-
-def _bent_sensor(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    other, phase = _other(random, joint), random.uniform(-math.pi, math.pi)
-
-    def sized(size: float) -> Hidden:
-        scale = size * 2.5 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1]
-        setting = _fault(joint, other=float(other), other_scale=scale, other_phase=phase)
-        return Hidden(
-            "sensor scale by a neighbour's angle",
-            "sensor",
-            (joint,),
-            size,
-            _everywhere(setting),
-            depends_on=(f"q{other}", f"tau{joint}"),
-        )
-
-    return sized
-
-
-def _dead_current(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
-    def sized(size: float) -> Hidden:
-        dead = min(COULOMB[joint - 1], size * 15.0 * MOTOR_NOISE[joint - 1])
-        setting = _fault(joint, motor_dead=dead)
-        return Hidden(
-            "small currents not reported",
-            "motor",
-            (joint,),
-            size,
-            _everywhere(setting),
-            depends_on=(f"tau{joint}",),
-        )
-
-    return sized
-
-
 _ARM = (0,)
-_LOADED = (2, 3, 4)
 
 CAUSES: Mapping[str, Cause] = {
     cause.name: cause
@@ -697,19 +490,3 @@ CAUSES: Mapping[str, Cause] = {
     )
 }
 """Causes of the catalogue by name."""
-
-CATALOGUE = frozenset(CAUSES)
-
-OUTSIDE: Mapping[str, Cause] = {
-    cause.name: cause
-    for cause in (
-        Cause("friction by a neighbour's angle", "motor", _other_friction),
-        Cause("drag by a neighbour's speed", "motor", _other_drag),
-        Cause("drag by past speed", "motor", _memory),
-        Cause("friction by acceleration", "motor", _inertial),
-        Cause("shaking from outside", "motor", _shake),
-        Cause("sensor scale by a neighbour's angle", "sensor", _bent_sensor, joints=_LOADED),
-        Cause("small currents not reported", "motor", _dead_current),
-    )
-}
-"""Causes that no catalogue has."""

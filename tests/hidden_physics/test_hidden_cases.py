@@ -11,7 +11,9 @@ import pytest
 
 from hidden_physics import cases
 from hidden_physics.cases import Store, draw, twin
-from hidden_physics.causes import CAUSES, OUTSIDE, Scene
+from hidden_physics.causes import CAUSES
+from hidden_physics.hidden import Scene
+from hidden_physics.outside import OUTSIDE
 from hidden_physics.robots import SESSIONS, Day, Setting, session_settings
 
 CONTRACT = {

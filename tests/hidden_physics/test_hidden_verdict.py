@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hidden_physics.causes import CAUSES, OUTSIDE, Hidden, Scene
+from hidden_physics.causes import CAUSES
+from hidden_physics.hidden import Hidden, Scene
+from hidden_physics.outside import OUTSIDE
 from hidden_physics.verdict import judge
 
 PEAKS = (20.0, 60.0, 15.0, 40.0, 5.0, 12.0, 9.0)
