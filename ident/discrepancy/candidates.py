@@ -25,6 +25,8 @@ _ABOUT_ONE = 0.3
 _ONE_LIMIT = 1e-3
 # Fall of the chi-square from which on the parameters of a shape are sought together.
 _VALLEY = 30.0
+# Fall of the chi-square by which a push that recurs explains more than one that does not.
+_TIED = 6.0
 # What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
 _STEP_ROOM_S = 1.0
 
@@ -204,9 +206,27 @@ class Dictionary:
                     "link": float(link),
                 }
                 trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
-                if trial is not None and (best is None or trial.score.gain > best.score.gain):
+                better = trial is not None and (best is None or trial.score.gain > best.score.gain)
+                if trial is not None and better and not self._recurs(trial):
                     best = trial
         return best
+
+    def _recurs(self, trial: Trial) -> bool:
+        """Whether the same push, a period earlier or later as well, explains more: then it is tied to the pose and
+        not to the moment, and nobody pushes.
+        """
+        shape = trial.shape
+        recording = next(r for r in self.nominal.recordings if r.number == int(shape["session"]) - 1)
+        if not recording.repeats:
+            return False
+        for periods in (-1.0, 1.0):
+            again = {**shape, "time": shape["time"] + periods * recording.period_s}
+            rows = self.rows(trial.candidate, again)
+            both = {**rows, **trial.rows}
+            both.update({key: trial.rows[key] + rows[key] for key in trial.rows.keys() & rows.keys()})
+            if self.evidence.score(self.evidence.padded(both)).fitted > trial.score.fitted + _TIED:
+                return True
+        return False
 
     def best(self, candidate: Candidate) -> Trial | None:
         """The candidate with the best shape of its grid, None where no shape is plausible."""

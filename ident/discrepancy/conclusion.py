@@ -114,6 +114,11 @@ def conclude(
         )
         for claim, finding in kept
     ]
+    unnamed = {(r.side, r.joint - 1) for r in remainders}
+    findings = [
+        _borne_out_by_none(finding) if unnamed & set(claim.trial.rows) else finding
+        for finding, (claim, _) in zip(findings, kept, strict=True)
+    ]
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     findings += timing
     if loss:
@@ -122,15 +127,16 @@ def conclude(
     before, after = baseline.held.where(after), after.where(baseline.held)
     extended_rms, base_rms = after.rms(), before.rms()
     base_model, extended, changes = _models(bench, baseline, claims, nuisance, findings, sessions)
+    nameless = [*_stuck(nominal), *((r.side, r.joint, r.depends_on) for r in remainders)]
     unexplained = tuple(
         Unexplained(
-            r.side,
-            r.joint,
-            r.depends_on,
-            float(extended_rms[r.side][r.joint - 1]),
-            float(evidence.floor[r.side][r.joint - 1]),
+            side,
+            joint,
+            depends_on,
+            float(extended_rms[side][joint - 1]),
+            float(evidence.floor[side][joint - 1]),
         )
-        for r in remainders
+        for side, joint, depends_on in nameless
     )
     replayed = list(test) or list(sessions)
     simulation = extended_simulation = None
@@ -153,7 +159,7 @@ def conclude(
         nuisance=selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=(*_notes(bench, reference), *_lines(nominal, remainders)),
+        notes=(*_notes(bench, reference), *_lines(nominal, remainders), *_stuck_notes(nominal)),
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
@@ -170,12 +176,13 @@ def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float
 
     What the healthy arm is a little like, and what a stronger cause of another form than its law leaves behind,
     is significant in the rows fitted but makes no prediction. Where the held-out sessions hardly excite the cause,
-    they need only not speak against it; of what was another in other sessions or lasted a moment they say nothing.
+    they need only not speak against it; of what was another in other sessions or lasted a moment they say nothing, and
+    what the samples themselves show needs no other.
     A cause that the rows fitted show with room to spare, or that the others all but bear out for sure, may be it or
     another. So may one that the rows fitted show faintly; that is said only where the others do bear it out.
     """
     effect = claim.trial.candidate.effect
-    if finding.mode == "between" or effect.repeats:
+    if finding.mode == "between" or effect.repeats or effect.witnessed(claim.trial.shape):
         return 1.0
     low, high = fallen
     if claim.faint:
@@ -326,6 +333,15 @@ def _encompassed(
     return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain
 
 
+def _borne_out_by_none(finding: Finding) -> Finding:
+    """Less confidence in what was another between the sessions, for no held-out session bears it out, where the rows
+    that it explains show something nameless too: what differs between motions is easily taken for a change.
+    """
+    if finding.mode != "between":
+        return finding
+    return replace(finding, confidence=min(finding.confidence, _OPEN))
+
+
 def _doubted(
     claim: Claim, finding: Finding, remainders: Sequence[Remainder], joints: int, encompassed: float
 ) -> Finding:
@@ -444,6 +460,23 @@ def _entry(finding: Finding) -> dict[str, Any]:
             name: {"value": v.value, "std": v.std, "unit": v.unit} for name, v in finding.parameters.items()
         },
     }
+
+
+def _stuck(nominal: Nominal) -> list[tuple[str, int, tuple[str, ...]]]:
+    """Side, joint (from 1) and variable of motor torques that the channel does not report as they are."""
+    joints = {one.joint for r in nominal.recordings if not r.test for one in r.stuck}
+    return [("motor", joint + 1, (f"load{joint + 1}",)) for joint in sorted(joints)]
+
+
+def _stuck_notes(nominal: Nominal) -> list[str]:
+    names = nominal.arm.chain.joint_names
+    return [
+        f"{r.name}: the motor torque of {names[one.joint]} reads exactly {one.value:.4g} Nm in {one.count} of "
+        f"{one.samples} samples in motion, so torques near that are not reported as they are; these samples are "
+        "left out"
+        for r in nominal.recordings
+        for one in r.stuck
+    ]
 
 
 def _lines(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:

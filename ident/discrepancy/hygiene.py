@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["SampleLoss", "clipped_at", "held_times", "sample_loss"]
+__all__ = ["SampleLoss", "Stuck", "clipped_at", "held_times", "sample_loss", "stuck_at"]
 
 # Number and share of samples amiss in a session from which on they are a finding.
 _LEAST, _SHARE = 3, 0.0005
@@ -20,9 +20,11 @@ _LEAST, _SHARE = 3, 0.0005
 _JOLT, _STEPS = 16.0, 4.0
 # Samples by which a jolt is away from a repeated sample that makes it.
 _NEAR = 4
-# Samples at the very largest torque that make a flat top, over those at the next smaller ones; a coarse channel
-# stays at its largest value about twice as long as at the next.
+# Samples of the very same torque that a noisy channel does not have by chance, also over those of the values next to
+# it; a coarse channel stays at its largest value about twice as long as at the next.
 _FLAT, _OVER_NEXT = 10, 10
+# Speed from which on a motor works.
+_MOVING_RAD_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,16 @@ class SampleLoss:
     def matters(self) -> bool:
         """More than one or two, and more than one in two thousand."""
         return self.amiss >= _LEAST and self.share > _SHARE
+
+
+@dataclass(frozen=True)
+class Stuck:
+    """A torque [Nm] that a channel reports for a joint (from 0) again and again: count of samples in motion."""
+
+    joint: int
+    value: float
+    count: int
+    samples: int
 
 
 def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
@@ -88,14 +100,47 @@ def clipped_at(columns: JointColumns) -> NDArray[np.float64]:
     if n > 1:
         fresh &= ~_same(effort)
     for joint in range(n):
-        values, counts = np.unique(effort[fresh, joint], return_counts=True)
-        if len(values) < 3:
-            continue
-        # The two ends, each beside the two values next to it.
-        ends = ((values[0], counts[0], counts[1:3]), (values[-1], counts[-1], counts[-3:-1]))
-        flat = [abs(v) for v, count, next_ in ends if count >= _FLAT and count > _OVER_NEXT * next_.max()]
-        if flat:
-            found[joint] = max(flat)
+        values = effort[fresh, joint]
+        ends = [abs(v) for v, _ in _flat(values) if v in (values.min(), values.max())]
+        if ends:
+            found[joint] = max(ends)
+    return found
+
+
+def stuck_at(motor: JointColumns, joint: JointColumns) -> tuple[Stuck, ...]:
+    """Values that motor torques of joints that move have again and again: what is small or large is not reported.
+
+    A motor that works is as noisy at one torque as at another.
+    """
+    if len(motor) < 2 or len(joint) < 2:
+        return ()
+    found = []
+    seconds = (motor.log_time - joint.log_time[0]) * 1e-9
+    clock = (joint.log_time - joint.log_time[0]) * 1e-9
+    held = _same(motor.effort) if motor.effort.shape[1] > 1 else np.zeros(len(motor), dtype=bool)
+    for k in range(motor.effort.shape[1]):
+        angle = np.interp(seconds, clock, joint.position[:, k])
+        speed = np.abs(np.diff(angle, prepend=angle[0])) / np.maximum(
+            np.diff(seconds, prepend=seconds[0]), 1e-6
+        )
+        moving = (speed > _MOVING_RAD_S) & ~held
+        values = motor.effort[moving, k]
+        found += [Stuck(k, value, count, int(moving.sum())) for value, count in _flat(values)]
+    return tuple(found)
+
+
+def _flat(values: NDArray[np.float64]) -> list[tuple[float, int]]:
+    """Values that a noisy channel has again and again, and how often: more often by far than the two next to each on
+    either side.
+    """
+    values, counts = np.unique(values, return_counts=True)
+    if len(values) < 3:
+        return []
+    found = []
+    for k in np.flatnonzero(counts >= _FLAT):
+        beside = np.concatenate([counts[max(0, k - 2) : k], counts[k + 1 : k + 3]])
+        if counts[k] > _OVER_NEXT * beside.max():
+            found.append((float(values[k]), int(counts[k])))
     return found
 
 

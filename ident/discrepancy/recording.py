@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.discrepancy.bandwidth import passed_band
-from ident.discrepancy.hygiene import clipped_at, held_times
+from ident.discrepancy.hygiene import Stuck, clipped_at, held_times, stuck_at
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
 from ident.signals.prepare import PreparedSession, prepare
@@ -54,7 +55,7 @@ class Recording:
     number : in the order of the sessions' beginnings. payload : mounted, None for none.
     period_s : of the excitation, or the duration where it does not repeat; start_s : its beginning.
     has_effort, has_motor : which channels exist. clipped : (n,) torque [Nm] at which the samples of a joint's sensor
-    stop, NaN where they do not.
+    stop, NaN where they do not. stuck : motor torques that are reported again and again, and are no measurements.
     joint_band_hz, motor_band_hz : upper edge of what a low-pass left of the torques, None where they are
     as measured.
     """
@@ -72,6 +73,7 @@ class Recording:
     joint_names: tuple[str, ...]
     warnings: tuple[str, ...]
     clipped: Floats
+    stuck: tuple[Stuck, ...]
     joint_band_hz: float | None = None
     motor_band_hz: float | None = None
 
@@ -98,7 +100,8 @@ def record(
         cutoff_hz=cutoff, decimate_hz=min(10.0, 0.5 * cutoff), motor_delay_s=0.0, standstill_share=1.0
     )
     prepared = prepare(chosen, signals)
-    stretches = tuple(_stretches(prepared, rate, held_times(chosen.joint)))
+    stuck = () if chosen.motor is None else stuck_at(chosen.motor, chosen.joint)
+    stretches = tuple(_stretches(prepared, rate, held_times(chosen.joint), stuck))
     if not stretches:
         raise DataError(f"{prepared.name}: no stretch of the session is long enough for a diagnosis")
     spans = chosen.spans("period")
@@ -121,13 +124,14 @@ def record(
         joint_names=prepared.joint_names,
         warnings=(),
         clipped=clipped_at(chosen.joint),
+        stuck=stuck,
         # Whoever filtered did it sample by sample, so the samples are looked at as they came.
         joint_band_hz=passed_band(chosen.joint.effort, chosen.joint.period_s),
         motor_band_hz=None if motor is None else passed_band(motor.effort, motor.period_s),
     )
 
 
-def _stretches(prepared: PreparedSession, rate: float, held: Floats) -> list[Stretch]:
+def _stretches(prepared: PreparedSession, rate: float, held: Floats, stuck: Sequence[Stuck]) -> list[Stretch]:
     found = []
     for passage in prepared.passages:
         joint = passage.joint
@@ -145,6 +149,8 @@ def _stretches(prepared: PreparedSession, rate: float, held: Floats) -> list[Str
             keep = (m.times >= joint.times[pick[0]] + 0.06) & (m.times <= joint.times[pick[-1]] - 0.06)
             motor_time, motor = m.times[keep], m.torque[keep]
             usable = ~m.flagged[keep] & _apart(motor_time, held)[:, None]
+            for one in stuck:
+                usable[:, one.joint] &= motor[:, one.joint] != one.value
         found.append(
             Stretch(
                 joint.times[pick],

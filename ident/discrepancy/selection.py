@@ -139,6 +139,21 @@ def _lasting(trial: Trial) -> bool:
     return not effect.event and effect.side != "timing" and effect.mode(trial.shape) != "between"
 
 
+def _answers(trial: Trial, other: Trial) -> bool:
+    """Whether a ripple of the motor torque is the answer to a larger one that the joint's sensor reads, and that the
+    controller acts on.
+    """
+    one, two = trial.candidate, other.candidate
+    if (one.cause, two.cause, one.joint) != ("gear_ripple", "sensor_ripple", two.joint):
+        return False
+    same = trial.shape == {
+        "cycles_per_turn": other.shape["cycles_per_turn"],
+        "gear_ratio": other.shape["ratio"],
+    }
+    size, read = (float(np.linalg.norm(t.score.coefficients)) for t in (trial, other))
+    return same and size < _ANSWER * read
+
+
 def _gain(trial: Trial) -> float:
     """Gain by which candidates are ordered: of two that explain the same, the one with less freedom."""
     return trial.score.gain - 2.0 * len(trial.shape)
@@ -369,9 +384,12 @@ class _State:
 
     def leftover(self, trial: Trial, others: Sequence[Trial]) -> bool:
         """Whether a trial beside others is no more carried once the stronger ones in its rows may be of any form, or
-        is so small beside one of them, in the rows of its joint, that the least error of its law explains it.
+        is so small beside one of them, in the rows of its joint, that the least error of its law explains it; or
+        answers to one.
         """
         wide = []
+        if any(_answers(trial, other) for other in others):
+            return True
         for other in others:
             if other.score.gain > trial.score.gain and set(trial.rows) & set(other.rows):
                 small = (
@@ -445,6 +463,8 @@ _SAME_ROWS = 0.2
 # Share of what a law explains that it may leave, and share of a trial's power in the rows of that law's joint from
 # which on the trial may be just that.
 _LAW_ERROR, _MOSTLY = 0.1, 0.8
+# Ripple of the motor torque over that of the sensor's reading up to which the controller may have made it.
+_ANSWER = 0.4
 # Least time between two pushes that are told from one [s].
 _PAUSE_S = 0.2
 # Gain from which on it is worth seeing what a candidate leaves.

@@ -12,7 +12,7 @@ from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simu
 from ident.effects.motion import Floats, Motion
 
 # Lost motions to begin with [rad].
-_SIZES = (3e-4, 1e-3, 3e-3, 1e-2)
+_SIZES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 
 
 class Backlash(Effect):
