@@ -139,6 +139,12 @@ def _lasting(trial: Trial) -> bool:
     return not effect.event and effect.side != "timing" and effect.mode(trial.shape) != "between"
 
 
+def _is_its_mean(trial: Trial, other: Trial) -> bool:
+    """Whether a zero that is off may be the mean twist of a joint that gives way in another way than its law."""
+    one, two = trial.candidate, other.candidate
+    return one.joint == two.joint and (one.cause, two.cause) == ("joint_zero_offset", "joint_elasticity")
+
+
 def _answers(trial: Trial, other: Trial) -> bool:
     """Whether a ripple of the motor torque is the answer to a larger one that the joint's sensor reads, and that the
     controller acts on.
@@ -391,7 +397,8 @@ class _State:
         if any(_answers(trial, other) for other in others):
             return True
         for other in others:
-            if other.score.gain > trial.score.gain and set(trial.rows) & set(other.rows):
+            stronger = other.score.gain > trial.score.gain or _is_its_mean(trial, other)
+            if stronger and set(trial.rows) & set(other.rows):
                 small = (
                     trial.score.gain < _LAW_ERROR * other.score.gain and not other.candidate.effect.whole_arm
                 )

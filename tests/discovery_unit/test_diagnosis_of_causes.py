@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.discrepancy import Diagnosis, Reference, commission, diagnose
-from ident.discrepancy.hygiene import clipped_at, held_times
+from ident.discrepancy import ArmData, Diagnosis, Reference, commission, diagnose
+from ident.discrepancy.hygiene import clipped_at, held_times, stuck_at
 from ident.kinematics import Chain
 from ident.model_file import model_text, read_model
 from ident.regressor import torque
@@ -394,6 +394,59 @@ def test_rest_and_coarse_or_held_samples_are_no_clipping(make: Make) -> None:
     still[top : top + 200] = still[top]
     effort[top : top + 200, 0] += np.arange(200)
     assert np.isnan(clipped_at(replace(columns, position=still, effort=effort))).all()
+
+
+def test_small_motor_torques_that_are_not_reported_are_seen(make: Make, chain: Chain) -> None:
+    sessions = [
+        replace(
+            one,
+            motor=replace(
+                one.motor, effort=np.where(dead & (np.abs(one.motor.effort) < 2.0), 0.0, one.motor.effort)
+            ),
+        )
+        for one in pair(make)
+        for dead in [np.array([False, True, False])]
+        if one.motor is not None
+    ]
+    assert [stuck_at(one.motor, one.joint) for one in pair(make) if one.motor is not None] == [(), ()]
+    for one in sessions:
+        assert one.motor is not None
+        (stuck,) = stuck_at(one.motor, one.joint)
+        assert (stuck.joint, stuck.value) == (1, 0.0)
+    found = diagnose(sessions, chain)
+    assert found.findings == ()
+    assert [(u.side, u.joint, u.depends_on) for u in found.unexplained] == [("motor", 2, ("load2",))]
+    assert any("motor torque of two reads exactly 0 Nm" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("times", "causes"), [((6.0,), ["contact"]), ((6.0, 16.0), [])])
+def test_what_recurs_in_each_period_is_no_push(
+    make: Make, chain: Chain, times: tuple[float, ...], causes: list[str]
+) -> None:
+    def pushed(s: Signals) -> None:
+        for time in times:
+            on = np.abs(s["time"] - 1.5 - time) < 0.2
+            s["joint"][on, 1] += 2.0
+            s["motor"][on, 1] += 2.0
+
+    found = diagnose([make("a.mcap", 1, pushed), make("b.mcap", 2, None, 1)], chain, causes=["contact"])
+    assert [f.cause for f in found.findings] == causes
+
+
+@pytest.mark.parametrize(
+    ("answer", "causes"), [(0.25, {"sensor_ripple"}), (1.0, {"sensor_ripple", "gear_ripple"})]
+)
+def test_a_controller_that_answers_to_ripple_is_no_second_cause(
+    make: Make, chain: Chain, answer: float, causes: set[str]
+) -> None:
+    def rippled(s: Signals) -> None:
+        ripple = 0.2 * np.cos(40.0 * s["q"][:, 1])
+        s["joint"][:, 1] += ripple
+        s["motor"][:, 1] += answer * ripple
+
+    known = ArmData(gear_ratio=np.full(3, 40.0))
+    found = diagnose(pair(make, rippled), chain, arm=known, causes=["sensor_ripple", "gear_ripple"])
+    assert {f.cause for f in found.findings} == causes
 
 
 def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
