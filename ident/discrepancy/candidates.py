@@ -206,8 +206,9 @@ class Dictionary:
                     "link": float(link),
                 }
                 trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
-                better = trial is not None and (best is None or trial.score.gain > best.score.gain)
-                if trial is not None and better and not self._recurs(trial):
+                if trial is None or (best is not None and trial.score.gain <= best.score.gain):
+                    continue
+                if not self._recurs(trial):
                     best = trial
         return best
 

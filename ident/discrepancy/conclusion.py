@@ -102,7 +102,7 @@ def conclude(
         finding = _finding(claim, bench, without, after, settings)
         most = _confirmed(claim, finding, bench, fall(without, after, _weights(claim, bench), settings.seed))
         if most > 0.0:
-            kept.append((claim, replace(finding, confidence=min(finding.confidence, most))))
+            kept.append((claim, _at_most(most, finding)))
     claims = [claim for claim, _ in kept]
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     after = held_out(evidence, [*(c.trial.rows for c in claims), *nuisance])
@@ -114,9 +114,11 @@ def conclude(
         )
         for claim, finding in kept
     ]
+    # No held-out session bears out what was another between the sessions, and what differs between motions is easily
+    # taken for such a change.
     unnamed = {(r.side, r.joint - 1) for r in remainders}
     findings = [
-        _borne_out_by_none(finding) if unnamed & set(claim.trial.rows) else finding
+        _at_most(_OPEN, finding) if finding.mode == "between" and unnamed & set(claim.trial.rows) else finding
         for finding, (claim, _) in zip(findings, kept, strict=True)
     ]
     evidence.replace([*(c.trial.rows for c in claims), *nuisance])
@@ -333,13 +335,9 @@ def _encompassed(
     return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain
 
 
-def _borne_out_by_none(finding: Finding) -> Finding:
-    """Less confidence in what was another between the sessions, for no held-out session bears it out, where the rows
-    that it explains show something nameless too: what differs between motions is easily taken for a change.
-    """
-    if finding.mode != "between":
-        return finding
-    return replace(finding, confidence=min(finding.confidence, _OPEN))
+def _at_most(confidence: float, finding: Finding) -> Finding:
+    """The finding with no more than that confidence."""
+    return replace(finding, confidence=min(finding.confidence, confidence))
 
 
 def _doubted(
@@ -347,15 +345,13 @@ def _doubted(
 ) -> Finding:
     """Less confidence in a name that leaves much in the rows that it explains, or that what it leaves explains."""
     if encompassed > _ENCOMPASSED:
-        finding = replace(finding, confidence=min(finding.confidence, _OPEN))
+        finding = _at_most(_OPEN, finding)
     mine = set(claim.trial.rows)
     left = sum(r.gain for r in remainders if (r.side, r.joint - 1) in mine)
     if len(mine) > joints:
         left /= 2.0
     if left > _DOUBT * claim.gain:
-        return replace(
-            finding, confidence=min(finding.confidence, float(0.75 * claim.gain / (claim.gain + left)))
-        )
+        return _at_most(float(0.75 * claim.gain / (claim.gain + left)), finding)
     return finding
 
 

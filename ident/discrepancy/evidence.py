@@ -369,10 +369,10 @@ class Evidence:
         gain = fitted
         if fitted > _NOTHING:
             gain = 0.0
+            pulled = whole[0], whole[1] + pull * np.eye(k), whole[2] + pull
             for part, fit in enumerate(self._held):
                 mine = base[part], own[part], target[part]
-                known = pull * np.eye(k)
-                rest = whole[0] - mine[0], whole[1] - mine[1] + known, whole[2] - mine[2] + pull
+                rest = pulled[0] - mine[0], pulled[1] - mine[1], pulled[2] - mine[2]
                 gain += self._held_gain(mine, rest, fit, part, ridge)
         rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
         if self.prior is not None and self.compared and fitted > _NOTHING:

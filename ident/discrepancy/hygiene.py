@@ -97,8 +97,7 @@ def clipped_at(columns: JointColumns) -> NDArray[np.float64]:
     if len(effort) < 2:
         return found
     fresh = np.concatenate([[False], np.any(np.diff(columns.position, axis=0) != 0.0, axis=1)])
-    if n > 1:
-        fresh &= ~_same(effort)
+    fresh &= ~_same(effort)
     for joint in range(n):
         values = effort[fresh, joint]
         ends = [abs(v) for v, _ in _flat(values) if v in (values.min(), values.max())]
@@ -117,7 +116,7 @@ def stuck_at(motor: JointColumns, joint: JointColumns) -> tuple[Stuck, ...]:
     found = []
     seconds = (motor.log_time - joint.log_time[0]) * 1e-9
     clock = (joint.log_time - joint.log_time[0]) * 1e-9
-    held = _same(motor.effort) if motor.effort.shape[1] > 1 else np.zeros(len(motor), dtype=bool)
+    held = _same(motor.effort)
     for k in range(motor.effort.shape[1]):
         angle = np.interp(seconds, clock, joint.position[:, k])
         speed = np.abs(np.diff(angle, prepend=angle[0])) / np.maximum(
@@ -171,7 +170,9 @@ def _channel(name: str, channel: str, columns: JointColumns) -> SampleLoss:
 
 
 def _same(effort: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Samples (N,) at which all joints have the torque of the one before."""
+    """Samples (N,) at which all joints have the torque of the one before; of one joint alone that means nothing."""
+    if effort.shape[1] < 2:
+        return np.zeros(len(effort), dtype=bool)
     return np.concatenate([[False], np.all(np.diff(effort, axis=0) == 0.0, axis=1)])
 
 

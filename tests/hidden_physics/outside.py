@@ -18,6 +18,7 @@ from hidden_physics.hidden import (
     fault,
     trait,
 )
+from hidden_physics.robots import Setting
 from hidden_physics.traits import JOINTS
 
 __all__ = ["OUTSIDE"]
@@ -27,6 +28,13 @@ def _other(random: Random, joint: int) -> int:
     return int(random.choice([other for other in range(1, JOINTS + 1) if other != joint]))
 
 
+def _unlisted(
+    cause: str, joint: int, size: float, setting: Setting, depends_on: tuple[str, ...], side: str = "motor"
+) -> Hidden:
+    """The same in all sessions, on one joint."""
+    return Hidden(cause, side, (joint,), size, everywhere(setting), depends_on=depends_on)
+
+
 def _other_friction(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     other, phase = _other(random, joint), random.uniform(-math.pi, math.pi)
 
@@ -34,14 +42,7 @@ def _other_friction(random: Random, joint: int, scene: Scene) -> Callable[[float
         share = min(0.6, size * 2.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         setting = trait(joint, other_friction=share, other=float(other), other_phase=phase)
         depends = (f"qd{joint}", f"q{other}")
-        return Hidden(
-            "friction by a neighbour's angle",
-            "motor",
-            (joint,),
-            size,
-            everywhere(setting),
-            depends_on=depends,
-        )
+        return _unlisted("friction by a neighbour's angle", joint, size, setting, depends)
 
     return sized
 
@@ -52,14 +53,7 @@ def _other_drag(random: Random, joint: int, scene: Scene) -> Callable[[float], H
     def sized(size: float) -> Hidden:
         drag = sign * size * 1.2 * MOTOR_NOISE[joint - 1]
         setting = trait(joint, other_drag=drag, other=float(other))
-        return Hidden(
-            "drag by a neighbour's speed",
-            "motor",
-            (joint,),
-            size,
-            everywhere(setting),
-            depends_on=(f"qd{other}",),
-        )
+        return _unlisted("drag by a neighbour's speed", joint, size, setting, (f"qd{other}",))
 
     return sized
 
@@ -70,14 +64,7 @@ def _memory(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidde
     def sized(size: float) -> Hidden:
         drag = sign * size * 4.0 * MOTOR_NOISE[joint - 1]
         setting = trait(joint, memory=drag, memory_time=past_s)
-        return Hidden(
-            "drag by past speed",
-            "motor",
-            (joint,),
-            size,
-            everywhere(setting),
-            depends_on=(f"qd{joint}", "history"),
-        )
+        return _unlisted("drag by past speed", joint, size, setting, (f"qd{joint}", "history"))
 
     return sized
 
@@ -86,14 +73,7 @@ def _inertial(random: Random, joint: int, scene: Scene) -> Callable[[float], Hid
     def sized(size: float) -> Hidden:
         share = min(1.0, size * 1.0 * MOTOR_NOISE[joint - 1] / COULOMB[joint - 1])
         setting = trait(joint, inertial_friction=share)
-        return Hidden(
-            "friction by acceleration",
-            "motor",
-            (joint,),
-            size,
-            everywhere(setting),
-            depends_on=(f"qd{joint}", f"qdd{joint}"),
-        )
+        return _unlisted("friction by acceleration", joint, size, setting, (f"qd{joint}", f"qdd{joint}"))
 
     return sized
 
@@ -104,9 +84,7 @@ def _shake(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden
 
     def sized(size: float) -> Hidden:
         setting = trait(joint, shake=size * 1.5 * MOTOR_NOISE[joint - 1], shake_hz=rate)
-        return Hidden(
-            "shaking from outside", "motor", (joint,), size, everywhere(setting), depends_on=("time",)
-        )
+        return _unlisted("shaking from outside", joint, size, setting, ("time",))
 
     return sized
 
@@ -117,13 +95,13 @@ def _bent_sensor(random: Random, joint: int, scene: Scene) -> Callable[[float], 
     def sized(size: float) -> Hidden:
         scale = size * 2.5 * JOINT_NOISE[joint - 1] / scene.peaks[joint - 1]
         setting = fault(joint, other=float(other), other_scale=scale, other_phase=phase)
-        return Hidden(
+        return _unlisted(
             "sensor scale by a neighbour's angle",
-            "sensor",
-            (joint,),
+            joint,
             size,
-            everywhere(setting),
-            depends_on=(f"q{other}", f"tau{joint}"),
+            setting,
+            (f"q{other}", f"tau{joint}"),
+            side="sensor",
         )
 
     return sized
@@ -133,14 +111,7 @@ def _dead_current(random: Random, joint: int, scene: Scene) -> Callable[[float],
     def sized(size: float) -> Hidden:
         dead = min(COULOMB[joint - 1], size * 15.0 * MOTOR_NOISE[joint - 1])
         setting = fault(joint, motor_dead=dead)
-        return Hidden(
-            "small currents not reported",
-            "motor",
-            (joint,),
-            size,
-            everywhere(setting),
-            depends_on=(f"tau{joint}",),
-        )
+        return _unlisted("small currents not reported", joint, size, setting, (f"tau{joint}",))
 
     return sized
 
