@@ -16,7 +16,7 @@ from ident.discrepancy.evidence import Floats
 from ident.discrepancy.nominal import Arm
 from ident.discrepancy.presliding import SlowTurns, presliding_reach, slow_turns, with_far_presliding
 from ident.discrepancy.recording import Recording, record
-from ident.discrepancy.reference import Reference
+from ident.discrepancy.reference import DELAY_STD_S, Reference
 from ident.discrepancy.selection import gains, select
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.kinematics import Chain
@@ -25,7 +25,7 @@ from ident.model import DynamicModel
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["commission"]
+__all__ = ["commission", "delay_std"]
 
 Side = Literal["link", "motor"]
 
@@ -37,13 +37,15 @@ _TUNING_SETS = 3
 _ROUNDS = 3
 _ENOUGH = 3
 _LATEST_S = 0.02
+_CHANNELS = ("motor", "joint")
+_USUAL_DAYS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class _Day:
     """What one set says: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of
     the drives (n,) [Nm] and what of it turns slowly, see `presliding.slow_turns`; by how much the channels are later
-    than the arm says, by side [s].
+    than the arm says, with standard deviation, by side [s].
     """
 
     values: Floats
@@ -51,7 +53,7 @@ class _Day:
     sigma: Mapping[str, Floats]
     coulomb: Floats
     slow_turns: SlowTurns
-    late: Mapping[str, float]
+    late: Mapping[str, tuple[float, float]]
 
 
 def commission(
@@ -93,7 +95,7 @@ def commission(
     for _ in range(_SETTLING):
         # How late a channel seems depends on how friction turns at reversals, so its delay is settled last.
         days = [_day(known, recordings, settings, base) for recordings in recorded]
-        late = {side: float(np.mean([day.late[side] for day in days])) for side in ("motor", "joint")}
+        late = {side: float(np.mean([day.late[side][0] for day in days])) for side in _CHANNELS}
         known = replace(
             known,
             motor_delay_s=known.motor_delay_s + late["motor"],
@@ -178,7 +180,7 @@ def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings,
         evidence.sigma,
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
-        {side: mean_delay(nuisance, side)[0] for side in ("motor", "joint")},
+        {side: mean_delay(nuisance, side) for side in _CHANNELS},
     )
 
 
@@ -223,7 +225,21 @@ def _reference(
         arm.reach,
         arm.far,
         arm.far_share,
+        {side: delay_std([day.late[side] for day in days]) for side in _CHANNELS},
     )
+
+
+def delay_std(late: Sequence[tuple[float, float]]) -> float:
+    """Standard deviation [s] of a healthy channel's delay on a further day around the mean of these, from values with
+    standard deviations.
+
+    A few days know their scatter badly, so what is usual counts as further days.
+    """
+    values, deviations = np.array(late).T
+    own = float(np.sum((values - values.mean()) ** 2 - (1.0 - 1.0 / len(values)) * deviations**2))
+    days = len(values) - 1
+    variance = (_USUAL_DAYS * DELAY_STD_S**2 + max(own, 0.0)) / (_USUAL_DAYS + days)
+    return float(np.sqrt(variance * (1.0 + 1.0 / len(values))))
 
 
 def _sound(matrix: Floats) -> Floats:

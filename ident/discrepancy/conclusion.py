@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ident.discrepancy.bench import Bench, mean_delay
+from ident.discrepancy.bench import Bench
 from ident.discrepancy.candidates import Trial
 from ident.discrepancy.evidence import Floats, Key, Rows
 from ident.discrepancy.gain import HeldOut, fall, held_out, interval
@@ -17,7 +17,7 @@ from ident.discrepancy.imperfection import beyond_law, turning
 from ident.discrepancy.intervals import estimated
 from ident.discrepancy.nominal import TRAVEL_RAD, Arm, Nominal
 from ident.discrepancy.probes import Remainder, find_remainders
-from ident.discrepancy.reference import Reference
+from ident.discrepancy.reference import DELAY_STD_S, Reference
 from ident.discrepancy.result import (
     Diagnosis,
     Evident,
@@ -41,8 +41,6 @@ Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 """Replays sessions with a model and says how far off it is; what the runner gives."""
 
 _DOUBT = 0.2
-# Share of the tolerance for delays by which a healthy channel's delay differs from day to day.
-_DAY_TO_DAY = 0.2
 # Confidence in what the rows fitted show and others bear out on the whole only, and gain over the least one from
 # which on that is said at all.
 _OPEN, _TO_SPARE = 0.7, 2.0
@@ -356,9 +354,16 @@ def _doubted(
 
 
 def timing_finding(
-    claim: Claim, known: Arm, bench: Bench, after: Selection, before: HeldOut, settings: DiagnosisSettings
+    claim: Claim,
+    known: Arm,
+    bench: Bench,
+    after: Selection,
+    rest: tuple[float, float],
+    before: HeldOut,
+    settings: DiagnosisSettings,
+    reference: Reference | None,
 ) -> Finding:
-    """Finding of a late channel: the shift that was made and what is left of it."""
+    """Finding of a late channel: the shift that was made and the `rest` of it, with its standard deviation [s]."""
     candidate = claim.trial.candidate
     side = "motor" if candidate.cause == "motor_torque_delay" else "joint"
     arm = bench.nominal.arm
@@ -367,9 +372,10 @@ def timing_finding(
         if side == "motor"
         else arm.joint_delay_s - known.joint_delay_s
     )
-    rest, std = mean_delay(after.nuisance, side)
+    left, std = rest
     # The healthy channel itself is a little later on one day than on another.
-    std = float(np.hypot(std, _DAY_TO_DAY * settings.delay_tolerance_s))
+    days = (reference.delay_std_s if reference is not None else {}).get(side, DELAY_STD_S)
+    std = float(np.hypot(std, days))
     now = held_out(bench.evidence, [*(c.trial.rows for c in after.claims), *after.nuisance_rows])
     keys = [(side, j) for j in range(bench.nominal.arm.chain.n)]
     numbers = interval(before, now, keys, settings.seed)
@@ -377,7 +383,7 @@ def timing_finding(
         candidate.cause,
         "timing",
         (),
-        {"delay": Value(made + rest, std, "s")},
+        {"delay": Value(made + left, std, "s")},
         Evident(-claim.score.fitted, claim.score.p_value, numbers[0], numbers[1], (numbers[2], numbers[3])),
         claim.confidence,
         tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),

@@ -9,7 +9,7 @@ where nothing was wrong, from which follows what a claim must exceed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +20,10 @@ from ident.discrepancy.evidence import Floats
 from ident.distributions import fisher_limit
 from ident.model import DynamicModel
 
-__all__ = ["Reference"]
+__all__ = ["DELAY_STD_S", "Reference"]
+
+DELAY_STD_S = 2e-4
+"""Standard deviation [s] of a healthy channel's delay from day to day where few sets or none tell it."""
 
 _KEY = "commissioning"
 _WIDER = 1.5
@@ -38,6 +41,7 @@ class Reference:
     noise : of a row [Nm] by side, (n,). null : mean gain of each candidate by (cause, joint from 0).
     sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
     reach : (n,) of presliding [rad], None where unknown. far, far_share : (n,) see `nominal.Arm`.
+    delay_std_s : of the channels' delays from day to day, by side.
     """
 
     model: DynamicModel
@@ -51,6 +55,7 @@ class Reference:
     reach: Floats | None = None
     far: Floats | None = None
     far_share: Floats | None = None
+    delay_std_s: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, model: DynamicModel) -> Reference:
@@ -64,12 +69,13 @@ class Reference:
             compliance = np.array(stored["compliance"], dtype=np.float64)
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
+            delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
             reach, far, far_share = (
                 np.array(stored[name], dtype=np.float64) if stored.get(name) else None
                 for name in ("reach", "far", "far_share")
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
                 f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
             ) from error
@@ -78,7 +84,7 @@ class Reference:
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
         side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
-        return cls(model, compliance, *delays, noise, null, sets, side, reach, far, far_share)
+        return cls(model, compliance, *delays, noise, null, sets, side, reach, far, far_share, delay_std)
 
     def stored(self) -> dict[str, Any]:
         """Content for the provenance of the model."""
@@ -87,6 +93,7 @@ class Reference:
                 "compliance": [float(v) for v in self.compliance],
                 "motor_delay_s": self.motor_delay_s,
                 "joint_delay_s": self.joint_delay_s,
+                "delay_std_s": dict(self.delay_std_s),
                 "noise": {side: [float(v) for v in values] for side, values in self.noise.items()},
                 "null": {
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
@@ -122,6 +129,15 @@ class Reference:
             found[key] = noise + quantile * max(mean - noise, 0.0)
         return found
 
+    def loosened(self, symbol: str, share: float) -> Reference:
+        """The same, but parameters of a symbol, such as `Ia`, known to that share of their value at best."""
+        model = self.model
+        if model.covariance is None:
+            return self
+        mine = np.array([_symbol(name) == symbol for name in model.names])
+        more = np.diag(np.where(mine, share * model.values, 0.0) ** 2)
+        return replace(self, model=replace(model, covariance=model.covariance + more))
+
     def prior(self, base: BaseSet) -> tuple[Floats, Floats] | None:
         """Precision (p, p) and values (p,) of base parameters that mean the same in the reference.
 
@@ -155,8 +171,12 @@ def _listed(values: Floats | None) -> list[float] | None:
 
 
 def _tolerance(name: str) -> float:
-    symbol = name.rstrip("R").rstrip("0123456789")
-    return _DAY_TO_DAY.get(symbol, _ELSE)
+    return _DAY_TO_DAY.get(_symbol(name), _ELSE)
+
+
+def _symbol(name: str) -> str:
+    """Symbol of a base parameter: without joint and mark of regrouping."""
+    return name.rstrip("R").rstrip("0123456789")
 
 
 def _split(key: str) -> tuple[str, int]:

@@ -114,11 +114,15 @@ def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, 
     return {"file": out, "sets": paths, **{k: v for k, v in stored.items() if k != "sets"}}
 
 
+def _delay(delay_s: float, found: Reference, side: str) -> str:
+    return f"{1e3 * delay_s:.2f} ms (from day to day +-{1e3 * found.delay_std_s[side]:.2f} ms)"
+
+
 def _text(found: Reference, sets: int, sessions: int, names: tuple[str, ...]) -> str:
     lines = [
         f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}",
-        f"  delays: motor torque {1e3 * found.motor_delay_s:.2f} ms, joint torque "
-        f"{1e3 * found.joint_delay_s:.2f} ms; positions are the {found.encoder}s'",
+        f"  delays: motor torque {_delay(found.motor_delay_s, found, 'motor')}, joint torque "
+        f"{_delay(found.joint_delay_s, found, 'joint')}; positions are the {found.encoder}s'",
         f"  {'':<24}" + "".join(f"{name:>9}" for name in names),
     ]
     if len(found.compliance) and (found.compliance > 0.0).all():

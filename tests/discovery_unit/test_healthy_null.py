@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ident.base import numeric_base
+from ident.discrepancy.commission import delay_std
 from ident.discrepancy.nominal import Arm
 from ident.discrepancy.presliding import with_far_presliding
-from ident.discrepancy.reference import Reference
+from ident.discrepancy.reference import DELAY_STD_S, Reference
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.structure import ModelStructure
@@ -85,3 +86,30 @@ def test_few_sets_ask_for_more(model: DynamicModel) -> None:
     limits = [reference(model, null, sets).limits()["backlash", 0] for sets in (1, 4, 20)]
     assert limits[0] > limits[1] > limits[2] > 12.0
     assert reference(model, {}, 0).limits() == {}
+
+
+def test_scatter_of_a_delay_between_days_is_learned() -> None:
+    rng = np.random.default_rng(5)
+    late = [(1e-3 + value, 1e-4) for value in rng.normal(0.0, np.hypot(5e-4, 1e-4), 200)]
+    assert delay_std(late) == pytest.approx(5e-4, rel=0.1)
+    steady = [(1e-3 + value, 1e-4) for value in rng.normal(0.0, 1e-4, 200)]
+    assert delay_std(steady) < 0.5 * DELAY_STD_S
+    # One day says nothing of other days: what is usual, about a value that has that scatter itself.
+    assert delay_std([(3e-3, 1e-4)]) == pytest.approx(np.sqrt(2.0) * DELAY_STD_S)
+
+
+def test_loosened_parameters_are_less_tied_and_no_others(chain: Chain) -> None:
+    structure = ModelStructure(chain, 2)
+    base = numeric_base(structure)
+    count = len(base)
+    model = DynamicModel("arm", structure, base.names, np.full(count, 2.0), 1e-6 * np.eye(count), base)
+    healthy = reference(model, {}, 8)
+    tied, loose = healthy.prior(base), healthy.loosened("Ia", 0.05).prior(base)
+    assert tied is not None
+    assert loose is not None
+    std = [1.0 / np.sqrt(np.diag(precision)) for precision, _ in (tied, loose)]
+    inertias = np.array([name.startswith("Ia") for name in base.names])
+    assert inertias.any()
+    assert std[1][inertias] == pytest.approx(np.full(inertias.sum(), 1.5 * 0.1), rel=0.01)
+    np.testing.assert_allclose(std[1][~inertias], std[0][~inertias])
+    np.testing.assert_array_equal(loose[1], tied[1])

@@ -91,3 +91,15 @@ def test_what_no_catalogue_has_is_flagged_and_not_surely_named(store: Store) -> 
     verdict = judge(diagnosis, case.hidden)
     assert not verdict.sure_wrong, verdict.findings
     assert verdict.unexplained
+
+
+@pytest.mark.slow
+def test_how_late_the_motor_torques_are_is_told_between_whole_periods_of_the_commands(store: Store) -> None:
+    """They are sampled every third command; 5 to 7 ms later they meet the ripple between two commands elsewhere."""
+    case = draw(1, "single", store, causes=["motor_torque_delay"], size=1.5)
+    assert case.hidden[0].parameters["delay"] == pytest.approx(6e-3)
+    diagnosis, _ = diagnosed(store.sessions(case), REFERENCE)
+    verdict = judge(diagnosis, case.hidden)
+    assert verdict.exact, verdict.findings
+    assert not verdict.unexplained
+    assert abs(verdict.deviations["motor_torque_delay.delay"]) < 2.0
