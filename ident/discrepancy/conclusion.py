@@ -269,7 +269,8 @@ def _relative(without: HeldOut, after: HeldOut, key: tuple[str, int]) -> float:
 def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
     """Values with standard deviations, see `intervals`.
 
-    What a value would be if friction also turned in another way after a reversal is part of its uncertainty.
+    Of friction near standstill, those beside any way in which it may turn after a reversal, which no law of it
+    says; what that changes is part of the uncertainty.
     """
     effect, evidence = trial.candidate.effect, bench.evidence
     values, deviations = estimated(bench.dictionary, evidence, trial)
@@ -277,12 +278,11 @@ def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
     if columns is not None:
         kept = list(evidence.extra)
         evidence.replace([*kept, columns])
-        again = bench.dictionary.trial(trial.candidate, trial.shape)
-        if again is not None:
-            others, _ = estimated(bench.dictionary, evidence, again)
-            deviations = {
-                name: float(np.hypot(d, others[name] - values[name])) for name, d in deviations.items()
-            }
+        beside = bench.dictionary.trial(trial.candidate, trial.shape)
+        if beside is not None:
+            alone = values
+            values, own = estimated(bench.dictionary, evidence, bench.dictionary.refine(beside))
+            deviations = {name: float(np.hypot(own[name], values[name] - alone[name])) for name in own}
         evidence.replace(kept)
     return {
         p.name: Value(values[p.name], deviations[p.name], p.unit)
