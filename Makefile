@@ -6,12 +6,12 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.test-ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: help setup experiment test test-slow lint browser screenshot clean
+.PHONY: help setup experiment test test-long lint browser screenshot clean
 
 help:
 	@echo "make experiment   set up and run the whole experiment against the built-in emulator"
 	@echo "make test         set up and run ruff, mypy and the tests"
-	@echo "make test-slow    run the tests that take longer"
+	@echo "make test-long    run the tests that take minutes each"
 	@echo "make screenshot   make the pictures of the README anew"
 	@echo "make clean        remove the virtual environment and the caches"
 
@@ -46,11 +46,11 @@ lint: $(TEST_READY)
 	$(BIN)/mypy
 
 test: lint browser
-	$(BIN)/pytest -n auto --dist loadfile -m "not slow"
+	$(BIN)/pytest -n auto --dist loadfile -m "not long"
 
 # What takes longer: benchmarks named in the documents, campaigns.
-test-slow: $(TEST_READY) browser
-	$(BIN)/pytest -m slow
+test-long: $(TEST_READY) browser
+	$(BIN)/pytest -m long
 
 screenshot: $(TEST_READY) browser
 	$(BIN)/python docs/images/take.py

@@ -16,7 +16,7 @@ from runner.report.look_alike_figures import look_alike_figure
 from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
 from runner.report.replay_figures import replay_figures
 from runner.report.residual_figures import finding_figure, residual_figures
-from runner.report.verdicts import extension_gain
+from runner.report.verdicts import error_change, extension_gain
 
 __all__ = ["diagnosis_parts", "diagnosis_section"]
 
@@ -206,7 +206,7 @@ def _gain(folder: DiagnosisFolder) -> str:
     if not rows:
         return ""
     whole = extension_gain(diagnosis)
-    text = "" if whole is None else paragraph(f"Mean over joints and sides: {100 * whole:.0f} % less error.")
+    text = "" if whole is None else paragraph(f"Mean over joints and sides: {error_change(whole)} error.")
     worse = [one for one in details.get("rows", []) if named and one["gain_interval_95"][1] < 0.0]
     if worse:
         places = ", ".join(f"{one['side']} torque of {joints_text([one['joint']], names)}" for one in worse)

@@ -14,7 +14,7 @@ from runner.report.diagnosis import diagnosis_parts
 from runner.report.diagnosis_folder import DiagnosisFolder
 from runner.report.markup import section
 from runner.report.page import page_html, write_page
-from runner.report.verdicts import Level, Verdict, extension_gain, largest_gain
+from runner.report.verdicts import Level, Verdict, error_change, extension_gain, largest_gain
 from runner.versions import versions
 
 __all__ = ["diagnosis_html", "diagnosis_verdicts", "write_diagnosis_report"]
@@ -82,7 +82,7 @@ def diagnosis_verdicts(diagnosis: DiagnosisFolder) -> list[Verdict]:
     gain = extension_gain(content)
     if gain is not None:
         place, best = largest_gain(content, names)
-        text = f"{-100 * gain:+.0f} % error on unseen motions on average, {place} {-100 * best:+.0f} %"
+        text = f"{error_change(gain)} error on unseen motions on average, {place} {error_change(best)}"
         rows = diagnosis.details.get("rows", [])
         worse = [f"{names[r['joint'] - 1]} {r['side']}" for r in rows if r["gain_interval_95"][1] < 0.0]
         text += f"; worse: {', '.join(worse)}" if worse else ""

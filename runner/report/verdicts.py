@@ -13,7 +13,7 @@ import numpy as np
 from runner.report.curves import Curves
 from runner.report.folder import ResultFolder
 
-__all__ = ["Level", "Verdict", "headline", "verdicts"]
+__all__ = ["Level", "Verdict", "error_change", "extension_gain", "headline", "largest_gain", "verdicts"]
 
 Level = Literal["good", "look", "bad"]
 
@@ -223,9 +223,15 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
     gain = extension_gain(diagnosis)
     if gain is not None:
         place, best = largest_gain(diagnosis, results.joint_names)
-        change = f"{-100 * best:+.0f} % error on unseen motions, {-100 * gain:+.0f} % on average"
+        change = f"{error_change(best)} error on unseen motions, {error_change(gain)} on average"
         text += f"; the extended model: {place} {change}"
     return Verdict("diagnosis", text, "", "look" if causes or unexplained else "good", "diagnosis")
+
+
+def error_change(gain: float) -> str:
+    """A share of the error that goes, as the change of the error; small ones with a decimal, none without a sign."""
+    percent = round(-100.0 * gain, 0 if abs(gain) >= 0.01 else 1)
+    return f"{percent:+g} %" if percent else "0 %"
 
 
 def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:

@@ -244,7 +244,7 @@ def test_a_failure_of_the_diagnosis_leaves_the_experiment_alone(
     assert ended.to_dict()["diagnosis"] is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_decide_runs_the_motions_and_names_the_hidden_cause(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,7 +280,7 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
     assert after["findings"][0]["confidence"] >= 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_doubt_that_comes_by_itself_is_settled_by_the_slow_sweep(tmp_path: Path) -> None:
     """The Stribeck effect and friction that bends with speed look alike in one short session."""
     parameters = {"amplitude": 0.6, "velocity": 0.08, "exponent": 1.0}
@@ -297,7 +297,7 @@ def test_a_doubt_that_comes_by_itself_is_settled_by_the_slow_sweep(tmp_path: Pat
     assert answer["named"] == {"cause": "stribeck", "joints": [4]}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commission_records_sets_with_their_own_noise_and_goes_on_where_it_was(tmp_path: Path) -> None:
     experiment = Experiment.load(experiment_file(tmp_path, [], sessions=[*SHORT["sessions"], LOADED]))
     logs = record_sets(experiment, tmp_path / "sets", 2, assume_yes=True)

@@ -67,7 +67,7 @@ def test_a_turn_about_the_vertical_is_nothing_beyond_its_law(make: Make, chain: 
     assert beyond(1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cause_is_claimed_only_where_a_motion_that_was_not_fitted_shows_it_too(
     make: Make, chain: Chain
 ) -> None:

@@ -92,7 +92,7 @@ def test_base_model_alone_leaves_only_noise(healthy: Diagnosis) -> None:
         (sensor_gain, "sensor_gain", (2,), "error", 0.03),
         (crosstalk, "sensor_crosstalk", (1,), "factor", 0.02),
         (drift, "sensor_offset_drift", (3,), "drift", 0.1),
-        pytest.param(clipped, "sensor_saturation", (2,), "limit", None, marks=pytest.mark.slow),
+        pytest.param(clipped, "sensor_saturation", (2,), "limit", None, marks=pytest.mark.long),
         (late_motor, "motor_torque_delay", (), "delay", 0.006),
     ],
 )

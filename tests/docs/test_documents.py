@@ -67,7 +67,7 @@ def test_slow_commands_exist_with_these_options(document: Path, command: Command
             verb.make_context(rest[0], rest[1:], parent=context, resilient_parsing=False)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("document", sorted({document for document, _ in SLOW}), ids=str)
 def test_slow_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]) -> None:
     place = workplace()

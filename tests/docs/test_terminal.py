@@ -84,7 +84,7 @@ MAPPING = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW_REPORTS else n for n in REPORTS]
+    "name", [pytest.param(n, marks=pytest.mark.long) if n in SLOW_REPORTS else n for n in REPORTS]
 )
 def test_commands_that_report_print_one_json_value(
     name: str, workplace: Callable[[], Path], monkeypatch: pytest.MonkeyPatch

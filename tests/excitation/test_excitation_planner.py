@@ -99,7 +99,7 @@ def test_plan_is_good_and_keeps_every_limit_by_an_independent_check(
         assert found.distanceResults[nearest].min_distance >= 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_seed_and_counts_decide_not_the_number_of_processes(
     problem: PlanProblem, solved: ExcitationPlan
 ) -> None:
@@ -370,7 +370,7 @@ def test_hypervolume_of_boxes() -> None:
     np.testing.assert_array_equal(not_dominated(np.array([[1, 2], [2, 1], [2, 2]])), [True, True, False])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_planning_the_default_problem_gives_the_stored_plan() -> None:
     stored = ExcitationPlan.load(CONFIGS / "plans/default.plan.yaml")
     found = plan(PlanProblem.load("plans/default.yaml"))

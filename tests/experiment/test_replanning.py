@@ -80,7 +80,7 @@ def test_the_joint_estimate_is_sharper_than_that_of_the_first_round(twice: Finis
     assert len(summary["signals"]) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_resume_keeps_a_begun_round_and_repeats_nothing_that_is_finished(twice: Finished) -> None:
     lost = twice.folder / "loaded-round2.mcap"
     kept = {path: messages(path) for path in twice.folder.glob("*.mcap") if path != lost}

@@ -40,8 +40,8 @@ def test_nothing_hidden_nothing_claimed_on_the_command_line(store: Store) -> Non
     ("causes", "seed", "size"),
     [
         (("friction_asymmetry", "cable_spring"), 2, 1.5),
-        pytest.param(("sensor_hysteresis", "motor_torque_delay"), 3, 3.0, marks=pytest.mark.slow),
-        pytest.param(("payload_change", "stribeck"), 4, 2.5, marks=pytest.mark.slow),
+        pytest.param(("sensor_hysteresis", "motor_torque_delay"), 3, 3.0, marks=pytest.mark.long),
+        pytest.param(("payload_change", "stribeck"), 4, 2.5, marks=pytest.mark.long),
     ],
 )
 def test_two_hidden_causes_are_named_and_nothing_else(
@@ -53,7 +53,7 @@ def test_two_hidden_causes_are_named_and_nothing_else(
     assert verdict.exact, ([(h.cause, h.joints) for h in case.hidden], verdict.findings)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cause", "seed"), [("viscous_nonlinear", 2), ("sensor_crosstalk", 3), ("friction_asymmetry", 4)]
 )
@@ -65,7 +65,7 @@ def test_a_hidden_cause_is_named(store: Store, cause: str, seed: int) -> None:
     assert not verdict.sure_wrong
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("cause", "seed", "size"),
     [
@@ -84,7 +84,7 @@ def test_a_hidden_cause_is_named_and_nothing_else(store: Store, cause: str, seed
     assert verdict.exact, (case.hidden[0].joints, verdict.findings)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_no_catalogue_has_is_flagged_and_not_surely_named(store: Store) -> None:
     case = draw(2, "outside", store, causes=["drag by a neighbour's speed"], size=3.0)
     diagnosis, _ = diagnosed(store.sessions(case), REFERENCE)
@@ -93,7 +93,7 @@ def test_what_no_catalogue_has_is_flagged_and_not_surely_named(store: Store) -> 
     assert verdict.unexplained
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_how_late_the_motor_torques_are_is_told_between_whole_periods_of_the_commands(store: Store) -> None:
     """They are sampled every third command; 5 to 7 ms later they meet the ripple between two commands elsewhere."""
     case = draw(1, "single", store, causes=["motor_torque_delay"], size=1.5)

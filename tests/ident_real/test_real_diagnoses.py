@@ -25,7 +25,7 @@ from lwr_driver.session import Session, read_session
 SURE = 0.8
 SPLITS = [
     pytest.param((3,), 1, 3.0, id="3 -> 1"),
-    pytest.param((1, 2), 3, 3.5, id="1, 2 -> 3", marks=pytest.mark.slow),
+    pytest.param((1, 2), 3, 3.5, id="1, 2 -> 3", marks=pytest.mark.long),
 ]
 
 
@@ -92,7 +92,7 @@ def test_joint_torque_alone_makes_no_sure_claim_about_a_sensor(train, test, boun
 
 
 @needs_recordings
-@pytest.mark.slow
+@pytest.mark.long
 def test_repeated_runs_give_the_floor_and_both_splits_agree():
     pair, single = diagnosis((1, 2), 3), diagnosis((3,), 1)
     np.testing.assert_allclose(pair.noise_floor["joint"] * np.sqrt(2.0), repeatability(), rtol=0.35)
@@ -135,7 +135,7 @@ def test_drives_of_the_tx40_grow_slower_than_speed(tmp_path: Path) -> None:
     assert np.all(found.rms_extended["motor"][:2] < found.rms_base["motor"][:2])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_torque_of_the_iiwas_wrist_repeats_with_its_angle(tmp_path: Path) -> None:
     """Sweeps of joint 6 at three speeds, the others at rest: of them nothing is said."""
     folder = other("iiwa14")

@@ -35,7 +35,7 @@ def test_mangled_input_is_refused_or_right(name):
         assert targets.check(name, data) in ACCEPTED, number
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(targets.TARGETS))
 def test_more_mangled_input(name):
     corpus = targets.corpus(name)

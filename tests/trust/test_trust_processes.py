@@ -33,7 +33,7 @@ def test_network_promises_hold():
     assert ledger.failed == 0, [line.failures for line in ledger.lines.values()]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("section", ["computer", "robot", "soak", "reaction", "clients"])
 def test_a_few_runs_of_a_section(section):
     ledger = Ledger(None, 5)

@@ -65,7 +65,7 @@ def test_runs_of_the_campaign_keep_every_promise(ring, tmp_path, first):
         assert not result.complaints, f"run {number} of seed {SEED}: {result}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("first", range(1000, 3000, 100))
 def test_more_runs_of_the_campaign(ring, tmp_path, first):
     for number in range(first, first + 100):

@@ -130,7 +130,7 @@ sessions:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_experiment_in_lock_step_is_watched_while_it_runs(tmp_path: Path, chrome: Browser) -> None:
     (tmp_path / "watched.yaml").write_text(EXPERIMENT)
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:

@@ -48,7 +48,7 @@ def test_without_a_folder_the_default_experiment_is_run(
     assert (report.name, target) == ("report.html", ROOT / "docs/images")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_pictures_are_not_blank(
     take: ModuleType, finished: Path, chrome: Browser, tmp_path: Path
 ) -> None:

@@ -27,7 +27,7 @@ from runner.published import TABLE_1, TABLE_2
 from runner.report.figures import torque_figure
 from runner.report.folder import ResultFolder
 from runner.report.page import write_report
-from runner.report.verdicts import headline, verdicts
+from runner.report.verdicts import error_change, headline, verdicts
 
 DIAGNOSIS: dict[str, Any] = {
     "schema_version": 1,
@@ -350,3 +350,11 @@ def test_a_session_that_is_not_there_is_named_with_those_that_are(finished: Path
     done = CliRunner().invoke(main, ["preview", str(finished / "experiment.yaml"), "--session", "heavy"])
     assert done.exit_code == 2
     assert "unloaded, loaded" in done.output
+
+
+@pytest.mark.parametrize(
+    ("gain", "text"),
+    [(0.084, "-8 %"), (0.0042, "-0.4 %"), (0.0001, "0 %"), (-0.0001, "0 %"), (-0.021, "+2 %")],
+)
+def test_a_change_of_the_error_too_small_to_show_has_no_sign(gain: float, text: str) -> None:
+    assert error_change(gain) == text
