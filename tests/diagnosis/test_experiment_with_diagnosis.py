@@ -33,6 +33,8 @@ from runner.report.page import report_html
 from runner.report.residual_figures import AGAINST
 from sim_backend.configuration import load_configuration
 
+pytestmark = pytest.mark.slow
+
 SHORT: dict[str, Any] = {
     "name": "short",
     "emulator_settings": {"fri.period_ms": 10},

@@ -32,6 +32,7 @@ def stribeck(s: Signals) -> None:
     s["motor"][:, 1] += 0.3 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
 
+@pytest.mark.slow
 def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain: Chain) -> None:
     found = diagnose([make("a.mcap", 1, odd_hose), make("b.mcap", 2, odd_hose, 1)], chain)
     assert {(f.cause, f.joints) for f in found.findings} == {("cable_spring", (3,))}

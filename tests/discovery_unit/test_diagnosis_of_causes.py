@@ -153,6 +153,7 @@ def test_gain_is_measured_on_sessions_never_fitted(make: Make, chain: Chain) -> 
     assert found.rms_extended["motor"][1] < 0.97 * found.rms_base["motor"][1]
 
 
+@pytest.mark.slow
 def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bodies: np.ndarray) -> None:
     from ident.regressor import torque
 
@@ -182,6 +183,7 @@ def test_reference_alone_claims_nothing(make: Make, chain: Chain, reference: Ref
     assert diagnose(pair(make, seed=5), chain, reference=reference).findings == ()
 
 
+@pytest.mark.slow
 def test_what_shows_faintly_is_named_where_held_out_sessions_bear_it_out(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
@@ -283,6 +285,7 @@ def test_zero_of_each_session_is_no_function_of_the_angle(
     assert found.parameters["zero"].value == pytest.approx(-0.12, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "turns", "phase", "commissioned"),
     [
@@ -308,6 +311,7 @@ def test_unknown_physics_is_not_named_with_confidence(
     assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
 
 
+@pytest.mark.slow
 def test_scale_that_follows_another_angle_is_no_sure_gain(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
@@ -320,6 +324,7 @@ def test_scale_that_follows_another_angle_is_no_sure_gain(
     assert {"q1", "load2"} <= set(left.depends_on)
 
 
+@pytest.mark.slow
 def test_friction_that_follows_the_acceleration_is_not_named_with_confidence(
     make: Make, chain: Chain, reference: Reference
 ) -> None:

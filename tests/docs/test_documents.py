@@ -37,6 +37,7 @@ def run(command: Command) -> None:
         Path(command.output).write_text(result.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("document", WITH_COMMANDS, ids=str)
 def test_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]) -> None:
     place = workplace()
@@ -90,6 +91,7 @@ def test_slow_commands_do_what_they_say(document: Path, workplace: Callable[[], 
         assert done.returncode == command.code, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("document", WITH_PYTHON, ids=str)
 def test_python_examples_work_one_after_the_other(document: Path, workplace: Callable[[], Path]) -> None:
     workplace()

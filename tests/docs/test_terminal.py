@@ -83,6 +83,7 @@ MAPPING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.long) if n in SLOW_REPORTS else n for n in REPORTS]
 )

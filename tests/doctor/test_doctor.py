@@ -62,6 +62,7 @@ def link_test(counts: dict[int, int] | None = None, fresh: int = 833, **end: Any
     return LinkTest(10.0, state(), state(**({"received": 2000} | end)), worst, edges, histogram, msr, fresh)
 
 
+@pytest.mark.slow
 def test_the_emulator_is_found_and_tested(tmp_path: Path) -> None:
     code, text = doctor("--link", "--seconds", "0.5", "--period-ms", "20", "--json")
     content = json.loads(text)

@@ -155,6 +155,7 @@ def test_a_quick_polish_still_ends_inside_every_limit(problem: PlanProblem, solv
     assert outcome.check.ok, outcome.check.violations
 
 
+@pytest.mark.slow
 def test_bounds_on_other_criteria_are_kept(problem: PlanProblem, solved: ExcitationPlan) -> None:
     mean = "mean predicted relative deviation, essential 49 [%]"
     objective = Objective(criterion="mean_rsd", condition_at_most=45.0)
@@ -171,6 +172,7 @@ def test_bounds_on_other_criteria_are_kept(problem: PlanProblem, solved: Excitat
         )
 
 
+@pytest.mark.slow
 def test_goal_attainment_meets_its_goals_together_and_finds_the_one_not_given(problem: PlanProblem) -> None:
     few = Search(seed=1, starts=3, hops=6, lanes=1)
     wanted = Objective(criterion="goal_attainment", goal_condition=35.0)
@@ -348,6 +350,7 @@ def test_table_and_report_name_what_they_show(problem: PlanProblem, solved: Exci
     assert "tightest margins" in report
 
 
+@pytest.mark.slow
 def test_trade_off_gives_motions_within_their_bounds(problem: PlanProblem) -> None:
     assembled = assemble(problem)
     criteria = assembled.criteria

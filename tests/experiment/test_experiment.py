@@ -89,6 +89,7 @@ def test_log_keeps_the_contract(finished: Finished) -> None:
     assert (spans[0][1] - spans[0][0]) * 1e-9 == pytest.approx(6.0, abs=0.011)
 
 
+@pytest.mark.slow
 def test_a_finished_experiment_is_estimated_again_and_told_as_json(finished: Finished) -> None:
     again = run("experiment", "--resume", str(finished.folder), "--yes", "--json")
     assert again.code == 0, again.text
@@ -98,6 +99,7 @@ def test_a_finished_experiment_is_estimated_again_and_told_as_json(finished: Fin
     assert len(told["parameters"]) == 102
 
 
+@pytest.mark.slow
 def test_repeating_the_experiment_gives_identical_logs(finished: Finished, tmp_path: Path) -> None:
     again = run("experiment", str(experiment_file(tmp_path)), "--yes", "--out", str(tmp_path / "second"))
     assert again.code == 0, again.text
@@ -121,6 +123,7 @@ def test_a_payload_that_is_not_there_is_noticed_before_anything_moves(tmp_path: 
     assert (tmp_path / "out" / "unloaded.mcap").exists()
 
 
+@pytest.mark.slow
 def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) -> None:
     stop = [{"command": "emergency_stop", "when": "moving", "occurrence": 5, "after_cycles": 200}]
     settings = {"fri.period_ms": 5, "schedule": stop}
@@ -168,6 +171,7 @@ def test_a_validation_needs_an_estimate(tmp_path: Path, sessions: list[object], 
     assert message in done.text
 
 
+@pytest.mark.slow
 def test_motor_torques_from_the_controllers_trace(tmp_path: Path) -> None:
     file = experiment_file(tmp_path, motor_torque={"source": "trace_file"})
     done = run("experiment", str(file), "--yes", "--out", str(tmp_path / "out"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from experiment_rig import experiment_file, run
 
 
@@ -23,6 +24,7 @@ def test_payload_that_is_lost_in_motion_fails_the_session(tmp_path: Path) -> Non
     assert summary["exit_status"] == "fail"
 
 
+@pytest.mark.slow
 def test_motor_torques_of_swapped_joints_and_wrong_scale_are_said(tmp_path: Path) -> None:
     krl = {"reals": [1, 4, 3, 2, 5, 6, 7], "scale": [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]}
     file = experiment_file(

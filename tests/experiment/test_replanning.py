@@ -14,6 +14,8 @@ from ident.excitation import ExcitationPlan
 from ident.model_file import read_model
 from lwr_driver.session import read_session
 
+pytestmark = pytest.mark.slow
+
 PROBLEM = {
     "name": "second",
     "motion": {"period_s": 6.0, "harmonics": 3},

@@ -6,6 +6,7 @@ import socket
 import time
 
 import numpy as np
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -13,6 +14,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from fri.packets import CMD, CMD_SIZE, MSR_SIZE, new_msr
 from fri.remote import RemoteEnd
 from fri.states import FLAGS, Control, State
+
+pytestmark = pytest.mark.slow
 
 PATIENCE_S = 5.0
 

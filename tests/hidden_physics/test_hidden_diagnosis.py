@@ -30,12 +30,14 @@ def by_command(store: Store, case: Case) -> dict[str, Any]:
     return dict(json.loads((out / "diagnosis.json").read_text()))
 
 
+@pytest.mark.slow
 def test_nothing_hidden_nothing_claimed_on_the_command_line(store: Store) -> None:
     case = draw(1, "none", store)
     verdict = judge(by_command(store, case), case.hidden)
     assert verdict.silent, verdict.findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("causes", "seed", "size"),
     [
@@ -93,7 +95,7 @@ def test_what_no_catalogue_has_is_flagged_and_not_surely_named(store: Store) -> 
     assert verdict.unexplained
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_how_late_the_motor_torques_are_is_told_between_whole_periods_of_the_commands(store: Store) -> None:
     """They are sampled every third command; 5 to 7 ms later they meet the ripple between two commands elsewhere."""
     case = draw(1, "single", store, causes=["motor_torque_delay"], size=1.5)

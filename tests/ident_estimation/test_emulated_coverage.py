@@ -15,6 +15,8 @@ from estimation_arm import chain, true_base
 from ident.identify import Identification, identify
 from runner.published import TABLE_2
 
+pytestmark = pytest.mark.slow
+
 SEEDS = (11, 12, 13)
 
 

@@ -54,6 +54,7 @@ def finding(found: Diagnosis, cause: str, joints: tuple[int, ...]) -> Finding:
     pytest.fail(f"no {cause} {joints} in\n{found}")
 
 
+@pytest.mark.slow
 @needs_recordings
 @pytest.mark.parametrize(("train", "test", "bound"), SPLITS)
 def test_the_extended_model_predicts_the_run_that_was_not_used(train, test, bound):

@@ -71,6 +71,7 @@ def test_posterior_deviations_hold_between_two_different_motions():
     assert np.mean(np.abs(z) < 2.0) >= 0.85
 
 
+@pytest.mark.slow
 def test_with_the_tilt_the_physical_estimators_deviations_hold_between_any_two_runs():
     for one, other in (((1,), (2,)), ((1,), (3,)), ((2,), (3,)), ((1, 2), (3,))):
         first, second = (mounted(runs).identification.estimate for runs in (one, other))

@@ -29,6 +29,8 @@ from runner.report.folder import ResultFolder
 from runner.report.page import write_report
 from runner.report.verdicts import error_change, headline, verdicts
 
+pytestmark = pytest.mark.slow
+
 DIAGNOSIS: dict[str, Any] = {
     "schema_version": 1,
     "findings": [

@@ -23,6 +23,8 @@ from runner.report.folder import ResultFolder
 from runner.report.page import write_report
 from runner.report.verdicts import headline, verdicts
 
+pytestmark = pytest.mark.slow
+
 
 def lwr_run(*arguments: str | Path) -> str:
     done = CliRunner().invoke(main, [str(word) for word in arguments])
