@@ -502,7 +502,8 @@ def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:
     if reference is None:
         notes.append(
             "no reference of the healthy arm: a constant change that base parameters absorb (payload, torque "
-            "constant, wear, offsets) cannot be seen; run `lwr-run commission` when the arm is healthy"
+            "constant, wear, offsets) cannot be seen, and what the arm always had, such as friction that turns over "
+            "some distance after a reversal, is named like a fault; run `lwr-run commission` when the arm is healthy"
         )
     elif bench.evidence.prior is None:
         notes.append(
