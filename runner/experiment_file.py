@@ -110,10 +110,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Moves:
-    """Approach and return: where the arm rests [rad], and how gently it goes there.
-
-    max_start_distance_rad : from where the arm is to the start of the excitation, or to home on the way there.
-    """
+    """Approach and return: where the arm rests [rad], and how gently it goes there."""
 
     home: tuple[float, ...] = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
     speed_scale: float = 0.2

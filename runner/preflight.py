@@ -144,7 +144,7 @@ def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
 
 
 def check_start(arm: Arm, q: Vector, first: Vector, limit: float) -> Item:
-    """Distance of the arm from the `first` pose of its way, the first row of the excitation or home."""
+    """Distance of the arm from the first row of the excitation, which the approach must bridge."""
     distance = np.abs(first - q)
     joint = int(np.argmax(distance))
     return Item(

@@ -38,8 +38,7 @@ def session_motion(
 ) -> tuple[Motion, Preflight]:
     """One session as one motion from `start`, (n,) [rad], with its preflight.
 
-    The straight way to the first row of the excitation is tried first, then the way over the home position, to which
-    the arm may be nearer;
+    The straight way to the first row of the excitation is tried first, then the way over the home position;
     the arm returns home, or stays at the last row where the way home is not free. If no way passes every
     check, the first one is returned with the checks that it fails. `folder` is where the log will go.
     """
@@ -59,7 +58,7 @@ def session_motion(
             brake_s=moves.brake_s,
         )
         items: list[Item] = [
-            check_start(arm, start, [*approach, excitation.q[0]][1], moves.max_start_distance_rad),
+            check_start(arm, start, excitation.q[0], moves.max_start_distance_rad),
             *check_motion_limits(arm, motion),
             check_torque(arm, motion, plan.payload),
             check_path(collision, motion, margin),

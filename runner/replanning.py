@@ -28,13 +28,16 @@ from lwr_driver.motion import Motion
 from runner.experiment import Record, Run
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import excitation_rows
+from runner.preflight import check_start
 from runner.results import estimate, identified_model, summarise, write_results
 from runner.status import StatusLine
 
-__all__ = ["Rounds", "next_problem", "rounds_begun", "show_search"]
+__all__ = ["Rounds", "next_problem", "planned_near_home", "rounds_begun", "show_search"]
 
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"
+# Searches for a motion that begins near enough to home, and the distance of rows of which the first is looked at [s].
+_SEARCHES, _ROW_S = 4, 0.01
 
 
 def rounds_begun(folder: Path) -> int:
@@ -98,7 +101,7 @@ class Rounds:
         status.show(
             f"planning round {number}", 0.0, "Ctrl-C ends the search and keeps the best motion so far"
         )
-        motion = plan(problem, lambda now: show_search(status, now))
+        motion = planned_near_home(self.experiment, self.arm, problem, lambda now: show_search(status, now))
         motion.save(path)
         status.clear()
         essential = found.estimate if found.essential is None else found.essential.estimate
@@ -109,6 +112,22 @@ class Rounds:
             f"{after:.2f} % predicted after it"
         )
         return motion
+
+
+def planned_near_home(
+    experiment: Experiment, arm: Arm, problem: PlanProblem, show: Callable[[SearchProgress], None]
+) -> ExcitationPlan:
+    """The motion of a search, of one with the next seed where it begins farther from home than the approach may go.
+
+    The last of a few searches is given as it is; the preflight refuses it and says why.
+    """
+    search = problem.search
+    for seed in range(search.seed, search.seed + _SEARCHES):
+        motion = plan(replace(problem, search=replace(search, seed=seed)), show)
+        first = motion.rows(_ROW_S, 1)[0]
+        if check_start(arm, experiment.home(len(first)), first, experiment.moves.max_start_distance_rad).ok:
+            break
+    return motion
 
 
 def next_problem(

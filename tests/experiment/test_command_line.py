@@ -67,10 +67,10 @@ def test_check_prints_value_and_limit_of_every_item(tmp_path: Path) -> None:
 
 
 def test_check_refuses_a_motion_that_comes_too_near(tmp_path: Path) -> None:
-    moves = {"home": [0.0, 2.0, 0.0, -0.3, 0.0, 0.0, 0.0]}
+    moves = {"home": [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], "max_start_distance_rad": 0.01}
     done = run("check", str(experiment_file(tmp_path, moves=moves)))
     assert done.code == 3
-    assert "FAIL clearance" in done.text
+    assert "FAIL distance to the start" in done.text
     assert "preflight refuses the motion" in done.text
 
 

@@ -11,8 +11,13 @@ import yaml
 from experiment_rig import Finished, experiment_file, messages, run
 
 from ident.excitation import ExcitationPlan
+from ident.excitation.problem import PlanProblem
 from ident.model_file import read_model
+from lwr_driver.arm import Arm
+from lwr_driver.configuration import find
 from lwr_driver.session import read_session
+from runner import replanning
+from runner.experiment_file import DEFAULT, Experiment
 
 pytestmark = pytest.mark.slow
 
@@ -92,3 +97,28 @@ def test_resume_keeps_a_begun_round_and_repeats_nothing_that_is_finished(twice: 
     assert lost.is_file()
     for path, before in kept.items():
         assert messages(path) == before
+
+
+@pytest.mark.parametrize(("near", "searches"), [(3, [2, 3]), (99, [2, 3, 4, 5])])
+def test_a_motion_that_begins_too_far_from_home_is_planned_again(
+    near: int, searches: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+    experiment = Experiment.load(DEFAULT)
+    home = experiment.home(7)
+
+    class Beginning:
+        def __init__(self, seed: int) -> None:
+            self.first = home + (0.5 if seed == near else 3.3)
+
+        def rows(self, period_s: float, periods: int) -> np.ndarray:
+            return np.tile(self.first, (3, 1))
+
+    def search(problem: PlanProblem, show: object) -> Beginning:
+        seeds.append(problem.search.seed)
+        return Beginning(problem.search.seed)
+
+    monkeypatch.setattr(replanning, "plan", search)
+    problem = PlanProblem.load(find("plans/replan.yaml"))
+    replanning.planned_near_home(experiment, Arm.load(), problem, lambda now: None)
+    assert seeds == searches
