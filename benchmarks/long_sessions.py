@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ident.discrepancy import diagnose
+from ident.diagnosis import diagnose
 from ident.kinematics import Chain
 from ident.regressor import torque
 from lwr_driver.configuration import find

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ident.discrepancy import ArmData, Diagnosis, diagnose
+from ident.diagnosis import ArmData, Diagnosis, diagnose
 from ident.import_log import LogMapping, import_log
 from ident.kinematics import Chain
 from ident.structure import Coupling

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from fri.errors import ConfigurationError, DataError
-from ident.discrepancy import SimulationError
+from ident.diagnosis import SimulationError
 from ident.model import DynamicModel
 from ident.signals.filters import low_pass
 from lwr_driver.arm import Arm

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident import regressor
 from ident.cad_prior import cad_prior
-from ident.effects import Simulated, find_effect
+from ident.effects import Parameters, Simulated, find_effect
 from ident.effects.model_torque import parameter_values
 from ident.export import consistent_parameters
 from ident.model import DynamicModel
@@ -131,29 +131,18 @@ class ModelEffect(Effect):
 class Cause(ModelEffect):
     """An effect of the dictionary as a plug-in of the emulator's configuration: something to be found.
 
-    cause : its name. joint : from 1; of no meaning for the whole arm. parameters : all values by name, SI units; those
-    of other forms of the effect may be left out. Raises ConfigurationError for an unknown cause and where a parameter
-    is missing or foreign.
+    cause : its name. joint : from 1; of no meaning for the whole arm. form : of an effect of several forms.
+    parameters : all values of the form by name, SI units. Raises ConfigurationError for an unknown cause or form, and
+    for a missing or foreign parameter.
     """
 
-    def __init__(self, cause: str, parameters: Mapping[str, float], joint: int = 1) -> None:
+    def __init__(
+        self, cause: str, parameters: Mapping[str, float], joint: int = 1, form: str | None = None
+    ) -> None:
         effect = find_effect(cause)
-        known = [p.name for p in effect.parameters if p.name not in effect.hidden]
-        wrong = sorted((set(known) ^ set(parameters)) - (set(effect.optional) - set(parameters)))
-        if wrong:
-            raise ConfigurationError(
-                f"effect {cause}: `parameters` must be exactly {', '.join(known)}; look at {wrong[0]!r}"
-            )
-        super().__init__(
-            effect.simulate(
-                joint - 1,
-                {
-                    name: float(parameters.get(name, 0.0))
-                    for name in known
-                    if name in parameters or name in effect.optional
-                },
-            )
-        )
+        effect.check(parameters, form, whole=True)
+        values = {name: float(value) for name, value in parameters.items()}
+        super().__init__(effect.simulate(joint - 1, values, form))
 
 
 def model_effects(
@@ -168,16 +157,14 @@ def model_effects(
     found = []
     for entry in model.effects:
         effect = find_effect(str(entry["cause"]))
-        values = parameter_values(entry)
+        values: Parameters = parameter_values(entry)
         own = round(values.get("session", 0.0)) - 1
         if effect.event and own != session:
             continue
-        before = session is not None and session + 1 < values.get("since", 2.0)
-        if before and values.get("time_constant") == 0.0:
-            # What changed between the sessions was not there in the first ones.
-            values = {**values, effect.linear[0].name: 0.0}
+        form = entry.get("form")
+        values = effect.in_session(values, form, session)
         for joint in entry["joints"] or [1]:
-            found.append(ModelEffect(effect.simulate(int(joint) - 1, values), begin_s))
+            found.append(ModelEffect(effect.simulate(int(joint) - 1, values, form), begin_s))
     return tuple(found)
 
 

@@ -1,85 +1,92 @@
-"""Effects: physics that the linear model leaves out, one cause a class.
+"""Effects: physics beyond the linear model, one cause a class.
 
-`EFFECTS` maps the name of each cause to its effect. An entry of a model's `effects` is a mapping
-with `cause`,
-`side`, `joints` (from 1; empty for the whole arm) and `parameters`, each with `value`, `std` and `unit`.
+`EFFECTS` maps the name of each cause to its effect. An entry of a model's `effects` is a mapping with `cause`, `side`,
+`joints` (from 1; empty for the whole arm), `form` for an effect of several forms, and `parameters`, each with `value`,
+`std` and `unit`.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
+from typing import Any
 
 from fri.errors import ConfigurationError
-from ident.effects.backlash import Backlash
-from ident.effects.base_tilt import BaseTilt
-from ident.effects.cable_spring import CableSpring
-from ident.effects.contact import Contact
-from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
-from ident.effects.friction_asymmetry import FrictionAsymmetry
-from ident.effects.friction_load import FrictionLoad
-from ident.effects.friction_position import FrictionPosition
-from ident.effects.friction_temperature import FrictionTemperature
-from ident.effects.gear_ripple import GearRipple
-from ident.effects.joint_elasticity import JointElasticity
-from ident.effects.joint_torque_delay import JointTorqueDelay
-from ident.effects.joint_zero_offset import JointZeroOffset
-from ident.effects.lost_samples import LostSamples
+from ident.effects import drive, link, load, sensor, timing
+from ident.effects.effect import (
+    Column,
+    Effect,
+    Experiment,
+    Form,
+    Law,
+    Parameter,
+    Parameters,
+    Setting,
+    Shape,
+    Simulated,
+)
 from ident.effects.motion import Motion
-from ident.effects.motor_torque_delay import MotorTorqueDelay
-from ident.effects.motor_torque_gain import MotorTorqueGain
-from ident.effects.payload_change import PayloadChange
-from ident.effects.payload_error import PayloadError
-from ident.effects.presliding_hysteresis import PreslidingHysteresis
-from ident.effects.sensor_crosstalk import SensorCrosstalk
-from ident.effects.sensor_gain import SensorGain
-from ident.effects.sensor_hysteresis import SensorHysteresis
-from ident.effects.sensor_offset_drift import SensorOffsetDrift
-from ident.effects.sensor_ripple import SensorRipple
-from ident.effects.sensor_saturation import SensorSaturation
-from ident.effects.stribeck import Stribeck
-from ident.effects.viscous_nonlinear import ViscousNonlinear
+from ident.effects.words import Values, spoken
 
 __all__ = [
+    "DELAYS",
     "EFFECTS",
+    "ELASTICITY",
+    "LOST_SAMPLES",
+    "PRESLIDING",
+    "ZERO_OFFSET",
     "Column",
     "Effect",
+    "Experiment",
+    "Form",
+    "Law",
     "Motion",
     "Parameter",
+    "Parameters",
     "Setting",
     "Shape",
     "Simulated",
+    "described",
     "find_effect",
+    "summary_of",
 ]
+
+PRESLIDING = drive.PreslidingHysteresis()
+ELASTICITY = link.JointElasticity()
+ZERO_OFFSET = link.JointZeroOffset()
+LOST_SAMPLES = timing.LostSamples()
+DELAYS = {"motor": timing.MotorTorqueDelay(), "joint": timing.JointTorqueDelay()}
+"""The effect of a late channel, by side."""
 
 EFFECTS: dict[str, Effect] = {
     effect.cause: effect
     for effect in (
-        Stribeck(),
-        ViscousNonlinear(),
-        FrictionAsymmetry(),
-        FrictionLoad(),
-        FrictionTemperature(),
-        FrictionPosition(),
-        PreslidingHysteresis(),
-        GearRipple(),
-        MotorTorqueGain(),
-        Backlash(),
-        JointElasticity(),
-        CableSpring(),
-        BaseTilt(),
-        PayloadError(),
-        PayloadChange(),
-        JointZeroOffset(),
-        Contact(),
-        SensorGain(),
-        SensorCrosstalk(),
-        SensorHysteresis(),
-        SensorSaturation(),
-        SensorOffsetDrift(),
-        SensorRipple(),
-        MotorTorqueDelay(),
-        JointTorqueDelay(),
-        LostSamples(),
+        drive.Stribeck(),
+        drive.ViscousNonlinear(),
+        drive.FrictionAsymmetry(),
+        drive.FrictionLoad(),
+        drive.FrictionTemperature(),
+        drive.FrictionPosition(),
+        PRESLIDING,
+        drive.GearRipple(),
+        drive.MotorTorqueGain(),
+        link.Backlash(),
+        ELASTICITY,
+        link.CableSpring(),
+        link.BaseTilt(),
+        load.PayloadError(),
+        load.PayloadChange(),
+        ZERO_OFFSET,
+        link.EncoderEccentricity(),
+        load.Contact(),
+        sensor.SensorGain(),
+        sensor.SensorCrosstalk(),
+        sensor.SensorHysteresis(),
+        sensor.SensorSaturation(),
+        sensor.SensorOffsetDrift(),
+        sensor.SensorRipple(),
+        *DELAYS.values(),
+        LOST_SAMPLES,
     )
 }
 
@@ -91,3 +98,23 @@ def find_effect(cause: str) -> Effect:
         advice = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(EFFECTS)}"
         raise ConfigurationError(f"effect {cause!r} is unknown; {advice}")
     return EFFECTS[cause]
+
+
+def summary_of(cause: str) -> str:
+    """What is wrong, in a few words; the name itself of a cause from a file of another version."""
+    return EFFECTS[cause].summary if cause in EFFECTS else spoken(cause)
+
+
+def described(cause: str, values: Values, form: Any, names: Sequence[str]) -> str:
+    """The parameters of a finding as a phrase.
+
+    values : value, standard deviation and unit by name. form : of the effect, None for its only one. names : of the
+    joints. A finding from a file of another version is listed as it stands.
+    """
+    if cause in EFFECTS:
+        effect = EFFECTS[cause]
+        try:
+            return "; ".join(effect.sentence(values, effect.form_of(form), names))
+        except (ConfigurationError, KeyError):
+            return "; ".join(Effect.sentence(effect, values, None, names))
+    return ", ".join(f"{spoken(name)} {value:.4g} {unit}" for name, (value, _, unit) in values.items())

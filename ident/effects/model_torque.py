@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check_entry", "effects_torque", "parameter_values"]
 
-_ENTRY = frozenset({"cause", "side", "joints", "parameters"})
+_ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 
 
 def check_entry(entry: Mapping[str, Any], joints: int) -> None:
@@ -30,9 +30,8 @@ def check_entry(entry: Mapping[str, Any], joints: int) -> None:
     unknown = set(entry) - _ENTRY
     if unknown or not {"cause", "joints", "parameters"} <= set(entry):
         raise ConfigurationError(
-            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, parameters, each "
-            f"with value, "
-            "std, unit"
+            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, form where there are several, "
+            "parameters, each with value, std, unit"
         )
     effect = find_effect(str(entry["cause"]))
     numbers = list(entry["joints"])
@@ -41,13 +40,7 @@ def check_entry(entry: Mapping[str, Any], joints: int) -> None:
     if effect.whole_arm == bool(numbers):
         wanted = "no joint, for it belongs to the whole arm" if effect.whole_arm else "the joints it acts on"
         raise ConfigurationError(f"effect {effect.cause}: `joints` is {numbers}; give {wanted}")
-    known = {p.name for p in effect.parameters}
-    foreign = set(entry["parameters"]) - known
-    if foreign:
-        listed = ", ".join(sorted(known))
-        raise ConfigurationError(
-            f"effect {effect.cause} has no parameter {sorted(foreign)[0]!r}; it has {listed}"
-        )
+    effect.check(entry["parameters"], entry.get("form"))
 
 
 def parameter_values(entry: Mapping[str, Any]) -> dict[str, float]:
@@ -86,7 +79,7 @@ def effects_torque(
             continue
         values = parameter_values(entry)
         for joint in entry["joints"] or [1]:
-            motor, link = effect.torque(motion, int(joint) - 1, values)
+            motor, link = effect.torque(motion, int(joint) - 1, values, entry.get("form"))
             total += motor if side == "motor" else link if side == "joint" else motor - link
     return total
 

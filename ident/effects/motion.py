@@ -1,4 +1,4 @@
-"""The motion of an arm as effects see it: one uninterrupted stretch of samples on an even grid."""
+"""The motion of an arm as effects see it, and operators with memory along it: Dahl's hysteresis, play, low-pass."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from ident import regressor
 from ident.effects.springs import Springs
 from ident.kinematics import Chain
 
-__all__ = ["Floats", "Motion"]
+__all__ = ["Floats", "Motion", "dahl", "first_order", "play"]
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +23,7 @@ class Motion:
     """Motion of n joints at N samples and the torques that the present model predicts for it.
 
     chain : the arm. bodies : (n, 10) inertial parameters of the links, the payload in the last one.
-    session : number of the session in the order in which the sessions were run.
+    session : number of the session (from 0), in the order of the recordings.
     time : (N,) [s] from the start of the session, evenly spaced. duration_s : length of the session [s].
     q, qd, qdd : (N, n), positions as published [rad], and their derivatives.
     motor_speed, motor_acceleration : (N, n) of the motors referred to the joints; equal to qd and qdd where
@@ -31,12 +32,12 @@ class Motion:
         sensor's noise.
     gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
     link_coulomb, motor_coulomb : (n,) Coulomb friction of link and drive [Nm].
-    friction : function of the motors' speed (N, n) giving the model's drive friction (N, n) [Nm].
-    slip : (N, n) Coulomb friction of the drives over its level, which after a reversal goes from one sign to
-        the other within the reach of presliding; None: at once.
-    springs : on which the links hang behind motors whose positions are published; None where the positions are
-        the links', or the stiffness is unknown.
-    loaded : whether the payload hangs there, or the last link is what is spoken of.
+    friction : the model's drive friction (N, n) [Nm] as a function of the motors' speed (N, n).
+    slip : (N, n) Coulomb friction of the drives over its level: from one sign to the other within the presliding
+        length after a reversal; None: at once.
+    springs : between published motors and the links; None where the positions are the links', or the stiffness is
+        unknown.
+    loaded : whether the payload hangs there.
     """
 
     chain: Chain
@@ -87,7 +88,7 @@ class Motion:
         return regressor.torque(self.chain, q, qd, qdd, self.bodies if bodies is None else bodies)
 
     def smooth_torque(self, side: str) -> Floats:
-        """Predicted torque (N, n) of a side without the Coulomb friction, which jumps at reversals."""
+        """Predicted torque (N, n) of a side without the Coulomb friction and its jumps at reversals."""
         link = self.link_coulomb * np.sign(self.qd)
         if side == "joint":
             return self.joint_torque - link
@@ -100,10 +101,55 @@ class Motion:
         tilted = replace(self.chain, gravity=9.81 * np.asarray(direction, dtype=np.float64))
         return regressor.gravity_torque(tilted, self.q, self.bodies)
 
-    def displaced(self, shift: Floats, rate: Floats, thrust: Floats) -> Floats:
+    def displaced(self, shift: Floats, rate: Floats, acceleration: Floats) -> Floats:
         """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift.
 
-        shift, rate, thrust : (N, n) [rad, rad/s, rad/s^2].
+        shift, rate, acceleration : (N, n) [rad, rad/s, rad/s^2].
         """
-        moved = self.rigid_torque(self.q + shift, self.qd + rate, self.qdd + thrust)
+        moved = self.rigid_torque(self.q + shift, self.qd + rate, self.qdd + acceleration)
         return moved - self.rigid_torque(self.q, self.qd, self.qdd)
+
+
+@njit(cache=True)
+def dahl(path, length, start):  # type: ignore[no-untyped-def]
+    """State z (N,) in [-1, 1] of Dahl's friction along `path` (N,): dz = (1 - z sign(dx)) dx / length.
+
+    Integrated exactly over each step, so any step is stable. Dahl, Solid friction damping of mechanical
+    vibrations, AIAA Journal 14 (1976).
+    """
+    out = np.empty(path.shape[0])
+    z = start
+    out[0] = z
+    for k in range(1, path.shape[0]):
+        step = path[k] - path[k - 1]
+        if step > 0.0:
+            z = 1.0 - (1.0 - z) * np.exp(-step / length)
+        elif step < 0.0:
+            z = -1.0 + (1.0 + z) * np.exp(step / length)
+        out[k] = z
+    return out
+
+
+@njit(cache=True)
+def play(signal, half_width):  # type: ignore[no-untyped-def]
+    """Output (N,) of the play operator of `half_width` driven by `signal` (N,)."""
+    out = np.empty(signal.shape[0])
+    value = signal[0]
+    for k in range(signal.shape[0]):
+        if signal[k] - value > half_width:
+            value = signal[k] - half_width
+        elif value - signal[k] > half_width:
+            value = signal[k] + half_width
+        out[k] = value
+    return out
+
+
+@njit(cache=True)
+def first_order(signal, keep, start):  # type: ignore[no-untyped-def]
+    """Low-pass of first order (N,) of `signal` (N,) that keeps the share `keep` of its value each sample."""
+    out = np.empty(signal.shape[0])
+    value = start
+    for k in range(signal.shape[0]):
+        value = keep * value + (1.0 - keep) * signal[k]
+        out[k] = value
+    return out

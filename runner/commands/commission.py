@@ -12,7 +12,7 @@ from runner.options import coupling_option, gear_ratio_option, json_option
 from runner.plain import as_json as to_json
 
 if TYPE_CHECKING:
-    from ident.discrepancy import Reference
+    from ident.diagnosis import Reference
 
 __all__ = ["command"]
 
@@ -67,7 +67,7 @@ def command(
     lwr-run commission u1.mcap l1.mcap u2.mcap l2.mcap --sets 2 --out commissioned.yaml
     """
     from fri.errors import ConfigurationError
-    from ident.discrepancy import commission
+    from ident.diagnosis import commission
     from ident.model_file import write_model
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm

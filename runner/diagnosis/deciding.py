@@ -6,14 +6,16 @@ import dataclasses
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, LwrError, RefusedError
-from ident.discrepancy import Diagnosis, Finding
+from ident.diagnosis import Diagnosis, Finding
+from ident.effects import EFFECTS
+from ident.effects import Experiment as Discriminating
 from ident.excitation import ExcitationPlan
 from ident.excitation.motion import ParametricMotion
 from lwr_driver.arm import Arm
@@ -26,51 +28,18 @@ from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import checker, excitation_rows, plan_excitation
 from runner.preparation import session_motion
 
-__all__ = ["SURE", "Deciding", "Kind", "offers", "offers_of_sessions", "open_findings"]
+__all__ = ["SURE", "Deciding", "offers", "offers_of_sessions", "open_findings"]
 
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
-Kind = Literal["slow sweep", "reversal ladder", "static poses", "chirp", "repeated run", "hot and cold"]
 
 SURE = 0.8
 """Confidence below which a finding is open between look-alikes."""
 
-_KINDS: dict[str, Kind] = {
-    "stribeck": "slow sweep",
-    "viscous_nonlinear": "slow sweep",
-    "friction_asymmetry": "slow sweep",
-    "friction_load": "slow sweep",
-    "friction_position": "slow sweep",
-    "gear_ripple": "slow sweep",
-    "sensor_ripple": "slow sweep",
-    "cable_spring": "slow sweep",
-    "backlash": "slow sweep",
-    "presliding_hysteresis": "reversal ladder",
-    "sensor_hysteresis": "reversal ladder",
-    "motor_torque_gain": "static poses",
-    "sensor_gain": "static poses",
-    "sensor_crosstalk": "static poses",
-    "sensor_saturation": "static poses",
-    "base_tilt": "static poses",
-    "payload_error": "static poses",
-    "joint_zero_offset": "static poses",
-    "joint_elasticity": "chirp",
-    "motor_torque_delay": "chirp",
-    "joint_torque_delay": "chirp",
-    "contact": "repeated run",
-    "payload_change": "repeated run",
-    "lost_samples": "repeated run",
-    "friction_temperature": "hot and cold",
-    "sensor_offset_drift": "hot and cold",
-}
-_WITH_EVERY_PAYLOAD = {
-    "friction_load",
-    "motor_torque_gain",
-    "sensor_gain",
-    "sensor_crosstalk",
-    "payload_error",
-}
+# Motions of the whole arm, and those that run the exciting motion itself.
+_AGAIN = (Discriminating.REPEATED_RUN, Discriminating.HOT_AND_COLD)
+_OF_THE_ARM = (Discriminating.STATIC_POSES, *_AGAIN)
 _WARM_PERIODS = 4
 _REACHES = (0.9, 0.6, 0.4, 0.25)
 _SPREADS = (0.6, 0.4, 0.25)
@@ -87,7 +56,7 @@ class Deciding:
     """
 
     name: str
-    kind: Kind
+    kind: Discriminating
     joint: int | None
     plan: ExcitationPlan
     payloads: tuple[Payload | None, ...]
@@ -112,13 +81,13 @@ class Deciding:
         where = "" if self.joint is None else f" of {self.plan.joint_names[self.joint - 1]}"
         loads = " and ".join("bare" if p is None else f"with {p.name}" for p in self.payloads)
         causes = " or ".join(dict.fromkeys(cause for cause, _ in self.rivals))
-        return f"{self.kind}{where}, {self.plan.duration_s:.0f} s, {loads} ({causes}): {self.file}"
+        return f"{self.kind.value}{where}, {self.plan.duration_s:.0f} s, {loads} ({causes}): {self.file}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content."""
         return {
             "file": self.file,
-            "kind": self.kind,
+            "kind": self.kind.value,
             "joint": self.joint,
             "duration_s": self.plan.duration_s,
             "payloads": [None if payload is None else payload.name for payload in self.payloads],
@@ -142,9 +111,9 @@ def offers(
     for finding in open_findings(diagnosis, experiment.diagnosis.sure):
         rivals = ((finding.cause, finding.joints), *((c, j) for c, j, _ in finding.alternatives))
         for cause, joints in rivals:
-            kind = _KINDS.get(cause)
+            kind = EFFECTS[cause].experiment
             joint = joints[0] if joints else None
-            if kind is None or len(found) >= _MOST:
+            if len(found) >= _MOST:
                 continue
             name = _name(kind, joint)
             if name in found:
@@ -175,26 +144,22 @@ def offers_of_sessions(diagnosis: Diagnosis, sessions: Sequence[Session]) -> tup
         return ()
 
 
-def _name(kind: Kind, joint: int | None) -> str:
-    plain = kind.replace(" ", "_")
-    return (
-        plain
-        if joint is None or kind in ("static poses", "repeated run", "hot and cold")
-        else f"{plain}_{joint}"
-    )
+def _name(kind: Discriminating, joint: int | None) -> str:
+    plain = kind.value.replace(" ", "_")
+    return plain if joint is None or kind in _OF_THE_ARM else f"{plain}_{joint}"
 
 
 def _payloads(experiment: Experiment, causes: Sequence[str]) -> tuple[Payload | None, ...]:
     """What to run with: every payload of the experiment where the load decides, else the last one mounted."""
     used = list(dict.fromkeys(session.payload for session in experiment.sessions))
     last = experiment.sessions[-1].payload
-    if not _WITH_EVERY_PAYLOAD & set(causes):
+    if not any(EFFECTS[cause].every_payload for cause in causes):
         return (last,)
     return (last, *(payload for payload in used if payload != last))
 
 
 def _plan(
-    kind: Kind,
+    kind: Discriminating,
     joint: int | None,
     experiment: Experiment,
     arm: Arm,
@@ -203,9 +168,11 @@ def _plan(
     loads: Sequence[Payload | None],
 ) -> ExcitationPlan | None:
     """The first size of the motion that passes every check with every payload."""
-    provenance = {"made_by": "diagnosis", "kind": kind, "joint": joint}
-    if kind in ("repeated run", "hot and cold"):
-        periods = _WARM_PERIODS if kind == "hot and cold" else max(1, experiment.excitation.periods)
+    provenance = {"made_by": "diagnosis", "kind": kind.value, "joint": joint}
+    if kind in _AGAIN:
+        periods = (
+            _WARM_PERIODS if kind is Discriminating.HOT_AND_COLD else max(1, experiment.excitation.periods)
+        )
         return dataclasses.replace(exciting, periods=periods, provenance=provenance)
     home = experiment.home(len(arm.joint_names))
     for make in _sizes(kind, joint, arm, cell, experiment, home, loads):
@@ -215,13 +182,13 @@ def _plan(
             if all(_passes(experiment, arm, cell, payload, rows, home) for payload in loads):
                 return plan
         except (RefusedError, ConfigurationError) as error:
-            log.info("%s: %s", kind, error)
-    log.info("no %s passes every check", kind)
+            log.info("%s: %s", kind.value, error)
+    log.info("no %s passes every check", kind.value)
     return None
 
 
 def _sizes(
-    kind: Kind,
+    kind: Discriminating,
     joint: int | None,
     arm: Arm,
     cell: Cell,
@@ -231,7 +198,7 @@ def _sizes(
 ) -> list[Callable[[], ParametricMotion]]:
     """The motion in several sizes, the largest first."""
     one = 3 if joint is None else joint - 1
-    if kind == "static poses":
+    if kind is Discriminating.STATIC_POSES:
         margin = max(experiment.moves.clearance_m, cell.margin_m)
         watches = [checker(arm, cell, payload) for payload in loads]
 
@@ -239,7 +206,11 @@ def _sizes(
             return all(watch.clearance(pose).distance > margin for watch in watches)
 
         return [lambda spread=spread: poses(arm, home, spread, free) for spread in _SPREADS]  # type: ignore[misc]
-    make = {"slow sweep": slow_sweep, "reversal ladder": reversal_ladder, "chirp": chirp}[kind]
+    make = {
+        Discriminating.SLOW_SWEEP: slow_sweep,
+        Discriminating.REVERSAL_LADDER: reversal_ladder,
+        Discriminating.CHIRP: chirp,
+    }[kind]
     return [lambda reach=reach: make(arm, home, one, reach) for reach in _REACHES]  # type: ignore[misc]
 
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ident.discrepancy import Diagnosis, Finding
+from ident.diagnosis import Diagnosis, Finding
+from ident.effects.words import joints_text
 from runner.diagnosis.deciding import SURE, open_findings
-from runner.diagnosis.words import joints_text
 
 __all__ = ["Answer", "decision_text", "decisions"]
 

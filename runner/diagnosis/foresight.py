@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from ident.discrepancy import ArmData, Diagnosis, Reference
-from ident.discrepancy.signatures import overlap, signature_bench, signatures
+from ident.diagnosis import ArmData, Diagnosis, Reference
+from ident.diagnosis.signatures import overlap, signature_bench, signatures
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from lwr_driver.session import JointColumns, Phase, Session
@@ -65,7 +65,9 @@ def foresee(
             bench = signature_bench([*sessions, *further], chain, arm=arm, reference=reference)
             for k in mine:
                 pair = found[k]
-                a, b = signatures(bench, [pair.first, pair.second], parameters=pair.parameters)
+                a, b = signatures(
+                    bench, [pair.first, pair.second], parameters=pair.parameters, forms=pair.forms
+                )
                 seen = Foreseen(motion.file, overlap(a, b), a.strength)
                 if pair.foreseen is None or seen.apart > pair.foreseen.apart:
                     found[k] = replace(pair, foreseen=seen)

@@ -1,7 +1,7 @@
 """Two causes that look alike, side by side: what each would leave in these sessions, and how far that goes together.
 
 What a cause leaves is its torque less what the base model makes of it when it is fitted anew
-(`ident.discrepancy.signatures`). Where two causes leave the same, no method can tell them apart from these
+(`ident.diagnosis.signatures`). Where two causes leave the same, no method can tell them apart from these
 sessions, and another motion has to.
 """
 
@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident.discrepancy import ArmData, Diagnosis, DiagnosisSettings, Finding, Reference
-from ident.discrepancy.bench import Bench
-from ident.discrepancy.candidates import Candidate
-from ident.discrepancy.evidence import Rows
-from ident.discrepancy.selection import reach
-from ident.discrepancy.signatures import Signature, overlap, signature_bench, signatures
+from ident.diagnosis import ArmData, Diagnosis, DiagnosisSettings, Finding, Reference
+from ident.diagnosis.bench import Bench
+from ident.diagnosis.candidates import Candidate
+from ident.diagnosis.evidence import Rows
+from ident.diagnosis.selection import margin
+from ident.diagnosis.signatures import Signature, overlap, signature_bench, signatures
 from ident.effects import find_effect
+from ident.effects.words import joints_text, named
 from ident.kinematics import Chain
 from lwr_driver.session import Session
-from runner.diagnosis.words import joints_text, named, variable_of
 
 __all__ = [
     "FILE",
@@ -91,7 +91,7 @@ class Foreseen:
     @property
     def needed(self) -> float:
         """From how much on the two are told apart then."""
-        return math.sqrt(reach(self.strength**2))
+        return math.sqrt(margin(self.strength**2))
 
     def sentence(self) -> str:
         """What to expect of the motion."""
@@ -114,7 +114,7 @@ class LookAlikes:
     `first` leaves that `second` can imitate, the cosine of the angle between the two; 1: not to be told apart.
     strength : of what each leaves, in units of the noise. variables : what each depends on. decides : the motion
     that tells them apart, for each. sessions : names in their order. shape_alone : whether a sensor's error and a
-    torque of the arm are compared in the joint torque alone. parameters : of each, as they were compared.
+    torque of the arm are compared in the joint torque alone. parameters, forms : of each, as they were compared.
     foreseen : what the motion that decides is to bring, where there is a plan of it.
     """
 
@@ -128,6 +128,7 @@ class LookAlikes:
     sessions: tuple[str, ...] = ()
     shape_alone: bool = False
     parameters: tuple[Mapping[str, float], Mapping[str, float]] = ({}, {})
+    forms: tuple[str | None, ...] = (None, None)
     foreseen: Foreseen | None = None
     traces: tuple[Trace, ...] = field(default=(), repr=False)
 
@@ -139,7 +140,7 @@ class LookAlikes:
     @property
     def needed(self) -> float:
         """From how much on two causes of this strength are told apart, in units of the noise."""
-        return math.sqrt(reach(self.strength[0] ** 2))
+        return math.sqrt(margin(self.strength[0] ** 2))
 
     @property
     def told_apart(self) -> bool:
@@ -196,6 +197,7 @@ class LookAlikes:
             "sessions": list(self.sessions),
             "shape_alone": self.shape_alone,
             "parameters": [dict(values) for values in self.parameters],
+            "forms": list(self.forms),
             "foreseen": None if self.foreseen is None else self.foreseen.to_dict(),
         }
 
@@ -267,9 +269,9 @@ def _columns(bench: Bench, finding: Finding) -> Rows:
     """Columns of a finding on the bench; none for what leaves no torque."""
     effect = find_effect(finding.cause)
     candidate = Candidate(effect, finding.joints[0] - 1 if finding.joints else -1)
-    if finding.cause == "lost_samples":
+    if effect.counted:
         return {}
-    return bench.dictionary.rows(candidate, effect.shape_of(_values(finding)))
+    return bench.dictionary.rows(candidate, effect.shape_of(_values(finding), finding.form))
 
 
 def _values(finding: Finding) -> dict[str, float]:
@@ -280,7 +282,9 @@ def _side_by_side(
     bench: Bench, number: int, first: Place, second: Place, finding: Finding | None
 ) -> LookAlikes:
     given = [None if finding is None else _values(finding), None]
-    a, b = signatures(bench, [first, second], parameters=given)
+    a, b = signatures(
+        bench, [first, second], parameters=given, forms=[None if finding is None else finding.form, None]
+    )
     decides = [
         find_effect(cause).tell_apart.format(joint=joints[0] if joints else 1)
         for cause, joints in (first, second)
@@ -292,14 +296,15 @@ def _side_by_side(
         overlap(a, b),
         (a.strength, b.strength),
         (
-            variable_of(a.cause, a.parameters.get("ratio", 1.0)),
-            variable_of(b.cause, b.parameters.get("ratio", 1.0)),
+            find_effect(a.cause).variable(a.parameters),
+            find_effect(b.cause).variable(b.parameters),
         ),
         (decides[0], decides[1]),
         tuple(recording.name for recording in bench.nominal.recordings),
         "motor" not in bench.nominal.rows
         and "sensor" in {find_effect(cause).side for cause, _ in (first, second)},
         (a.parameters, b.parameters),
+        tuple(None if one.form is None else str(one.form.value) for one in (a, b)),
         None,
         _traces(bench, a, b),
     )
@@ -379,6 +384,7 @@ def read_look_alikes(path: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[
                         tuple(entry["sessions"]),
                         bool(entry["shape_alone"]),
                         (entry["parameters"][0], entry["parameters"][1]),
+                        tuple(entry["forms"]),
                         _foreseen(entry["foreseen"]),
                         tuple(traces),
                     )

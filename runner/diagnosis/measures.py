@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ident.discrepancy import Diagnosis
-from ident.discrepancy.gain import HeldOut, interval
+from ident.diagnosis import Diagnosis
+from ident.diagnosis.gain import HeldOut, interval
 
 __all__ = ["Moved", "RowGain", "moved_parameters", "row_gains"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from ident.discrepancy import Diagnosis
+from ident.diagnosis import Diagnosis
 
 __all__ = ["FILE", "Residuals", "SideResiduals"]
 

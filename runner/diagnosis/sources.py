@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.discrepancy import ArmData
+from ident.diagnosis import ArmData
 from ident.kinematics import Chain
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.discrepancy import ArmData, Diagnosis, Reference, diagnose
+from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.model_file import write_model

@@ -6,10 +6,10 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ident.discrepancy import Diagnosis, Finding, SimulationError
+from ident.diagnosis import Diagnosis, Finding, SimulationError
+from ident.effects import described, find_effect, summary_of
+from ident.effects.words import joints_text, named, quantity_text
 from runner.diagnosis.measures import Moved, RowGain
-from runner.diagnosis.phrases import described
-from runner.diagnosis.words import CAUSES, joints_text, named, quantity_text
 
 if TYPE_CHECKING:
     from runner.diagnosis.look_alikes import LookAlikes
@@ -77,14 +77,13 @@ def _headline(study: Study) -> list[str]:
 def _finding(number: int, finding: Finding, names: Sequence[str]) -> list[str]:
     sure = f"{finding.confidence:.2f}" + ("" if finding.confidence >= _SURE else ", open")
     place = joints_text(finding.joints, names)
-    mode = f", {finding.mode}" if finding.mode and finding.cause != "lost_samples" else ""
+    mode = f", {finding.mode}" if finding.mode and not find_effect(finding.cause).counted else ""
     lines = [f"{number}. {finding.cause}, {place} ({finding.side} side{mode}): confidence {sure}"]
-    if finding.cause in CAUSES:
-        lines.append(f"     {CAUSES[finding.cause]}")
-    if finding.cause == "lost_samples" and finding.mode:
+    lines.append(f"     {summary_of(finding.cause)}")
+    if find_effect(finding.cause).counted and finding.mode:
         lines.append(f"     {finding.mode}")
     else:
-        lines += _wrapped(described(finding.cause, finding.parameters, names), "     ", "     ")
+        lines += _wrapped(described(finding.cause, finding.values, finding.form, names), "     ", "     ")
         e = finding.evidence
         low, high = e.gain_interval_95
         lines.append(

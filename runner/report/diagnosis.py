@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+from ident.effects import EFFECTS, described, summary_of
+from ident.effects.words import joints_text, named, quantity_text
 from runner.diagnosis.look_alikes import LookAlikes
-from runner.diagnosis.phrases import described, parameter_rows
-from runner.diagnosis.words import CAUSES, joints_text, named
-from runner.report.diagnosis_folder import DiagnosisFolder
+from runner.report.diagnosis_folder import DiagnosisFolder, values_of
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.look_alike_figures import look_alike_figure
@@ -78,7 +78,9 @@ def _finding(diagnosis: DiagnosisFolder, number: int) -> str:
     )
     title = f"{_words(cause).capitalize()}, {joints_text(joints, names)}"
     intro = (
-        f"{CAUSES.get(cause, '').capitalize()}: {described(cause, parameters, names)}." if parameters else ""
+        f"{summary_of(cause).capitalize()}: {described(cause, values_of(finding), finding.get('form'), names)}."
+        if parameters
+        else ""
     )
     seen = _SEEN.get(side, "")
     parts = [f"<h3>{escape(title)}</h3>", paragraph(" ".join(part for part in (intro, seen, sure) if part))]
@@ -101,11 +103,11 @@ def _finding(diagnosis: DiagnosisFolder, number: int) -> str:
         rows.append(["what would decide", named(str(finding["tell_apart"]), names)])
     parts.append(table(("", ""), rows, f"Evidence: {title}", classes="facts"))
     if diagnosis.residuals is not None and side != "timing":
-        ratio = float((parameters.get("ratio") or {}).get("value", 1.0))
+        numbers = {name: value for name, (value, _, _) in values_of(finding).items()}
         others = [
             j for k, one in enumerate(diagnosis.findings) if k + 1 != number for j in one.get("joints", [])
         ]
-        figure = finding_figure(diagnosis.residuals, cause, side, joints, ratio, others)
+        figure = finding_figure(diagnosis.residuals, cause, side, joints, numbers, others)
         if figure is not None:
             parts.append(figure_html(figure))
     parts += [_beside(pair, names) for pair in diagnosis.look_alikes if pair.finding == number]
@@ -123,7 +125,7 @@ def _statistics(finding: Mapping[str, Any]) -> list[list[Cell]]:
     evidence = finding.get("evidence") or {}
     rows: list[list[Cell]] = [
         [name.replace("_", " "), f"{value} ({meaning.replace('`', '')})" if meaning else value]
-        for name, value, meaning in parameter_rows(str(finding["cause"]), finding.get("parameters") or {})
+        for name, value, meaning in parameter_rows(finding)
     ]
     for key, label in (("delta_bic", "ΔBIC"), ("p_value", "p-value")):
         if evidence.get(key) is not None:
@@ -132,6 +134,13 @@ def _statistics(finding: Mapping[str, Any]) -> list[list[Cell]]:
         if other.get("delta_bic") is not None:
             rows.append([f"ΔBIC with {_words(other['cause'])} instead", f"{other['delta_bic']:.3g}"])
     return rows
+
+
+def parameter_rows(finding: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Name, value with standard deviation and unit, and meaning of each parameter."""
+    cause = str(finding["cause"])
+    meanings = {p.name: p.meaning for p in EFFECTS[cause].parameters} if cause in EFFECTS else {}
+    return [(name, quantity_text(*one), meanings.get(name, "")) for name, one in values_of(finding).items()]
 
 
 def _beside(pair: LookAlikes, names: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +19,7 @@ from runner.diagnosis.residuals import FILE as RESIDUALS
 from runner.diagnosis.residuals import Residuals
 from runner.report.folder import ResultFolder
 
-__all__ = ["DiagnosisFolder"]
+__all__ = ["DiagnosisFolder", "values_of"]
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,14 @@ class DiagnosisFolder:
         """Causes side by side."""
         entries, file = self.details.get("look_alikes") or [], self.path / LOOK_ALIKES
         return read_look_alikes(file, entries) if entries and file.is_file() else ()
+
+
+def values_of(finding: Mapping[str, Any]) -> dict[str, tuple[float, float, str]]:
+    """Value, standard deviation and unit by parameter of a finding's plain content."""
+    return {
+        name: (float(one.get("value", math.nan)), float(one.get("std") or 0.0), str(one.get("unit", "1")))
+        for name, one in (finding.get("parameters") or {}).items()
+    }
 
 
 def _json(path: Path) -> Mapping[str, Any]:

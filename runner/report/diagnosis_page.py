@@ -8,10 +8,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from runner.diagnosis.phrases import described
-from runner.diagnosis.words import joints_text
+from ident.effects import described
+from ident.effects.words import joints_text
 from runner.report.diagnosis import diagnosis_parts
-from runner.report.diagnosis_folder import DiagnosisFolder
+from runner.report.diagnosis_folder import DiagnosisFolder, values_of
 from runner.report.markup import section
 from runner.report.page import page_html, write_page
 from runner.report.verdicts import Level, Verdict, error_change, extension_gain, largest_gain
@@ -102,7 +102,7 @@ def diagnosis_verdicts(diagnosis: DiagnosisFolder) -> list[Verdict]:
 def _found(finding: Mapping[str, Any], names: Sequence[str]) -> Verdict:
     cause = str(finding["cause"])
     evidence = finding.get("evidence") or {}
-    text = described(cause, finding.get("parameters") or {}, names)
+    text = described(cause, values_of(finding), finding.get("form"), names)
     if evidence.get("test_rms_before"):
         text += f"; error {evidence['test_rms_before']:.3g} to {evidence['test_rms_after']:.3g} Nm"
     text += f"; confidence {100 * finding['confidence']:.0f} %"

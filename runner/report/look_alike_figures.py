@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from ident.effects.words import joints_text
 from runner.diagnosis.look_alikes import LookAlikes, Trace
-from runner.diagnosis.words import joints_text
 from runner.report.figures import bin_means
 from runner.report.plot import Figure, Line, Mark, Panel
 from runner.report.residual_figures import LABELS

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.effects import Parameters, find_effect
 from runner.diagnosis.residuals import Residuals, SideResiduals
-from runner.diagnosis.words import variable_of
 from runner.report.figures import bin_means
 from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
 
@@ -41,16 +41,17 @@ def finding_figure(
     cause: str,
     side: str,
     joints: Sequence[int],
-    ratio: float = 1.0,
+    parameters: Parameters,
     others: Sequence[int] = (),
 ) -> Figure | None:
     """Held-out residual without and with the extension where a finding acts, over time and against its variable.
 
-    joints : from 1, none for the whole arm. ratio : of what a ripple repeats with. others : joints of other
+    joints : from 1, none for the whole arm. parameters : of the finding. others : joints of other
     findings, which show a cause of the whole arm less clearly. None where there is nothing to show.
     """
     seen = {"motor": ("motor",), "sensor": ("joint",)}.get(side, ("motor", "joint"))
-    if cause == "motor_torque_delay":
+    effect = find_effect(cause)
+    if effect.channel == "motor":
         seen = ("motor",)
     fall: dict[tuple[str, int], float] = {}
     for name in seen:
@@ -65,7 +66,7 @@ def finding_figure(
         fall = clear
     panels = []
     for name, joint in sorted(fall, key=lambda key: -fall[key])[:_PLACES]:
-        for against in dict.fromkeys((variable_of(cause, ratio), "time")):
+        for against in dict.fromkeys((effect.variable(parameters), "time")):
             panels.append(_panel(residuals, residuals.sides[name], name, joint, against, with_side=True))
     where = "-".join(map(str, joints)) or "arm"
     caption = f"Where {cause.replace('_', ' ')} shows"

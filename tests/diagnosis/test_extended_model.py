@@ -25,19 +25,21 @@ HEALTHY = Path(__file__).parents[1] / "hidden_physics" / "reference.yaml"
 HOSE_NM_RAD, PULL_NM = 2.0, 0.7
 
 
-def entry(cause: str, side: str, joints: list[int], **values: tuple[float, str]) -> dict[str, object]:
+def entry(
+    cause: str, side: str, joints: list[int], form: str | None = None, **values: tuple[float, str]
+) -> dict[str, object]:
     parameters = {name: {"value": v, "std": 0.01, "unit": unit} for name, (v, unit) in values.items()}
-    return {"cause": cause, "side": side, "joints": joints, "parameters": parameters}
+    named = {} if form is None else {"form": form}
+    return {"cause": cause, "side": side, "joints": joints, **named, "parameters": parameters}
 
 
-HOSE = entry(
-    "cable_spring", "joint", [4], stiffness=(HOSE_NM_RAD, "Nm/rad"), kind=(0.0, "1"), slack=(0.0, "rad")
-)
+HOSE = entry("cable_spring", "joint", [4], stiffness=(HOSE_NM_RAD, "Nm/rad"), form="linear")
 FILM = entry("stribeck", "motor", [2], amplitude=(1.5, "Nm"), velocity=(0.05, "rad/s"), exponent=(1.0, "1"))
 LOST = entry(
     "payload_change",
     "joint",
     [],
+    "jump",
     mass=(-1.0, "kg"),
     moment_x=(0.0, "kg m"),
     moment_y=(0.0, "kg m"),
@@ -111,11 +113,11 @@ def test_a_tilted_base_leans_once_however_often_it_is_simulated(healthy: Dynamic
 
 
 def test_a_hidden_cause_needs_the_parameters_of_its_form_only() -> None:
-    Cause("cable_spring", {"stiffness": 1.0, "kind": 0.0, "slack": 0.0}, joint=4)
-    with pytest.raises(ConfigurationError, match="look at 'slack'"):
-        Cause("cable_spring", {"stiffness": 1.0, "kind": 0.0}, joint=4)
-    with pytest.raises(ConfigurationError, match="look at 'length'"):
-        Cause("cable_spring", {"stiffness": 1.0, "kind": 0.0, "slack": 0.0, "length": 1.0}, joint=4)
+    Cause("cable_spring", {"stiffness": 1.0}, joint=4, form="linear")
+    with pytest.raises(ConfigurationError, match="needs `slack`"):
+        Cause("cable_spring", {"stiffness": 1.0}, joint=4, form="play")
+    with pytest.raises(ConfigurationError, match="has no parameter 'length'"):
+        Cause("cable_spring", {"stiffness": 1.0, "length": 1.0}, joint=4, form="linear")
 
 
 def test_a_model_of_another_arm_is_refused(tmp_path: Path) -> None:

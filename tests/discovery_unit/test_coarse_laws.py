@@ -8,10 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.discrepancy import diagnose
-from ident.discrepancy.evidence import Rows
-from ident.discrepancy.imperfection import beyond_law
-from ident.discrepancy.signatures import signature_bench
+from ident.diagnosis import diagnose
+from ident.diagnosis.candidates import Candidate
+from ident.diagnosis.evidence import Rows
+from ident.diagnosis.model_form import model_form_error
+from ident.diagnosis.signatures import signature_bench
+from ident.effects import find_effect
 from ident.kinematics import Chain
 from lwr_driver.session import Session
 
@@ -62,7 +64,7 @@ def test_a_turn_about_the_vertical_is_nothing_beyond_its_law(make: Make, chain: 
     dictionary = signature_bench([make("a.mcap", 1)], chain).dictionary
 
     def beyond(joint: int) -> Rows | None:
-        return beyond_law(dictionary, SimpleNamespace(candidate=SimpleNamespace(cause=cause, joint=joint)))
+        return model_form_error(dictionary, SimpleNamespace(candidate=Candidate(find_effect(cause), joint)))
 
     assert beyond(0) is None
     assert beyond(1)

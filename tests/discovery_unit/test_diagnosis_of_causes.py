@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.discrepancy import ArmData, Diagnosis, Reference, commission, diagnose
-from ident.discrepancy.hygiene import clipped_at, held_times, stuck_at
+from ident.diagnosis import ArmData, Diagnosis, Reference, commission, diagnose
+from ident.diagnosis.hygiene import clipped_at, held_times, stuck_at
 from ident.kinematics import Chain
 from ident.model_file import model_text, read_model
 from ident.regressor import torque

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.discrepancy import Diagnosis, DiagnosisSettings, diagnose
-from ident.discrepancy.signatures import signature_bench
+from ident.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from ident.diagnosis.signatures import signature_bench
 from ident.kinematics import Chain
 from ident.regressor import torque
 from ident.signals.filters import low_pass

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.effects import EFFECTS, Motion, Setting, find_effect
-from ident.effects.body import leaning, slide
+from ident.effects import EFFECTS, Motion, Setting, Shape, find_effect
+from ident.effects.load import leaning, slide
 from ident.effects.model_torque import check_entry
-from ident.effects.operators import dahl, play
+from ident.effects.motion import dahl, play
 from ident.kinematics import Chain
 
 TABLE = {
@@ -33,6 +33,7 @@ TABLE = {
         "payload_error",
         "payload_change",
         "joint_zero_offset",
+        "encoder_eccentricity",
         "contact",
     },
     "sensor": {
@@ -87,25 +88,13 @@ def setting() -> Setting:
     )
 
 
-def shapes(cause: str) -> list[dict[str, float]]:
-    return [dict(s) for s in EFFECTS[cause].shapes(setting(), 1)] or (
-        [CONTACT] if cause == "contact" else [{}]
-    )
+def shapes(cause: str) -> list[Shape]:
+    return [*EFFECTS[cause].shapes(setting(), 1)] or ([Shape(**CONTACT)] if cause == "contact" else [Shape()])
 
 
 def test_causes_and_sides_are_those_of_the_table() -> None:
     for side, causes in TABLE.items():
         assert {e.cause for e in EFFECTS.values() if e.side == side} == causes
-
-
-@pytest.mark.parametrize("cause", sorted(EFFECTS))
-def test_effect_describes_itself(cause: str) -> None:
-    effect = EFFECTS[cause]
-    assert effect.physics
-    assert effect.source
-    assert effect.tell_apart.format(joint=2)
-    assert all(p.unit and p.meaning for p in effect.parameters)
-    assert len({p.name for p in effect.parameters}) == len(effect.parameters)
 
 
 @pytest.mark.parametrize("cause", sorted(EFFECTS))
@@ -120,7 +109,7 @@ def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: Motion
                     assert part.shape in ((len(motion.time),), (len(motion.time), 3))
                     assert np.all(np.isfinite(part))
         parameters = {**{p.name: 0.01 * (k + 1) for k, p in enumerate(effect.linear)}, **shape}
-        motor, joint = effect.torque(motion, 1, parameters)
+        motor, joint = effect.torque(motion, 1, parameters, shape.form)
         assert motor.shape == joint.shape == (len(motion.time), 3)
         expected = sum(
             (
@@ -130,21 +119,6 @@ def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: Motion
             np.zeros((len(motion.time), 3)),
         )
         np.testing.assert_allclose(motor, expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("cause", ["stribeck", "viscous_nonlinear", "presliding_hysteresis", "friction_load"])
-def test_derivative_is_the_slope_of_the_torque(cause: str, motion: Motion) -> None:
-    effect = EFFECTS[cause]
-    parameters = {**{p.name: 0.3 for p in effect.linear}, **shapes(cause)[2 if cause == "stribeck" else 0]}
-    for parameter in effect.parameters:
-        if parameter.name == "exponent" and cause == "stribeck":
-            continue
-        step = 1e-5 * abs(parameters[parameter.name])
-        upper = effect.torque(motion, 1, {**parameters, parameter.name: parameters[parameter.name] + step})
-        lower = effect.torque(motion, 1, {**parameters, parameter.name: parameters[parameter.name] - step})
-        slope = (upper[0] - lower[0]) / (2.0 * step)
-        found, _ = effect.derivative(motion, 1, parameters, parameter.name)
-        np.testing.assert_allclose(found, slope, rtol=1e-3, atol=1e-4 * np.abs(slope).max() + 1e-12)
 
 
 def test_sensor_causes_leave_the_motor_torque_alone(motion: Motion) -> None:
@@ -158,7 +132,7 @@ def test_motor_causes_leave_the_joint_torque_alone(motion: Motion) -> None:
 
 
 def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: Motion) -> None:
-    (column,) = EFFECTS["joint_zero_offset"].columns(motion, 1, {})
+    (column,) = EFFECTS["joint_zero_offset"].columns(motion, 1, Shape())
     shift = np.array([0.0, 1e-3, 0.0])
     expected = motion.rigid_torque(motion.q + shift, motion.qd, motion.qdd) - motion.joint_torque
     assert column.joint is not None
@@ -175,7 +149,7 @@ def test_tilt_column_is_gravity_of_a_tilted_base(motion: Motion) -> None:
         motion.chain, motion.q, motion.bodies
     )
     # A base turned by +angle about x sees (0, 0, -g) turned by -angle: (0, -g sin, -g cos).
-    column, _ = EFFECTS["base_tilt"].columns(motion, 0, {})
+    column, _ = EFFECTS["base_tilt"].columns(motion, 0, Shape())
     assert column.joint is not None
     np.testing.assert_allclose(angle * column.joint, change, atol=2e-5)
 
@@ -207,13 +181,19 @@ def test_unknown_cause_names_the_nearest() -> None:
     ],
 )
 def test_wrong_entries_are_refused(change: dict[str, object], message: str) -> None:
-    entry = {"cause": "stribeck", "side": "motor", "joints": [2], "parameters": {}, **change}
+    entry = {
+        "cause": "stribeck",
+        "side": "motor",
+        "joints": [2],
+        "parameters": {"velocity": {"value": 0.1}},
+        **change,
+    }
     with pytest.raises(ConfigurationError, match=message):
         check_entry(entry, 7)
 
 
 def test_a_payload_does_not_come_loose_metres_from_the_flange() -> None:
-    effect, shape = EFFECTS["payload_change"], {"time": 5.0, "session": 1.0}
+    effect, shape = EFFECTS["payload_change"], Shape(time=5.0, session=1.0)
     assert effect.plausible(np.array([-0.5, 0.02, 0.0, -0.1]), shape)
     assert effect.plausible(np.array([0.0, 0.3, 0.0, 0.4]), shape)
     assert not effect.plausible(np.array([0.4, 3.2, 0.0, 1.2]), shape)
@@ -223,8 +203,8 @@ def test_a_payload_does_not_come_loose_metres_from_the_flange() -> None:
 @pytest.mark.parametrize(
     ("stated", "pulls"),
     [
-        ({"kind": 3.0, "stiffness": 2.0 + 3 * 0.7 * 0.09, "quadratic": -0.63, "cubic": 0.7}, "hardening"),
-        ({"kind": 4.0, "stiffness": 2.0, "slack": 0.1, "play": 0.2}, "play"),
+        ({"stiffness": 2.0 + 3 * 0.7 * 0.09, "quadratic": -0.63, "cubic": 0.7}, "hardening"),
+        ({"stiffness": 2.0, "slack": 0.1, "play": 0.2}, "play"),
     ],
 )
 def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
@@ -239,10 +219,10 @@ def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
         if pulls == "hardening"
         else 2.0 * np.sign(angle - 0.1) * np.maximum(np.abs(angle - 0.1) - 0.2, 0)
     )
-    motor, joint = effect.torque(motion, 1, {"slack": 0.0, **stated})
+    motor, joint = effect.torque(motion, 1, stated, pulls)
     assert joint[:, 1] == pytest.approx(wanted, abs=1e-9)
     assert motor[:, 1] == pytest.approx(wanted, abs=1e-9)
-    simulated = effect.simulate(1, {"slack": 0.0, **stated})
+    simulated = effect.simulate(1, stated, pulls)
     for row in (0, 300, 900):
         loads = SimpleNamespace(link_torque=np.zeros(3))
         simulated.load(0.0, SimpleNamespace(position=motion.q[row]), loads)
@@ -251,31 +231,33 @@ def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
 
 def test_a_rough_spot_grips_in_the_rows_as_in_a_simulation(motion: Motion) -> None:
     effect = EFFECTS["friction_position"]
-    spot = {"cosine": 0.6, "cycles_per_turn": 0.0, "centre": 0.2, "reach": 0.3}
-    grip = motion.direction[:, 1] * effect.torque(motion, 1, spot)[0][:, 1]
+    spot = {"cosine": 0.6, "centre": 0.2, "half_width": 0.3}
+    grip = motion.direction[:, 1] * effect.torque(motion, 1, spot, "spot")[0][:, 1]
     away = np.abs(motion.q[:, 1] - 0.2)
     assert np.all(grip[away >= 0.3] == 0.0)
     assert grip[np.argmin(away)] == pytest.approx(0.6, abs=1e-3)
     half = np.argmin(np.abs(away - 0.15))
     assert grip[half] == pytest.approx(0.3, abs=0.02)
-    simulated = effect.simulate(1, spot)
+    simulated = effect.simulate(1, spot, "spot")
     for row in (0, 300, int(half), int(np.argmin(away))):
         loads = SimpleNamespace(Fcm=np.full(3, 1.5))
         simulated.load(0.0, SimpleNamespace(motor_position=motion.q[row]), loads)
         assert loads.Fcm == pytest.approx([1.5, 1.5 + grip[row], 1.5], abs=1e-9)
 
 
-def test_a_rough_spot_without_a_reach_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match=r"`reach` is 0 rad; give how far"):
-        EFFECTS["friction_position"].simulate(1, {"cosine": 0.6, "cycles_per_turn": 0.0})
+def test_a_rough_spot_without_a_width_is_refused() -> None:
+    spot = {"cosine": {"value": 0.6}, "centre": {"value": 0.2}}
+    entry = {"cause": "friction_position", "joints": [2], "form": "spot", "parameters": spot}
+    with pytest.raises(ConfigurationError, match="needs `half_width`"):
+        check_entry(entry, 7)
 
 
 def test_viscous_friction_rises_from_standstill_on() -> None:
     thinning = EFFECTS["viscous_nonlinear"].plausible
-    assert thinning(np.array([2.0]), {"exponent": 0.4})
-    assert thinning(np.array([-1.5]), {"exponent": 1.6})
+    assert thinning(np.array([2.0]), Shape(exponent=0.4))
+    assert thinning(np.array([-1.5]), Shape(exponent=1.6))
     # A friction that falls as the speed rises is Stribeck's.
-    assert not thinning(np.array([-2.0]), {"exponent": 0.4})
+    assert not thinning(np.array([-2.0]), Shape(exponent=0.4))
 
 
 def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
@@ -283,9 +265,9 @@ def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
     pose = motion.chain.forward(motion.q[7])[-1][:3, :3]
     down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
     np.testing.assert_allclose(lean[7], pose.T @ down, atol=1e-12)
-    shape = {"time": 1.0, "session": float(motion.session + 1), "loose": 1.0}
-    loose = EFFECTS["payload_change"].columns(motion, 0, shape)
-    firm = EFFECTS["payload_change"].columns(motion, 0, {**shape, "loose": 0.0})
+    effect, when = EFFECTS["payload_change"], {"time": 1.0, "session": float(motion.session + 1)}
+    loose = effect.columns(motion, 0, effect.shape_of(when, "loose"))
+    firm = effect.columns(motion, 0, effect.shape_of(when, "jump"))
     assert (len(loose), len(firm)) == (3, 4)
     after = motion.time >= 1.0
     for axis, (one, other) in enumerate(zip(loose, firm, strict=False)):
@@ -296,18 +278,19 @@ def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
 
 
 def test_drive_warms_up_by_the_power_of_its_friction(motion: Motion) -> None:
-    def at(speed: float, heat: float) -> np.ndarray:
+    effect = EFFECTS["friction_temperature"]
+
+    def at(speed: float, form: str) -> np.ndarray:
         steady = replace(motion, motor_speed=np.full_like(motion.q, speed), slip=None)
-        shape = {"time_constant": 1.5, "heat": heat}
-        (column,) = EFFECTS["friction_temperature"].columns(steady, 1, shape)
+        (column,) = effect.columns(steady, 1, effect.shape_of({"time_constant": 1.5}, form))
         assert column.motor is not None
         return column.motor / steady.drive_friction[:, 1]
 
     expected = 1.0 - np.exp(-motion.time / 1.5)
-    np.testing.assert_allclose(at(1.0, 1.0), expected, atol=2e-3)
-    np.testing.assert_allclose(at(0.3, 0.0), expected)
-    assert at(2.0, 1.0)[-1] > 2.0 * at(1.0, 1.0)[-1] - 1e-9
-    assert at(0.3, 1.0)[-1] < 0.3 * expected[-1] + 1e-9
+    np.testing.assert_allclose(at(1.0, "heated by friction"), expected, atol=2e-3)
+    np.testing.assert_allclose(at(0.3, "within a session"), expected)
+    assert at(2.0, "heated by friction")[-1] > 2.0 * at(1.0, "heated by friction")[-1] - 1e-9
+    assert at(0.3, "heated by friction")[-1] < 0.3 * expected[-1] + 1e-9
 
 
 @pytest.mark.parametrize("cause", ["motor_torque_delay", "joint_torque_delay"])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ident.base import numeric_base
-from ident.discrepancy.commission import delay_std
-from ident.discrepancy.nominal import Arm
-from ident.discrepancy.presliding import with_far_presliding
-from ident.discrepancy.reference import DELAY_STD_S, Reference
+from ident.diagnosis.commission import delay_std
+from ident.diagnosis.nominal import Arm
+from ident.diagnosis.presliding import with_far_presliding
+from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.kinematics import Chain
 from ident.model import DynamicModel
 from ident.structure import ModelStructure

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ident.discrepancy.bench import Bench
-from ident.discrepancy.candidates import Candidate, Trial
-from ident.discrepancy.intervals import estimated, phases_of
-from ident.discrepancy.signatures import signature_bench
-from ident.effects import EFFECTS
+from ident.diagnosis.bench import Bench
+from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.intervals import estimated, phases_of
+from ident.diagnosis.signatures import signature_bench
+from ident.effects import EFFECTS, Shape
 from ident.kinematics import Chain
 from lwr_driver.session import Session
 
@@ -27,7 +27,7 @@ def bench(make: Callable[..., Session], chain: Chain) -> Bench:
 
 def trial(bench: Bench, velocity: float) -> Trial:
     candidate = Candidate(EFFECTS["stribeck"], 1)
-    found = bench.dictionary.trial(candidate, {"velocity": velocity, "exponent": 1.0})
+    found = bench.dictionary.trial(candidate, Shape(velocity=velocity, exponent=1.0))
     assert found is not None
     return found
 
@@ -59,9 +59,9 @@ def test_phases_repeat_with_the_motion(bench: Bench) -> None:
 
 def test_a_law_that_is_coarse_says_so(bench: Bench) -> None:
     contact = EFFECTS["contact"]
-    shape = {"time": 8.0, "duration": 1.5, "session": 1.0, "link": 3.0}
+    shape = Shape(time=8.0, duration=1.5, session=1.0, link=3.0)
     found = bench.dictionary.trial(Candidate(contact, -1), shape)
     assert found is not None
     _, deviations = estimated(bench.dictionary, bench.evidence, found)
-    assert deviations["time"] >= contact.coarse({"duration": 1.5})["time"] > 0.1
-    assert not EFFECTS["stribeck"].coarse({"amplitude": 1.0})
+    assert deviations["time"] >= contact.law_std({"duration": 1.5}, None)["time"] > 0.1
+    assert not EFFECTS["stribeck"].law_std({"amplitude": 1.0}, None)

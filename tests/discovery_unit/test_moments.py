@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from typing import cast
 
-from ident.discrepancy.candidates import Candidate, Trial
-from ident.discrepancy.evidence import Score
-from ident.discrepancy.selection import _same_moment
+from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.evidence import Score
+from ident.diagnosis.selection import _same_moment
 from ident.effects import EFFECTS
 
 

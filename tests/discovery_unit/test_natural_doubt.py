@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.discrepancy import Diagnosis, diagnose
+from ident.diagnosis import Diagnosis, diagnose
 from ident.excitation import ExcitationPlan
 from ident.excitation.bspline import SplineMotion
 from ident.kinematics import Chain

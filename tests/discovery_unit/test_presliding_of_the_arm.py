@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.discrepancy.nominal import Arm
+from ident.diagnosis.nominal import Arm
 from ident.effects import EFFECTS, Setting
 from ident.kinematics import Chain
 
@@ -28,7 +28,14 @@ def test_friction_turns_within_the_reach_and_at_once_without_one(chain: Chain) -
 def test_presliding_near_the_reach_of_the_healthy_drive_is_no_cause() -> None:
     spread = np.array([[-0.6, 0.6]] * 3)
     known = Setting(
-        1, (4.0,), np.ones(3), np.ones(3), np.ones(3, dtype=bool), np.ones(3), spread, reach=np.full(3, 2e-4)
+        1,
+        (4.0,),
+        np.ones(3),
+        np.ones(3),
+        np.ones(3, dtype=bool),
+        np.ones(3),
+        spread,
+        presliding=np.full(3, 2e-4),
     )
     lengths = [s["length"] for s in EFFECTS["presliding_hysteresis"].shapes(known, 0)]
     assert lengths

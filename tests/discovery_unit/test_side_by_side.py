@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
+from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
 from ident.excitation.bspline import SplineMotion
 from ident.kinematics import Chain
@@ -65,7 +66,7 @@ def test_what_a_motion_will_tell_is_foreseen(found: Study) -> None:
     # Slowly over a wide range, which the session does not cover.
     points[2] = 2.6 * np.sin(4.0 * np.pi * share) * np.minimum(1.0, 20.0 * np.minimum(share, 1.0 - share))
     plan = ExcitationPlan(SplineMotion(24.0, points), NAMES, 1)
-    sweep = Deciding("slow_sweep_3", "slow sweep", 3, plan, (None,), (pair.first, pair.second))
+    sweep = Deciding("slow_sweep_3", Experiment.SLOW_SWEEP, 3, plan, (None,), (pair.first, pair.second))
     again = found.with_offers([sweep]).pairs
     seen = again[0].foreseen
     assert seen is not None

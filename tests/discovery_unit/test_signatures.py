@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident.discrepancy.bench import Bench
-from ident.discrepancy.signatures import overlap, signature_bench, signatures
+from ident.diagnosis.bench import Bench
+from ident.diagnosis.signatures import overlap, signature_bench, signatures
 from ident.kinematics import Chain
 from lwr_driver.session import Session
 
@@ -26,7 +26,8 @@ def bench(make: Make, chain: Chain) -> Bench:
 def test_signature_is_the_torque_of_the_cause_that_the_data_fit(bench: Bench) -> None:
     (cable,) = signatures(bench, [("cable_spring", (3,))])
     assert cable.joints == (3,)
-    assert cable.parameters["kind"] == 1.0
+    assert cable.form is not None
+    assert cable.form.value == "cubic"
     assert cable.parameters["stiffness"] == pytest.approx(0.1, rel=0.1)
     assert cable.strength > 20.0
     assert 0.05 < cable.share < 0.99

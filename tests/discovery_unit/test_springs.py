@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ident.effects import EFFECTS, Motion
+from ident.effects import EFFECTS, ELASTICITY, Motion
 from ident.effects.springs import Springs
 
 MASS, STIFFNESS, DAMPING, GAP = 2.0, 8000.0, 8.0, 2e-3
@@ -103,13 +103,13 @@ def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
         motor_coulomb=np.zeros(1),
         springs=plain,
     )
-    shape = {"encoder": 1.0, "width": 0.1, "size": GAP}
+    shape = EFFECTS["backlash"].shape_of({"width": 0.1, "size": GAP}, "encoder at the motor")
     (column,) = EFFECTS["backlash"].columns(motion, 0, shape)
     assert column.joint is not None
     change = plain.with_play(0, GAP).torque - plain.torque
     np.testing.assert_allclose(GAP * column.joint, change)
     assert np.abs(change).max() > 3.0
-    (soft,) = EFFECTS["joint_elasticity"].columns(motion, 0, {"encoder": 1.0, "size": 2e-5})
+    (soft,) = ELASTICITY.columns(motion, 0, ELASTICITY.at_encoder("motor").at(size=2e-5))
     assert soft.joint is not None
     np.testing.assert_allclose(2e-5 * soft.joint, plain.softer(0, 2e-5).torque - plain.torque)
     unknown = replace(motion, springs=None)

@@ -15,7 +15,7 @@ from typing import Any
 from hidden_physics.cases import Case, Sessions, Store, twin
 from hidden_physics.motions import SCHEDULES
 from hidden_physics.robots import Day, Encoder
-from ident.discrepancy import ArmData, Reference, commission, diagnose
+from ident.diagnosis import ArmData, Reference, commission, diagnose
 from ident.kinematics import Chain
 from ident.model_file import read_model, write_model
 from lwr_driver.arm import Arm

@@ -20,11 +20,8 @@ CABLE = {
     "cause": "cable_spring",
     "side": "joint",
     "joints": [1],
-    "parameters": {
-        "stiffness": {"value": 0.3, "std": 0.01, "unit": "Nm/rad"},
-        "kind": {"value": 0.0, "std": 0.0, "unit": "1"},
-        "slack": {"value": 0.0, "std": 0.0, "unit": "rad"},
-    },
+    "form": "linear",
+    "parameters": {"stiffness": {"value": 0.3, "std": 0.01, "unit": "Nm/rad"}},
 }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from real_lwr4 import DATA, EVERY, chain, mounted, needs_recordings, repeatability, session
 
-from ident.discrepancy import ArmData, Diagnosis, Finding, diagnose
+from ident.diagnosis import ArmData, Diagnosis, Finding, diagnose
 from ident.import_log import LogMapping, import_log
 from ident.kinematics import Chain
 from ident.model import DynamicModel

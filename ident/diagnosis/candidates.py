@@ -1,0 +1,383 @@
+"""Candidates: every cause on every joint, with its shapes, as columns in rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from ident.diagnosis.events import find_bursts
+from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
+from ident.diagnosis.nominal import Nominal
+from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
+from ident.effects.motion import Motion
+
+__all__ = ["Candidate", "Dictionary", "Trial"]
+
+# Gain that a further coefficient of the same cause must bring.
+_A_COEFFICIENT = 6.0
+# Standard deviation of a coefficient that is 1 by the physics, in what is held against parts of the motion.
+_ABOUT_ONE = 0.3
+# Relative difference of the torques at which samples of several sessions stop, of one limit.
+_ONE_LIMIT = 1e-3
+# Fall of the chi-square from which on the parameters of a shape are sought together.
+_VALLEY = 30.0
+# Fall of the chi-square by which a push that recurs explains more than one that does not.
+_TIED = 6.0
+# What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
+_STEP_ROOM_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A cause on a joint (counted from 0, -1 for the whole arm)."""
+
+    effect: Effect
+    joint: int
+
+    @property
+    def cause(self) -> str:
+        """Name of the cause."""
+        return self.effect.cause
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Joints counted from 1, empty for the whole arm."""
+        return () if self.joint < 0 else (self.joint + 1,)
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Identifies it."""
+        return self.effect.cause, self.joint
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A candidate with the shape that suits the data best, and its score."""
+
+    candidate: Candidate
+    shape: Shape
+    score: Score
+    rows: Rows = field(repr=False)
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Range of a shape parameter in the coordinate of a search: itself, or its logarithm."""
+
+    name: str
+    low: float
+    high: float
+    logarithmic: bool
+
+    def value(self, coordinate: float) -> float:
+        """The parameter."""
+        return float(np.exp(coordinate)) if self.logarithmic else float(coordinate)
+
+    def coordinate(self, shape: Shape) -> float:
+        """Where a shape is."""
+        here = float(shape[self.name])
+        return float(np.clip(np.log(here) if self.logarithmic else here, self.low, self.high))
+
+
+class Dictionary:
+    """Columns of all candidates for the rows of a nominal arm, made once and kept.
+
+    causes : names to consider; None for all.
+    """
+
+    def __init__(self, nominal: Nominal, evidence: Evidence, causes: Sequence[str] | None = None) -> None:
+        self.nominal = nominal
+        self.evidence = evidence
+        self.setting = _setting(nominal, compared=evidence.prior is not None and evidence.compared)
+        wanted = list(EFFECTS) if causes is None else list(causes)
+        motor = "motor" in nominal.rows
+        # A low-pass of another hand may have shifted a channel, and the arm is not to blame.
+        hidden = {DELAYS[side].cause for side, band in nominal.band_hz.items() if band is not None}
+        if nominal.moving.sum() < 2:
+            # A late channel is late in all joints; of one joint it could be its elasticity as well.
+            hidden |= {delay.cause for delay in DELAYS.values()}
+        self.candidates = tuple(
+            Candidate(EFFECTS[cause], joint)
+            for cause in wanted
+            if cause not in hidden
+            if motor or EFFECTS[cause].side != "motor"
+            for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
+        )
+        self._kept: dict[tuple[str, int], list[tuple[Shape, Rows, dict[Key, Floats], Products]]] = {}
+
+    def rows(self, candidate: Candidate, shape: Shape) -> Rows:
+        """Columns of a candidate in rows: (m, k) by side and joint."""
+        nominal = self.nominal
+        by_motion = [
+            candidate.effect.columns(motion, max(candidate.joint, 0), shape) for motion in nominal.motions
+        ]
+        found: dict[Key, Floats] = {}
+        for side in nominal.rows:
+            per_column = [
+                [getattr(columns[k], side) for columns in by_motion] for k in range(len(by_motion[0]))
+            ]
+            per_column = [c for c in per_column if c[0] is not None]
+            if not per_column:
+                continue
+            reduced = [nominal.reduce(side, column) for column in per_column]
+            if reduced[0].ndim == 1:
+                found[side, candidate.joint] = np.stack(reduced, axis=1)
+                continue
+            for j in range(nominal.arm.chain.n):
+                column = np.stack([r[:, j] for r in reduced], axis=1)
+                if np.any(column):
+                    found[side, j] = column
+        return found
+
+    def _prepared(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
+        if candidate.key not in self._kept:
+            entries = []
+            for shape in candidate.effect.shapes(self.setting, max(candidate.joint, 0)):
+                rows = self.rows(candidate, shape)
+                if not rows or not any(np.any(values) for values in rows.values()):
+                    continue
+                padded = self.evidence.padded(rows)
+                base = self.evidence.alone(padded)
+                entries.append((shape, rows, padded, base))
+            self._kept[candidate.key] = entries
+        return self._kept[candidate.key]
+
+    def _step(self, candidate: Candidate) -> Trial | None:
+        """The best edge of a block for an effect that sets in at a time and stays.
+
+        The products of the whole session are made once; those after an edge are a part of their blocks.
+        """
+        evidence = self.evidence
+        best: tuple[Shape, Score, tuple[str, int]] | None = None
+        forms = list(dict.fromkeys(s.form for s in self._grid(candidate)))
+        sessions = sorted(set(evidence.block_session.tolist()))
+        for number, (form, session) in enumerate(product(forms, sessions)):
+            mine = np.flatnonzero(evidence.block_session == session)
+            starts = evidence.block_start[mine]
+            shape = Shape(form, time=starts.min() - 1.0, session=session + 1)
+            key = (candidate.cause, -2 - number)
+            if key not in self._kept:
+                rows = self.rows(candidate, shape)
+                padded = evidence.padded(rows)
+                self._kept[key] = [(shape, rows, padded, evidence.alone(padded))]
+            _, _, padded, known = self._kept[key][0]
+            whole = evidence.products(padded, known)
+            for edge in np.sort(starts)[1:]:
+                if not _STEP_ROOM_S <= edge <= self.setting.durations_s[session] - _STEP_ROOM_S:
+                    continue
+                on = (evidence.block_session > session).astype(float)
+                on[mine[starts >= edge]] = 1.0
+                score = evidence.event_score(
+                    evidence.score_products(whole.only(on), list(padded)), evidence.blocks
+                )
+                if best is None or score.gain > best[1].gain:
+                    best = (shape.at(time=edge), score, key)
+        if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
+            return None
+        # The rows themselves are made only where the step may matter.
+        if best[1].gain < 10.0:
+            return Trial(candidate, best[0], best[1], self._kept[best[2]][0][1])
+        return Trial(candidate, best[0], best[1], self.rows(candidate, best[0]))
+
+    def _grid(self, candidate: Candidate) -> Sequence[Shape]:
+        return candidate.effect.shapes(self.setting, max(candidate.joint, 0))
+
+    def _contacts(self, candidate: Candidate) -> Trial | None:
+        """The best contact in a burst of the residual, on any link from the third on."""
+        best: Trial | None = None
+        n = self.nominal.arm.chain.n
+        for burst in find_bursts(self.evidence):
+            for link in range(min(3, n), n + 1):
+                shape = Shape(
+                    time=burst.start_s + 0.5 * burst.duration_s,
+                    duration=burst.duration_s + 0.1,
+                    session=burst.session + 1,
+                    link=link,
+                )
+                trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
+                if trial is None or (best is not None and trial.score.gain <= best.score.gain):
+                    continue
+                if not self._recurs(trial):
+                    best = trial
+        return best
+
+    def _recurs(self, trial: Trial) -> bool:
+        """Whether the same push, a period earlier or later as well, explains more: then it is tied to the pose and
+        not to the moment, and nobody pushes.
+        """
+        shape = trial.shape
+        recording = next(r for r in self.nominal.recordings if r.number == int(shape["session"]) - 1)
+        if not recording.repeats:
+            return False
+        for periods in (-1.0, 1.0):
+            again = shape.at(time=shape["time"] + periods * recording.period_s)
+            rows = self.rows(trial.candidate, again)
+            both = {**rows, **trial.rows}
+            both.update({key: trial.rows[key] + rows[key] for key in trial.rows.keys() & rows.keys()})
+            if self.evidence.score(self.evidence.padded(both)).fitted > trial.score.fitted + _TIED:
+                return True
+        return False
+
+    def best(self, candidate: Candidate) -> Trial | None:
+        """The candidate with the best shape of its grid, None where no shape is plausible."""
+        if candidate.effect.repeats:
+            return self._contacts(candidate)
+        if candidate.effect.step:
+            return self._step(candidate)
+        best: Trial | None = None
+        entries = self._prepared(candidate)
+        for shape, rows, padded, known in entries:
+            score = self.measure(candidate, padded, len(entries), known)
+            if not candidate.effect.plausible(score.coefficients, shape):
+                continue
+            if best is None or _worth(score) > _worth(best.score):
+                best = Trial(candidate, shape, score, rows)
+        return best
+
+    def measure(
+        self,
+        candidate: Candidate,
+        padded: Mapping[Key, Floats],
+        choices: int = 1,
+        known: Products | None = None,
+    ) -> Score:
+        """Score of padded columns in the way that suits the candidate."""
+        pull = _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
+        score = self.evidence.score(padded, known=known, pull=pull)
+        return self.evidence.event_score(score, choices) if candidate.effect.event else score
+
+    def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
+        """The candidate with a given shape, None where it has no rows or makes no sense."""
+        rows = self.rows(candidate, shape)
+        if not rows or not any(np.any(values) for values in rows.values()):
+            return None
+        score = self.measure(candidate, self.evidence.padded(rows), choices)
+        if not candidate.effect.plausible(score.coefficients, shape):
+            return None
+        return Trial(candidate, shape, score, rows)
+
+    def refine(self, trial: Trial, choices: int = 1, evaluations: int = 12) -> Trial:
+        """The same with its continuous shape parameters at the best fit: one after the other, then together, for a
+        speed and an exponent make up for each other along a narrow valley.
+        """
+        best = trial
+
+        def loss(shape: Shape) -> float:
+            nonlocal best
+            tried = self.trial(trial.candidate, shape, choices)
+            if tried is None:
+                return 0.0
+            if tried.score.fitted > best.score.fitted:
+                best = tried
+            return -tried.score.fitted
+
+        for span in self._spans(trial):
+            minimize_scalar(
+                lambda x, span=span: loss(best.shape.at(**{span.name: span.value(x)})),
+                bounds=(span.low, span.high),
+                method="bounded",
+                options={"maxiter": evaluations},
+            )
+        spans = [] if trial.candidate.effect.event else self._spans(best)
+        if len(spans) > 1 and best.score.fitted > _VALLEY:
+            begin = [span.coordinate(best.shape) for span in spans]
+            minimize(
+                lambda point: loss(
+                    best.shape.at(**{s.name: s.value(x) for s, x in zip(spans, point, strict=True)})
+                ),
+                begin,
+                method="Nelder-Mead",
+                bounds=[(span.low, span.high) for span in spans],
+                options={"maxfev": 3 * evaluations * (len(spans) - 1), "fatol": 0.1, "xatol": 1e-3},
+            )
+        return best
+
+    def _spans(self, trial: Trial) -> list[_Span]:
+        """Where each continuous parameter of a trial's shape may be: between its neighbours in the grid."""
+        effect, found = trial.candidate.effect, []
+        grid = effect.shapes(self.setting, max(trial.candidate.joint, 0))
+        for name in effect.continuous(trial.shape):
+            values = sorted({s[name] for s in grid if name in s and _alike(s, trial.shape, name)})
+            limits = next(p for p in effect.shape_parameters if p.name == name)
+            here = float(trial.shape[name])
+            low, high = _neighbours(values, here, signed=limits.low < 0.0 < limits.high)
+            if effect.step:
+                last = self.setting.durations_s[int(trial.shape["session"]) - 1] - _STEP_ROOM_S
+                low, high = max(here - 2.5, _STEP_ROOM_S), min(here + 2.5, last)
+            elif effect.event:
+                low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
+            low, high = max(low, limits.low), min(high, limits.high)
+            if low < high:
+                logarithmic = low > 0.0 and not effect.event
+                ends = (float(np.log(low)), float(np.log(high))) if logarithmic else (low, high)
+                found.append(_Span(name, *ends, logarithmic))
+        return found
+
+    def trials(self) -> Iterator[Trial]:
+        """The best shape of every candidate."""
+        for candidate in self.candidates:
+            found = self.best(candidate)
+            if found is not None:
+                yield found
+
+
+def _worth(score: Score) -> float:
+    """Gain less what further coefficients would gain by chance."""
+    return score.gain - _A_COEFFICIENT * len(score.coefficients)
+
+
+def _alike(a: Shape, b: Shape, besides: str) -> bool:
+    return a.form is b.form and all(a[k] == b[k] for k in a if k != besides and k in b)
+
+
+def _neighbours(values: Sequence[float], here: float, *, signed: bool) -> tuple[float, float]:
+    """The values next to one, on its own side of zero unless the parameter is `signed`."""
+    below = [v for v in values if v < here * (1 - 1e-9) - 1e-12]
+    above = [v for v in values if v > here * (1 + 1e-9) + 1e-12]
+    low = below[-1] if below else (0.4 * here if here > 0 else here - 0.5)
+    high = above[0] if above else (2.5 * here if here > 0 else here + 0.5)
+    if signed:
+        return low, high
+    if here > 0.0 and low <= 0.0:
+        low = 0.3 * here
+    if here < 0.0 and high >= 0.0:
+        high = 0.3 * here
+    return low, high
+
+
+def _setting(nominal: Nominal, *, compared: bool) -> Setting:
+    motions: list[Motion] = nominal.motions
+    q = np.concatenate([m.q for m in motions])
+    positive = np.mean(np.concatenate([m.joint_torque for m in motions]) > 0.0, axis=0)
+    return Setting(
+        sessions=len({m.session for m in motions}),
+        durations_s=tuple(
+            max(m.time[-1] for m in motions if m.session == k) for k in sorted({m.session for m in motions})
+        ),
+        gear_ratio=nominal.arm.gear_ratio,
+        torque_range=np.max([np.abs(m.joint_torque).max(axis=0) for m in motions], axis=0),
+        torque_turns=np.minimum(positive, 1.0 - positive) > 0.02,
+        speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
+        position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
+        encoder=nominal.arm.encoder if nominal.arm.encoder_known else None,
+        presliding=nominal.arm.reach,
+        compared=compared,
+        compliance=nominal.arm.compliance if all(m.springs is not None for m in motions) else None,
+        clipped=_clipped(nominal),
+    )
+
+
+def _clipped(nominal: Nominal) -> Floats:
+    """Torque (n,) [Nm] at which the samples of each joint's sensor stop, the same in all sessions that are fitted and
+    show one, else NaN.
+    """
+    limits = np.array([r.clipped for r in nominal.recordings if not r.test and r.has_effort])
+    if not limits.size:
+        return np.full(nominal.arm.chain.n, np.nan)
+    low = np.min(np.where(np.isfinite(limits), limits, np.inf), axis=0)
+    high = np.max(np.where(np.isfinite(limits), limits, -np.inf), axis=0)
+    return np.where((high > 0.0) & (high - low <= _ONE_LIMIT * high), high, np.nan)

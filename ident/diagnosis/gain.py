@@ -1,0 +1,108 @@
+"""How much was gained: errors on rows that were not fitted, before and after, with intervals from blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
+
+__all__ = ["HeldOut", "fall", "held_out", "interval"]
+
+_DRAWS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Residual (m, n) [Nm] by side on rows that were not fitted, NaN elsewhere, and the blocks
+    (m,) of rows.
+    """
+
+    residual: dict[str, Floats]
+    block: dict[str, Floats]
+
+    def where(self, other: HeldOut) -> HeldOut:
+        """The same on the rows that `other` has too: a channel that is put in time is used in other rows."""
+        residual = {
+            side: np.where(np.isfinite(other.residual[side]), values, np.nan)
+            for side, values in self.residual.items()
+        }
+        return HeldOut(residual, self.block)
+
+    def rms(self) -> dict[str, Floats]:
+        """Root mean square (n,) by side."""
+        found = {}
+        for side, values in self.residual.items():
+            count = np.isfinite(values).sum(axis=0)
+            total = np.nansum(values**2, axis=0)
+            found[side] = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+        return found
+
+
+def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
+    """Residuals with the base and further columns: on the test sessions where there are any, else
+    on each part
+    of the motion as predicted from the others."""
+    evidence.replace(extra)
+    rows = evidence.nominal.rows
+    if any(side.test.any() for side in rows.values()):
+        blocks = {side: np.floor(r.time / 2.0) + 1e6 * r.session for side, r in rows.items()}
+        return HeldOut(evidence.residuals(test=True), blocks)
+    return HeldOut(evidence.held_residuals(), {side: evidence.block_of(side) for side in rows})
+
+
+def interval(
+    before: HeldOut, after: HeldOut, keys: Sequence[Key], seed: int
+) -> tuple[float, float, float, float]:
+    """RMS before and after, pooled over the rows of `keys`, and the 95 % interval of their difference.
+
+    From 1000 draws of blocks with replacement.
+    """
+    table = _by_block(before, after, dict.fromkeys(keys, 1.0))
+    if not len(table):
+        return 0.0, 0.0, 0.0, 0.0
+    drawn = _drawn(table, seed)
+    difference = np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2])
+    total = table.sum(axis=0)
+    low, high = np.quantile(difference, [0.025, 0.975])
+    return (
+        float(np.sqrt(total[0] / total[2])),
+        float(np.sqrt(total[1] / total[2])),
+        float(low),
+        float(high),
+    )
+
+
+def fall(before: HeldOut, after: HeldOut, weights: Mapping[Key, float], seed: int) -> tuple[float, float]:
+    """95 % interval of the fall of the weighted sum of squares over the rows of all keys, from draws of blocks.
+
+    weights : of a row's square, by side and joint [1/Nm^2]. Zeros where there are no rows.
+    """
+    table = _by_block(before, after, weights)
+    if not len(table):
+        return 0.0, 0.0
+    drawn = _drawn(table, seed)
+    low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:
+    """Weighted sums of squares before and after, and number of rows, (blocks, 3)."""
+    blocks: dict[float, Floats] = {}
+    for (side, joint), weight in weights.items():
+        a, b = before.residual[side][:, joint], after.residual[side][:, joint]
+        ok = np.isfinite(a) & np.isfinite(b)
+        for block in np.unique(before.block[side][ok]):
+            mine = ok & (before.block[side] == block)
+            part = np.array([weight * np.sum(a[mine] ** 2), weight * np.sum(b[mine] ** 2), mine.sum()])
+            blocks[float(block)] = blocks.get(float(block), np.zeros(3)) + part
+    return np.array(list(blocks.values()))
+
+
+def _drawn(table: Floats, seed: int) -> Floats:
+    """Sums (draws, 3) over as many blocks as there are, drawn with replacement."""
+    rng = np.random.default_rng(seed)
+    drawn: Floats = table[rng.integers(0, len(table), (_DRAWS, len(table)))].sum(axis=1)
+    return drawn

@@ -1,0 +1,123 @@
+"""Parameters of a finding with standard deviations that cover: all parameters at a time, from phases of the motion.
+
+The torque of a finding is not linear in the parameters of its shape. Around the shape that was chosen, columns of
+the derivatives stand beside the cause's own, and everything is fitted at a time: base parameters, tolerated
+deviations, all other findings. The derivatives' coefficients are the last step of a Gauss-Newton fit, so values are
+those of the least squares in all parameters and not of one after the other.
+
+What a model gets wrong repeats where the motion repeats, so the same phases of all periods of a session are one
+observation. Their scores `s_k = X_k' r_k` give the covariance, each corrected for what the fit leans towards its own
+phase, so that with noise alone it is exactly that of least squares (Bell and McCaffrey, Survey Methodology 28 (2002)):
+
+    V = sum_k g_k g_k' + G^-1 P G^-1,  g_k = G^-1/2 (1 - A_k)^-1/2 G^-1/2 s_k,  A_k = G^-1/2 X_k' X_k G^-1/2
+
+with `G = sum_k X_k' X_k + P`, P the precision of what a reference says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.diagnosis.candidates import Dictionary, Trial
+from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
+
+__all__ = ["Estimate", "estimated", "phases_of"]
+
+# Largest last step of a shape parameter, over its value: what is linear about a shape is no longer so further away.
+_NEAR = 0.3
+# Least share of a direction that other phases must know; of less nothing can be told from one phase.
+_LEAST_REST = 0.05
+
+Estimate = tuple[dict[str, float], dict[str, float]]
+"""Values and standard deviations by the names of a cause's parameters."""
+
+
+def estimated(dictionary: Dictionary, evidence: Evidence, trial: Trial) -> Estimate:
+    """Values and standard deviations of a trial's parameters beside the columns that the evidence holds.
+
+    The evidence is left as it was. Shape parameters that are chosen and not fitted have no standard deviation.
+    """
+    effect, shape = trial.candidate.effect, trial.shape
+    moved, rows = _with_derivatives(dictionary, trial)
+    linear = [p.name for p in effect.linear][: len(trial.score.coefficients)]
+    kept = list(evidence.extra)
+    evidence.replace([*kept, rows])
+    place = evidence.full.values.size - len(linear) - len(moved)
+    found = evidence.full.values[place:].copy()
+    covariance = _clustered(evidence)[place:, place:]
+    evidence.replace(kept)
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    values = dict(zip(linear, (float(v) for v in trial.score.coefficients), strict=True))
+    steps = {name: float(found[len(linear) + k]) for k, name in enumerate(moved)}
+    if all(abs(step) < _NEAR * abs(shape[name]) for name, step in steps.items()):
+        values = dict(zip(linear, (float(v) for v in found), strict=False))
+        for name, step in steps.items():
+            limits = next(p for p in effect.shape_parameters if p.name == name)
+            shape = shape.at(**{name: float(np.clip(shape[name] + step, limits.low, limits.high))})
+    deviations = dict(zip([*linear, *moved], (float(v) for v in deviation), strict=True))
+    values.update({name: float(value) for name, value in shape.items()})
+    for name, law in effect.law_std(values, shape.form).items():
+        deviations[name] = float(np.hypot(deviations.get(name, 0.0), law))
+    return values, {name: deviations.get(name, 0.0) for name in values}
+
+
+def phases_of(evidence: Evidence) -> NDArray[np.int64]:
+    """Number (blocks,) of the phase of the motion that each block belongs to: the same in all periods of a session."""
+    numbers: dict[tuple[int, int], int] = {}
+    found = np.zeros(evidence.blocks, dtype=np.int64)
+    recordings = {r.number: r for r in evidence.nominal.recordings}
+    for block, (session, begin) in enumerate(zip(evidence.block_session, evidence.block_start, strict=True)):
+        recording = recordings[int(session)]
+        phase = round(1e3 * ((begin - recording.start_s) % recording.period_s))
+        found[block] = numbers.setdefault((int(session), phase), len(numbers))
+    return found
+
+
+def _with_derivatives(dictionary: Dictionary, trial: Trial) -> tuple[Sequence[str], Rows]:
+    """Names of the shape parameters that the torque depends on, and the trial's columns with the derivatives."""
+    shape = trial.shape
+    parts: dict[Key, list[Floats]] = {key: [columns] for key, columns in trial.rows.items()}
+    moved = []
+    for name in trial.candidate.effect.continuous(shape):
+        step = 0.02 * abs(shape[name]) or 0.02
+        upper = dictionary.rows(trial.candidate, shape.at(**{name: shape[name] + step}))
+        lower = dictionary.rows(trial.candidate, shape.at(**{name: shape[name] - step}))
+        derivative = {
+            key: ((upper.get(key, 0.0) - lower.get(key, 0.0)) / (2.0 * step) @ trial.score.coefficients)[
+                :, None
+            ]
+            for key in trial.rows
+        }
+        if any(np.any(column) for column in derivative.values()):
+            moved.append(name)
+            for key, column in derivative.items():
+                parts[key].append(column)
+    return moved, {key: np.concatenate(columns, axis=1) for key, columns in parts.items()}
+
+
+def _clustered(evidence: Evidence) -> Floats:
+    """Covariance (P, P) of all present columns from phases, at least that of independent rows."""
+    phases = phases_of(evidence)
+    on = (np.arange(int(phases.max()) + 1)[:, None] == phases).astype(float)
+    gram, target = np.tensordot(on, evidence.gram, axes=1), on @ evidence.target
+    scores = target - gram @ evidence.full.values
+    inverse = evidence.full.inverse
+    size = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    # A root R of the inverse, R R' = G^-1; any will do, for A_k turns with it.
+    values, vectors = np.linalg.eigh(inverse / np.outer(size, size))
+    root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    covariance = np.zeros_like(inverse)
+    for part, score in zip(gram, scores, strict=True):
+        share, axes = np.linalg.eigh(root.T @ part @ root)
+        own = axes.T @ (root.T @ score) / np.sqrt(np.maximum(1.0 - share, _LEAST_REST))
+        step = root @ (axes @ own)
+        covariance += np.outer(step, step)
+    if evidence.prior is not None:
+        p = evidence.base_count
+        covariance += inverse[:, :p] @ evidence.prior[0] @ inverse[:p]
+    least = np.maximum(np.diag(inverse), 0.0)
+    widen = np.sqrt(np.maximum(least / np.maximum(np.diag(covariance), 1e-300), 1.0))
+    return covariance * np.outer(widen, widen)

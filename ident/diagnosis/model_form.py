@@ -1,0 +1,111 @@
+"""Model-form error: what a strong cause leaves beside its law, so that it is not taken for another cause.
+
+A law is an idealisation. A hose is no plain spring, friction falls with speed in its own way, an unannounced payload
+has another inertia too. The rest beside the law of a strong cause may exceed the noise by far, and then another cause
+of a similar torque is significant. It is a cause of its own only if it remains beside any function of the first one's
+own variable, acting on the same rows in the same proportion (Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.diagnosis.candidates import Dictionary, Trial
+from ident.diagnosis.evidence import Floats, Key, Rows
+from ident.diagnosis.probes import groups, hats, hats_of
+from ident.effects import ZERO_OFFSET, Shape
+
+__all__ = ["companions", "model_form_error"]
+
+
+def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
+    """Columns of the trial's cause beyond its law, None where nothing is known of it.
+
+    Hat functions of the law's variable on the sides that it acts on, one coefficient for all of them, beside the
+    companions of the cause; of a joint that gives way any turn of the link by the load.
+    """
+    effect, joint = trial.candidate.effect, trial.candidate.joint
+    if effect.displaces:
+        return _twist(dictionary, joint)
+    beside = companions(dictionary, trial) or {}
+    if effect.law is None:
+        return beside or None
+    name = "time" if effect.law.variable == "time" else f"{effect.law.variable}{joint + 1}"
+    found: dict[Key, Floats] = {}
+    own = {key: value for key, value in hats_of(dictionary).items() if key == name}
+    for side, at in trial.rows:
+        if at != joint or not own:
+            continue
+        if effect.law.variable == "qd":
+            columns = _of_speed(dictionary, side, joint)
+        else:
+            group = groups(dictionary, own, side, joint)
+            wanted = f"{name} sign(qd{joint + 1})" if effect.law.signed else name
+            # All hats together are a constant, which the base has.
+            columns = group[wanted][side, joint][:, 0 if effect.law.signed else 1 :]
+        more = [beside[side, joint]] if (side, joint) in beside else []
+        found[side, joint] = np.column_stack([columns, *more])
+    return found or None
+
+
+def companions(dictionary: Dictionary, trial: Trial) -> Rows | None:
+    """Columns of the torques that come with the trial's cause in a real arm, in the rows of the trial."""
+    effect, joint, nominal = trial.candidate.effect, trial.candidate.joint, dictionary.nominal
+    own = max(joint, 0)
+    parts: dict[Key, list[Floats]] = {}
+    for columns in zip(
+        *(effect.companions(m, own, dictionary.setting) for m in nominal.motions), strict=True
+    ):
+        for side, at in trial.rows:
+            if joint >= 0 and at != joint:
+                continue
+            signals = [column.wide(own, nominal.arm.chain.n)[side == "joint"] for column in columns]
+            if signals[0] is not None:
+                parts.setdefault((side, at), []).append(_reduced(dictionary, side, signals, at))
+    if not effect.whole_arm:
+        return {key: np.column_stack(columns) for key, columns in parts.items()} or None
+    # A body adds nothing where it does not hang, or did not yet.
+    return {
+        key: np.column_stack(columns) * np.any(trial.rows[key] != 0.0, axis=1)[:, None]
+        for key, columns in parts.items()
+    } or None
+
+
+def _reduced(dictionary: Dictionary, side: str, signals: Sequence[Floats | None], joint: int) -> Floats:
+    return dictionary.nominal.reduce(side, [signal[:, joint] for signal in signals if signal is not None])
+
+
+def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
+    """Functions (m, k) of a drive's speed and of its direction, finer the slower it is: laws of friction differ most
+    there.
+    """
+    motions = dictionary.nominal.motions
+    roots = [np.sqrt(np.abs(m.motor_speed[:, joint])) for m in motions]
+    high = max(float(root.max()) for root in roots)
+    parts = [hats(root, 0.0, high)[:, 1:] for root in roots]
+    signed = [part * m.direction[:, joint : joint + 1] for part, m in zip(parts, motions, strict=True)]
+    both = [np.column_stack(pair) for pair in zip(parts, signed, strict=True)]
+    return dictionary.nominal.reduce(side, both)
+
+
+def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
+    """Change of all torques by a turn of the joint by each hat function of its load."""
+    nominal = dictionary.nominal
+    loads = hats_of(dictionary).get(f"load{joint + 1}")
+    if loads is None:
+        return None
+    turns = [ZERO_OFFSET.columns(m, joint, Shape())[0] for m in nominal.motions]
+    found: dict[Key, Floats] = {}
+    for side in nominal.rows:
+        parts = [
+            turn.wide(joint, m.n)[side == "joint"] for turn, m in zip(turns, nominal.motions, strict=True)
+        ]
+        for k in range(nominal.arm.chain.n):
+            signals = [p[:, k : k + 1] * h for p, h in zip(parts, loads, strict=True) if p is not None]
+            columns = nominal.reduce(side, signals)
+            if np.any(columns):
+                found[side, k] = columns
+    # A turn about an axis along gravity changes no torque.
+    return found or None

@@ -1,0 +1,144 @@
+"""The noise of rows, told by what differs from period to period."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.diagnosis.nominal import SideRows
+from ident.diagnosis.recording import Recording
+from ident.estimators.covariance import correlation_time
+
+__all__ = ["noise_floor", "repeatability"]
+
+Floats = NDArray[np.float64]
+
+
+def noise_floor(
+    rows: SideRows, residual: Floats, periods: Mapping[int, tuple[float, float]]
+) -> tuple[Floats, Floats, bool]:
+    """Noise (n,) of a row [Nm], the dilution (n,) of rows by correlation, and whether periods told it.
+
+    Where the excitation repeats, the difference of two periods of the residual is noise and nothing else.
+    Otherwise the residual itself stands for it, counted with its effective number of rows: what a model leaves
+    for seconds is then one observation and not a thousand, and a claim must explain most of it.
+    periods : start and length [s] of each session's period.
+    """
+    n = residual.shape[1]
+    pairs: list[Floats] = []
+    for session, (start, length) in periods.items():
+        mine = np.flatnonzero(rows.session == session)
+        phase = (rows.time[mine] - start) / length
+        first, second = mine[(phase >= 0) & (phase < 1)], mine[(phase >= 1) & (phase < 2)]
+        if len(first) < 50 or len(second) < 0.6 * len(first):
+            continue
+        at = rows.time[second] - length
+        step = float(np.median(np.diff(rows.time[first])))
+        # Rows need not be evenly spaced: a slow tick seldom fits the cycle.
+        after = np.clip(np.searchsorted(rows.time[first], at), 1, len(first) - 1)
+        earlier = at - rows.time[first[after - 1]] < rows.time[first[after]] - at
+        nearest = after - earlier
+        close = np.abs(rows.time[first[nearest]] - at) < 0.6 * step
+        pairs.append((residual[second[close]] - residual[first[nearest[close]]]) / np.sqrt(2.0))
+    sigma, dilution = np.ones(n), np.ones(n)
+    told = bool(pairs)
+    if not told:
+        return *_misfit(rows, residual), False
+    differences = np.concatenate(pairs)
+    for j in range(n):
+        d = differences[:, j]
+        d = d[np.isfinite(d)]
+        if len(d) < 20:
+            continue
+        d = _without_slow(d, max(4, round(1.0 / max(float(np.median(np.diff(rows.time))), 1e-6))))
+        sigma[j] = max(_robust_rms(d), 1e-9)
+        width = max(2, round(0.2 / max(float(np.median(np.diff(rows.time))), 1e-6)))
+        count = len(d) // width
+        if count >= 4:
+            means = d[: count * width].reshape(count, width).mean(axis=1)
+            dilution[j] = float(np.clip(width * np.mean(means**2) / np.mean(d**2), 1.0, width))
+            if dilution[j] < 1.0 + 3.0 * np.sqrt(2.0 / count):
+                dilution[j] = 1.0
+    return sigma, dilution, told
+
+
+def repeatability(
+    recordings: Sequence[Recording], rows: SideRows, residual: Floats
+) -> tuple[Floats, tuple[tuple[int, int], ...]]:
+    """Noise (n,) of a row [Nm] from sessions that repeat a motion, and the pairs of their numbers.
+
+    NaN where none does. Everything counts that differs from run to run, a drift as well.
+    """
+    pairs, squares, counts = [], np.zeros(residual.shape[1]), np.zeros(residual.shape[1])
+    for k, one in enumerate(recordings):
+        for other in recordings[k + 1 :]:
+            if not _same_motion(one, other):
+                continue
+            pairs.append((one.number, other.number))
+            first, second = (np.flatnonzero(rows.session == r.number) for r in (one, other))
+            at = rows.time[first] - one.start_s
+            there = rows.time[second] - other.start_s
+            for j in range(residual.shape[1]):
+                d = residual[first, j] - np.interp(at, there, residual[second, j], np.nan, np.nan)
+                d = d[np.isfinite(d)]
+                squares[j] += 0.5 * float(d @ d)
+                counts[j] += len(d)
+    return np.sqrt(np.where(counts > 0, squares / np.maximum(counts, 1.0), np.nan)), tuple(pairs)
+
+
+def _same_motion(one: Recording, other: Recording) -> bool:
+    """Whether two sessions run the same path in the same time, to a twentieth of its range."""
+    if abs(one.duration_s - other.duration_s) > 0.02 * one.duration_s:
+        return False
+    a, b = (max(r.stretches, key=lambda s: len(s.time)) for r in (one, other))
+    if len(a.time) < 2 or abs(len(a.time) - len(b.time)) > 0.02 * len(a.time):
+        return False
+    at = a.time - one.start_s
+    scale = np.maximum(np.std(a.q, axis=0), 1e-3)
+    for j in range(a.q.shape[1]):
+        d = a.q[:, j] - np.interp(at, b.time - other.start_s, b.q[:, j])
+        if np.sqrt(np.mean(d**2)) > 0.05 * scale[j]:
+            return False
+    return True
+
+
+def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
+    """Size (n,) of the residual and the number (n,) of rows that count as one, from its autocorrelation."""
+    from scipy.signal import correlate
+
+    n = residual.shape[1]
+    sigma, dilution = np.ones(n), np.ones(n)
+    for j in range(n):
+        total, power, count = np.zeros(1), 0.0, 0
+        for session in np.unique(rows.session):
+            d = residual[(rows.session == session) & ~rows.test, j]
+            ok = np.isfinite(d)
+            if ok.sum() < 8:
+                continue
+            part = correlate(np.where(ok, d, 0.0), np.where(ok, d, 0.0), method="fft")[len(d) - 1 :]
+            part = part[: max(8, len(d) // 3)]
+            if len(part) > len(total):
+                total = np.pad(total, (0, len(part) - len(total)))
+            total[: len(part)] += part
+            power, count = power + float(np.sum(d[ok] ** 2)), count + int(ok.sum())
+        if count:
+            sigma[j] = max(float(np.sqrt(power / count)), 1e-9)
+            dilution[j] = correlation_time(total)
+    return sigma, dilution
+
+
+def _without_slow(values: Floats, width: int) -> Floats:
+    """Values less their means over `width` samples: a drift from period to period is no noise."""
+    count = len(values) // width * width
+    if not count:
+        return values
+    parts = values[:count].reshape(-1, width)
+    return ((parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(width / (width - 1.0))).ravel()
+
+
+def _robust_rms(values: Floats) -> float:
+    """Root mean square without the largest five per cent, scaled as for a normal distribution."""
+    limit = np.quantile(np.abs(values), 0.95)
+    return float(np.sqrt(np.mean(values[np.abs(values) <= limit] ** 2)) / 0.8711)

@@ -1,0 +1,177 @@
+"""Sessions on an even grid: measured torques beside filtered motion, before any model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from ident.diagnosis.bandwidth import passed_band
+from ident.diagnosis.hygiene import Stuck, clipped_at, held_times, stuck_at
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.kinematics import Chain
+from ident.signals.prepare import PreparedSession, prepare
+from ident.signals.settings import SignalSettings
+from ident.structure import Side
+
+if TYPE_CHECKING:
+    from lwr_driver.session import Session
+
+__all__ = ["Recording", "Stretch", "record"]
+
+Floats = NDArray[np.float64]
+
+_HELD_S = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """An uninterrupted part of a session.
+
+    time : (N,) even grid [s] from the first sample of the log; q, qd, qdd : (N, n).
+    effort : (N, n) joint torque on the grid; usable : (N, n) samples that are neither bridged nor outliers.
+    motor_time : (M,) times of the motor torque as published [s]; motor : (M, n); motor_usable : (M, n).
+    """
+
+    time: Floats
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    effort: Floats
+    usable: NDArray[np.bool_]
+    motor_time: Floats
+    motor: Floats
+    motor_usable: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A session ready for rows.
+
+    number : in the order of the sessions' beginnings. payload : mounted, None for none.
+    period_s : of the excitation, or the duration where it does not repeat; start_s : its beginning.
+    has_effort, has_motor : which channels exist. clipped : (n,) torque [Nm] at which the samples of a joint's sensor
+    stop, NaN where they do not. stuck : motor torques that are reported again and again, and are no measurements.
+    joint_band_hz, motor_band_hz : upper edge of what a low-pass left of the torques, None where they are
+    as measured.
+    """
+
+    name: str
+    number: int
+    payload: str | None
+    stretches: tuple[Stretch, ...]
+    start_s: float
+    period_s: float
+    duration_s: float
+    has_effort: bool
+    has_motor: bool
+    test: bool
+    joint_names: tuple[str, ...]
+    warnings: tuple[str, ...]
+    clipped: Floats
+    stuck: tuple[Stuck, ...]
+    joint_band_hz: float | None = None
+    motor_band_hz: float | None = None
+
+    @property
+    def repeats(self) -> bool:
+        """Whether the excitation repeats within the session."""
+        return self.period_s < 0.999 * self.duration_s
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides whose torque was recorded."""
+        present: dict[Side, bool] = {"motor": self.has_motor, "joint": self.has_effort}
+        return tuple(side for side, there in present.items() if there)
+
+
+def record(
+    session: Session, number: int, chain: Chain, settings: DiagnosisSettings, *, test: bool = False
+) -> Recording:
+    """Filter one session. Raises DataError, with advice, when it cannot be used."""
+    chosen = session.select(chain.joint_names)
+    rate = 1.0 / chosen.joint.period_s
+    cutoff = min(settings.cutoff_hz, 0.2 * rate)
+    signals = SignalSettings(
+        cutoff_hz=cutoff, decimate_hz=min(10.0, 0.5 * cutoff), motor_delay_s=0.0, standstill_share=1.0
+    )
+    prepared = prepare(chosen, signals)
+    stuck = () if chosen.motor is None else stuck_at(chosen.motor, chosen.joint)
+    stretches = tuple(_stretches(prepared, rate, held_times(chosen.joint), stuck))
+    if not stretches:
+        raise DataError(f"{prepared.name}: no stretch of the session is long enough for a diagnosis")
+    spans = chosen.spans("period")
+    first = stretches[0].time[0]
+    last = stretches[-1].time[-1]
+    period = float(spans[0][1] - spans[0][0]) * 1e-9 if spans else last - first
+    payload = chosen.metadata.get("payload", "none").strip()
+    motor = chosen.motor
+    return Recording(
+        name=prepared.name,
+        number=number,
+        payload=None if payload in ("", "none") else payload,
+        stretches=stretches,
+        start_s=float(first),
+        period_s=period,
+        duration_s=float(last - first),
+        has_effort=bool(chosen.joint.effort.shape[1]),
+        has_motor=prepared.has_motor,
+        test=test,
+        joint_names=prepared.joint_names,
+        warnings=(),
+        clipped=clipped_at(chosen.joint),
+        stuck=stuck,
+        # Whoever filtered did it sample by sample, so the samples are looked at as they came.
+        joint_band_hz=passed_band(chosen.joint.effort, chosen.joint.period_s),
+        motor_band_hz=None if motor is None else passed_band(motor.effort, motor.period_s),
+    )
+
+
+def _stretches(prepared: PreparedSession, rate: float, held: Floats, stuck: Sequence[Stuck]) -> list[Stretch]:
+    found = []
+    for passage in prepared.passages:
+        joint = passage.joint
+        inside = (joint.times >= passage.rows[0]) & (joint.times <= passage.rows[-1])
+        if inside.sum() < 32:
+            continue
+        # Sampling beyond 1 kHz adds cost and nothing else.
+        thin = max(1, round(rate / 1000.0))
+        pick = np.flatnonzero(inside)[::thin]
+        n = joint.q.shape[1]
+        motor_time, motor, usable = np.zeros(0), np.zeros((0, n)), np.zeros((0, n), dtype=bool)
+        if passage.motor is not None:
+            m = passage.motor
+            # A margin keeps the samples inside the grid when the channel is shifted.
+            keep = (m.times >= joint.times[pick[0]] + 0.06) & (m.times <= joint.times[pick[-1]] - 0.06)
+            motor_time, motor = m.times[keep], m.torque[keep]
+            usable = ~m.flagged[keep] & _apart(motor_time, held)[:, None]
+            for one in stuck:
+                usable[:, one.joint] &= motor[:, one.joint] != one.value
+        found.append(
+            Stretch(
+                joint.times[pick],
+                joint.q[pick],
+                joint.qd[pick],
+                joint.qdd[pick],
+                joint.torque[pick],
+                ~joint.flagged[pick] & _apart(joint.times[pick], held)[:, None],
+                motor_time,
+                motor,
+                usable,
+            )
+        )
+    return found
+
+
+def _apart(times: Floats, held: Floats) -> NDArray[np.bool_]:
+    """Whether times (N,) are far enough from samples that were held, where the filtered positions are wrong too."""
+    if not len(held):
+        return np.ones(len(times), dtype=bool)
+    after = np.searchsorted(held, times)
+    before = np.maximum(after - 1, 0)
+    after = np.minimum(after, len(held) - 1)
+    return np.minimum(np.abs(times - held[before]), np.abs(times - held[after])) > _HELD_S

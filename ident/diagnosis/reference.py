@@ -1,0 +1,196 @@
+"""The commissioned arm: what its healthy sessions taught, kept in the provenance of its model.
+
+A reference ties the base parameters to their healthy values, within their uncertainty and a tolerance for
+what changes from day to day, so that causes show which the parameters would otherwise absorb. It also holds
+the noise, the delays and the stiffness of the healthy arm, and the gain that each candidate reached in the mean
+where nothing was wrong, from which follows what a claim must exceed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from ident.base import BaseSet
+from ident.diagnosis.evidence import Floats
+from ident.distributions import fisher_limit
+from ident.model import DynamicModel
+
+__all__ = ["DELAY_STD_S", "Reference"]
+
+DELAY_STD_S = 2e-4
+"""Standard deviation [s] of a healthy channel's delay from day to day where few sets or none tell it."""
+
+_KEY = "commissioning"
+_WIDER = 1.5
+_DAY_TO_DAY = {"Fvl": 0.02, "Fcl": 0.02, "Fvm": 0.02, "Fcm": 0.02, "Ia": 0.005}
+_ELSE = 0.002
+_ONE_IN = 0.01
+_AS_SETS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A healthy arm.
+
+    model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
+    noise : of a row [Nm] by side, (n,). null : mean gain of each candidate by (cause, joint from 0).
+    sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
+    reach : (n,) of presliding [rad], None where unknown. far, far_share : (n,) see `nominal.Arm`.
+    delay_std_s : of the channels' delays from day to day, by side.
+    """
+
+    model: DynamicModel
+    compliance: Floats
+    motor_delay_s: float
+    joint_delay_s: float
+    noise: Mapping[str, Floats]
+    null: Mapping[tuple[str, int], float]
+    sets: int
+    encoder: Literal["link", "motor"] = "link"
+    reach: Floats | None = None
+    far: Floats | None = None
+    far_share: Floats | None = None
+    delay_std_s: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, model: DynamicModel) -> Reference:
+        """From a model file that `lwr-run commission` wrote; other models give their parameters alone."""
+        n = model.structure.chain.n
+        stored = model.provenance.get(_KEY)
+        if not isinstance(stored, Mapping):
+            return cls(model, np.zeros(0), 0.0, 0.0, {}, {}, 0)
+        try:
+            null = {_split(key): float(value) for key, value in stored["null"].items()}
+            compliance = np.array(stored["compliance"], dtype=np.float64)
+            noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
+            delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
+            delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
+            sets, encoder = int(stored["sets"]), str(stored["encoder"])
+            reach, far, far_share = (
+                np.array(stored[name], dtype=np.float64) if stored.get(name) else None
+                for name in ("reach", "far", "far_share")
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ConfigurationError(
+                f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
+            ) from error
+        if compliance.shape != (n,):
+            raise ConfigurationError(
+                f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
+            )
+        side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
+        return cls(model, compliance, *delays, noise, null, sets, side, reach, far, far_share, delay_std)
+
+    def stored(self) -> dict[str, Any]:
+        """Content for the provenance of the model."""
+        return {
+            _KEY: {
+                "compliance": [float(v) for v in self.compliance],
+                "motor_delay_s": self.motor_delay_s,
+                "joint_delay_s": self.joint_delay_s,
+                "delay_std_s": dict(self.delay_std_s),
+                "noise": {side: [float(v) for v in values] for side, values in self.noise.items()},
+                "null": {
+                    f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
+                },
+                "sets": self.sets,
+                "encoder": self.encoder,
+                "reach": _listed(self.reach),
+                "far": _listed(self.far),
+                "far_share": _listed(self.far_share),
+            }
+        }
+
+    def limits(self) -> dict[tuple[str, int], float]:
+        """Gain of each candidate by (cause, joint from 0) that a healthy set stays below, but for one in a hundred.
+
+        How much a candidate finds in a healthy set differs from set to set: the arm is never quite the nominal
+        one. Taken as a deviation with a normal distribution over sets, whose square is the gain, a further set's
+        gain over the mean of `sets` of them has Fisher's distribution F(1, sets). Few sets know their own mean
+        badly, so that of the same cause in all joints counts as further sets.
+        """
+        if not self.sets:
+            return {}
+        by_cause: dict[str, list[float]] = {}
+        for (cause, _), gain in self.null.items():
+            by_cause.setdefault(cause, []).append(gain)
+        # What noise alone gives to a candidate has no such tail; the smallest gain of a claim sees to it.
+        noise = float(np.median(list(self.null.values()))) if self.null else 0.0
+        sets = self.sets + _AS_SETS
+        quantile = fisher_limit(_ONE_IN, 1, sets)
+        found = {}
+        for key, gain in self.null.items():
+            mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
+            found[key] = noise + quantile * max(mean - noise, 0.0)
+        return found
+
+    def loosened(self, symbol: str, share: float) -> Reference:
+        """The same, but parameters of a symbol, such as `Ia`, known to that share of their value at best."""
+        model = self.model
+        if model.covariance is None:
+            return self
+        mine = np.array([_symbol(name) == symbol for name in model.names])
+        more = np.diag(np.where(mine, share * model.values, 0.0) ** 2)
+        return replace(self, model=replace(model, covariance=model.covariance + more))
+
+    def prior(self, base: BaseSet) -> tuple[Floats, Floats] | None:
+        """Precision (p, p) and values (p,) of base parameters that mean the same in the reference.
+
+        None where the reference has no covariance or none of them.
+        """
+        own = self.model
+        if own.covariance is None or own.base is None:
+            return None
+        pairs = _same(own.base, base)
+        mine = {int(p): k for k, p in enumerate(own.positions)}
+        pairs = [(mine[a], b) for a, b in pairs if a in mine]
+        if not pairs:
+            return None
+        here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
+        covariance = own.covariance[np.ix_(there, there)] * _WIDER**2
+        values = own.values[there]
+        # Several sets tell by themselves what changes from day to day; one set cannot.
+        share = 1.0 if self.sets < 3 else 0.25
+        tolerance = share * np.array([_tolerance(base.names[b]) for b in here]) * np.abs(values)
+        std = np.sqrt(np.diag(covariance))
+        covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
+        precision = np.zeros((len(base), len(base)))
+        precision[np.ix_(here, here)] = np.linalg.inv(covariance)
+        mean = np.zeros(len(base))
+        mean[here] = values
+        return precision, mean
+
+
+def _listed(values: Floats | None) -> list[float] | None:
+    return None if values is None else [float(v) for v in values]
+
+
+def _tolerance(name: str) -> float:
+    return _DAY_TO_DAY.get(_symbol(name), _ELSE)
+
+
+def _symbol(name: str) -> str:
+    """Symbol of a base parameter: without joint and mark of regrouping."""
+    return name.rstrip("R").rstrip("0123456789")
+
+
+def _split(key: str) -> tuple[str, int]:
+    cause, _, joint = key.rpartition(" ")
+    return cause, int(joint) - 1
+
+
+def _same(a: BaseSet, b: BaseSet) -> list[tuple[int, int]]:
+    """Pairs of base parameters that stand for the same sum of standard parameters in two sets."""
+    rows_a = [_combination(a, k) for k in range(len(a))]
+    rows_b = {_combination(b, k): k for k in range(len(b))}
+    return [(k, rows_b[row]) for k, row in enumerate(rows_a) if row in rows_b]
+
+
+def _combination(base: BaseSet, k: int) -> tuple[tuple[str, float], ...]:
+    names, row = base.structure.names, base.matrix[k]
+    return tuple((names[c], round(float(row[c]), 6)) for c in np.flatnonzero(np.abs(row) > 1e-9))

@@ -1,0 +1,264 @@
+"""The diagnosis as a value: findings, what is unexplained, what was gained; as text and as plain content."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.diagnosis.evidence import Floats
+from ident.model import DynamicModel
+
+__all__ = [
+    "SCHEMA_VERSION",
+    "Diagnosis",
+    "Evident",
+    "Finding",
+    "RowStates",
+    "SimulationError",
+    "Unexplained",
+    "Value",
+]
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter: value, standard deviation, SI unit."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Evident:
+    """Evidence of a finding. test_rms [Nm] over the rows that it acts on; interval of their difference."""
+
+    delta_bic: float
+    p_value: float
+    test_rms_before: float
+    test_rms_after: float
+    gain_interval_95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions,
+    where it says so.
+    alternatives : (cause, joints, delta_bic). gain : fall of the held-back chi-square."""
+
+    cause: str
+    side: str
+    joints: tuple[int, ...]
+    parameters: Mapping[str, Value]
+    evidence: Evident
+    confidence: float
+    alternatives: tuple[tuple[str, tuple[int, ...], float], ...]
+    tell_apart: str
+    gain: float
+    mode: str | None = None
+    form: str | None = None
+
+    @property
+    def values(self) -> dict[str, tuple[float, float, str]]:
+        """Value, standard deviation and unit by parameter."""
+        return {name: (v.value, v.std, v.unit) for name, v in self.parameters.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content."""
+        content: dict[str, Any] = {
+            "cause": self.cause,
+            "side": self.side,
+            "joints": list(self.joints),
+            "parameters": {
+                name: {"value": v.value, "std": v.std, "unit": v.unit} for name, v in self.parameters.items()
+            },
+            "evidence": {
+                "delta_bic": self.evidence.delta_bic,
+                "p_value": self.evidence.p_value,
+                "test_rms_before": self.evidence.test_rms_before,
+                "test_rms_after": self.evidence.test_rms_after,
+                "gain_interval_95": list(self.evidence.gain_interval_95),
+            },
+            "confidence": self.confidence,
+            "alternatives": [
+                {"cause": cause, "joints": list(joints), "delta_bic": bic}
+                for cause, joints, bic in self.alternatives
+            ],
+            "tell_apart": self.tell_apart,
+        }
+        if self.mode is not None:
+            content["mode"] = self.mode
+        if self.form is not None:
+            content["form"] = self.form
+        return content
+
+    def __str__(self) -> str:
+        where = f"joint {self.joints[0]}" if self.joints else "whole arm"
+        values = ", ".join(f"{name} {_short(v.value, v.std)} {v.unit}" for name, v in self.parameters.items())
+        e = self.evidence
+        doubt = ""
+        if self.alternatives:
+            other = self.alternatives[0]
+            place = f" joint {other[1][0]}" if other[1] else ""
+            doubt = f"\n      or {other[0]}{place}; to decide: {self.tell_apart}"
+        return (
+            f"  {self.cause} ({self.side} side, {where}), confidence {self.confidence:.2f}\n"
+            f"      {values}\n"
+            f"      error on held-out rows {e.test_rms_before:.4g} -> {e.test_rms_after:.4g} Nm{doubt}"
+        )
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What is there but has no name, in the rows of a joint (from 1) and side."""
+
+    side: str
+    joint: int
+    depends_on: tuple[str, ...]
+    test_rms: float
+    noise_floor: float
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationError:
+    """RMS error (n,) of the simulated session: position [rad], motor and joint torque [Nm]."""
+
+    position: Floats
+    motor: Floats | None
+    joint: Floats | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content."""
+        return {"motor": _plain(self.motor), "joint": _plain(self.joint), "position": _plain(self.position)}
+
+
+@dataclass(frozen=True, eq=False)
+class RowStates:
+    """Where the arm was in the m rows of a side: what residuals can be held against.
+
+    time : (m,) [s] in the session. session : (m,) number in the order of the sessions, from 0. block : (m,) of
+    rows that are taken to depend on each other. position, speed, load : (m, n) [rad, rad/s, Nm] of each joint,
+    the load as the model predicts it.
+    """
+
+    time: Floats
+    session: NDArray[np.int64]
+    block: Floats
+    position: Floats
+    speed: Floats
+    load: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Everything that was found; prints itself.
+
+    base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
+    changes : change of the base parameters by the extension, in their standard deviations.
+    notes : sentences on what could not be seen or used.
+    residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN where a row is not
+    used. states : where the arm was in these rows, by side.
+    """
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    model_number: int
+    findings: tuple[Finding, ...]
+    unexplained: tuple[Unexplained, ...]
+    noise_floor: Mapping[str, Floats]
+    rms_base: Mapping[str, Floats]
+    rms_extended: Mapping[str, Floats]
+    base_model: DynamicModel
+    extended_model: DynamicModel
+    changes: Mapping[str, float]
+    scores: Mapping[tuple[str, int], float]
+    nuisance: Mapping[str, tuple[float, float]]
+    simulation_base: SimulationError | None = None
+    simulation_extended: SimulationError | None = None
+    notes: tuple[str, ...] = ()
+    residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
+    states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Content of `diagnosis.json`. Errors of a simulation that was not made are null."""
+        none = {"motor": None, "joint": None, "position": None}
+        base = self.simulation_base.to_dict() if self.simulation_base else none
+        extended = self.simulation_extended.to_dict() if self.simulation_extended else none
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "sessions": {"train": list(self.train), "test": list(self.test)},
+            "baseline": {
+                "model": self.model_number,
+                "test_rms": _sides(self.rms_base),
+                "noise_floor": _sides(self.noise_floor),
+                "simulation_error": base,
+            },
+            "findings": [finding.to_dict() for finding in self.findings],
+            "unexplained": [
+                {
+                    "side": u.side,
+                    "joint": u.joint,
+                    "depends_on": list(u.depends_on),
+                    "test_rms": u.test_rms,
+                    "noise_floor": u.noise_floor,
+                }
+                for u in self.unexplained
+            ],
+            "gain": {
+                "test_rms_base": _sides(self.rms_base),
+                "test_rms_extended": _sides(self.rms_extended),
+                "simulation_error_base": base,
+                "simulation_error_extended": extended,
+            },
+            "model": "model_extended.yaml",
+        }
+
+    def __str__(self) -> str:
+        lines = [f"Diagnosis of {', '.join(self.train)}"]
+        lines.append("  held-out sessions: " + (", ".join(self.test) or "none, parts of the motion in turn"))
+        if not self.findings and not self.unexplained:
+            lines.append("Nothing is wrong that these data could show.")
+        if self.findings:
+            lines.append(f"{len(self.findings)} finding{'s' if len(self.findings) > 1 else ''}:")
+            lines += [str(finding) for finding in self.findings]
+        for u in self.unexplained[:6]:
+            lines.append(
+                f"  unexplained: {u.side} torque of joint {u.joint} depends on {', '.join(u.depends_on)} "
+                f"({u.test_rms:.4g} Nm, noise {u.noise_floor:.4g} Nm)"
+            )
+        lines.append("Error on held-out rows [Nm]: noise floor, base model, extended model")
+        for side, values in self.rms_base.items():
+            for label, row in (
+                ("noise", self.noise_floor.get(side)),
+                ("base", values),
+                ("extended", self.rms_extended.get(side)),
+            ):
+                if row is not None:
+                    lines.append(f"  {side:<6}{label:<10}" + "".join(f"{v:>9.4f}" for v in row))
+        for label, error in (("base", self.simulation_base), ("extended", self.simulation_extended)):
+            if error is not None:
+                cells = "".join(f"{1e3 * v:>9.3f}" for v in error.position)
+                lines.append(f"  simulated position {label:<9} mrad" + cells)
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+
+def _sides(table: Mapping[str, Floats]) -> dict[str, Any]:
+    return {side: _plain(table.get(side)) for side in ("motor", "joint")}
+
+
+def _plain(values: Floats | None) -> list[float | None] | None:
+    if values is None:
+        return None
+    return [float(v) if math.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+
+
+def _short(value: float, std: float) -> str:
+    return f"{value:.4g}" + (f" ± {std:.2g}" if std > 0.0 else "")

@@ -1,0 +1,115 @@
+"""The course of what drifts: within each session, from one session to the next, or since the reference.
+
+Between two sessions a zero moves, or a drive cools down, by whatever it likes. Compared with a reference each session
+then has a value of its own: a level of the first ones and a step to the later ones. One number for all of them would
+leave the rest to any cause with another mean in each session. Without a reference the base parameters hold the level,
+and only the step shows.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from ident.effects.effect import Effect, Form, Parameter, Parameters, Setting, Shape
+from ident.effects.motion import Floats, Motion, first_order
+from ident.effects.words import Values, quantity
+
+__all__ = ["TIME_CONSTANT", "Course", "Drifting"]
+
+TIME_CONSTANT = (
+    Parameter("time_constant", "s", "within a session", shape=True, low=0.0),
+    Parameter("since", "1", "number of the first session after a change between the sessions", shape=True),
+)
+# Time constants to begin with, over the longest session: from a part of it to a steady drift.
+_SHARES = (0.15, 0.4, 1.0, 5.0)
+
+
+class Course(Form):
+    """How a value drifts: as 1 - exp(-t / time_constant) in each session; with the heat of the drive's friction in its
+    place; from session `since` on, without and with a level of the sessions before it; in all sessions.
+    """
+
+    WITHIN = "within a session", "change", "drift", "time_constant"
+    HEATED = "heated by friction", "change", "time_constant"
+    STEP = "between sessions", "change", "drift", "since"
+    LEVEL_AND_STEP = "level, and step between sessions", "change", "level", "drift", "zero", "since"
+    SINCE_REFERENCE = "since the reference", "change", "drift"
+
+
+class Drifting(Effect):
+    """An effect with a course in time; its first parameter is the change, its second one the level of all sessions."""
+
+    forms = Course
+    depends_on = "time"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """From a fifth of the session to a steady drift, and between sessions where there are several."""
+        longest = max(setting.durations_s)
+        step = Course.LEVEL_AND_STEP if setting.compared else Course.STEP
+        return [
+            *(Shape(form, time_constant=share * longest) for form in self.courses for share in _SHARES),
+            *(Shape(step, since=k) for k in range(2, setting.sessions + 1)),
+            Shape(Course.SINCE_REFERENCE),
+        ]
+
+    @property
+    def known_forms(self) -> tuple[Course, ...]:
+        """Those within a session, and all between sessions."""
+        return (*self.courses, Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE)
+
+    @property
+    @abstractmethod
+    def courses(self) -> tuple[Course, ...]:
+        """Forms of the drift within a session."""
+
+    def mode(self, shape: Shape) -> Literal["within", "between"]:
+        """Within a session or between sessions."""
+        return "within" if shape.form in (Course.WITHIN, Course.HEATED) else "between"
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """The time constant, where there is one."""
+        return ("time_constant",) if "time_constant" in shape else ()
+
+    def course(self, motion: Motion, joint: int, shape: Shape) -> tuple[Floats, ...]:
+        """Factor (N,) of each coefficient."""
+        if shape.form is Course.HEATED:
+            friction = motion.drive_friction[:, joint]
+            power = np.ascontiguousarray(friction * motion.motor_speed[:, joint])
+            usual = max(float(motion.friction(np.ones((1, motion.n)))[0, joint]), 1e-9)
+            return (first_order(power / usual, np.exp(-motion.dt / shape["time_constant"]), 0.0),)
+        if shape.form is Course.WITHIN:
+            return (1.0 - np.exp(-motion.time / shape["time_constant"]),)
+        whole = np.ones(len(motion.time))
+        if shape.form is Course.SINCE_REFERENCE:
+            return (whole,)
+        step = float(motion.session + 1 >= round(shape.get("since", 2.0))) * whole
+        return (step, whole) if shape.form is Course.LEVEL_AND_STEP else (step,)
+
+    def in_session(self, parameters: Parameters, form: str | Form | None, number: int | None) -> Parameters:
+        """Without the step in the sessions before it."""
+        between = self.form_of(form) in (Course.STEP, Course.LEVEL_AND_STEP)
+        if between and number is not None and number + 1 < parameters.get("since", 2.0):
+            return {**parameters, self.linear[0].name: 0.0}
+        return parameters
+
+    def drift(self, parameters: Parameters, form: str | Form | None, time_s: float) -> float:
+        """Change and level of a simulated arm at a time of the session [s]; in HEATED form not of the time alone."""
+        change, level = self.coefficients_of(parameters)
+        if self.form_of(form) is Course.WITHIN:
+            change *= 1.0 - np.exp(-time_s / parameters["time_constant"])
+        return float(change + level)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Size and course."""
+        first = self.linear[0]
+        size = f"{first.name} {quantity(values[first.name], share=first.share)}"
+        if form is Course.STEP or form is Course.LEVEL_AND_STEP:
+            return [f"{size} from session {values['since'][0]:.0f} on"]
+        if form is Course.SINCE_REFERENCE:
+            return [f"{size} against the reference"]
+        when = "with the heat of its own friction" if form is Course.HEATED else "while a session lasts"
+        return [f"{size} {when}, with a time constant of {quantity(values['time_constant'])}"]

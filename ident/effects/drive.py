@@ -1,0 +1,542 @@
+"""Causes in the drive, seen in the motor torque only: friction, ripple of the gear, torque constant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ident.effects.course import TIME_CONSTANT, Course, Drifting
+from ident.effects.effect import (
+    Column,
+    Effect,
+    Experiment,
+    Form,
+    Law,
+    Loads,
+    Parameter,
+    Parameters,
+    Plant,
+    Reading,
+    Setting,
+    Shape,
+    Simulated,
+)
+from ident.effects.motion import Floats, Motion, dahl
+from ident.effects.words import Values, quantity, quantity_text, times, wave
+
+__all__ = [
+    "FrictionAsymmetry",
+    "FrictionLoad",
+    "FrictionPosition",
+    "FrictionTemperature",
+    "GearRipple",
+    "MotorTorqueGain",
+    "PreslidingHysteresis",
+    "Stribeck",
+    "ViscousNonlinear",
+    "gain_sentence",
+]
+
+
+class PreslidingHysteresis(Effect):
+    """Part of the Coulomb friction is Dahl's: it turns over within a sliding distance, not at once."""
+
+    cause = "presliding_hysteresis"
+    side = "motor"
+    summary = "hysteresis around reversals"
+    physics = "asperities bend before they slide, so friction turns over a distance after each reversal"
+    source = "Dahl, AIAA Journal 14 (1976); Swevers et al., IEEE Trans. Autom. Control 45 (2000)"
+    parameters = (
+        Parameter("amplitude", "Nm", "Coulomb friction that turns over slowly", low=0.0),
+        Parameter("length", "rad", "distance in which it turns by 63 %", shape=True, low=1e-5, high=0.5),
+    )
+    depends_on = "velocity"
+    evidence_factor = 2.0
+    confused_with = ("stribeck", "backlash", "motor_torque_delay")
+    experiment = Experiment.REVERSAL_LADDER
+    tell_apart = "reversals of joint {joint} at three accelerations and amplitudes (0.5, 2 and 10 mrad)"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """From half a milliradian, or ten times the presliding length of the model, to a tenth of a radian."""
+        # Near the length of the healthy drive it is that length which is a little different.
+        least = 0.0 if setting.presliding is None else 10.0 * float(setting.presliding[joint])
+        return [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Dahl's state less sign(v) in the motor torque."""
+        speed = motion.motor_speed[:, joint]
+        path = np.cumsum(speed) * motion.dt
+        state = dahl(path, shape["length"], float(np.sign(speed[0])))
+        return (Column(motor=state - motion.direction[:, joint]),)
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Takes the amplitude out of the set-valued friction and gives it back through Dahl's state."""
+        return _Dahl(joint, float(parameters["amplitude"]), float(parameters["length"]))
+
+
+class _Dahl(Simulated):
+    def __init__(self, joint: int, amplitude: float, length: float) -> None:
+        super().__init__()
+        self.joint, self.amplitude, self.length = joint, amplitude, length
+        self.state = 0.0
+        self.before: float | None = None
+
+    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
+        here = float(plant.motor_position[self.joint])
+        step = 0.0 if self.before is None else here - self.before
+        self.before = here
+        sign = 1.0 if step > 0.0 else -1.0
+        self.state = sign - (sign - self.state) * float(np.exp(-abs(step) / self.length))
+        loads.Fcm[self.joint] = max(0.0, loads.Fcm[self.joint] - self.amplitude)
+        loads.motor_torque[self.joint] -= self.amplitude * self.state
+
+
+class Stribeck(Effect):
+    """Coulomb friction gains `amplitude exp(-(|v| / velocity)^exponent)` near standstill."""
+
+    cause = "stribeck"
+    side = "motor"
+    summary = "friction rises as the velocity falls towards zero"
+    physics = "the lubricant film breaks down at low speed, so friction rises as the speed falls towards zero"
+    source = "Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994)"
+    parameters = (
+        Parameter("amplitude", "Nm", "friction at standstill above the Coulomb level", low=0.0),
+        Parameter("velocity", "rad/s", "speed at which 1/e of it is left", shape=True, low=1e-3, high=1.0),
+        Parameter("exponent", "1", "1: Tustin, 2: Gauss", shape=True, low=0.5, high=3.0, optional=True),
+    )
+    depends_on = "velocity"
+    law = Law("qd")
+    beside_companions = True
+    confused_with = ("viscous_nonlinear", "presliding_hysteresis", "friction_load")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = "a slow constant-velocity sweep of joint {joint} through 0.01 to 0.2 rad/s"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """Speeds from 0.01 rad/s to half the largest one."""
+        speeds = [v for v in (0.01, 0.02, 0.04, 0.08, 0.16, 0.3) if v < setting.speed_range[joint]]
+        return [Shape(velocity=v, exponent=e) for e in (1.0, 2.0) for v in speeds]
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """sign(v) exp(-(|v| / velocity)^exponent) in the motor torque."""
+        speed = motion.motor_speed[:, joint]
+        fall = np.exp(-((np.abs(speed) / shape["velocity"]) ** shape.get("exponent", 1.0)))
+        return (Column(motor=motion.direction[:, joint] * fall),)
+
+    def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
+        """Bristles that carry more at low speed are no stiffer: they bend further before they slip."""
+        turning = PreslidingHysteresis()
+        shapes = turning.shapes(setting, joint)
+        return tuple(column for shape in shapes for column in turning.columns(motion, joint, shape))
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Raises the Coulomb friction of the drive."""
+        amplitude, velocity = float(parameters["amplitude"]), float(parameters["velocity"])
+        exponent = float(parameters.get("exponent", 1.0))
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            speed = abs(plant.motor_velocity[joint])
+            loads.Fcm[joint] += amplitude * np.exp(-((speed / velocity) ** exponent))
+
+        return Simulated(load)
+
+
+class ViscousNonlinear(Effect):
+    """Friction `coefficient |v|^exponent sign(v)` beside the linear viscous one.
+
+    It bends the course of the viscous friction; a friction that falls as the speed rises is Stribeck's.
+    """
+
+    cause = "viscous_nonlinear"
+    side = "motor"
+    summary = "viscous friction is not proportional to velocity"
+    physics = "the lubricant thins under shear, so viscous friction grows slower (or faster) than the speed"
+    source = "Wolf and Iskandar, ICRA 2018; Tjahjowidodo et al., Mech. Mach. Theory 2013"
+    parameters = (
+        Parameter("coefficient", "Nm (s/rad)^exponent", "friction at 1 rad/s beside the linear one"),
+        Parameter("exponent", "1", "power of the speed", shape=True, low=0.2, high=4.0),
+    )
+    depends_on = "velocity"
+    law = Law("qd")
+    confused_with = ("stribeck", "friction_temperature")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = "a staircase of constant speeds of joint {joint} up to its limit, in random order"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """Powers below and above one."""
+        return [Shape(exponent=p) for p in (0.4, 0.6, 0.8, 1.25, 1.6, 2.0, 3.0)]
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """sign(v) |v|^exponent in the motor torque."""
+        speed = motion.motor_speed[:, joint]
+        return (Column(motor=np.sign(speed) * np.abs(speed) ** shape["exponent"]),)
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether friction rises from standstill on."""
+        rises = shape["exponent"] > 1.0 or bool(coefficients[0] > 0.0)
+        return super().plausible(coefficients, shape) and rises
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """A resisting torque at the motor."""
+        coefficient, exponent = float(parameters["coefficient"]), float(parameters["exponent"])
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            speed = plant.motor_velocity[joint]
+            loads.motor_torque[joint] -= coefficient * np.sign(speed) * abs(speed) ** exponent
+
+        return Simulated(load)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """The course, and the power law."""
+        (coefficient, std, _), (exponent, spread, _) = values["coefficient"], values["exponent"]
+        slower = (coefficient > 0.0) == (exponent < 1.0)
+        power = quantity_text(exponent, spread, "1")
+        size = quantity_text(coefficient, std, "Nm")
+        return [
+            f"the drag grows {'slower' if slower else 'faster'} than the speed",
+            f"beside the linear term {size} at 1 rad/s with the power {power} of the speed",
+        ]
+
+
+class _Asymmetric(Form):
+    VISCOUS = "viscous", "viscous"
+    VISCOUS_AND_COULOMB = "viscous and Coulomb", "viscous", "coulomb"
+
+
+class FrictionAsymmetry(Effect):
+    """Friction larger one way than the other: `viscous |v| + coulomb`.
+
+    The Coulomb part is a constant torque, taken up by the drive's offset; without a reference only the viscous part
+    shows.
+    """
+
+    cause = "friction_asymmetry"
+    side = "motor"
+    summary = "friction depends on the direction"
+    physics = "gear teeth and bearings engage differently in the two directions"
+    source = "Armstrong-Helouvry, Control of Machines with Friction (1991)"
+    parameters = (
+        Parameter("viscous", "Nm s/rad", "half the difference of the viscous friction of both ways"),
+        Parameter("coulomb", "Nm", "half the difference of the Coulomb friction; 0 without a reference"),
+    )
+    forms = _Asymmetric
+    depends_on = "velocity"
+    law = Law("qd")
+    confused_with = ("friction_position", "motor_torque_gain")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = "the same constant-speed sweep of joint {joint} both ways, twice"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """The viscous part alone, and both."""
+        return [Shape(form) for form in _Asymmetric]
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """|v| in the motor torque, and a constant."""
+        viscous = Column(motor=np.abs(motion.motor_speed[:, joint]))
+        if shape.form is _Asymmetric.VISCOUS:
+            return (viscous,)
+        # Of the Coulomb part, as much as has built up since the last reversal.
+        return viscous, Column(motor=motion.direction[:, joint] * np.sign(motion.motor_speed[:, joint]))
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """A torque at the motor."""
+        viscous, coulomb = self.coefficients_of(parameters)
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            loads.offm[joint] += coulomb
+            loads.motor_torque[joint] -= viscous * abs(plant.motor_velocity[joint])
+
+        return Simulated(load)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Both parts, as far as they are seen."""
+        parts = [f"viscous {quantity(values['viscous'])}"]
+        if form is _Asymmetric.VISCOUS_AND_COULOMB:
+            parts.append(f"Coulomb {quantity(values['coulomb'])}")
+        return [", ".join(parts) + " of half difference"]
+
+
+class FrictionLoad(Effect):
+    """Friction `factor |tau_l| sign(v)`."""
+
+    cause = "friction_load"
+    side = "motor"
+    summary = "friction grows with the transmitted torque"
+    physics = (
+        "the load presses the gear teeth together, so Coulomb friction grows with the transmitted torque"
+    )
+    source = (
+        "Hamon, Gautier and Garrec, IROS 2010; Bittencourt and Gunnarsson, J. Dyn. Syst. Meas. Control 2012"
+    )
+    parameters = (
+        Parameter("factor", "1", "Coulomb friction per transmitted torque", low=0.0, high=1.0, share=True),
+    )
+    depends_on = "load"
+    law = Law("load", signed=True)
+    confused_with = ("friction_position", "motor_torque_gain", "stribeck")
+    experiment = Experiment.SLOW_SWEEP
+    every_payload = True
+    tell_apart = "a slow back and forth of joint {joint} with gravity for and against, with two payloads"
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """|tau_l| sign(v) in the motor torque."""
+        return (Column(motor=np.abs(motion.joint_torque[:, joint]) * motion.direction[:, joint]),)
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Raises the Coulomb friction of the drive."""
+        factor = float(parameters["factor"])
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            loads.Fcm[joint] += factor * abs(plant.joint_torque[joint])
+
+        return Simulated(load)
+
+
+class FrictionTemperature(Drifting):
+    """Drive friction times `1 + change w`, with w from 0 to 1 as the drive warms up.
+
+    Within a session w starts anew in each: as 1 - exp(-t / time_constant), or heated by the power of the friction
+    itself, `time_constant w' = P / P1 - w` with P1 the power at 1 rad/s. Between sessions w is 1 from the session
+    `since` on, beside a `level` of all sessions; against a reference it is 1 in all.
+    """
+
+    cause = "friction_temperature"
+    side = "motor"
+    summary = "friction drifts as the joint warms up"
+    physics = "the lubricant thins as it warms up, so friction drifts with the time in use"
+    source = "Bittencourt, Wernholt, Sander-Tavallaey and Brogardh, IROS 2010; Simoni et al., Robotica 2017"
+    parameters = (
+        Parameter(
+            "change", "1", "relative change of the friction, cold to warm", low=-0.9, high=2.0, share=True
+        ),
+        Parameter(
+            "level",
+            "1",
+            "relative change in all sessions, against the reference",
+            low=-0.9,
+            high=2.0,
+            share=True,
+        ),
+        *TIME_CONSTANT,
+    )
+    courses = (Course.WITHIN, Course.HEATED)
+    law = Law("time", signed=True)
+    confused_with = ("viscous_nonlinear", "motor_torque_gain")
+    experiment = Experiment.HOT_AND_COLD
+    tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """The model's friction times w in the motor torque."""
+        friction = motion.drive_friction[:, joint]
+        return tuple(Column(motor=friction * factor) for factor in self.course(motion, joint, shape))
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Scales the friction of the drive."""
+        warmth = 0.0
+        heated = self.form_of(form) is Course.HEATED
+        change, level = self.coefficients_of(parameters)
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            nonlocal warmth
+            factor = 1.0 + self.drift(parameters, form, time_s)
+            if heated:
+                coulomb, viscous = loads.Fcm[joint], loads.Fvm[joint]
+                speed = abs(float(plant.motor_velocity[joint]))
+                power = (coulomb + viscous * speed) * speed / max(coulomb + viscous, 1e-9)
+                warmth += (power - warmth) * plant.cycle_s / parameters["time_constant"]
+                factor = 1.0 + change * warmth + level
+            loads.Fcm[joint] *= factor
+            loads.Fvm[joint] *= factor
+
+        return Simulated(load)
+
+
+class _Place(Form):
+    WAVE = "wave", "cosine", "sine", "cycles_per_turn"
+    SPOT = "spot", "cosine", "centre", "half_width"
+
+
+# Half widths of spots to begin with [rad], and how far apart they are tried, over their half width.
+_HALF_WIDTHS, _APART = (0.4, 0.9), 0.5
+
+
+class FrictionPosition(Effect):
+    """Coulomb friction varies with the joint angle: as a wave, `cosine cos(k q) + sine sin(k q)`, or in a spot, by
+    `cosine (1 + cos(pi (q - centre) / half_width)) / 2` within `half_width` of `centre`.
+    """
+
+    cause = "friction_position"
+    side = "motor"
+    summary = "friction depends on the joint angle"
+    physics = "a gear or bearing that runs out of true, or is worn in a spot, grips more at some angles of the joint"
+    source = "Armstrong-Helouvry, Control of Machines with Friction (1991), chapter 4"
+    parameters = (
+        Parameter("cosine", "Nm", "Coulomb friction with cos(k q), or at the centre of a spot"),
+        Parameter("sine", "Nm", "Coulomb friction with sin(k q)"),
+        Parameter("cycles_per_turn", "1", "k, of a wave", shape=True),
+        Parameter("centre", "rad", "of a spot", shape=True),
+        Parameter("half_width", "rad", "of a spot", shape=True, low=0.1, high=1.5),
+    )
+    forms = _Place
+    depends_on = "position"
+    law = Law("q", signed=True)
+    confused_with = ("friction_load", "friction_asymmetry", "cable_spring")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = (
+        "a slow sweep of joint {joint} over its whole range, both ways, in two postures of the others"
+    )
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """One to four cycles a turn, and spots all over the range."""
+        low, high = (float(limit) for limit in setting.position_range[joint])
+        spots = [
+            Shape(_Place.SPOT, centre=float(centre), half_width=width)
+            for width in _HALF_WIDTHS
+            if width < high - low
+            for centre in np.linspace(low, high, 1 + int(np.ceil((high - low) / (_APART * width))))
+        ]
+        return [*(Shape(_Place.WAVE, cycles_per_turn=k) for k in (1, 2, 3, 4)), *spots]
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """Place and size of a spot; cycles are whole numbers."""
+        return ("centre", "half_width") if shape.form is _Place.SPOT else ()
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """sign(v) cos(k q) and sign(v) sin(k q), or sign(v) in the spot, in the motor torque."""
+        sign = motion.direction[:, joint]
+        return tuple(Column(motor=sign * curve) for curve in _curves(motion.q[:, joint], shape))
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Changes the Coulomb friction of the drive."""
+        coefficients, shape = self.coefficients_of(parameters), self.shape_of(parameters, form)
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            curves = _curves(plant.motor_position[joint], shape)
+            change = sum(c * x for c, x in zip(coefficients, curves, strict=False))
+            loads.Fcm[joint] = max(0.0, loads.Fcm[joint] + change)
+
+        return Simulated(load)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Amplitude and cycles, or size and place."""
+        if form is _Place.WAVE:
+            return [f"{wave(values)}, {times(values['cycles_per_turn'][0])} a turn of the joint"]
+        size, std, unit = values["cosine"]
+        more = f"{quantity_text(abs(size), std, unit)} {'more' if size > 0.0 else 'less'}"
+        width, centre = quantity(values["half_width"]), quantity(values["centre"])
+        return [f"{more} in the middle of a spot, {width} to either side of {centre}"]
+
+
+def _curves(angle: Any, shape: Shape) -> tuple[Any, ...]:
+    """What the coefficients of a shape multiply, at `angle` [rad]."""
+    if shape.form is _Place.SPOT:
+        away = np.clip((angle - shape["centre"]) / shape["half_width"], -1.0, 1.0)
+        return (0.5 * (1.0 + np.cos(np.pi * away)),)
+    cycles = shape["cycles_per_turn"]
+    return np.cos(cycles * angle), np.sin(cycles * angle)
+
+
+# Ripple of the motor torque over that of the sensor's reading up to which the controller may have made it.
+_ANSWER = 0.4
+
+
+class GearRipple(Effect):
+    """Motor torque `cosine cos(k N q) + sine sin(k N q)`, N the gear ratio."""
+
+    cause = "gear_ripple"
+    side = "motor"
+    summary = "torque periodic in the motor angle"
+    physics = "the elliptic wave generator and the teeth give a torque with one or two cycles a motor turn"
+    source = "Taghirad and Belanger, J. Dyn. Syst. Meas. Control 120 (1998)"
+    parameters = (
+        Parameter("cosine", "Nm", "torque with cos(k N q)"),
+        Parameter("sine", "Nm", "torque with sin(k N q)"),
+        Parameter("cycles_per_turn", "1/turn of the motor", "k", shape=True),
+        Parameter("gear_ratio", "1", "N", shape=True),
+    )
+    depends_on = "motor angle"
+    law = Law("q")
+    confused_with = ("sensor_ripple", "friction_position")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = "the same path of joint {joint} at two constant speeds below 0.1 rad/s and with two payloads"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """Once and twice a turn of the motor."""
+        ratio = float(setting.gear_ratio[joint])
+        return [Shape(cycles_per_turn=k, gear_ratio=ratio) for k in (1.0, 2.0)] if ratio > 1.0 else []
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """Cycles are whole numbers."""
+        return ()
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Cosine and sine in the motor torque."""
+        angle = shape["cycles_per_turn"] * shape["gear_ratio"] * motion.q[:, joint]
+        return Column(motor=np.cos(angle)), Column(motor=np.sin(angle))
+
+    def follows_from(self, shape: Shape, coefficients: Floats, other: Effect, at: Shape, of: Floats) -> bool:
+        """Whether it answers to a larger ripple of the joint torque sensor: the controller acts on that reading."""
+        if other.cause != "sensor_ripple":
+            return False
+        same = (shape["cycles_per_turn"], shape["gear_ratio"]) == (at["cycles_per_turn"], at["ratio"])
+        return same and float(np.linalg.norm(coefficients)) < _ANSWER * float(np.linalg.norm(of))
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """A torque at the motor."""
+        cosine, sine = self.coefficients_of(parameters)
+        cycles = float(parameters["cycles_per_turn"]) * float(parameters["gear_ratio"])
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            angle = cycles * plant.motor_position[joint]
+            loads.motor_torque[joint] -= cosine * np.cos(angle) + sine * np.sin(angle)
+
+        return Simulated(load)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Amplitude and cycles."""
+        return [f"{wave(values)}, {times(values['cycles_per_turn'][0])} a turn of the motor"]
+
+
+class MotorTorqueGain(Effect):
+    """The motor torque is reported `1 + error` times too large.
+
+    Friction and drive inertia take up their share of the error; what shows is the load of the joint.
+    """
+
+    cause = "motor_torque_gain"
+    side = "motor"
+    summary = "wrong torque constant"
+    physics = "the constant between current and torque is wrong"
+    source = "Gautier and Briot, ICRA 2011; Jubien, Gautier and Janot, IFAC 2014"
+    parameters = (Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),)
+    depends_on = "load"
+    law = Law("load")
+    confused_with = ("friction_load", "sensor_gain", "friction_temperature")
+    experiment = Experiment.STATIC_POSES
+    every_payload = True
+    tell_apart = "static poses of joint {joint} with a weighed mass and without it"
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """The predicted motor torque."""
+        return (Column(motor=motion.motor_torque[:, joint]),)
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Scales the reported motor torque."""
+        error = float(parameters["error"])
+
+        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
+            reading.motor_torque[joint] *= 1.0 + error
+
+        return Simulated(sense_motor=sense)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Too much or too little."""
+        return gain_sentence(values)
+
+
+def gain_sentence(values: Values) -> list[str]:
+    """Phrase of a wrong scale."""
+    error, std, _ = values["error"]
+    much = "much" if error > 0.0 else "little"
+    return [f"reads {quantity_text(100.0 * abs(error), 100.0 * std, '1')} % too {much}"]

@@ -1,0 +1,524 @@
+"""Causes on the link side, seen in both torques: elastic joints, hoses, the base, the encoders' reading."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ident.effects.effect import (
+    Column,
+    Effect,
+    Experiment,
+    Form,
+    Law,
+    Loads,
+    Parameter,
+    Parameters,
+    Plant,
+    Reading,
+    Setting,
+    Shape,
+    Simulated,
+    both_sides,
+)
+from ident.effects.motion import Floats, Motion, dahl
+from ident.effects.springs import Springs
+from ident.effects.words import Values, quantity, quantity_text, times, wave
+from ident.signals.filters import differentiate, low_pass
+
+__all__ = ["Backlash", "BaseTilt", "CableSpring", "EncoderEccentricity", "JointElasticity", "JointZeroOffset"]
+
+# Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
+_LINK_HZ, _MOTOR_HZ = 8.0, 30.0
+
+
+class _Encoder(Form):
+    """Where the published positions come from: the other end of the joint is elsewhere."""
+
+    MOTOR = "encoder at the motor", "compliance", "gap", "width", "size"
+    LINK = "encoder at the link", "compliance", "gap", "width"
+
+
+class _Twisting(Effect):
+    """A joint whose link and motor stand at different angles."""
+
+    side = "joint"
+    forms = _Encoder
+    depends_on = "load"
+    displaces = True
+    evidence_factor = 2.0
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """The size."""
+        return ("size",) if "size" in shape else ()
+
+    def twist(self, torque: Any, parameters: Parameters) -> Any:
+        """Angle of the motor minus angle of the link [rad] under a joint torque [Nm]."""
+        raise NotImplementedError
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Displaces the published position; with the link's encoder, the motor drags against its friction."""
+        past: list[float] = []
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            past.append(float(self.twist(plant.joint_torque[joint], parameters)))
+            if len(past) > 3:
+                past.pop(0)
+            if len(past) == 3:
+                loads.motor_torque[joint] -= loads.Fvm[joint] * (past[2] - past[0]) / 2e-3
+
+        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
+            reading.position[joint] += self.twist(plant.joint_torque[joint], parameters)
+
+        return Simulated(sense=sense) if self.form_of(form) is _Encoder.MOTOR else Simulated(load)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Size, and where the encoder sits."""
+        first = self.linear[0].name
+        width = [f"crossed within {quantity(values['width'])}"] if "width" in values else []
+        place = "the motors" if form is _Encoder.MOTOR else "the links"
+        return [f"{first} {quantity(values[first])}", *width, f"the encoders sit at {place}"]
+
+
+def _places(setting: Setting) -> tuple[_Encoder, ...]:
+    """Places of the encoder to try."""
+    known = {"motor": (_Encoder.MOTOR,), "link": (_Encoder.LINK,)}
+    return tuple(_Encoder) if setting.encoder is None else known[setting.encoder]
+
+
+# Compliances to begin with, over the joint's own: less is no other joint. And one [rad/Nm] for a derivative.
+_SHARES = (0.3, 0.45, 0.65, 1.0, 1.6)
+_SMALL = 1e-6
+
+
+class JointElasticity(_Twisting):
+    """The joint twists by `compliance tau_l` beyond the model's twist."""
+
+    cause = "joint_elasticity"
+    summary = "the link is not where the motor encoder says"
+    physics = (
+        "the gear's flexspline and the torque sensor twist under load: the link is not where the motor is"
+    )
+    source = "Spong, J. Dyn. Syst. Meas. Control 109 (1987); Janot, Gautier, Jubien and Vandanjon, 2014"
+    parameters = (
+        Parameter("compliance", "rad/Nm", "twist per torque beyond the model's", low=0.0, high=0.02),
+        Parameter(
+            "size",
+            "rad/Nm",
+            "compliance of the ringing links",
+            shape=True,
+            low=1e-7,
+            high=0.02,
+            optional=True,
+        ),
+    )
+    confused_with = ("backlash", "joint_zero_offset", "joint_torque_delay")
+    experiment = Experiment.CHIRP
+    tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """Places of the encoder; sizes where the links ring on springs of known stiffness."""
+        found = []
+        for place in _places(setting):
+            if place is _Encoder.MOTOR and setting.compliance is not None:
+                own = float(setting.compliance[joint])
+                found += [Shape(place, size=share * own) for share in _SHARES]
+            else:
+                found.append(Shape(place))
+        return found
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether the compliance is about the size of the ringing."""
+        more, size = float(coefficients[0]), shape.get("size")
+        return super().plausible(coefficients, shape) and (size is None or 0.6 * size < more < 1.7 * size)
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
+        if motion.springs is not None and shape.form is _Encoder.MOTOR:
+            size = shape.get("size", _SMALL)
+            return _changed_springs(motion.springs, motion.springs.softer(joint, size), size)
+        return _deflected(motion, joint, motion.joint_torque[:, joint], shape.form is _Encoder.MOTOR, 1e-5)
+
+    def twist(self, torque: Any, parameters: Parameters) -> Any:
+        """In proportion to the torque."""
+        return parameters["compliance"] * torque
+
+    def at_encoder(self, encoder: str) -> Shape:
+        """The shape with the encoder at the `motor` or at the `link`."""
+        return Shape(_Encoder.MOTOR if encoder == "motor" else _Encoder.LINK)
+
+
+# Gaps to begin with [rad].
+_GAPS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+
+
+class Backlash(_Twisting):
+    """The link lags the motor by half the `gap`, to the side of the joint torque.
+
+    With published motors the link crosses the gap almost free, arrives, and rings on its spring: how, depends on the
+    `size` of the gap.
+    """
+
+    cause = "backlash"
+    summary = "lost motion when the torque reverses"
+    physics = "gear teeth lose contact and cross a gap where the transmitted torque changes its sign"
+    source = "Nordin and Gutman, Automatica 38 (2002)"
+    parameters = (
+        Parameter("gap", "rad", "lost motion", low=0.0, high=0.1),
+        Parameter("width", "Nm", "torque over which the gap is crossed", shape=True),
+        Parameter("size", "rad", "gap of the ringing links", shape=True, low=1e-5, high=0.1, optional=True),
+    )
+    confused_with = ("joint_elasticity", "joint_zero_offset", "presliding_hysteresis")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """Places of the encoder, sharp and soft crossing; none where the torque keeps its sign."""
+        if not setting.torque_turns[joint]:
+            return []
+        top = float(setting.torque_range[joint])
+        found = []
+        for place in _places(setting):
+            if place is _Encoder.MOTOR and setting.compliance is not None:
+                found += [Shape(place, width=0.01 * top, size=size) for size in _GAPS]
+            else:
+                found += [Shape(place, width=max(1e-3, w * top)) for w in (0.01, 0.05)]
+        return found
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether the gap is about the size of the crossing."""
+        gap, size = float(coefficients[0]), shape.get("size")
+        return super().plausible(coefficients, shape) and (size is None or 0.5 * size < gap < 2.0 * size)
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
+        size = shape.get("size", 0.0)
+        if motion.springs is not None and size > 0.0 and shape.form is _Encoder.MOTOR:
+            return _changed_springs(motion.springs, motion.springs.with_play(joint, size), size)
+        half = 0.5 * np.tanh(motion.joint_torque[:, joint] / shape["width"])
+        return _deflected(motion, joint, half, shape.form is _Encoder.MOTOR, 1e-3)
+
+    def twist(self, torque: Any, parameters: Parameters) -> Any:
+        """Half the gap to the side of the torque."""
+        return 0.5 * parameters["gap"] * np.tanh(torque / parameters["width"])
+
+
+def _deflected(
+    motion: Motion, joint: int, twist: Floats, encoder_at_motor: bool, scale: float
+) -> tuple[Column, ...]:
+    """Column for a twist (N,) of the joint, motor minus link, by a unit coefficient [rad].
+
+    With the encoder at the motor the link stands at q - twist, and all torques change. With the encoder at the link
+    the motor moves by the twist beside it: drive inertia and drive friction see its derivatives. scale : coefficient
+    of the linearisation. The links are taken to follow at once.
+    """
+    dt = motion.dt
+    # The torque's own acceleration part is noisy, and two more derivatives amplify it: with the link's inertia
+    # behind them more than with the drive's friction.
+    cutoff = min(_LINK_HZ if encoder_at_motor else _MOTOR_HZ, 0.2 / dt)
+    twist = low_pass(twist[:, None], dt, cutoff)
+    first, second = differentiate(twist, dt)
+    if encoder_at_motor:
+        shifts = (_alone(motion, joint, -scale * part[:, 0]) for part in (twist, first, second))
+        return (both_sides(motion.displaced(*shifts) / scale),)
+    first, second = first[:, 0], second[:, 0]
+    # The jump of Coulomb friction moves by a millisecond or so; a column of spikes would say nothing else.
+    here, there = motion.motor_speed, motion.motor_speed.copy()
+    there[:, joint] += scale * first
+    friction = (motion.friction(there) - motion.friction(here))[:, joint]
+    friction -= motion.motor_coulomb[joint] * (np.sign(there) - np.sign(here))[:, joint]
+    friction /= scale
+    return (Column(motor=motion.inertia[joint] * second + friction),)
+
+
+def _alone(motion: Motion, joint: int, values: Floats) -> Floats:
+    """Values (N,) of a joint as (N, n), zero for the others."""
+    shift = np.zeros_like(motion.q)
+    shift[:, joint] = values
+    return shift
+
+
+def _changed_springs(springs: Springs, changed: Springs, size: float) -> tuple[Column, ...]:
+    """Column of a change of the springs behind the published motors, over its `size`.
+
+    The links follow as the springs let them, and ring; that is not proportional to the size, so the column belongs
+    to one size, and its coefficient is that size where it suits the data.
+    """
+    return (both_sides((changed.torque - springs.torque) / size),)
+
+
+class _Spring(Form):
+    LINEAR = "linear", "stiffness"
+    CUBIC = "cubic", "stiffness"
+    HARDENING = "hardening", "stiffness", "quadratic", "cubic"
+    TAUT_ABOVE = "taut above", "stiffness", "slack"
+    TAUT_BELOW = "taut below", "stiffness", "slack"
+    PLAY = "play", "stiffness", "slack", "play"
+
+
+# Distance in which the friction of a hose along the arm turns over [rad].
+_RUB_RAD = 0.1
+
+
+class CableSpring(Effect):
+    """Hoses and cables pull with `stiffness f(q)`.
+
+    f is q; q^3 (cubic); the angle above or below `slack` (taut above, taut below); the angle beyond `play` on either
+    side of `slack` (play). One that hardens pulls with `stiffness q + quadratic q^2 + cubic q^3`, which is
+    `k (q - c) + h (q - c)^3` about its angle of rest c.
+    """
+
+    cause = "cable_spring"
+    side = "joint"
+    summary = "a torque that depends on the joint angle (hoses, cables)"
+    physics = "hoses and cables along the arm are bent or stretched, and pull the link back"
+    source = "Swevers, Verdonck and De Schutter, IEEE Control Systems Magazine 27 (2007)"
+    parameters = (
+        Parameter("stiffness", "Nm/rad", "of the spring (Nm/rad^3 for a cubic one)"),
+        Parameter("quadratic", "Nm/rad^2", "of one that hardens: the angle it rests at is not zero"),
+        Parameter("cubic", "Nm/rad^3", "of one that hardens"),
+        Parameter(
+            "slack", "rad", "angle where the cable becomes taut, or the middle of its play", shape=True
+        ),
+        Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
+    )
+    forms = _Spring
+    depends_on = "position"
+    law = Law("q")
+    confused_with = ("joint_zero_offset", "payload_error", "sensor_ripple", "encoder_eccentricity")
+    experiment = Experiment.SLOW_SWEEP
+    tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """Linear, cubic, hardening and one-sided springs, and springs with play."""
+        low, high = setting.position_range[joint]
+        angles = [float(low + share * (high - low)) for share in (0.3, 0.5, 0.7)]
+        return [
+            *(Shape(form) for form in (_Spring.LINEAR, _Spring.CUBIC, _Spring.HARDENING)),
+            *(
+                Shape(form, slack=angle)
+                for form in (_Spring.TAUT_ABOVE, _Spring.TAUT_BELOW)
+                for angle in angles
+            ),
+            *(
+                Shape(_Spring.PLAY, slack=angle, play=share * (high - low))
+                for angle in angles
+                for share in (0.1, 0.25)
+            ),
+        ]
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether it pulls back; one that hardens over a radian to both sides at least in the mean."""
+        if shape.form is _Spring.HARDENING:
+            return bool(coefficients[0] + coefficients[2] >= 0.0)
+        return bool(coefficients[0] >= 0.0)
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """The same torque on both sides."""
+        return tuple(both_sides(pull) for pull in _pulls(motion.q[:, joint], shape))
+
+    def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
+        """A hose rubs along the arm: Dahl's friction along the angle."""
+        return (both_sides(dahl(np.ascontiguousarray(motion.q[:, joint]), _RUB_RAD, 0.0)),)
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """A torque on the link."""
+        coefficients, shape = self.coefficients_of(parameters), self.shape_of(parameters, form)
+
+        def load(time_s: float, plant: Plant, loads: Loads) -> None:
+            pulls = _pulls(plant.position[joint], shape)
+            loads.link_torque[joint] -= sum(c * pull for c, pull in zip(coefficients, pulls, strict=False))
+
+        return Simulated(load)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Stiffness, and the course of the pull."""
+        stiffness = quantity(values["stiffness"])
+        if form is _Spring.CUBIC:
+            return [f"grows with the cube of the angle, {quantity_text(*values['stiffness'][:2], 'Nm/rad³')}"]
+        if form is _Spring.HARDENING:
+            bent = ", ".join(
+                f"{name} {quantity(values[name])}" for name in ("quadratic", "cubic") if name in values
+            )
+            return [f"{stiffness}, hardening: {bent}"]
+        if form is _Spring.PLAY:
+            return [
+                f"{stiffness}, with no pull within {quantity(values['play'])} of {quantity(values['slack'])}"
+            ]
+        if form is _Spring.LINEAR:
+            return [stiffness]
+        where = "above" if form is _Spring.TAUT_ABOVE else "below"
+        return [f"{stiffness}, taut {where} {quantity(values['slack'])} and slack elsewhere"]
+
+
+def _pulls(angle: Any, shape: Shape) -> tuple[Any, ...]:
+    """Torque of unit coefficients at `angle` [rad]."""
+    if shape.form is _Spring.LINEAR:
+        return (1.0 * angle,)
+    if shape.form is _Spring.CUBIC:
+        return (angle**3,)
+    if shape.form is _Spring.HARDENING:
+        return angle, angle**2, angle**3
+    away = angle - shape["slack"]
+    if shape.form is _Spring.PLAY:
+        return (away - np.clip(away, -shape["play"], shape["play"]),)
+    return (np.maximum(away, 0.0) if shape.form is _Spring.TAUT_ABOVE else np.minimum(away, 0.0),)
+
+
+class BaseTilt(Effect):
+    """Gravity is turned by `tilt_x` about x and `tilt_y` about y of the base frame (small angles)."""
+
+    cause = "base_tilt"
+    side = "joint"
+    summary = "gravity is not along the assumed axis"
+    physics = "the base is not level, so gravity is not along the assumed axis"
+    source = "Khalil and Dombre, Modeling, Identification and Control of Robots (2002), chapter 12"
+    parameters = (
+        Parameter("tilt_x", "rad", "rotation of the base about its x axis", low=-0.5, high=0.5),
+        Parameter("tilt_y", "rad", "rotation of the base about its y axis", low=-0.5, high=0.5),
+    )
+    depends_on = "position"
+    whole_arm = True
+    confused_with = ("joint_zero_offset", "payload_error")
+    experiment = Experiment.STATIC_POSES
+    tell_apart = "static poses over a whole turn of joint 1 with the arm stretched out; a spirit level"
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Gravity torques of the sideways parts of gravity, in all rows."""
+        down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
+        # The base turned by +angle sees gravity turned by -angle.
+        return tuple(both_sides(motion.gravity_along(-np.cross(axis, down))) for axis in np.eye(3)[:2])
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Gravity of the simulated arm turned."""
+        return _Tilt(np.append(self.coefficients_of(parameters), 0.0))
+
+
+class _Tilt(Simulated):
+    def __init__(self, tilt: Floats) -> None:
+        super().__init__()
+        self.tilt = tilt
+        self.turned: Any = None
+
+    def start(self, joints: int, random: np.random.Generator) -> None:
+        self.turned = None
+
+    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
+        gravity = np.array(plant.model.gravity.linear)
+        if self.turned is None:
+            self.turned = gravity - np.cross(self.tilt, gravity)
+        if not np.array_equal(gravity, self.turned):
+            # The links may be another arm's as well, and a payload that is mounted brings new ones.
+            model = plant.model.copy()
+            model.gravity.linear = self.turned
+            plant.model = model
+
+
+class JointZeroOffset(Effect):
+    """The joint stands at q + `offset` when q is published."""
+
+    cause = "joint_zero_offset"
+    side = "joint"
+    summary = "the zero of the encoder is off"
+    physics = "the encoder's zero is off, so the arm stands elsewhere than the positions say"
+    source = "Khalil and Dombre, Modeling, Identification and Control of Robots (2002), chapter 11"
+    parameters = (Parameter("offset", "rad", "true minus published position", low=-0.3, high=0.3),)
+    depends_on = "position"
+    confused_with = ("base_tilt", "payload_error", "cable_spring", "encoder_eccentricity", "backlash")
+    mean_of = ("joint_elasticity",)
+    experiment = Experiment.STATIC_POSES
+    tell_apart = (
+        "static poses with joint {joint} on both sides of its gravity-free position; a mastering gauge"
+    )
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Derivative of the joint torque by the joint's position, in all rows."""
+        step = np.zeros_like(motion.q)
+        step[:, joint] = 1e-4
+        upper = motion.rigid_torque(motion.q + step, motion.qd, motion.qdd)
+        lower = motion.rigid_torque(motion.q - step, motion.qd, motion.qdd)
+        return (both_sides((upper - lower) / 2e-4),)
+
+    def same_as(self, setting: Setting, joint: int) -> str | None:
+        """Backlash behind the motor's encoder: a gap under a torque of one sign holds the link to one side."""
+        return "backlash" if setting.encoder == "motor" and not setting.torque_turns[joint] else None
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Shifts the published positions."""
+        offset = float(parameters["offset"])
+
+        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
+            reading.position[joint] -= offset
+
+        return Simulated(sense=sense)
+
+
+# Reading error of the linearisation [rad].
+_STEP_RAD = 1e-4
+
+
+class EncoderEccentricity(Effect):
+    """The encoder reads `cosine cos(k q) + sine sin(k q)` too much, with k cycles a turn of the joint.
+
+    The arm moves by the published motion minus that error and its derivatives, so all rows see it.
+    """
+
+    cause = "encoder_eccentricity"
+    side = "joint"
+    summary = "the reading of the encoder errs with the turn of the joint"
+    physics = (
+        "the code disc runs out of true (one cycle a turn) or is oval (two), so positions err with the angle"
+    )
+    source = (
+        "Lu, Graetz, Amin-Shahidi and Smeds, CIRP Annals 59 (2010); Renishaw, The accuracy of rotary encoders"
+    )
+    parameters = (
+        Parameter("cosine", "rad", "reading error with cos(k q)", low=-0.1, high=0.1),
+        Parameter("sine", "rad", "reading error with sin(k q)", low=-0.1, high=0.1),
+        Parameter("cycles_per_turn", "1", "k", shape=True),
+    )
+    depends_on = "position"
+    law = Law("q")
+    confused_with = ("joint_zero_offset", "cable_spring", "sensor_ripple")
+    contains = ("joint_zero_offset",)
+    experiment = Experiment.STATIC_POSES
+    every_payload = True
+    tell_apart = "static poses over a whole turn of joint {joint} with two payloads; a gauge at the link"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """One and two cycles a turn."""
+        return [Shape(cycles_per_turn=k) for k in (1, 2)]
+
+    def continuous(self, shape: Shape) -> tuple[str, ...]:
+        """Cycles are whole numbers."""
+        return ()
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Change of the joint torque with the joint displaced by the error, in all rows."""
+        k = shape["cycles_per_turn"]
+        q, qd, qdd = (values[:, joint] for values in (motion.q, motion.qd, motion.qdd))
+        cos, sin = np.cos(k * q), np.sin(k * q)
+        found = []
+        # Error e(q), its slope e' and curvature e'': the rate is e' qd, the acceleration e'' qd^2 + e' qdd.
+        for error, slope, curvature in ((cos, -k * sin, -(k**2) * cos), (sin, k * cos, -(k**2) * sin)):
+            moved = (error, slope * qd, curvature * qd**2 + slope * qdd)
+            shifts = (_alone(motion, joint, -_STEP_RAD * part) for part in moved)
+            found.append(both_sides(motion.displaced(*shifts) / _STEP_RAD))
+        return tuple(found)
+
+    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+        """Shifts the published position."""
+        cosine, sine = self.coefficients_of(parameters)
+        cycles = float(parameters["cycles_per_turn"])
+
+        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
+            angle = cycles * plant.position[joint]
+            reading.position[joint] += cosine * np.cos(angle) + sine * np.sin(angle)
+
+        return Simulated(sense=sense)
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Amplitude and cycles."""
+        return [f"{wave(values)}, {times(values['cycles_per_turn'][0])} a turn of the joint"]
