@@ -13,8 +13,7 @@ from time import monotonic
 from types import TracebackType
 
 from fri.errors import NetworkError
-from fri.krc import KrcSession, Setpoint
-from fri.sample import Sample
+from fri.krc import KrcSession, Sample, Setpoint
 from fri.states import State
 
 __all__ = ["ControllerEnd"]

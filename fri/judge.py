@@ -11,10 +11,9 @@ from math import isfinite
 
 import numpy as np
 
-from fri.event import EventKind
 from fri.packets import JOINT_NAMES, JOINTS, CmdBuffer
 from fri.policy import KrcLimits, KrcPolicy
-from fri.states import ALLOWED_FLAGS, CommandFlag, Control
+from fri.states import ALLOWED_FLAGS, CommandFlag, Control, EventKind
 
 __all__ = ["CommandJudge", "Objection"]
 

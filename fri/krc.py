@@ -19,22 +19,23 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fri.event import Event, EventKind
 from fri.judge import CommandJudge, Objection
 from fri.packets import CMD, JOINT_NAMES, JOINTS, CmdBuffer, Fault, new_msr
 from fri.policy import KrcLimits, KrcPolicy
-from fri.sample import IDENTITY_POSE, Sample
 from fri.states import (
     ALL_DRIVES,
     CONTROL_BY_STRATEGY,
     TRANSITIONS,
     CommandFlag,
     Control,
+    Event,
+    EventKind,
     Quality,
     State,
     Trigger,
@@ -43,6 +44,37 @@ from fri.timing import AnswerStatistics, classify
 from fri.track import SetpointTrack
 
 __all__ = ["Event", "EventKind", "KrcLimits", "KrcPolicy", "KrcSession", "Sample", "Setpoint"]
+
+
+#: 3x4 row-major pose without rotation and translation.
+IDENTITY_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def _identity() -> np.ndarray:
+    return np.array(IDENTITY_POSE)
+
+
+def _joints() -> np.ndarray:
+    return np.zeros(JOINTS)
+
+
+@dataclass(slots=True)
+class Sample:
+    """What the arm measures, in the units of `MSR`.
+
+    The emulator writes the arrays in place, ``KrcSession.packet`` reads them.
+    """
+
+    msr_jnt_pos: np.ndarray = field(default_factory=_joints)
+    msr_cart_pos: np.ndarray = field(default_factory=_identity)
+    cmd_cart_pos: np.ndarray = field(default_factory=_identity)
+    msr_jnt_trq: np.ndarray = field(default_factory=_joints)
+    est_ext_jnt_trq: np.ndarray = field(default_factory=_joints)
+    est_ext_tcp_ft: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    jacobian: np.ndarray = field(default_factory=lambda: np.zeros((6, JOINTS)))
+    mass_matrix: np.ndarray = field(default_factory=lambda: np.zeros((JOINTS, JOINTS)))
+    gravity: np.ndarray = field(default_factory=_joints)
+    temperature: np.ndarray = field(default_factory=_joints)
 
 
 class Setpoint(NamedTuple):

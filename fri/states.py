@@ -1,7 +1,7 @@
-"""Enumerations of FRI 1.0 and its session state machine, as data.
+"""Enumerations of FRI 1.0, its session state machine as data, and the events of a session.
 
-The numbers are the protocol's. The members that exist only inside a KUKA client (state and quality "invalid")
-are left out: a packet that carries anything else than these values is malformed.
+The numbers are the protocol's, without the "invalid" members of a KUKA client: a packet with any other value
+is malformed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Enum, IntEnum, IntFlag
 from types import MappingProxyType
+from typing import NamedTuple
 
 __all__ = [
     "ALLOWED_FLAGS",
@@ -19,6 +20,8 @@ __all__ = [
     "TRANSITIONS",
     "CommandFlag",
     "Control",
+    "Event",
+    "EventKind",
     "Quality",
     "State",
     "Trigger",
@@ -119,3 +122,34 @@ STRATEGY_BY_CONTROL: Mapping[Control, int] = MappingProxyType(
 CONTROL_BY_STRATEGY: Mapping[int, Control] = MappingProxyType(
     {strategy: control for control, strategy in STRATEGY_BY_CONTROL.items()}
 )
+
+
+class EventKind(Enum):
+    """What happened to the session; those after REFUSED ended command mode."""
+
+    OPENED = "opened"
+    STARTED = "started"
+    STOPPED = "stopped"
+    CLOSED = "closed"
+    REFUSED = "start refused"
+    MISSES = "answers missing"
+    MALFORMED = "malformed datagram"
+    WRONG_FLAGS = "wrong command flags"
+    FLAGS_CHANGED = "command flags changed"
+    NOT_FINITE = "value not finite"
+    NOT_MIRRORED = "command away from the mirror"
+    POSITION = "position limit"
+    VELOCITY = "velocity limit"
+    ACCELERATION = "acceleration limit"
+    QUALITY = "quality"
+    DRIVES_OFF = "drives off"
+    DRIVE_ERROR = "drive error"
+    EXTERNAL = "external"
+
+
+class Event(NamedTuple):
+    """Something that happened to the session: in which cycle, what, and a sentence about it."""
+
+    cycle: int
+    kind: EventKind
+    text: str

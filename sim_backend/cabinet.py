@@ -20,14 +20,12 @@ from fri.krl import Interpreter, KrlProgram
 from fri.packets import CMD_OFFSETS, CMD_SIZE
 from fri.states import ALL_DRIVES, State
 from lwr_driver.arm import Arm
-from sim_backend.configuration import EmulatorConfig, LoadData, Plugin
+from sim_backend.configuration import OWN_PROGRAM, EmulatorConfig, LoadData, Plugin, krl_program
 from sim_backend.controller import ControllerModel, PositionController
-from sim_backend.krl_program import OWN_PROGRAM, krl_program
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
-from sim_backend.recording import ControllerTrace, KrlReals
 from sim_backend.rigid_body import chain
-from sim_backend.sensors import Sensors
+from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 from sim_backend.truth import robot_file, robot_model, true_arm
 
 __all__ = ["Cabinet"]

@@ -14,10 +14,13 @@ from typing import Any, Literal
 import yaml
 
 from fri.errors import ConfigurationError
-from fri.krc import KrcPolicy
+from fri.handshake import HANDSHAKES
+from fri.krl import KrlProgram, Machinery
+from fri.policy import KrcPolicy
 from lwr_driver.configuration import find, parse, read_mapping
 
 __all__ = [
+    "OWN_PROGRAM",
     "ControllerConfig",
     "EmulatorConfig",
     "FriConfig",
@@ -26,8 +29,12 @@ __all__ = [
     "RobotConfig",
     "SensorConfig",
     "TraceConfig",
+    "krl_program",
     "load_configuration",
 ]
+
+OWN_PROGRAM = "lwr_identification"
+"""The KRL program of this project."""
 
 JOINTS = 7
 Joints = tuple[float, float, float, float, float, float, float]
@@ -230,8 +237,7 @@ class TraceConfig:
 class FriConfig:
     """The link: `friSetup` and `friOpen`, the KRL program, and the limits the controller enforces.
 
-    program : KRL program by its name in `fri.krl.PROGRAMS`, or `lwr_identification`: the text of
-    configs/krl/lwr_identification.src itself. autostart : it runs from the beginning
+    program : KRL program by its name in configs/krl. autostart : it runs from the beginning
     velocity [rad/s], acceleration [rad/s^2] : limits beyond which the controller drops the session
     answer_delay_s : age of an undisturbed answer in lock step
     patience_s : in lock step and command mode, wall time after which an answer counts as missing
@@ -294,6 +300,21 @@ class EmulatorConfig:
 def _check_period(period_ms: int) -> None:
     if not 1 <= period_ms <= 100:
         raise ConfigurationError(f"period_ms {period_ms} is outside 1 to 100")
+
+
+def krl_program(
+    name: str, period_ms: int, machinery: Machinery | None = None, **settings: float
+) -> KrlProgram:
+    """Program `name` of configs/krl, ready to start with an FRI cycle of `period_ms`.
+
+    machinery : motor currents and load data, None leaves both at zero; settings : values for its data list
+    """
+    if name not in HANDSHAKES:
+        raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(HANDSHAKES)}")
+    text = find(f"krl/{name}.src")
+    data = text.with_suffix(".dat").read_text(encoding="utf-8")
+    values = {"LWR_CYCLE": period_ms, **settings}
+    return KrlProgram(text.read_text(encoding="utf-8"), data, values, machinery, name)
 
 
 def load_configuration(

@@ -17,8 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fri.errors import ConfigurationError, LwrError, RobotError
-from fri.event import EventKind
-from fri.states import Quality, State
+from fri.states import EventKind, Quality, State
 from lwr_driver.configuration import parse
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import LoadData
