@@ -14,35 +14,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from fri import krl_source as tree
 from fri.errors import ConfigurationError
 from fri.krc import KrcSession
-from fri.krl_source import (
-    Assign,
-    Binary,
-    Branch,
-    Call,
-    Constant,
-    Expression,
-    For,
-    Leave,
-    Loop,
-    Move,
-    Name,
-    Source,
-    Statement,
-    Switch,
-    Unary,
-    WaitFor,
-    WaitSeconds,
-    parse_source,
-)
 from fri.states import State
 
 __all__ = ["AXES", "LOAD", "Interpreter", "KrlProgram", "Machinery", "NoMachinery"]
 
 #: Period of the KRL interpreter [ms].
 TICK_MS = 12
-#: Where the axes of KRL (A1 to A6, then E1) stand in the kinematic order A1 A2 E1 A3 A4 A5 A6.
+#: Indices of the axes of KRL (A1 to A6, then E1) in the kinematic order A1 A2 E1 A3 A4 A5 A6.
 AXES = (0, 1, 3, 4, 5, 6, 2)
 #: Load data in the order of ``Machinery.load``: mass [kg], centre of mass [mm], inertia about it [kg m2].
 LOAD = (".M", ".CM.X", ".CM.Y", ".CM.Z", ".J.X", ".J.Y", ".J.Z")
@@ -127,7 +108,7 @@ class KrlProgram:
     ) -> None:
         self.name = name
         self.finished = False
-        self.source = parse_source(text, data, name)
+        self.source = tree.parse_source(text, data, name)
         self.machinery: Any = machinery if machinery is not None else NoMachinery()
         self._session: KrcSession | None = None
         self._strategy = 10
@@ -159,14 +140,14 @@ class KrlProgram:
         yield from self._block(self.source.subprograms[name])
         return ""
 
-    def _block(self, statements: tuple[Statement, ...]) -> Flow:
+    def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
         """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
         for statement in statements:
-            if isinstance(statement, Assign):
+            if isinstance(statement, tree.Assign):
                 self._write(statement.target, self._value(statement.value))
-            elif isinstance(statement, Call):
+            elif isinstance(statement, tree.Call):
                 yield from self._call(statement)
-            elif isinstance(statement, Leave):
+            elif isinstance(statement, tree.Leave):
                 return statement.what
             else:
                 left = yield from self._compound(statement)
@@ -174,38 +155,38 @@ class KrlProgram:
                     return left
         return ""
 
-    def _compound(self, statement: Statement) -> Flow:
-        if isinstance(statement, Branch):
+    def _compound(self, statement: tree.Statement) -> Flow:
+        if isinstance(statement, tree.Branch):
             chosen = statement.then if self._value(statement.condition) else statement.otherwise
             return (yield from self._block(chosen))
-        if isinstance(statement, Switch):
+        if isinstance(statement, tree.Switch):
             return (yield from self._block(self._case(statement)))
-        if isinstance(statement, Loop):
+        if isinstance(statement, tree.Loop):
             return (yield from self._loop(statement))
-        if isinstance(statement, For):
+        if isinstance(statement, tree.For):
             for value in range(int(self._value(statement.first)), int(self._value(statement.last)) + 1):
                 self._write(statement.variable, value)
                 left = yield from self._block(statement.body)
                 if left:
                     return "" if left == "EXIT" else left
-        elif isinstance(statement, WaitFor):
+        elif isinstance(statement, tree.WaitFor):
             while not self._value(statement.condition):
                 yield
-        elif isinstance(statement, WaitSeconds):
+        elif isinstance(statement, tree.WaitSeconds):
             for _ in range(math.ceil(round(1000 * float(self._value(statement.seconds)) / TICK_MS, 9))):
                 yield
-        elif isinstance(statement, Move):
+        elif isinstance(statement, tree.Move):
             yield from self._move()
         return ""
 
-    def _case(self, statement: Switch) -> tuple[Statement, ...]:
+    def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:
         subject = self._value(statement.subject)
         for values, block in statement.cases:
             if any(self._value(value) == subject for value in values):
                 return block
         return statement.default
 
-    def _loop(self, statement: Loop) -> Flow:
+    def _loop(self, statement: tree.Loop) -> Flow:
         passes = 0
         while True:
             if statement.condition is not None and not self._value(statement.condition):
@@ -226,7 +207,7 @@ class KrlProgram:
         if session.state is not State.CMD:
             session.resync()
 
-    def _call(self, call: Call) -> Flow:
+    def _call(self, call: tree.Call) -> Flow:
         if call.name in self.source.subprograms:
             yield from self._subprogram(call.name)
         else:
@@ -237,24 +218,24 @@ class KrlProgram:
         assert self._session is not None
         return self._session
 
-    def _value(self, expression: Expression) -> Any:
-        if isinstance(expression, Constant):
+    def _value(self, expression: tree.Expression) -> Any:
+        if isinstance(expression, tree.Constant):
             return expression.value
-        if isinstance(expression, Name):
+        if isinstance(expression, tree.Name):
             return self._read(expression)
-        if isinstance(expression, Binary):
+        if isinstance(expression, tree.Binary):
             left, right = self._value(expression.left), self._value(expression.right)
             if expression.operator == "/":
                 # KRL divides whole numbers without remainder.
                 whole = isinstance(left, int) and isinstance(right, int)
                 return int(left / right) if whole else left / right
             return _OPERATORS[expression.operator](left, right)
-        if isinstance(expression, Unary):
+        if isinstance(expression, tree.Unary):
             value = self._value(expression.operand)
             return not value if expression.operator == "NOT" else -value
         return self._function(expression)
 
-    def _read(self, name: Name) -> Any:
+    def _read(self, name: tree.Name) -> Any:
         session, (title, field) = self._need(), _split(name.name)
         if title in self._variables or title == "$LOAD":
             value = self.machinery.load if title == "$LOAD" else self._variables[title]
@@ -281,10 +262,10 @@ class KrlProgram:
             return not session.needs_resync
         return not session.ramping if title == "$ROB_STOPPED" else self._strategy
 
-    def _write(self, name: Name, value: Any) -> None:
+    def _write(self, name: tree.Name, value: Any) -> None:
         session, (title, field) = self._need(), _split(name.name)
         if field:
-            load = list(self._read(Name(title)))
+            load = list(self._read(tree.Name(title)))
             load[LOAD.index(field)] = float(value)
             value = tuple(load)
         if title == "$LOAD":
@@ -303,7 +284,7 @@ class KrlProgram:
             bit = 1 << self._place(name)
             session.to_bool = session.to_bool | bit if value else session.to_bool & ~bit
 
-    def _place(self, name: Name) -> int:
+    def _place(self, name: tree.Name) -> int:
         assert name.index is not None
         number = int(self._value(name.index))
         if not 1 <= number <= _ARRAYS[name.name]:
@@ -312,7 +293,7 @@ class KrlProgram:
             )
         return number - 1
 
-    def _function(self, call: Call) -> Any:
+    def _function(self, call: tree.Call) -> Any:
         session = self._need()
         values = [self._value(argument) for argument in call.arguments]
         if call.name == "FRIOPEN":
@@ -355,29 +336,29 @@ def _split(name: str) -> tuple[str, str]:
 class _Check:
     """Search a module for unknown names and wrong numbers of arguments."""
 
-    def __init__(self, source: Source, name: str) -> None:
+    def __init__(self, source: tree.Source, name: str) -> None:
         self._source, self._name = source, name
 
     def module(self) -> None:
         for block in self._source.subprograms.values():
             self._part(block, 0, written=False)
 
-    def _statement(self, statement: Statement) -> None:
+    def _statement(self, statement: tree.Statement) -> None:
         for value in vars(statement).values():
             self._part(value, statement.line, written=False)
-        if isinstance(statement, (Assign, For)):
-            target = statement.target if isinstance(statement, Assign) else statement.variable
+        if isinstance(statement, (tree.Assign, tree.For)):
+            target = statement.target if isinstance(statement, tree.Assign) else statement.variable
             self._variable(target, statement.line, written=True)
 
     def _part(self, value: Any, line: int, *, written: bool) -> None:
         if isinstance(value, tuple):
             for item in value:
                 self._part(item, line, written=written)
-        elif isinstance(value, Name):
+        elif isinstance(value, tree.Name):
             self._variable(value, line, written=written)
-        elif isinstance(value, Statement) and not isinstance(value, Call):
+        elif isinstance(value, tree.Statement) and not isinstance(value, tree.Call):
             self._statement(value)
-        elif isinstance(value, Call):
+        elif isinstance(value, tree.Call):
             wanted = _FUNCTIONS.get(value.name, 0 if value.name in self._source.subprograms else None)
             if wanted is None:
                 raise self._error(value.line, f"there is no function {value.name}")
@@ -386,11 +367,11 @@ class _Check:
                     value.line, f"{value.name} takes {wanted} arguments, not {len(value.arguments)}"
                 )
             self._part(value.arguments, value.line, written=False)
-        elif isinstance(value, (Unary, Binary)):
+        elif isinstance(value, (tree.Unary, tree.Binary)):
             for inner in vars(value).values():
                 self._part(inner, line, written=False)
 
-    def _variable(self, name: Name, line: int, *, written: bool) -> None:
+    def _variable(self, name: tree.Name, line: int, *, written: bool) -> None:
         title, field = _split(name.name)
         declared = self._source.declarations.get(title)
         if field and title != "$LOAD" and (declared is None or declared.kind != "LOAD"):

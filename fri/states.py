@@ -58,7 +58,7 @@ class Control(IntEnum):
 
 
 class CommandFlag(IntFlag):
-    """Which fields of a command the controller shall use; may change in monitor mode only."""
+    """Fields of a command in use; may change in monitor mode only."""
 
     JNTPOS = 0x0001
     JNTTRQ = 0x0004
@@ -71,7 +71,7 @@ class CommandFlag(IntFlag):
 
 
 class Trigger(Enum):
-    """What moves the session from one state to another."""
+    """Causes of a change of state."""
 
     FRI_OPEN = "friOpen"
     FRI_START = "friStart with the timing in sync"
@@ -80,7 +80,7 @@ class Trigger(Enum):
     FAULT = "fault"
 
 
-#: The session state machine: what is not listed does not change the state.
+#: The session state machine; any other trigger leaves the state unchanged.
 TRANSITIONS: Mapping[tuple[State, Trigger], State] = MappingProxyType(
     {
         (State.OFF, Trigger.FRI_OPEN): State.MON,
@@ -94,7 +94,7 @@ TRANSITIONS: Mapping[tuple[State, Trigger], State] = MappingProxyType(
 _JOINT = CommandFlag.JNTPOS | CommandFlag.JNTTRQ | CommandFlag.JNTSTIFF | CommandFlag.JNTDAMP
 _CARTESIAN = CommandFlag.CARTPOS | CommandFlag.TCPFT | CommandFlag.CARTSTIFF | CommandFlag.CARTDAMP
 
-#: The full flag set that a client sends in each control mode: 0x0001, 0x0035, 0x3500.
+#: Full flag set of a client for each control mode: 0x0001, 0x0035, 0x3500.
 FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
     {
         Control.OTHER: CommandFlag(0),
@@ -104,7 +104,7 @@ FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
     }
 )
 
-#: Flags that make sense in each control mode. In Cartesian impedance JNTPOS asks for a null-space posture.
+#: Flags allowed in each control mode. In Cartesian impedance JNTPOS asks for a null-space posture.
 ALLOWED_FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
     {
         Control.OTHER: _JOINT | _CARTESIAN,
@@ -125,7 +125,7 @@ CONTROL_BY_STRATEGY: Mapping[int, Control] = MappingProxyType(
 
 
 class EventKind(Enum):
-    """What happened to the session; those after REFUSED ended command mode."""
+    """Kinds of events; those after REFUSED end command mode."""
 
     OPENED = "opened"
     STARTED = "started"
@@ -148,7 +148,7 @@ class EventKind(Enum):
 
 
 class Event(NamedTuple):
-    """Something that happened to the session: in which cycle, what, and a sentence about it."""
+    """An event of the session: its cycle, its kind, and a sentence about it."""
 
     cycle: int
     kind: EventKind

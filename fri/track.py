@@ -19,17 +19,16 @@ __all__ = ["SetpointTrack", "StopRamp"]
 
 
 class StopRamp:
-    """Positions of seven joints that brake from (q, v) at their bounds, each joint by itself.
+    """Positions of seven joints braking from (q, v), each joint at its own bounds.
 
     Parameters
     ----------
     q, v : np.ndarray
-        (7,) position [rad] and velocity [rad/s] where the stop begins.
+        (7,) position [rad] and velocity [rad/s] at the beginning of the stop.
     a, j : np.ndarray
         (7,) bounds of deceleration [rad/s^2] and jerk [rad/s^3].
     q_min, q_max : np.ndarray
-        (7,) ends of travel [rad]; the ramp does not leave them, or does not go further out if it begins
-        outside.
+        (7,) ends of travel [rad]; the ramp stays inside, or goes no further out if it begins outside.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class SetpointTrack:
 
     def rest(self) -> None:
         """Forget the velocity of the commands."""
-        # The last command, its mean step per cycle, and the cycles over which that is the mean.
+        # The last command, its mean step per cycle, and the number of cycles in this mean.
         self._previous = self._goal = self._accepted = self.target
         self._step = np.zeros(JOINTS)
         self._span = 1
@@ -160,7 +159,7 @@ class SetpointTrack:
         self._ramp_ms = 0
 
     def coast(self) -> np.ndarray:
-        """The setpoints of a period without commands, (n, 7): braking, or as ``shift`` said."""
+        """The setpoints of a period without commands, (n, 7): braking, or moved by ``shift``."""
         if self._ramp is None:
             positions = self._line(self.target, self._goal)
             self.target = self._goal
