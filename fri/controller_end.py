@@ -10,7 +10,6 @@ import select
 import socket
 from collections.abc import Callable
 from time import monotonic
-from types import TracebackType
 
 from fri.errors import NetworkError
 from fri.krc import KrcSession, Sample, Setpoint
@@ -28,17 +27,10 @@ _SHORTEST_FLOOD_S = 0.005
 class ControllerEnd:
     """UDP client of the controller; as a context manager it closes the socket.
 
-    Parameters
-    ----------
-    remote : tuple of str and int
-        Address and port of the PC. Datagrams of anybody else are counted in `foreign` and dropped.
-    local : tuple of str and int
-        Address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``.
+    remote : address and port of the PC; other datagrams are counted in `foreign` and dropped
+    local : address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``
 
-    Raises
-    ------
-    NetworkError
-        The local address cannot be bound.
+    Raises NetworkError if the local address cannot be bound.
     """
 
     def __init__(self, remote: tuple[str, int], local: tuple[str, int] = ("127.0.0.1", 0)) -> None:
@@ -148,10 +140,5 @@ class ControllerEnd:
     def __enter__(self) -> ControllerEnd:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -92,22 +92,9 @@ class Setpoint(NamedTuple):
 class KrcSession:
     """An FRI session at the controller's end.
 
-    Parameters
-    ----------
-    limits : KrcLimits
-        Limits of the commands.
-    q : array_like
-        (7,) position of KRL's setpoint at the beginning [rad].
-    policy : KrcPolicy or None
-        Thresholds; None takes the defaults.
-    control : Control
-        Control mode; ``set_strategy`` changes it.
-    power : int
-        Drive bits.
-    uptime_s : float
-        The controller's clock at the beginning.
-    first_sequence : int
-        Counter of the first packet.
+    Parameters: limits of the commands; `q` (7,), KRL's setpoint at the beginning [rad]; policy, None takes the
+    defaults; control mode (``set_strategy`` changes it); `power`, drive bits; `uptime_s`, the controller's clock
+    at the beginning; `first_sequence`, counter of the first packet.
 
     Attributes
     ----------
@@ -116,20 +103,14 @@ class KrcSession:
         Drive bits; change them with ``set_drives``.
     quality_ceiling : Quality
         Upper bound on the quality, for provoking a drop; PERFECT is no bound.
-    sample_time_ms : int
-        Period of the last ``fri_open``; 1 before it.
-    cycle : int
-        Packets made so far.
+    sample_time_ms, cycle : int
+        Period of the last ``fri_open``, 1 before it; packets made so far.
     to_real, to_int : np.ndarray
-        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL. `to_bool` is a mask, bit 0 is
-        ``[1]``.
-    answered : bool
-        Whether this cycle has its valid answer.
-    needs_resync : bool
-        Whether KRL's setpoint must be set anew before a start, after a fallback.
-    last_event : Event or None
+        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL, as bit 0 of the mask `to_bool`.
+    answered, needs_resync : bool
+        Whether this cycle has its valid answer; whether KRL's setpoint must be set anew after a fallback.
     events : deque of Event
-        The last 256.
+        The last 256; `last_event` is the newest or None.
     """
 
     _head = struct.Struct("<HH").pack_into

@@ -82,20 +82,11 @@ class NoMachinery:
 class KrlProgram:
     """A KRL module at work; ``step`` is one tick of the interpreter.
 
-    Parameters
-    ----------
-    text, data : str
-        Content of the `.src` and the `.dat` file.
-    settings : mapping
-        Values for variables of the data list, e.g. ``LWR_CYCLE``.
-    machinery : Machinery or None
-        Motor currents and load data; None takes drives without current.
-    name : str
+    text, data : content of the `.src` and the `.dat` file
+    settings : values for variables of the data list, e.g. ``LWR_CYCLE``
+    machinery : motor currents and load data; None takes drives without current
 
-    Raises
-    ------
-    ConfigurationError
-        The text is no program, or names an unknown variable or function; with the line.
+    Raises ConfigurationError with the line for a syntax error, or an unknown variable or function.
     """
 
     def __init__(
@@ -130,53 +121,52 @@ class KrlProgram:
         self._session = session
         self._tick += 1
         if self._flow is None:
-            self._flow = self._subprogram(self.source.main)
+            self._flow = self._block(self.source.subprograms[self.source.main])
         try:
             next(self._flow)
         except StopIteration:
             self.finished = True
 
-    def _subprogram(self, name: str) -> Flow:
-        yield from self._block(self.source.subprograms[name])
-        return ""
-
     def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
         """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
         for statement in statements:
+            left = ""
             if isinstance(statement, tree.Assign):
                 self._write(statement.target, self._value(statement.value))
             elif isinstance(statement, tree.Call):
-                yield from self._call(statement)
+                if statement.name in self.source.subprograms:
+                    yield from self._block(self.source.subprograms[statement.name])
+                else:
+                    self._function(statement)
             elif isinstance(statement, tree.Leave):
-                return statement.what
+                left = statement.what
+            elif isinstance(statement, tree.Branch):
+                chosen = statement.then if self._value(statement.condition) else statement.otherwise
+                left = yield from self._block(chosen)
+            elif isinstance(statement, tree.Switch):
+                left = yield from self._block(self._case(statement))
+            elif isinstance(statement, tree.Loop):
+                left = yield from self._loop(statement)
+            elif isinstance(statement, tree.For):
+                left = yield from self._count(statement)
+            elif isinstance(statement, tree.WaitFor):
+                while not self._value(statement.condition):
+                    yield
+            elif isinstance(statement, tree.WaitSeconds):
+                for _ in range(math.ceil(round(1000 * float(self._value(statement.seconds)) / TICK_MS, 9))):
+                    yield
             else:
-                left = yield from self._compound(statement)
-                if left:
-                    return left
+                yield from self._move()
+            if left:
+                return left
         return ""
 
-    def _compound(self, statement: tree.Statement) -> Flow:
-        if isinstance(statement, tree.Branch):
-            chosen = statement.then if self._value(statement.condition) else statement.otherwise
-            return (yield from self._block(chosen))
-        if isinstance(statement, tree.Switch):
-            return (yield from self._block(self._case(statement)))
-        if isinstance(statement, tree.Loop):
-            return (yield from self._loop(statement))
-        if isinstance(statement, tree.For):
-            for value in range(int(self._value(statement.first)), int(self._value(statement.last)) + 1):
-                self._write(statement.variable, value)
-                left = yield from self._block(statement.body)
-                if left:
-                    return "" if left == "EXIT" else left
-        elif isinstance(statement, tree.WaitFor):
-            while not self._value(statement.condition):
-                yield
-        elif isinstance(statement, tree.WaitSeconds):
-            for _ in range(math.ceil(round(1000 * float(self._value(statement.seconds)) / TICK_MS, 9))):
-                yield
-        elif isinstance(statement, tree.Move):
-            yield from self._move()
+    def _count(self, statement: tree.For) -> Flow:
+        for value in range(int(self._value(statement.first)), int(self._value(statement.last)) + 1):
+            self._write(statement.variable, value)
+            left = yield from self._block(statement.body)
+            if left:
+                return "" if left == "EXIT" else left
         return ""
 
     def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:
@@ -206,13 +196,6 @@ class KrlProgram:
             yield
         if session.state is not State.CMD:
             session.resync()
-
-    def _call(self, call: tree.Call) -> Flow:
-        if call.name in self.source.subprograms:
-            yield from self._subprogram(call.name)
-        else:
-            self._function(call)
-        return ""
 
     def _need(self) -> KrcSession:
         assert self._session is not None

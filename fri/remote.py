@@ -23,7 +23,6 @@ from collections import deque
 from enum import Enum
 from math import hypot, isfinite
 from time import monotonic, monotonic_ns
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -255,19 +254,8 @@ class RemoteEnd:
     def foresee(self, jnt_pos: np.ndarray, out: memoryview, ahead: int = 0) -> None:
         """Prepare the datagram of ``answer(jnt_pos)`` for the packet `ahead` packets after the next one.
 
-        Parameters
-        ----------
-        jnt_pos : np.ndarray
-            (7,) float32, finite [rad].
-        out : memoryview
-            The 376 bytes of the answer.
-        ahead : int
-            Number of answered packets before it.
-
-        Raises
-        ------
-        RuntimeError
-            ``foreseen`` is None.
+        jnt_pos : (7,) float32, finite [rad]; out : the 376 bytes of the answer; ahead : number of answered packets
+        before it. RuntimeError if ``foreseen`` is None.
         """
         expected = self.foreseen
         if expected is None:
@@ -283,17 +271,9 @@ class RemoteEnd:
 
         Repeated, late, malformed and foreign datagrams are counted and passed over within the same timeout.
 
-        Parameters
-        ----------
-        timeout_s : float
-            Longest wait [s]; 0 does not wait. The kernel rounds it up to its tick, up to 10 ms.
-        arrived : tuple or None
-            Length, source and time [ns] of a datagram already in ``buffer``.
-
-        Returns
-        -------
-        np.ndarray or None
-            ``self.msr``, or None after `timeout_s`.
+        timeout_s : longest wait [s]; 0 does not wait. The kernel rounds it up to its tick, up to 10 ms.
+        arrived : length, source and time [ns] of a datagram already in ``buffer``, or None
+        Returns ``self.msr``, or None after `timeout_s`.
         """
         self._unanswered = False
         deadline = monotonic() + max(timeout_s, _SHORTEST_FLOOD_S)
@@ -329,29 +309,15 @@ class RemoteEnd:
     ) -> bool:
         """Answer the packet of the last ``receive``, once.
 
-        Parameters
-        ----------
-        jnt_pos : array_like or None
-            (7,) setpoint [rad], used only while `commanding`. Otherwise, and with None, the mirror is sent.
-        add_jnt_trq : array_like or None
-            (7,) additional torque [Nm], likewise; None is zero.
-        insist : bool
-            Send the setpoint although, by the packet, the arm does not follow: the packet may be damaged, and
-            a controller in monitor mode ignores the setpoint.
-        sent : bool
-            The datagram of ``foresee`` has been sent already: only count it.
+        jnt_pos : (7,) setpoint [rad], used only while `commanding`. Otherwise, and with None, the mirror is sent.
+        add_jnt_trq : (7,) additional torque [Nm], likewise; None is zero
+        insist : send the setpoint although, by the packet, the arm does not follow: the packet may be damaged, and
+        a controller in monitor mode ignores the setpoint
+        sent : the datagram of ``foresee`` has been sent already: only count it
 
-        Returns
-        -------
-        bool
-            True if `jnt_pos` was sent, False if the mirror was, or if the network refused the datagram.
-
-        Raises
-        ------
-        RuntimeError
-            There is no packet to answer, or it has been answered.
-        ValueError
-            A value is not finite as float32; nothing is sent.
+        Returns True if `jnt_pos` was sent, False if the mirror was, or if the network refused the datagram. Raises
+        RuntimeError without a packet to answer or for a second answer, ValueError for a value not finite as
+        float32; nothing is sent then.
         """
         if not self._unanswered:
             raise RuntimeError(
@@ -429,12 +395,7 @@ class RemoteEnd:
     def __enter__(self) -> RemoteEnd:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _set_timeout(self, timeout_s: float) -> int:

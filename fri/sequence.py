@@ -38,15 +38,10 @@ class Arrival(Enum):
 class SequenceTracker:
     """Unwraps `send_seq` and counts.
 
-    Attributes
-    ----------
-    sequence : int
-        Number of the newest packet. It starts with the first packet's own count and always increases; after a
-        restart of the controller it goes on with the next number.
-    lost : int
-        Packets missing, or arrived after a newer one.
-    repeated, reordered, suspect, restarts : int
-        Repeated packets; packets after a newer one; packets with an implausible counter; restarts.
+    sequence : number of the newest packet. It starts with the first packet's own count and always increases; after
+    a restart of the controller it goes on with the next number.
+    lost : packets missing, or arrived after a newer one. repeated, reordered, suspect, restarts : repeated packets;
+    packets after a newer one; packets with an implausible counter; restarts
     """
 
     __slots__ = (

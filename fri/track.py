@@ -21,14 +21,9 @@ __all__ = ["SetpointTrack", "StopRamp"]
 class StopRamp:
     """Positions of seven joints braking from (q, v), each joint at its own bounds.
 
-    Parameters
-    ----------
-    q, v : np.ndarray
-        (7,) position [rad] and velocity [rad/s] at the beginning of the stop.
-    a, j : np.ndarray
-        (7,) bounds of deceleration [rad/s^2] and jerk [rad/s^3].
-    q_min, q_max : np.ndarray
-        (7,) ends of travel [rad]; the ramp stays inside, or goes no further out if it begins outside.
+    q, v : (7,) position [rad] and velocity [rad/s] at the beginning of the stop. a, j : (7,) bounds of
+    deceleration [rad/s^2] and jerk [rad/s^3]. q_min, q_max : (7,) ends of travel [rad]; the ramp stays inside, or
+    goes no further out if it begins outside.
     """
 
     def __init__(
@@ -67,21 +62,10 @@ class StopRamp:
 
 
 class SetpointTrack:
-    """Setpoint of seven joints over time.
+    """Setpoint of seven joints over time, from `q` (7,) [rad] on; limits and policy bound the braking.
 
-    Parameters
-    ----------
-    limits, policy : KrcLimits, KrcPolicy
-        Bounds of the braking.
-    q : np.ndarray
-        (7,) setpoint at the beginning [rad].
-
-    Attributes
-    ----------
-    target : np.ndarray
-        (7,) setpoint at the end of the present period [rad]; never written in place.
-    missed : int
-        Commands missing since the last one.
+    target : (7,) setpoint at the end of the present period [rad]; never written in place. missed : commands missing
+    since the last one
     """
 
     def __init__(self, limits: KrcLimits, policy: KrcPolicy, q: np.ndarray) -> None:

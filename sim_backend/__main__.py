@@ -29,7 +29,7 @@ def run(
     follow_stdin: bool = False,
     announce: bool = False,
 ) -> None:
-    """Run an emulator in this process until it is told to end; see `main` for the arguments."""
+    """Run an emulator in this process until its end is asked for; see `main` for the arguments."""
     service = Service(
         load_configuration(config, overrides),
         (fri_host, fri_port),
@@ -38,8 +38,8 @@ def run(
     )
     try:
         signal.signal(signal.SIGTERM, lambda *_: service.stop())
-        # Ctrl-C at a terminal reaches all its processes; an emulator that follows another ends with that one,
-        # not under an arm that is being braked.
+        # Ctrl-C at a terminal goes to all its processes. A child ends with its parent instead, so that the
+        # parent can still brake the arm.
         signal.signal(signal.SIGINT, signal.SIG_IGN if follow_stdin else lambda *_: service.stop())
         if announce:
             sys.stdout.write(json.dumps({"pendant_port": service.pendant.port}) + "\n")

@@ -56,9 +56,9 @@ def _read_motor(
 class Sensors:
     """Reads a plant once per millisecond, in two steps.
 
-    The controller needs position and joint torque to decide the motor torque of the next millisecond; only
-    with that is the motor torque at this instant known, midway between the torques held before and after it.
-    `reading` holds the last values; its arrays keep their identity.
+    Position and joint torque come first: the controller needs them for the motor torque of the next millisecond.
+    The motor torque at this instant is midway between the torques held before and after it. `reading` holds the
+    last values; its arrays keep their identity.
     """
 
     def __init__(self, config: SensorConfig, joints: int, random: np.random.SeedSequence) -> None:
@@ -83,9 +83,7 @@ class Sensors:
         self.reading = Reading(*self._rows)
 
     def read(self, plant: Plant) -> Reading:
-        """Position, motor position and joint torque at this instant; the motor torque is still the last
-        one.
-        """
+        """Position, motor position and joint torque at this instant; the motor torque is still the last."""
         if self._next == _BLOCK:
             for row, stream in enumerate(self._streams):
                 self._noise[:, row] = stream.standard_normal(self._noise.shape[::2])
@@ -97,16 +95,12 @@ class Sensors:
         return self.reading
 
     def read_motor(self, before: np.ndarray, after: np.ndarray) -> None:
-        """Motor torque at this instant, from the torques (n,) held in the milliseconds before and after
-        it.
-        """
+        """Motor torque at this instant, from the torques (n,) of the milliseconds before and after it."""
         _read_motor(before, after, self._settings, self._row, self._rows)
 
 
 def trace_columns(joint_names: tuple[str, ...]) -> tuple[str, ...]:
-    """Header of a trace file: time [s], motor torques referred to the joint [Nm], measured positions
-    [rad].
-    """
+    """Header of a trace file: time [s], motor torques referred to the joint [Nm], positions [rad]."""
     return ("time_s", *(f"tau_m_{name}" for name in joint_names), *(f"q_{name}" for name in joint_names))
 
 
@@ -118,7 +112,7 @@ class _Delay:
         self._next = 0
 
     def put(self, values: np.ndarray) -> np.ndarray:
-        """Take `values` (size,) in, give those of `milliseconds` ago; do not keep them."""
+        """Take in `values` (size,), return those of `milliseconds` ago; do not keep them."""
         rows = self._rows
         if len(rows) == 1:
             return values
@@ -129,7 +123,7 @@ class _Delay:
 
 
 class KrlReals:
-    """The KRL loop that publishes motor torques; `millisecond` runs at 1 kHz."""
+    """The KRL loop for the motor torques; `millisecond` runs at 1 kHz."""
 
     def __init__(self, config: KrlRealsConfig, joints: int) -> None:
         self.config = config
@@ -151,14 +145,12 @@ class KrlReals:
         to_int[self._counter] = self._count
 
     def late(self, motor_torque: np.ndarray) -> np.ndarray:
-        """Take `motor_torque` (7,) of this millisecond in, give that of `delay_ms` ago; do not keep it."""
+        """Take in `motor_torque` (7,), return the one of `delay_ms` ago; do not keep it."""
         return self._delay.put(motor_torque)
 
 
 class ControllerTrace:
-    """The controller's recording: time on its own clock, motor torque and position of each joint, at 1
-    kHz.
-    """
+    """The controller's recording at 1 kHz: time on its own clock, motor torque and position of each joint."""
 
     def __init__(self, config: TraceConfig, joint_names: tuple[str, ...]) -> None:
         self.config = config
@@ -201,7 +193,7 @@ class ControllerTrace:
         self._filled += 1
 
     def samples(self) -> np.ndarray:
-        """What was recorded: (n, 15), columns as in `columns`."""
+        """The recorded samples, (n, 15), with the columns of `columns`."""
         if not self._blocks:
             return np.empty((0, len(self.columns)))
         return np.concatenate([*self._blocks[:-1], self._block[: self._filled]])[-self._longest :]
@@ -209,7 +201,7 @@ class ControllerTrace:
     def save(self, path: Path) -> int:
         """End the recording and write it as CSV in a process of its own; returns the number of samples.
 
-        The file appears under its name when it is complete; `saving` tells.
+        The file appears under its name when it is complete, see `saving`.
         """
         rows = self.samples()
         self.recording = False
@@ -232,7 +224,7 @@ class ControllerTrace:
         return len(rows)
 
     def saving(self) -> bool:
-        """Whether a file is still being written. Raises OSError once if that failed."""
+        """Whether a file is still being written. Raises OSError once after a failure."""
         if self._writer is None:
             return False
         done, status = os.waitpid(self._writer, os.WNOHANG)

@@ -16,7 +16,7 @@ from sim_backend.configuration import (
     load_configuration,
 )
 from sim_backend.controller import ControllerModel
-from sim_backend.rigid_body import chain
+from sim_backend.robot import chain
 from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
 NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
