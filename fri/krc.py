@@ -201,7 +201,7 @@ class KrcSession:
     @t1.setter
     def t1(self, value: bool) -> None:
         self._t1 = value
-        self._tell_judge()
+        self._tighten_judge()
 
     @property
     def malformed_now(self) -> bool:
@@ -260,7 +260,7 @@ class KrcSession:
             return self.state
         self.sample_time_ms = int(sample_time_ms)
         self._track.set_period(self.sample_time_ms)
-        self._tell_judge()
+        self._tighten_judge()
         self._statistics = AnswerStatistics(self.policy.window)
         self.quality = Quality.UNACCEPTABLE
         self._dwell = 0
@@ -287,7 +287,7 @@ class KrcSession:
             )
             return self.state
         self._safety_limits = float(safety_limits)
-        self._tell_judge()
+        self._tighten_judge()
         self._start_pending = True
         return self.state
 
@@ -478,7 +478,7 @@ class KrcSession:
         self.events.append(event)
         return event
 
-    def _tell_judge(self) -> None:
+    def _tighten_judge(self) -> None:
         self._judge.tighten(self.sample_time_s, self._safety_limits, self._t1)
 
     def _rate(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Generator, Mapping
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -308,6 +309,7 @@ class Interpreter:
         self._due_ms -= milliseconds
 
 
+@lru_cache(maxsize=256)
 def _split(name: str) -> tuple[str, str]:
     """A name of load data and its field, `$LOAD` and `.CM.X`; any other name and nothing."""
     for field in LOAD:

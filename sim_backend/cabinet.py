@@ -215,9 +215,9 @@ class Cabinet:
                 self.model.update_gravity(self._last_setpoint),
                 self.reading.motor_position,
             )
-        self.tell_drives()
+        self.report_drives()
 
-    def tell_drives(self) -> None:
+    def report_drives(self) -> None:
         """Drive bits into the session."""
         self.session.set_drives(ALL_DRIVES if self.powered else 0, self.error_bits, self.warning_bits)
 
@@ -255,7 +255,7 @@ class Cabinet:
             self.monitor.take(np.frombuffer(datagram, "<f4", self.joints, _JNT_POS), self.cycle)
 
     def receive(self, datagram: bytes, age_s: float) -> None:
-        """A command reaches the session `age_s` after its packet left."""
+        """Hand a command to the session, `age_s` [s] after its packet."""
         self.session.receive(datagram, age_s)
 
     def close(self) -> None:

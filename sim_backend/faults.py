@@ -111,7 +111,7 @@ class FaultyWire:
         return {number: active.fault for number, active in self._active.items()}
 
     def inject(self, fault: WireFault, cycle: int) -> int:
-        """Begin `fault` at `cycle`; returns its number, which selects its random stream."""
+        """Begin `fault` at `cycle`; returns its number, also that of its random stream."""
         number = next(self._numbers)
         stream = np.random.default_rng(self._random.spawn(1)[0])
         self._active[number] = _Active(fault, stream, cycle)

@@ -104,7 +104,7 @@ def arm_of(
 
 
 class ModelEffect(Effect):
-    """An effect of a model for the plant. begin_s : time of the session at the beginning of the plant's [s]."""
+    """An effect of a model for the plant. begin_s : time of the session at time zero of the plant [s]."""
 
     def __init__(self, part: Simulated, begin_s: float = 0.0) -> None:
         self.part = part

@@ -250,7 +250,7 @@ class Operator:
             raise RobotError("drives stay off: the emergency stop is pressed; release it first")
         self.cabinet.error_bits = 0
         self.cabinet.power(True)
-        self.cabinet.tell_drives()
+        self.cabinet.report_drives()
 
     def drives_off(self) -> None:
         """Drives off, brakes closed."""
@@ -283,11 +283,11 @@ class Operator:
             raise ConfigurationError(f"joint {joint} is outside 0 to {self.cabinet.joints - 1}")
         if error:
             self.cabinet.error_bits |= 1 << joint
-            self.cabinet.tell_drives()
+            self.cabinet.report_drives()
             self.cabinet.power(False)
         else:
             self.cabinet.warning_bits |= 1 << joint
-        self.cabinet.tell_drives()
+        self.cabinet.report_drives()
 
     def start_program(self, name: str | None = None, period_ms: float | None = None) -> None:
         """Start a KRL program."""
