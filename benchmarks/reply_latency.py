@@ -25,17 +25,17 @@ from pathlib import Path
 
 import numpy as np
 
-from fri.krc import KrcSession
-from fri.krl import PROGRAMS, Interpreter
+from fri.krc import KrcSession, Sample
+from fri.krl import Interpreter
 from fri.packets import CMD_SIZE
 from fri.policy import KrcLimits, KrcPolicy
-from fri.sample import Sample
 from fri.states import Quality
 from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings
 from lwr_driver.motion import move_to
 from lwr_driver.realtime import assess, set_up
 from lwr_driver.session import session_metadata
+from sim_backend.configuration import krl_program
 
 START = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
 # Sleeping longer, the sender's processor would wake late.
@@ -60,7 +60,7 @@ class _Link:
         )
         self._period_ms = period_ms
         self.session = KrcSession(limits, START, policy)
-        self._interpreter = Interpreter(self.session, PROGRAMS["stanford"](period_ms))
+        self._interpreter = Interpreter(self.session, krl_program("stanford", period_ms))
         self._sample = Sample()
         self._wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._wire.connect(("127.0.0.1", port))

@@ -1,7 +1,7 @@
 """The controller's socket: sends first, collects the answers of one PC.
 
-``lock_step`` and ``real_time`` run whole cycles of a session. An emulator that damages, delays or loses
-datagrams on purpose uses ``send`` and ``receive`` and stands in between itself.
+``lock_step`` and ``real_time`` run whole cycles of a session. An emulator with faults on the wire uses ``send``
+and ``receive`` instead.
 """
 
 from __future__ import annotations
@@ -10,11 +10,9 @@ import select
 import socket
 from collections.abc import Callable
 from time import monotonic
-from types import TracebackType
 
 from fri.errors import NetworkError
-from fri.krc import KrcSession, Setpoint
-from fri.sample import Sample
+from fri.krc import KrcSession, Sample, Setpoint
 from fri.states import State
 
 __all__ = ["ControllerEnd"]
@@ -22,24 +20,17 @@ __all__ = ["ControllerEnd"]
 _BUFFER_SIZE = 2048
 _SLICE_S = 0.05
 _RESEND_S = 0.2
-# Even with a timeout of zero, datagrams of strangers are passed over for so long.
+# Time for passing over foreign datagrams, even with a timeout of zero.
 _SHORTEST_FLOOD_S = 0.005
 
 
 class ControllerEnd:
-    """UDP client of the controller; a context manager that closes the socket.
+    """UDP client of the controller; as a context manager it closes the socket.
 
-    Parameters
-    ----------
-    remote : tuple of str and int
-        Address and port of the PC. Datagrams of anybody else are counted in `foreign` and dropped.
-    local : tuple of str and int
-        Address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``.
+    remote : address and port of the PC; other datagrams are counted in `foreign` and dropped
+    local : address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``
 
-    Raises
-    ------
-    NetworkError
-        The local address cannot be bound.
+    Raises NetworkError if the local address cannot be bound.
     """
 
     def __init__(self, remote: tuple[str, int], local: tuple[str, int] = ("127.0.0.1", 0)) -> None:
@@ -59,18 +50,18 @@ class ControllerEnd:
         self.send_errors = 0
 
     def fileno(self) -> int:
-        """File descriptor, so that the socket can be waited for together with others."""
+        """File descriptor, for waiting for several sockets at once."""
         return self._socket.fileno()
 
     def send(self, datagram: bytes) -> None:
-        """Send one datagram to the PC; what the network refuses is counted in `send_errors`."""
+        """Send one datagram to the PC; refusals of the network are counted in `send_errors`."""
         try:
             self._socket.sendto(datagram, self.remote)
         except OSError:
             self.send_errors += 1
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Next datagram of the PC, or None after `timeout_s` [s]; 0 takes what is there."""
+        """Next datagram of the PC, or None after `timeout_s` [s]; 0 does not wait."""
         began = monotonic()
         deadline, flooded = began + timeout_s, began + max(timeout_s, _SHORTEST_FLOOD_S)
         while True:
@@ -96,12 +87,12 @@ class ControllerEnd:
         patience_s: float = 10.0,
         idle: Callable[[], bool] | None = None,
     ) -> Setpoint | None:
-        """One cycle in which virtual time stands still until the PC has answered.
+        """One cycle in virtual time, which waits for the answer of the PC.
 
-        In monitor mode it waits for ever, in command mode `patience_s` [s] of real time, then the answer is
-        missing. A malformed answer ends the wait too. Until the session has had its first answer the packet
-        is sent again every 0.2 s. `idle` is called every 50 ms of waiting; if it returns True the cycle is
-        given up: the result is None and the session must be closed.
+        The wait has no end in monitor mode; in command mode the answer is missing after `patience_s` [s] of
+        real time. A malformed answer ends the wait too. Before the first answer of a session the packet is
+        sent again every 0.2 s. `idle` is called every 50 ms of waiting; if it returns True the cycle is given
+        up: the result is None and the session must be closed.
         """
         if session.state is State.OFF:
             return session.close_cycle()
@@ -149,10 +140,5 @@ class ControllerEnd:
     def __enter__(self) -> ControllerEnd:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

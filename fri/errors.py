@@ -30,9 +30,9 @@ __all__ = [
 
 
 class LwrError(Exception):
-    """Base of every error this project raises on purpose.
+    """Base of all errors of this project.
 
-    rows : the last cycles of the link before the error, where there were any (dtype `lwr_driver.ring.ROW`)
+    rows : last cycles of the link before the error, None without a link (dtype `lwr_driver.ring.ROW`)
     """
 
     exit_code = 1
@@ -64,7 +64,7 @@ class RobotError(LwrError):
 
 
 class NetworkError(LwrError, ConnectionError):
-    """Packets do not arrive, arrive late, or are not what they should be."""
+    """Packets do not arrive, arrive late, or are malformed."""
 
     exit_code = 6
 

@@ -1,15 +1,15 @@
-"""The PC's side of the published KRL programs: asking for command mode and seeing that it was granted.
+"""The PC's side of the KRL programs: requests for command mode and their acknowledgements.
 
-The objects have no state. They write requests into the command that goes out next (``RemoteEnd.command``) and
-read the last measurement (``RemoteEnd.msr``). A request is made in every cycle until its effect is seen
-(``started``, ``stopped``); the variables stay in the command after that.
+The objects have no state. They write requests into the next command (``RemoteEnd.command``) and read the last
+measurement (``RemoteEnd.msr``). A request is repeated in every cycle until its effect is seen (``started``,
+``stopped``); afterwards its variables stay in the command.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -37,10 +37,10 @@ class Handshake(Protocol):
         """Ask for command mode in `control`."""
 
     def request_stop(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """Ask for monitor mode; also acknowledges a fallback, after which a start may be asked for anew."""
+        """Ask for monitor mode; after a fallback this must come before a new start."""
 
     def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """Ask for the end of the program; where `can_close` is False this only asks for monitor mode."""
+        """Ask for the end of the program; if `can_close` is False, for monitor mode only."""
 
     def opened(self, msr: np.ndarray) -> bool:
         """Whether the program runs and takes requests."""
@@ -52,17 +52,49 @@ class Handshake(Protocol):
         """Whether a stop was granted and monitor mode is on."""
 
     def fallen(self, msr: np.ndarray) -> bool:
-        """Whether the program believes itself in command mode while FRI has fallen back to monitor mode.
+        """Whether FRI has fallen back to monitor mode while the program still reports command mode.
 
-        It takes no start then before a stop.
+        The program then needs a stop before a start.
         """
 
 
-class StanfordHandshake:
-    """Stanford's FRIControl: ``$FRI_FRM_INT[15..16]``, ``$FRI_TO_INT[15..16]``."""
+class _StatusHandshake:
+    """A program with its status in one integer: `status` is the index in ``krl_int``, from 0."""
+
+    name: str
+    can_close = True
+    status: ClassVar[int]
+    open_values: ClassVar[tuple[int, ...]]
+    started_value: ClassVar[int]
+    stopped_values: ClassVar[tuple[int, ...]]
+    fallen_values: ClassVar[tuple[int, ...]]
+
+    def opened(self, msr: np.ndarray) -> bool:
+        """Packets come and the status is one of `open_values`."""
+        return bool(msr["krl_int"][self.status] in self.open_values)
+
+    def started(self, msr: np.ndarray) -> bool:
+        """Status `started_value`, state CMD."""
+        return bool(msr["krl_int"][self.status] == self.started_value and msr["state"] == State.CMD)
+
+    def stopped(self, msr: np.ndarray) -> bool:
+        """Status among `stopped_values`, state MON."""
+        return bool(msr["krl_int"][self.status] in self.stopped_values and msr["state"] == State.MON)
+
+    def fallen(self, msr: np.ndarray) -> bool:
+        """Status among `fallen_values`, state MON."""
+        return bool(msr["krl_int"][self.status] in self.fallen_values and msr["state"] == State.MON)
+
+
+class StanfordHandshake(_StatusHandshake):
+    """Stanford's FRIControl: ``$FRI_FRM_INT[15..16]``, status in ``$FRI_TO_INT[16]``."""
 
     name = "stanford"
-    can_close = True
+    status = 15
+    open_values = (10, 20)
+    started_value = 20
+    stopped_values = (10,)
+    fallen_values = (20,)
 
     def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
         """Strategy in [15], 10 in [16]."""
@@ -74,31 +106,20 @@ class StanfordHandshake:
         cmd["krl_int"][15] = 20
 
     def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """The program's abort code in [16]."""
+        """The program's abort code, from ``$FRI_TO_INT[15]``, in [16]."""
         cmd["krl_int"][15] = msr["krl_int"][14]
 
-    def opened(self, msr: np.ndarray) -> bool:
-        """10 or 20 in [16]."""
-        return bool(msr["krl_int"][15] in (10, 20))
 
-    def started(self, msr: np.ndarray) -> bool:
-        """20 in [16], state CMD."""
-        return bool(msr["krl_int"][15] == 20 and msr["state"] == State.CMD)
-
-    def stopped(self, msr: np.ndarray) -> bool:
-        """10 in [16], state MON."""
-        return bool(msr["krl_int"][15] == 10 and msr["state"] == State.MON)
-
-    def fallen(self, msr: np.ndarray) -> bool:
-        """20 in [16], state MON."""
-        return bool(msr["krl_int"][15] == 20 and msr["state"] == State.MON)
-
-
-class RosHandshake:
-    """CentroEPiaggio's ros_control: ``$FRI_FRM_INT[1..2]``, ``$FRI_TO_INT[2]``."""
+class RosHandshake(_StatusHandshake):
+    """CentroEPiaggio's ros_control: ``$FRI_FRM_INT[1..2]``, status in ``$FRI_TO_INT[2]``; it has no close."""
 
     name = "ros_control"
     can_close = False
+    status = 1
+    open_values = (0, 1, 10)
+    started_value = 1
+    stopped_values = (0, 10)
+    fallen_values = (1,)
 
     def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
         """Strategy in [1], 1 in [2]."""
@@ -109,32 +130,18 @@ class RosHandshake:
         """0 in [2]."""
         cmd["krl_int"][1] = 0
 
-    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """The program has no close: as ``request_stop``."""
-        self.request_stop(cmd, msr)
+    request_close = request_stop
 
     def opened(self, msr: np.ndarray) -> bool:
-        """The program marks nothing but its state: 10, 1 or 0 in [2]."""
-        return bool(msr["state"] != State.OFF and msr["krl_int"][1] in (0, 1, 10))
-
-    def started(self, msr: np.ndarray) -> bool:
-        """1 in [2], state CMD."""
-        return bool(msr["krl_int"][1] == 1 and msr["state"] == State.CMD)
-
-    def stopped(self, msr: np.ndarray) -> bool:
-        """0 or 10 in [2], state MON."""
-        return bool(msr["krl_int"][1] in (0, 10) and msr["state"] == State.MON)
-
-    def fallen(self, msr: np.ndarray) -> bool:
-        """1 in [2], state MON."""
-        return bool(msr["krl_int"][1] == 1 and msr["state"] == State.MON)
+        """State MON or CMD: the status is 0 before the program too."""
+        return bool(msr["state"] != State.OFF and super().opened(msr))
 
 
 class RcprgHandshake:
-    """RCPRG's fri_start: ``$FRI_FRM_BOOL[1]`` with ``$FRI_FRM_INT[1]``, ``$FRI_TO_BOOL[1]``.
+    """RCPRG's fri_start: ``$FRI_FRM_BOOL[1]`` with ``$FRI_FRM_INT[1]``, ``$FRI_TO_BOOL[1]``; it has no close.
 
-    The published program carries a request out again and again while the bit is set, even after a fallback,
-    so the bit is taken back as soon as the program acknowledges. The control mode is the program's own.
+    The published program repeats a request while the bit is set, even after a fallback. The bit is therefore
+    taken back with the acknowledgement. The control mode is the program's own.
     """
 
     name = "rcprg"
@@ -148,9 +155,7 @@ class RcprgHandshake:
         """2 in [1], request bit set until acknowledged."""
         self._request(cmd, msr, 2, State.MON)
 
-    def request_close(self, cmd: np.ndarray, msr: np.ndarray) -> None:
-        """The program has no close: as ``request_stop``."""
-        self.request_stop(cmd, msr)
+    request_close = request_stop
 
     def opened(self, msr: np.ndarray) -> bool:
         """The program takes requests as soon as packets come."""
@@ -178,18 +183,22 @@ class RcprgHandshake:
         cmd["krl_bool"] |= 1
 
 
-class IdentificationHandshake:
+class IdentificationHandshake(_StatusHandshake):
     """The program of this project, configs/krl/lwr_identification.src.
 
-    ``$FRI_FRM_INT[16]`` asks for 11 monitor mode, 22 command mode, 33 the end: a packet has no check sum, and no
-    single damaged bit makes one of these another or nothing. ``$FRI_TO_INT[16]`` tells the phase: 1 monitor
-    mode, 2 and 3 on the way to command mode, 4 command mode, 5 ended, 6 command mode was lost and the PC must
-    ask for monitor mode before anything else. ``[14]`` numbers the load data in ``$FRI_FRM_REA[1..7]``
-    (``[13]``: the number again, negative; ``$FRI_FRM_REA[8]``: their sum) and tells which are in force.
+    ``$FRI_FRM_INT[16]`` asks for 11 monitor mode, 22 command mode, 33 the end. A packet has no check sum, so the
+    requests differ in two bits at least. ``$FRI_TO_INT[16]`` is the phase: 1 monitor mode, 2 and 3 on the way to
+    command mode, 4 command mode, 5 ended, 6 command mode lost; after 6 the PC must ask for monitor mode.
+    ``[14]`` numbers the load data in ``$FRI_FRM_REA[1..7]``, with the negative number in ``[13]`` and the sum in
+    ``$FRI_FRM_REA[8]``; ``$FRI_TO_INT[14]`` is the number of the load data in force.
     """
 
     name = "lwr_identification"
-    can_close = True
+    status = 15
+    open_values = (1, 2, 3, 4)
+    started_value = 4
+    stopped_values = (1,)
+    fallen_values = (4, 6)
 
     def request_start(self, cmd: np.ndarray, msr: np.ndarray, control: Control) -> None:
         """22 in [16]; the program knows position control only."""
@@ -203,22 +212,6 @@ class IdentificationHandshake:
         """33 in [16], taken in monitor mode."""
         cmd["krl_int"][15] = 33
 
-    def opened(self, msr: np.ndarray) -> bool:
-        """Any phase but the end."""
-        return bool(1 <= msr["krl_int"][15] <= 4)
-
-    def started(self, msr: np.ndarray) -> bool:
-        """4 in [16], state CMD."""
-        return bool(msr["krl_int"][15] == 4 and msr["state"] == State.CMD)
-
-    def stopped(self, msr: np.ndarray) -> bool:
-        """1 in [16], state MON."""
-        return bool(msr["krl_int"][15] == 1 and msr["state"] == State.MON)
-
-    def fallen(self, msr: np.ndarray) -> bool:
-        """6 in [16], or still 4 in it, and state MON."""
-        return bool(msr["krl_int"][15] in (4, 6) and msr["state"] == State.MON)
-
     def request_load(self, cmd: np.ndarray, msr: np.ndarray, load: np.ndarray) -> None:
         """Put load data in force: mass [kg], centre of mass in the flange frame [mm] (3), inertia about it
         JX JY JZ [kg m2]; (7,) float. Repeat until `load_taken`.
@@ -230,25 +223,17 @@ class IdentificationHandshake:
             cmd["krl_int"][12:14] = (-number, number)
 
     def load_taken(self, cmd: np.ndarray, msr: np.ndarray) -> bool:
-        """Whether the load data last asked for are in force."""
+        """Whether the load data of the last request are in force."""
         return bool(cmd["krl_int"][13] != 0 and cmd["krl_int"][13] == msr["krl_int"][13])
 
     def load(self, msr: np.ndarray) -> np.ndarray:
-        """Mass [kg] and centre of mass in the flange frame [mm] that the controller compensates, (4,)."""
+        """Load data in force: mass [kg] and centre of mass in the flange frame [mm], (4,)."""
         return np.array(msr["krl_real"][7:11], dtype=np.float64)
 
 
 #: The handshakes by the name of the KRL program.
 HANDSHAKES: Mapping[str, Handshake] = MappingProxyType(
-    {
-        handshake.name: handshake
-        for handshake in (
-            IdentificationHandshake(),
-            StanfordHandshake(),
-            RosHandshake(),
-            RcprgHandshake(),
-        )
-    }
+    {h.name: h for h in (IdentificationHandshake(), StanfordHandshake(), RosHandshake(), RcprgHandshake())}
 )
 
 

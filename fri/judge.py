@@ -1,8 +1,7 @@
 """The controller's judgement of a command: flags, finiteness, mirror, limits.
 
-An objection is the kind and the sentence with which command mode ends; nothing is ever clipped. The
-arithmetic is on plain floats of seven joints, which is faster here than arrays, and every comparison is
-written so that NaN fails it.
+An objection is the kind and the text of the event at the end of command mode; nothing is ever clipped. Plain
+floats are faster here than arrays of seven. NaN fails every comparison.
 """
 
 from __future__ import annotations
@@ -11,17 +10,16 @@ from math import isfinite
 
 import numpy as np
 
-from fri.event import EventKind
 from fri.packets import JOINT_NAMES, JOINTS, CmdBuffer
 from fri.policy import KrcLimits, KrcPolicy
-from fri.states import ALLOWED_FLAGS, CommandFlag, Control
+from fri.states import ALLOWED_FLAGS, CommandFlag, Control, EventKind
 
 __all__ = ["CommandJudge", "Objection"]
 
 Objection = tuple[EventKind, str]
 
 _JNTPOS = int(CommandFlag.JNTPOS)
-# The positions are judged joint by joint; these only for being numbers.
+# Only finiteness is judged here, unlike for the positions.
 _OTHER_FIELDS = (
     (int(CommandFlag.JNTTRQ), "add_jnt_trq"),
     (int(CommandFlag.JNTSTIFF), "jnt_stiffness"),
@@ -85,7 +83,7 @@ class CommandJudge:
         return None
 
     def mirror(self, command: CmdBuffer, target: np.ndarray, what: str) -> Objection | None:
-        """The commanded position where the total setpoint is."""
+        """The commanded position equal to the total setpoint, within the tolerance."""
         tolerance = self._policy.mirror_tolerance
         q = command.jnt_pos.tolist()
         for joint, now in enumerate(target.tolist()):
@@ -119,7 +117,7 @@ class CommandJudge:
     def acceleration(self, change: np.ndarray, cycles: float) -> Objection | None:
         """The `change` (7,) [rad] of the step between two commands `cycles` apart within the limits.
 
-        Where the policy does not ask for it, there is nothing to object to.
+        No objection without an `acceleration_factor` of the policy.
         """
         factor = self._policy.acceleration_factor
         if factor is None:

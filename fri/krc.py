@@ -1,40 +1,39 @@
 """The controller's end of an FRI session, without a socket and without a clock.
 
-One cycle is ``packet`` (the 916 bytes to send), any number of ``receive`` (datagrams that came back) and
-``close_cycle`` (the setpoints of the next period). Everything else happens between cycles: the KRL calls
-``fri_open``, ``fri_start``, ``fri_stop``, ``fri_close``, the drives, the KRL variables. The same calls give
-the same bytes.
+One cycle is ``packet`` (the 916 bytes to send), any number of ``receive`` (answers) and ``close_cycle`` (the
+setpoints of the next period). Everything else happens between cycles: the KRL calls ``fri_open``,
+``fri_start``, ``fri_stop``, ``fri_close``, the drives, the KRL variables. The same calls give the same bytes.
 
-What the protocol fixes is fixed here: the controller sends first; in command mode ``cmd_jnt_pos`` remains
-KRL's own setpoint and ``cmd_jnt_pos_fri_offset`` is what FRI adds, so that absolute and superposing clients
-both work; missing answers are bridged by extrapolation and then end command mode, as do wrong commands and
-limits, never by clipping; commands are interpolated to 1 ms, which delays them by one period. Thresholds are
-the policy's (``fri.policy``).
+By the protocol, the controller sends first. In command mode ``cmd_jnt_pos`` remains KRL's own setpoint and
+``cmd_jnt_pos_fri_offset`` is FRI's addition, for absolute and superposing clients alike. Missing answers are
+bridged by extrapolation and then end command mode, as do wrong commands and limits; nothing is clipped.
+Commands are interpolated to 1 ms with a delay of one period. The thresholds are in ``fri.policy``.
 
-Two readings of ours: the offset refers to the setpoint accepted last, the end of the interpolation; and after
-a fallback KRL must set its own setpoint anew (``resync``) before command mode can be entered again.
+Two assumptions of this project: the offset refers to the setpoint accepted last, the end of the interpolation;
+and after a fallback KRL must set its own setpoint anew (``resync``) before the next start.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import deque
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fri.event import Event, EventKind
 from fri.judge import CommandJudge, Objection
 from fri.packets import CMD, JOINT_NAMES, JOINTS, CmdBuffer, Fault, new_msr
 from fri.policy import KrcLimits, KrcPolicy
-from fri.sample import IDENTITY_POSE, Sample
 from fri.states import (
     ALL_DRIVES,
     CONTROL_BY_STRATEGY,
     TRANSITIONS,
     CommandFlag,
     Control,
+    Event,
+    EventKind,
     Quality,
     State,
     Trigger,
@@ -45,11 +44,39 @@ from fri.track import SetpointTrack
 __all__ = ["Event", "EventKind", "KrcLimits", "KrcPolicy", "KrcSession", "Sample", "Setpoint"]
 
 
+#: 3x4 row-major pose without rotation and translation.
+IDENTITY_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def _identity() -> np.ndarray:
+    return np.array(IDENTITY_POSE)
+
+
+def _joints() -> np.ndarray:
+    return np.zeros(JOINTS)
+
+
+@dataclass(slots=True)
+class Sample:
+    """Measurements of the arm in the units of `MSR`; written in place, read by ``KrcSession.packet``."""
+
+    msr_jnt_pos: np.ndarray = field(default_factory=_joints)
+    msr_cart_pos: np.ndarray = field(default_factory=_identity)
+    cmd_cart_pos: np.ndarray = field(default_factory=_identity)
+    msr_jnt_trq: np.ndarray = field(default_factory=_joints)
+    est_ext_jnt_trq: np.ndarray = field(default_factory=_joints)
+    est_ext_tcp_ft: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    jacobian: np.ndarray = field(default_factory=lambda: np.zeros((6, JOINTS)))
+    mass_matrix: np.ndarray = field(default_factory=lambda: np.zeros((JOINTS, JOINTS)))
+    gravity: np.ndarray = field(default_factory=_joints)
+    temperature: np.ndarray = field(default_factory=_joints)
+
+
 class Setpoint(NamedTuple):
-    """What the arm shall follow during the period that begins.
+    """Setpoint of the arm during the next period.
 
     positions : (n, 7) [rad], one row for each millisecond of the period; state : of the session;
-    drop : the event that ended command mode since the last cycle, or None.
+    drop : end of command mode since the last cycle, or None.
     """
 
     positions: np.ndarray
@@ -63,24 +90,11 @@ class Setpoint(NamedTuple):
 
 
 class KrcSession:
-    """An FRI session as the controller sees it.
+    """An FRI session at the controller's end.
 
-    Parameters
-    ----------
-    limits : KrcLimits
-        What commands are held against.
-    q : array_like
-        (7,) position of KRL's setpoint at the beginning [rad].
-    policy : KrcPolicy or None
-        Our choices where KUKA is silent.
-    control : Control
-        Control mode; ``set_strategy`` changes it.
-    power : int
-        Drive bits.
-    uptime_s : float
-        The controller's clock at the beginning.
-    first_sequence : int
-        Counter of the first packet.
+    Parameters: limits of the commands; `q` (7,), KRL's setpoint at the beginning [rad]; policy, None takes the
+    defaults; control mode (``set_strategy`` changes it); `power`, drive bits; `uptime_s`, the controller's clock
+    at the beginning; `first_sequence`, counter of the first packet.
 
     Attributes
     ----------
@@ -88,21 +102,15 @@ class KrcSession:
     power, error, warning : int
         Drive bits; change them with ``set_drives``.
     quality_ceiling : Quality
-        Upper bound on the quality, for provoking a drop; PERFECT leaves it alone.
-    sample_time_ms : int
-        Period of the last ``fri_open``; 1 before it.
-    cycle : int
-        Packets made so far.
+        Upper bound on the quality, for provoking a drop; PERFECT is no bound.
+    sample_time_ms, cycle : int
+        Period of the last ``fri_open``, 1 before it; packets made so far.
     to_real, to_int : np.ndarray
-        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL. `to_bool` is a mask, bit 0 is
-        ``[1]``.
-    answered : bool
-        Whether this cycle has its valid answer.
-    needs_resync : bool
-        Whether KRL's setpoint must be set anew before a start, after a fallback.
-    last_event : Event or None
+        (16,) ``$FRI_TO_REA``, ``$FRI_TO_INT``; index 0 is ``[1]`` in KRL, as bit 0 of the mask `to_bool`.
+    answered, needs_resync : bool
+        Whether this cycle has its valid answer; whether KRL's setpoint must be set anew after a fallback.
     events : deque of Event
-        The last 256.
+        The last 256; `last_event` is the newest or None.
     """
 
     _head = struct.Struct("<HH").pack_into
@@ -145,8 +153,7 @@ class KrcSession:
         self._offset: np.ndarray = record["cmd_jnt_pos_fri_offset"]
         record["cmd_cart_pos_fri_offset"] = IDENTITY_POSE
 
-        # KRL's setpoint is kept as the float32 that is sent, so that setpoint plus offset is exact for
-        # clients.
+        # KRL's setpoint is rounded to float32 as sent: setpoint plus offset is exact for clients.
         self._krl = _as_sent(q)
         self._track = SetpointTrack(limits, policy, self._krl)
         self._safety_limits = 1.0
@@ -194,7 +201,7 @@ class KrcSession:
     @t1.setter
     def t1(self, value: bool) -> None:
         self._t1 = value
-        self._tell_judge()
+        self._tighten_judge()
 
     @property
     def malformed_now(self) -> bool:
@@ -253,7 +260,7 @@ class KrcSession:
             return self.state
         self.sample_time_ms = int(sample_time_ms)
         self._track.set_period(self.sample_time_ms)
-        self._tell_judge()
+        self._tighten_judge()
         self._statistics = AnswerStatistics(self.policy.window)
         self.quality = Quality.UNACCEPTABLE
         self._dwell = 0
@@ -280,7 +287,7 @@ class KrcSession:
             )
             return self.state
         self._safety_limits = float(safety_limits)
-        self._tell_judge()
+        self._tighten_judge()
         self._start_pending = True
         return self.state
 
@@ -355,7 +362,7 @@ class KrcSession:
         self._krl = krl
 
     def resync(self, q: ArrayLike | None = None) -> None:
-        """Set KRL's setpoint to `q`, or to the present total setpoint, so that the offset is zero.
+        """Set KRL's setpoint to `q`, or to the present total setpoint; the offset is zero then.
 
         Not in command mode and not while the arm is braking. A given `q` becomes the setpoint at once.
         """
@@ -366,7 +373,7 @@ class KrcSession:
         self.needs_resync = False
 
     def packet(self, sample: Sample) -> bytes:
-        """Begin a cycle: the 916 bytes that the controller sends now."""
+        """Begin a cycle: the 916 bytes of its packet."""
         if self.state is State.OFF or self._open:
             reason = (
                 "the session is not open" if self.state is State.OFF else "the cycle before is not closed"
@@ -411,10 +418,10 @@ class KrcSession:
         return bytes(buffer)
 
     def receive(self, datagram: bytes | bytearray | memoryview, delay_s: float = 0.0) -> bool:
-        """Take in a datagram that came `delay_s` after the packet; True if it is this cycle's answer.
+        """Take in a datagram `delay_s` after the packet; True if it is this cycle's answer.
 
-        The first valid answer counts. An answer is valid if length, id and size are right and it reflects the
-        packet sent last; one that reflects an older packet is late.
+        The first valid answer counts. A valid answer has the right length, id and size, and reflects the last
+        packet; with the counter of an older packet it is late.
         """
         if not self._open:
             return False
@@ -441,7 +448,7 @@ class KrcSession:
         return True
 
     def close_cycle(self) -> Setpoint:
-        """End the cycle: judge what came back and give the setpoints of the period that begins.
+        """End the cycle: judge the answer and give the setpoints of the next period.
 
         While the session is OFF it may be called without a packet: the arm holds, or goes on braking.
         """
@@ -471,7 +478,7 @@ class KrcSession:
         self.events.append(event)
         return event
 
-    def _tell_judge(self) -> None:
+    def _tighten_judge(self) -> None:
         self._judge.tighten(self.sample_time_s, self._safety_limits, self._t1)
 
     def _rate(self) -> None:
@@ -522,7 +529,7 @@ class KrcSession:
         return track.bridge() if target is None else track.command(target)
 
     def _missing(self) -> Objection | None:
-        """Whether one more missing answer can be bridged."""
+        """Objection to bridging one more missing answer."""
         missed = self._track.missed + 1
         if missed > self.policy.bridged_cycles:
             return (
@@ -532,14 +539,14 @@ class KrcSession:
         return self._judge.position(self._track.extrapolated().tolist(), "extrapolated")
 
     def _commanded(self) -> tuple[np.ndarray, Objection | None]:
-        """The setpoint of the answer, and what is to be said against it."""
+        """The setpoint of the answer, and the objection to it."""
         command, judge, held = self._command, self._judge, self._track.target
         objection = judge.flags(command, self._monitor_flags, self.control)
         if objection is not None or not command.cmd_flags & CommandFlag.JNTPOS:
             return held, objection
         if self.power == 0:
             return held, judge.mirror(command, held, "the command with the drives off")
-        # Through a list: numpy warns of a signalling NaN, which the judge will find.
+        # Through a list: numpy warns of a signalling NaN, left to the judge.
         target = np.array(command.jnt_pos.tolist())
         if self._first_command:
             objection = judge.mirror(command, held, "the first command")
@@ -554,7 +561,7 @@ class KrcSession:
 
 
 def _as_sent(q: ArrayLike) -> np.ndarray:
-    """(7,) float64 copy of `q` with the values that float32 can carry."""
+    """(7,) float64 copy of `q`, rounded to float32."""
     values = np.array(q, dtype=CMD["jnt_pos"].base).astype(float)
     if values.shape != (JOINTS,) or not np.isfinite(values).all():
         raise ValueError(f"joint position {values} must be {JOINTS} finite numbers")

@@ -1,284 +1,375 @@
-"""Emulated KRL programs: what runs on the controller beside FRI and obeys the PC's KRL variables.
+"""KRL programs on the emulated controller: the laboratory's program text itself is run.
 
-Three published programs are emulated by what they exchange with the PC: Stanford's FRIControl,
-CentroEPiaggio's ros_control, and RCPRG's fri_start. Each is a state machine stepped at the interpreter's tick
-of 12 ms. The PC's side of each is in ``fri.handshake``.
-
-Two liberties of ours: a wait for quality or for command mode also ends when the PC withdraws its request,
-where the published programs would hang; and after a fallback a start first sets KRL's setpoint anew (``PTP
-$AXIS_ACT``). Screen messages and their pauses are left out. None starts command mode again by itself.
+``KrlProgram`` knows the system variables and functions of the interface (``$FRI_TO_INT``, ``$FRISTATE``,
+``friOpen`` ...), the control strategy, motor currents and load data. ``Interpreter`` runs it beside an FRI
+session. Between two waits a program takes no time; a wait lasts whole ticks of 12 ms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from enum import Enum, auto
-from types import MappingProxyType
-from typing import Protocol
+import math
+import operator
+from collections.abc import Callable, Generator, Mapping
+from functools import lru_cache
+from typing import Any, Protocol
 
+import numpy as np
+
+from fri import krl_source as tree
+from fri.errors import ConfigurationError
 from fri.krc import KrcSession
-from fri.states import Quality, State
+from fri.states import State
 
-__all__ = ["PROGRAMS", "Interpreter", "KrlProgram", "RcprgProgram", "RosProgram", "StanfordProgram"]
+__all__ = ["AXES", "LOAD", "Interpreter", "KrlProgram", "Machinery", "NoMachinery"]
 
 #: Period of the KRL interpreter [ms].
 TICK_MS = 12
+#: Indices of the axes of KRL (A1 to A6, then E1) in the kinematic order A1 A2 E1 A3 A4 A5 A6.
+AXES = (0, 1, 3, 4, 5, 6, 2)
+#: Load data in the order of ``Machinery.load``: mass [kg], centre of mass [mm], inertia about it [kg m2].
+LOAD = (".M", ".CM.X", ".CM.Y", ".CM.Z", ".J.X", ".J.Y", ".J.Z")
+
+_LONGEST_RUN = 2000
+_ARRAYS = {f"$FRI_{way}_{kind}": 16 for way in ("FRM", "TO") for kind in ("INT", "REA", "BOOL")}
+_ARRAYS["$CURR_ACT"] = 7
+_STATES = ("$FRISTATE", "$FRIQUALITY", "$ON_PATH", "$ROB_STOPPED")
+_PLAIN = (*_STATES, "$STIFFNESS.STRATEGY", "$STIFFNESS.COMMIT", "$ADVANCE", "$LOAD")
+_READ_ONLY = (*_STATES, "$FRI_FRM_INT", "$FRI_FRM_REA", "$FRI_FRM_BOOL", "$CURR_ACT")
+_GOALS = ("$AXIS_ACT", "$AXIS_ACT_MES")
+_FUNCTIONS = {"FRISETUP": 3, "FRIOPEN": 1, "FRISTART": 1, "FRISTOP": 0, "FRICLOSE": 0, "BAS": 2}
+_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
+    "AND": lambda a, b: a and b,
+    "OR": lambda a, b: a or b,
+    "==": operator.eq,
+    "<>": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+    "<=": operator.le,
+    ">=": operator.ge,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+}
+
+Flow = Generator[None, None, str]
 
 
-class KrlProgram(Protocol):
-    """A KRL program; ``step`` is one tick of the interpreter."""
+class Machinery(Protocol):
+    """Motor currents and load data of the controller, beside the FRI session."""
 
-    name: str
-    finished: bool
+    currents: np.ndarray
+    """(7,) motor currents in kinematic order, in the unit of the emulated drives."""
 
-    def step(self, session: KrcSession) -> None:
-        """Run one tick, between two cycles of `session`."""
+    @property
+    def load(self) -> tuple[float, ...]:
+        """Load data in force in the order of `LOAD`."""
+
+    def set_load(self, load: tuple[float, ...]) -> None:
+        """Put load data in force."""
 
 
-class Interpreter:
-    """Runs a program at the interpreter's tick.
+class NoMachinery:
+    """Drives without current, and load data without effect."""
 
-    Parameters
-    ----------
-    session : KrcSession
-    program : KrlProgram or None
-        None runs the background alone.
-    background : callable or None
-        Called with the session at every tick before the program, as the submit interpreter is; for instance
-        to publish motor torques in ``$FRI_TO_REA``.
-    tick_ms : int
-        Period [ms].
+    def __init__(self) -> None:
+        self.currents = np.zeros(7)
+        self.load: tuple[float, ...] = (0.0,) * len(LOAD)
+
+    def set_load(self, load: tuple[float, ...]) -> None:
+        """Keep `load`."""
+        self.load = load
+
+
+class KrlProgram:
+    """A KRL module at work; ``step`` is one tick of the interpreter.
+
+    text, data : content of the `.src` and the `.dat` file
+    settings : values for variables of the data list, e.g. ``LWR_CYCLE``
+    machinery : motor currents and load data; None takes drives without current
+
+    Raises ConfigurationError with the line for a syntax error, or an unknown variable or function.
     """
 
     def __init__(
         self,
-        session: KrcSession,
-        program: KrlProgram | None = None,
-        background: Callable[[KrcSession], None] | None = None,
-        tick_ms: int = TICK_MS,
+        text: str,
+        data: str = "",
+        settings: Mapping[str, float | int | str] | None = None,
+        machinery: Machinery | None = None,
+        name: str = "KRL program",
     ) -> None:
+        self.name = name
+        self.finished = False
+        self.source = tree.parse_source(text, data, name)
+        self.machinery: Any = machinery if machinery is not None else NoMachinery()
+        self._session: KrcSession | None = None
+        self._strategy = 10
+        self._tick = 0
+        self._flow: Flow | None = None
+        _Check(self.source, name).module()
+        self._variables: dict[str, Any] = {}
+        for declared in self.source.declarations.values():
+            empty: Any = (0.0,) * len(LOAD) if declared.kind == "LOAD" else 0
+            self._variables[declared.name] = empty if declared.value is None else declared.value.value
+        for key, value in (settings or {}).items():
+            if key.upper() not in self._variables:
+                known = ", ".join(sorted(self._variables))
+                raise ConfigurationError(f"{name}: has no variable {key}; it has {known}")
+            self._variables[key.upper()] = value
+
+    def step(self, session: KrcSession) -> None:
+        """One tick of the interpreter: on to the next wait."""
+        self._session = session
+        self._tick += 1
+        if self._flow is None:
+            self._flow = self._block(self.source.subprograms[self.source.main])
+        try:
+            next(self._flow)
+        except StopIteration:
+            self.finished = True
+
+    def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
+        """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
+        for statement in statements:
+            left = ""
+            if isinstance(statement, tree.Assign):
+                self._write(statement.target, self._value(statement.value))
+            elif isinstance(statement, tree.Call):
+                if statement.name in self.source.subprograms:
+                    yield from self._block(self.source.subprograms[statement.name])
+                else:
+                    self._function(statement)
+            elif isinstance(statement, tree.Leave):
+                left = statement.what
+            elif isinstance(statement, tree.Branch):
+                chosen = statement.then if self._value(statement.condition) else statement.otherwise
+                left = yield from self._block(chosen)
+            elif isinstance(statement, tree.Switch):
+                left = yield from self._block(self._case(statement))
+            elif isinstance(statement, tree.Loop):
+                left = yield from self._loop(statement)
+            elif isinstance(statement, tree.For):
+                left = yield from self._count(statement)
+            elif isinstance(statement, tree.WaitFor):
+                while not self._value(statement.condition):
+                    yield
+            elif isinstance(statement, tree.WaitSeconds):
+                for _ in range(math.ceil(round(1000 * float(self._value(statement.seconds)) / TICK_MS, 9))):
+                    yield
+            else:
+                yield from self._move()
+            if left:
+                return left
+        return ""
+
+    def _count(self, statement: tree.For) -> Flow:
+        for value in range(int(self._value(statement.first)), int(self._value(statement.last)) + 1):
+            self._write(statement.variable, value)
+            left = yield from self._block(statement.body)
+            if left:
+                return "" if left == "EXIT" else left
+        return ""
+
+    def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:
+        subject = self._value(statement.subject)
+        for values, block in statement.cases:
+            if any(self._value(value) == subject for value in values):
+                return block
+        return statement.default
+
+    def _loop(self, statement: tree.Loop) -> Flow:
+        passes = 0
+        while True:
+            if statement.condition is not None and not self._value(statement.condition):
+                return ""
+            tick = self._tick
+            left = yield from self._block(statement.body)
+            if left:
+                return "" if left == "EXIT" else left
+            passes = passes + 1 if tick == self._tick else 0
+            if passes > _LONGEST_RUN:
+                raise ConfigurationError(f"{self.name}, line {statement.line}: the loop never waits")
+
+    def _move(self) -> Generator[None, None, None]:
+        """Set KRL's setpoint to the position of the arm, once the arm stands."""
+        session = self._need()
+        while session.ramping:
+            yield
+        if session.state is not State.CMD:
+            session.resync()
+
+    def _need(self) -> KrcSession:
+        assert self._session is not None
+        return self._session
+
+    def _value(self, expression: tree.Expression) -> Any:
+        if isinstance(expression, tree.Constant):
+            return expression.value
+        if isinstance(expression, tree.Name):
+            return self._read(expression)
+        if isinstance(expression, tree.Binary):
+            left, right = self._value(expression.left), self._value(expression.right)
+            if expression.operator == "/":
+                # KRL divides whole numbers without remainder.
+                whole = isinstance(left, int) and isinstance(right, int)
+                return int(left / right) if whole else left / right
+            return _OPERATORS[expression.operator](left, right)
+        if isinstance(expression, tree.Unary):
+            value = self._value(expression.operand)
+            return not value if expression.operator == "NOT" else -value
+        return self._function(expression)
+
+    def _read(self, name: tree.Name) -> Any:
+        session, (title, field) = self._need(), _split(name.name)
+        if title in self._variables or title == "$LOAD":
+            value = self.machinery.load if title == "$LOAD" else self._variables[title]
+            return value if not field else value[LOAD.index(field)]
+        if name.index is None:
+            return self._state(title)
+        place = self._place(name)
+        if title == "$CURR_ACT":
+            return float(self.machinery.currents[AXES[place]])
+        if title.endswith("_BOOL"):
+            return bool((session.to_bool if "_TO_" in title else session.from_bool) >> place & 1)
+        if title.endswith("_INT"):
+            return int((session.to_int if "_TO_" in title else session.from_int)[place])
+        return float((session.to_real if "_TO_" in title else session.from_real)[place])
+
+    def _state(self, title: str) -> Any:
+        session = self._need()
+        if title == "$FRISTATE":
+            return f"#{session.state.name}"
+        if title == "$FRIQUALITY":
+            return f"#{session.quality.name}"
+        if title == "$ON_PATH":
+            # A fallback leaves the arm away from the setpoint of KRL.
+            return not session.needs_resync
+        return not session.ramping if title == "$ROB_STOPPED" else self._strategy
+
+    def _write(self, name: tree.Name, value: Any) -> None:
+        session, (title, field) = self._need(), _split(name.name)
+        if field:
+            load = list(self._read(tree.Name(title)))
+            load[LOAD.index(field)] = float(value)
+            value = tuple(load)
+        if title == "$LOAD":
+            self.machinery.set_load(value)
+        elif title in self._variables:
+            self._variables[title] = value
+        elif title == "$STIFFNESS.STRATEGY":
+            self._strategy = int(value)
+        elif title == "$STIFFNESS.COMMIT":
+            session.set_strategy(self._strategy)
+        elif title == "$FRI_TO_INT":
+            session.to_int[self._place(name)] = int(value)
+        elif title == "$FRI_TO_REA":
+            session.to_real[self._place(name)] = float(value)
+        elif title == "$FRI_TO_BOOL":
+            bit = 1 << self._place(name)
+            session.to_bool = session.to_bool | bit if value else session.to_bool & ~bit
+
+    def _place(self, name: tree.Name) -> int:
+        assert name.index is not None
+        number = int(self._value(name.index))
+        if not 1 <= number <= _ARRAYS[name.name]:
+            raise ConfigurationError(
+                f"{self.name}: {name.name}[{number}] is outside 1 to {_ARRAYS[name.name]}"
+            )
+        return number - 1
+
+    def _function(self, call: tree.Call) -> Any:
+        session = self._need()
+        values = [self._value(argument) for argument in call.arguments]
+        if call.name == "FRIOPEN":
+            session.fri_open(int(values[0]))
+        elif call.name == "FRISTART":
+            session.fri_start(float(values[0]))
+        elif call.name == "FRISTOP":
+            session.fri_stop()
+        elif call.name == "FRICLOSE":
+            session.fri_close()
+        # friSetup and BAS have no effect: address, tool and velocities are the emulator's own.
+        return f"#{session.state.name}"
+
+
+class Interpreter:
+    """Runs `program` beside `session`, a tick every 12 ms; the first tick comes with the first call."""
+
+    def __init__(self, session: KrcSession, program: KrlProgram) -> None:
         self.session = session
         self.program = program
-        self.background = background
-        self.tick_ms = tick_ms
-        # The first tick comes with the first call.
         self._due_ms = 0
 
     def advance(self, milliseconds: int) -> None:
-        """Let `milliseconds` pass, between two cycles; runs the ticks that fall due."""
+        """Let `milliseconds` pass, between two cycles; runs the ticks due."""
         while self._due_ms <= 0:
-            if self.background is not None:
-                self.background(self.session)
-            if self.program is not None and not self.program.finished:
+            if not self.program.finished:
                 self.program.step(self.session)
-            self._due_ms += self.tick_ms
+            self._due_ms += TICK_MS
         self._due_ms -= milliseconds
 
 
-class _Step(Enum):
-    BEGIN = auto()
-    SETTLE = auto()
-    LOOP = auto()
-    QUALITY = auto()
-    COMMAND = auto()
-    PAUSE = auto()
-    ENDING = auto()
-    END = auto()
+@lru_cache(maxsize=256)
+def _split(name: str) -> tuple[str, str]:
+    """A name of load data and its field, `$LOAD` and `.CM.X`; any other name and nothing."""
+    for field in LOAD:
+        if name.endswith(field):
+            return name.removesuffix(field), field
+    return name, ""
 
 
-def _begin(session: KrcSession) -> None:
-    """What every program does first: end what was open and clear the variables to the PC."""
-    session.fri_close()
-    session.to_int[:] = 0
-    session.to_real[:] = 0.0
-    session.to_bool = 0
+class _Check:
+    """Search a module for unknown names and wrong numbers of arguments."""
 
+    def __init__(self, source: tree.Source, name: str) -> None:
+        self._source, self._name = source, name
 
-class StanfordProgram:
-    """Stanford's FRIControl.
+    def module(self) -> None:
+        for block in self._source.subprograms.values():
+            self._part(block, 0, written=False)
 
-    ``$FRI_FRM_INT[15]`` strategy, ``[16]`` 10 start, 20 stop, abort code: close. ``$FRI_TO_INT[16]`` 10
-    opened, 20 started, 30 closed; ``[15]`` the abort code, 30 or 40, toggled from one run of the program to
-    the next.
-    """
+    def _statement(self, statement: tree.Statement) -> None:
+        for value in vars(statement).values():
+            self._part(value, statement.line, written=False)
+        if isinstance(statement, (tree.Assign, tree.For)):
+            target = statement.target if isinstance(statement, tree.Assign) else statement.variable
+            self._variable(target, statement.line, written=True)
 
-    name = "stanford"
-    _CLOSING_TICKS = 8
+    def _part(self, value: Any, line: int, *, written: bool) -> None:
+        if isinstance(value, tuple):
+            for item in value:
+                self._part(item, line, written=written)
+        elif isinstance(value, tree.Name):
+            self._variable(value, line, written=written)
+        elif isinstance(value, tree.Statement) and not isinstance(value, tree.Call):
+            self._statement(value)
+        elif isinstance(value, tree.Call):
+            wanted = _FUNCTIONS.get(value.name, 0 if value.name in self._source.subprograms else None)
+            if wanted is None:
+                raise self._error(value.line, f"there is no function {value.name}")
+            if wanted != len(value.arguments):
+                raise self._error(
+                    value.line, f"{value.name} takes {wanted} arguments, not {len(value.arguments)}"
+                )
+            self._part(value.arguments, value.line, written=False)
+        elif isinstance(value, (tree.Unary, tree.Binary)):
+            for inner in vars(value).values():
+                self._part(inner, line, written=False)
 
-    def __init__(self, sample_time_ms: int, abort_code: int = 30) -> None:
-        if abort_code not in (30, 40):
-            raise ValueError(f"abort code {abort_code} is neither 30 nor 40")
-        self.finished = False
-        self.abort_code = abort_code
-        self._sample_time_ms = sample_time_ms
-        self._step = _Step.BEGIN
-        self._ticks = 0
+    def _variable(self, name: tree.Name, line: int, *, written: bool) -> None:
+        title, field = _split(name.name)
+        declared = self._source.declarations.get(title)
+        if field and title != "$LOAD" and (declared is None or declared.kind != "LOAD"):
+            raise self._error(line, f"there is no variable {name.name}")
+        if declared is None:
+            if title not in (*_ARRAYS, *_PLAIN, *_GOALS):
+                raise self._error(line, f"there is no variable {title}")
+            if title in _ARRAYS and name.index is None:
+                raise self._error(line, f"{title} needs an index")
+            if written and title in (*_READ_ONLY, *_GOALS):
+                raise self._error(line, f"{title} cannot be written")
+        if name.index is not None:
+            self._part(name.index, line, written=False)
 
-    def step(self, session: KrcSession) -> None:
-        """One tick of the interpreter."""
-        request = int(session.from_int[15])
-        status = session.to_int
-        if self._step is _Step.BEGIN:
-            _begin(session)
-            status[14] = self.abort_code
-            self._step = _Step.SETTLE
-        elif self._step is _Step.SETTLE:
-            if session.ramping:
-                return
-            session.resync()
-            session.set_strategy(10)
-            session.fri_open(self._sample_time_ms)
-            status[15] = 10
-            self._step = _Step.LOOP
-        elif self._step is _Step.LOOP:
-            if request == self.abort_code:
-                status[15] = 30
-                self._step = _Step.ENDING
-            elif request == 10 and status[15] != 20:
-                if _ready(session):
-                    session.set_strategy(int(session.from_int[14]))
-                    self._step = _Step.QUALITY
-            elif request == 20 and status[15] != 10:
-                session.fri_stop()
-                status[15] = 10
-        elif self._step is _Step.QUALITY or self._step is _Step.COMMAND:
-            self._step = _starting(session, self._step, withdrawn=request != 10)
-            if self._step is _Step.LOOP and session.state is State.CMD:
-                status[15] = 20
-        elif self._step is _Step.ENDING:
-            # The PC must be able to read the 30 before the packets end.
-            self._ticks += 1
-            if self._ticks >= self._CLOSING_TICKS:
-                session.fri_close()
-                self._step = _Step.END
-                self.finished = True
-
-
-class RosProgram:
-    """CentroEPiaggio's ros_control.
-
-    ``$FRI_FRM_INT[1]`` strategy, ``[2]`` 1 start, 0 stop. ``$FRI_TO_INT[2]`` 10 until the first start, then 1
-    started, 0 stopped. The first start stays in position control. There is no close.
-    """
-
-    name = "ros_control"
-
-    def __init__(self, sample_time_ms: int) -> None:
-        self.finished = False
-        self._sample_time_ms = sample_time_ms
-        self._step = _Step.BEGIN
-
-    def step(self, session: KrcSession) -> None:
-        """One tick of the interpreter."""
-        request = int(session.from_int[1])
-        status = session.to_int
-        if self._step is _Step.BEGIN:
-            _begin(session)
-            status[1] = 10
-            self._step = _Step.SETTLE
-        elif self._step is _Step.SETTLE:
-            if session.ramping:
-                return
-            session.resync()
-            session.set_strategy(10)
-            session.fri_open(self._sample_time_ms)
-            self._step = _Step.LOOP
-        elif self._step is _Step.LOOP:
-            if request == 0 and status[1] == 1:
-                session.fri_stop()
-                status[1] = 0
-            elif request == 1 and status[1] != 1 and _ready(session):
-                if status[1] != 10:
-                    session.set_strategy(int(session.from_int[0]))
-                self._step = _Step.QUALITY
-        elif self._step is _Step.QUALITY or self._step is _Step.COMMAND:
-            self._step = _starting(session, self._step, withdrawn=request != 1)
-            if self._step is _Step.LOOP and session.state is State.CMD:
-                status[1] = 1
-
-
-class RcprgProgram:
-    """RCPRG's fri_start.
-
-    ``$FRI_FRM_BOOL[1]`` makes the request of ``$FRI_FRM_INT[1]``: 1 start, 2 stop, 3 open again with the
-    period of ``$FRI_FRM_INT[2]``; ``$FRI_TO_BOOL[1]`` acknowledges while it is being carried out. Joint
-    impedance control. A request that simply stays is carried out once; the published program repeats it.
-    """
-
-    name = "rcprg"
-    _PAUSE_TICKS = 17
-
-    def __init__(self, sample_time_ms: int) -> None:
-        self.finished = False
-        self._sample_time_ms = sample_time_ms
-        self._step = _Step.BEGIN
-        self._ticks = 0
-        self._served: int | None = None
-
-    def step(self, session: KrcSession) -> None:
-        """One tick of the interpreter."""
-        if self._step is _Step.BEGIN:
-            _begin(session)
-            self._step = _Step.SETTLE
-        elif self._step is _Step.SETTLE:
-            if session.ramping:
-                return
-            session.resync()
-            session.set_strategy(30)
-            session.fri_open(self._sample_time_ms)
-            self._step = _Step.LOOP
-        elif self._step is _Step.LOOP:
-            request = int(session.from_int[0]) if session.from_bool & 1 else None
-            if request is not None and request != self._served:
-                session.to_bool |= 1
-                self._carry_out(session, request)
-                self._ticks = 0
-                self._step = _Step.PAUSE
-            self._served = request
-        elif self._step is _Step.PAUSE:
-            self._ticks += 1
-            if self._ticks >= self._PAUSE_TICKS and not session.ramping:
-                if session.state is State.MON:
-                    session.resync()
-                session.to_bool &= ~1
-                self._step = _Step.LOOP
-
-    def _carry_out(self, session: KrcSession, request: int) -> None:
-        if request == 1 and _ready(session):
-            session.fri_start(1.0)
-        elif request == 2:
-            session.fri_stop()
-        elif request == 3 and 1 <= int(session.from_int[1]) <= 100:
-            self._sample_time_ms = int(session.from_int[1])
-            session.fri_close()
-            session.fri_open(self._sample_time_ms)
-
-
-def _ready(session: KrcSession) -> bool:
-    """Whether a start may begin: monitor mode, the arm at rest, KRL's setpoint in step."""
-    if session.state is State.CMD:
-        return True
-    if session.ramping:
-        return False
-    if session.needs_resync:
-        session.resync()
-    return True
-
-
-def _starting(session: KrcSession, step: _Step, withdrawn: bool) -> _Step:
-    """Wait for quality, call friStart, wait for command mode; back to the loop when there or withdrawn."""
-    if withdrawn:
-        session.fri_stop()
-        return _Step.LOOP
-    if step is _Step.QUALITY:
-        if session.quality is not Quality.PERFECT:
-            return step
-        session.fri_start(1.0)
-        return _Step.COMMAND
-    return _Step.LOOP if session.state is State.CMD else step
-
-
-#: The programs by name; each is made with the sample time [ms].
-PROGRAMS: Mapping[str, Callable[[int], KrlProgram]] = MappingProxyType(
-    {program.name: program for program in (StanfordProgram, RosProgram, RcprgProgram)}
-)
+    def _error(self, line: int, text: str) -> ConfigurationError:
+        return ConfigurationError(f"{self._name}, line {line}: {text}")

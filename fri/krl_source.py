@@ -1,9 +1,8 @@
-"""KRL source text as a tree: the part of the language that a program beside FRI needs.
+"""KRL source text as a tree, for the part of the language used beside FRI.
 
 Assignments, IF, SWITCH, LOOP, WHILE, FOR, EXIT, RETURN, WAIT FOR, WAIT SEC, PTP, calls, DEF without
 parameters; INT, REAL, BOOL, CHAR and enumeration variables, declared in the program or in its data list.
-Anything else is an error that names the line, so that a program that is understood here has no typing mistake
-in it.
+Anything else is an error with its line, so a program without errors has no typing mistake.
 """
 
 from __future__ import annotations
@@ -14,27 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from fri.errors import ConfigurationError
 
-__all__ = [
-    "Assign",
-    "Binary",
-    "Branch",
-    "Call",
-    "Constant",
-    "Declaration",
-    "Expression",
-    "For",
-    "Leave",
-    "Loop",
-    "Move",
-    "Name",
-    "Source",
-    "Statement",
-    "Switch",
-    "Unary",
-    "WaitFor",
-    "WaitSeconds",
-    "parse_source",
-]
+__all__ = ["Expression", "Source", "Statement", "parse_source"]
 
 
 @dataclass(frozen=True)
@@ -62,7 +41,7 @@ class Unary:
 
 @dataclass(frozen=True)
 class Binary:
-    """Two operands and what joins them."""
+    """Two operands and their operator."""
 
     operator: str
     left: Expression
@@ -71,7 +50,7 @@ class Binary:
 
 @dataclass(frozen=True)
 class Call:
-    """A function or subprogram by its name in capitals; `line` where it stands."""
+    """A function or subprogram by its name in capitals, and its line."""
 
     name: str
     arguments: tuple[Expression, ...]
@@ -112,7 +91,7 @@ class Switch:
 
 @dataclass(frozen=True)
 class Loop:
-    """LOOP, or WHILE where there is a condition."""
+    """LOOP, or WHILE with a condition."""
 
     body: tuple[Statement, ...]
     condition: Expression | None
@@ -229,7 +208,7 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _declare(line: str, number: int, name: str) -> dict[str, Declaration] | None:
-    """Variables that a line declares; None where it is no declaration."""
+    """Variables declared in a line; None for any other line."""
     match = _DECLARED.fullmatch(line)
     if match is None:
         return None
@@ -424,7 +403,7 @@ class _Reader:
         return self._lines[self._at][1].split()[0].split("(")[0].upper()
 
     def _block(self, *ends: str) -> tuple[Statement, ...]:
-        """Statements up to one of `ends`, which is not taken."""
+        """Statements up to one of `ends`; this line remains."""
         found: list[Statement] = []
         while (word := self._keyword()) not in ends:
             if word in _BLOCK_ENDS:

@@ -5,8 +5,7 @@ Both are little-endian with natural 4-byte alignment and no implicit padding. Th
 one; offsets and sizes are asserted on import. Joints run in kinematic order A1 A2 E1 A3 A4 A5 A6, units are
 SI.
 
-``MsrBuffer`` and ``CmdBuffer`` are receive buffers with their field views bound once: a datagram is received
-into them without allocation and judged by ``fault``.
+``MsrBuffer`` and ``CmdBuffer`` receive datagrams without allocation: their field views are bound once.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ __all__ = [
     "new_msr",
 ]
 
-#: Joints in the order of the wire, which is the kinematic order; E1 is the third.
+#: Joints in the order of the wire, the kinematic order; E1 is the third.
 JOINT_NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 JOINTS = len(JOINT_NAMES)
 
@@ -79,7 +78,7 @@ MSR = np.dtype(
         ("msr_jnt_pos", "<f4", (7,)),  # [rad]
         ("msr_cart_pos", "<f4", (12,)),  # 3x4 row-major [R|p], p in m
         ("cmd_jnt_pos", "<f4", (7,)),  # setpoint of the KRL interpolator, before FRI [rad]
-        ("cmd_jnt_pos_fri_offset", "<f4", (7,)),  # what FRI adds to it [rad]
+        ("cmd_jnt_pos_fri_offset", "<f4", (7,)),  # FRI's addition to it [rad]
         ("cmd_cart_pos", "<f4", (12,)),
         ("cmd_cart_pos_fri_offset", "<f4", (12,)),
         ("msr_jnt_trq", "<f4", (7,)),  # joint torque sensors, after the gear [Nm]
@@ -91,7 +90,7 @@ MSR = np.dtype(
     ]
 )
 
-#: Command, PC to controller. The controller uses the fields that `cmd_flags` names and ignores the rest.
+#: Command, PC to controller. The controller uses only the fields named in `cmd_flags`.
 CMD = np.dtype(
     [
         *_HEAD,
@@ -118,7 +117,7 @@ _HEAD_OFFSETS = {
     "krl_fill": 138,
 }
 
-#: Byte offset of every field, from the protocol's table; what the dtypes are held against.
+#: Byte offset of every field, from the protocol's table; the dtypes are checked against it.
 MSR_OFFSETS = {
     **_HEAD_OFFSETS,
     "timestamp": 140,
@@ -178,7 +177,7 @@ def _assert_layout(dtype: np.dtype, size: int, offsets: dict[str, int]) -> None:
 _assert_layout(MSR, MSR_SIZE, MSR_OFFSETS)
 _assert_layout(CMD, CMD_SIZE, CMD_OFFSETS)
 
-# A datagram longer than a packet must be seen as such, so the buffers are larger than either.
+# Larger than either packet, so that longer datagrams are recognised.
 _BUFFER_SIZE = 2048
 # No axis of the arm turns by more than 340 degrees, no torque sensor reads 1000 Nm: more is a damaged packet.
 _MAX_POSITION_NORM = math.sqrt(3 * JOINTS) * 2 * math.pi
@@ -281,7 +280,7 @@ class MsrBuffer:
 class CmdBuffer:
     """Receive buffer for commands; ``load`` copies a datagram in and judges its header.
 
-    Which numbers must be finite depends on the flags, so the controller's end judges the values.
+    The values are judged by the controller's end: only fields in use must be finite.
     """
 
     _head = struct.Struct("<4H").unpack_from

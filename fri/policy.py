@@ -1,9 +1,8 @@
-"""What the controller enforces: the limits of the arm, and our choices where KUKA's documents are silent.
+"""Limits of the arm, and the thresholds of the controller for the link.
 
-The documents fix that the timing is rated over the last 100 packets, that command mode needs good timing "for
-some time", that single dropouts are bridged by extrapolation, and that limits and errors end command mode.
-They give no thresholds. Every number of ``KrcPolicy`` is therefore ours, chosen to be plausible and
-configurable.
+KUKA's documents fix four rules. The timing is rated over the last 100 packets. Command mode needs good timing
+"for some time". Extrapolation bridges single dropouts. Limits and errors end command mode. They give no
+thresholds: every number of ``KrcPolicy`` is an assumption of this project, plausible and configurable.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ __all__ = ["KrcLimits", "KrcPolicy"]
 
 @dataclass(frozen=True)
 class KrcPolicy:
-    """Policy of the controller's end where KUKA is silent; all of it is ours.
+    """Thresholds of the controller's end; assumptions of this project, not numbers of KUKA.
 
     Attributes
     ----------
     window : int
-        Packets over which answers are rated (this one is KUKA's: 100).
+        Packets in the rating of the answers (KUKA's own number: 100).
     minimum_packets : int
         Packets before any quality above UNACCEPTABLE is given.
     perfect_rate, ok_rate, bad_rate : float
@@ -34,9 +33,9 @@ class KrcPolicy:
     perfect_latency : float
         Largest mean latency for PERFECT, as a fraction of the sample time.
     start_quality : Quality
-        Quality that friStart needs ...
+        Least quality for friStart ...
     start_dwell : int
-        ... for so many packets in a row, counted anew when the control mode changes.
+        ... over so many packets in a row, counted anew after a change of the control mode.
     hold_quality : Quality
         Least quality for staying in command mode.
     bridged_cycles : int
@@ -57,7 +56,7 @@ class KrcPolicy:
     stop_acceleration_factor : float
         Deceleration of the arm after command mode, as a factor on the acceleration limits.
     stop_jerk_time_s : float
-        Time [s] in which that deceleration builds up.
+        Rise time of this deceleration [s].
     """
 
     window: int = 100
@@ -117,10 +116,10 @@ class KrcPolicy:
 
 @dataclass(frozen=True)
 class KrcLimits:
-    """Limits of the arm that the controller enforces, each (7,) in wire order.
+    """Limits of the arm, each (7,) in wire order.
 
-    q_min, q_max : positions [rad]; v_max : speeds [rad/s]; a_max : accelerations [rad/s^2], used for the stop
-    and, where the policy asks for it, for commands.
+    q_min, q_max : positions [rad]; v_max : speeds [rad/s]; a_max : accelerations [rad/s^2] of the stop, and of
+    commands if the policy has an `acceleration_factor`.
     """
 
     q_min: np.ndarray

@@ -1,16 +1,16 @@
 """The PC's end of the link: receive measurements, answer each one once.
 
-The PC is the server: it binds its port, the controller sends first, and every packet is answered to the
-address it came from. What arrives is checked (length, id, size field, enumerations, finite joint values) and
-counted; only packets of the controller are answered. Outside commanding the answer is the mirror of the
-controller's setpoint,
+The PC is the server: it binds its port, the controller sends first, and every packet is answered to its
+sender. Datagrams are checked (length, id, size field, enumerations, finite joint values) and counted; only
+packets of the controller are answered. Outside commanding the answer is the mirror of the controller's
+setpoint,
 
     jnt_pos = cmd_jnt_pos + cmd_jnt_pos_fri_offset,
 
 with the flags of the control mode and no additional torque. Flags change in monitor mode only.
 
-The path of a packet allocates nothing that lasts, logs nothing and makes one system call to receive and one
-to answer; what is rare (another sender, a restart) is kept in ``events`` for the caller to report.
+The path of a packet has no lasting allocation, no logging, and one system call each to receive and to answer.
+Rare events (another sender, a restart) are kept in ``events`` for the caller to report.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from collections import deque
 from enum import Enum
 from math import hypot, isfinite
 from time import monotonic, monotonic_ns
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -36,22 +35,21 @@ from fri.states import FLAGS, Control, State
 
 __all__ = ["DEFAULT_PORT", "LinkEvent", "LinkEventKind", "RemoteEnd"]
 
-#: UDP port on which FRI clients listen unless the controller is set up otherwise.
+#: UDP port of FRI clients by default.
 DEFAULT_PORT = 49938
 
 _CMD = int(State.CMD)
 _JNT_POS = slice(CMD_OFFSETS["jnt_pos"], CMD_OFFSETS["jnt_pos"] + 4 * JOINTS)
-# Another port of the controller's host is the controller started again only if the known port has been quiet
-# so long.
+# Silence of the known port [s] before another port of the same host is taken for the restarted controller.
 _PORT_GRACE_S = 0.1
-# So many different foreign hosts are named in events; further ones are counted only.
+# Number of foreign hosts named in events; further ones are counted only.
 _NAMED_FOREIGN = 16
-# Even with a timeout of zero, worthless datagrams are cleared away for so long.
+# Time for clearing away worthless datagrams, even with a timeout of zero.
 _SHORTEST_FLOOD_S = 0.005
 
 
 class LinkEventKind(Enum):
-    """What happened on the link."""
+    """Kinds of rare events on the link."""
 
     LOCKED = "locked"
     FOREIGN = "foreign"
@@ -60,7 +58,7 @@ class LinkEventKind(Enum):
 
 
 class LinkEvent(NamedTuple):
-    """Something rare on the link: number of the newest packet then, kind, and a sentence."""
+    """A rare event on the link: number of the newest packet then, kind, and a sentence."""
 
     sequence: int
     kind: LinkEventKind
@@ -77,12 +75,12 @@ def _ip(value: str, subject: str) -> str:
 
 
 class RemoteEnd:
-    """PC end of an FRI link; a context manager that closes the socket.
+    """PC end of an FRI link; as a context manager it closes the socket.
 
     Parameters
     ----------
     address : str
-        IPv4 address of the network interface to bind; nothing else is listened on.
+        IPv4 address of the network interface to bind.
     port : int
         UDP port to bind, 0 for any free one.
     controller : str or None
@@ -93,12 +91,12 @@ class RemoteEnd:
     Attributes
     ----------
     msr : np.ndarray
-        Last measurement, shape (), dtype `MSR`. The next ``receive`` overwrites it: copy what you keep.
+        Last measurement, shape (), dtype `MSR`. The next ``receive`` overwrites it: copy values to keep.
     command : np.ndarray
-        The command, shape (), dtype `CMD`; after ``answer`` it is exactly what was sent.
+        The command, shape (), dtype `CMD`; after ``answer`` it is exactly the datagram sent.
     krl_real, krl_int : np.ndarray
-        (16,) views into `command`: ``$FRI_FRM_REA[n]`` is ``krl_real[n - 1]``. They stay until changed and
-        are cleared when the controller restarts, so that a request made to the run before is not made again.
+        (16,) views into `command`: ``$FRI_FRM_REA[n]`` is ``krl_real[n - 1]``. They stay until changed. A
+        restart of the controller clears them, and with them the requests to its last run.
     sequence : int
         Unwrapped number of the last measurement; state, quality, power, control, error (int), timestamp_s and
         sample_time_s are its fields, received_ns the monotonic time of its arrival.
@@ -110,13 +108,13 @@ class RemoteEnd:
         Malformed datagrams by reason.
     received, answered, lost, repeated, reordered, suspect, malformed, foreign, restarts, port_changes,
     unreflected, send_errors : int
-        Counters. `lost` includes what came too late (`reordered`); `unreflected` counts answers of ours that
-        the controller had not seen when it sent its next packet.
+        Counters. `lost` includes late packets (`reordered`); `unreflected` counts answers not yet seen by the
+        controller in its next packet.
 
     Raises
     ------
     ConfigurationError
-        An address or the port is not one.
+        An address or the port is invalid.
     NetworkError
         The address cannot be bound.
     """
@@ -193,27 +191,27 @@ class RemoteEnd:
 
     @property
     def lost(self) -> int:
-        """Packets of the controller that never came or came too late."""
+        """Missing and late packets of the controller."""
         return self._tracker.lost
 
     @property
     def repeated(self) -> int:
-        """Packets that came more than once."""
+        """Packets received again."""
         return self._tracker.repeated
 
     @property
     def reordered(self) -> int:
-        """Packets that came after a newer one."""
+        """Packets received after a newer one."""
         return self._tracker.reordered
 
     @property
     def suspect(self) -> int:
-        """Packets held back because their counter fitted nothing."""
+        """Packets held back for an implausible counter."""
         return self._tracker.suspect
 
     @property
     def restarts(self) -> int:
-        """How often the controller has started counting anew."""
+        """Restarts of the controller's counter."""
         return self._tracker.restarts
 
     def counters(self) -> dict[str, int]:
@@ -235,43 +233,33 @@ class RemoteEnd:
 
     @property
     def descriptor(self) -> int:
-        """File descriptor of the socket, for somebody who waits in place of ``receive``."""
+        """File descriptor of the socket, for waiting outside ``receive``."""
         return self._socket.fileno()
 
     @property
     def buffer(self) -> bytearray:
-        """Where datagrams are received."""
+        """Receive buffer of the datagrams."""
         return self._msr.buffer
 
     @property
     def foreseen(self) -> int | None:
-        """Counter of the next packet; None if the answer to it depends on more than its being the next one in
-        command mode, still in position control with drives on.
+        """Counter of the next packet, or None if its answer cannot be prepared.
+
+        A prepared answer fits a next packet in command mode and position control with the drives on.
         """
         if self._torque_set or self._flags_control != Control.POSITION:
             return None
         return self._tracker.expected
 
     def foresee(self, jnt_pos: np.ndarray, out: memoryview, ahead: int = 0) -> None:
-        """Write what ``answer(jnt_pos)`` will send to the packet that comes `ahead` packets after the next one.
+        """Prepare the datagram of ``answer(jnt_pos)`` for the packet `ahead` packets after the next one.
 
-        Parameters
-        ----------
-        jnt_pos : np.ndarray
-            (7,) float32, finite [rad].
-        out : memoryview
-            The 376 bytes of the answer.
-        ahead : int
-            How many packets come, and are answered, before it.
-
-        Raises
-        ------
-        RuntimeError
-            ``foreseen`` is None.
+        jnt_pos : (7,) float32, finite [rad]; out : the 376 bytes of the answer; ahead : number of answered packets
+        before it. RuntimeError if ``foreseen`` is None.
         """
         expected = self.foreseen
         if expected is None:
-            raise RuntimeError("no answer can be told beforehand: the next packet is not known")
+            raise RuntimeError("no answer can be prepared: the next packet is not known")
         out[:] = self._out
         out[_JNT_POS] = jnt_pos.data.cast("B")
         self._pack_sequence(out, 0, (self.send_seq + 1 + ahead) & 0xFFFF, (expected + ahead) & 0xFFFF)
@@ -283,17 +271,9 @@ class RemoteEnd:
 
         Repeated, late, malformed and foreign datagrams are counted and passed over within the same timeout.
 
-        Parameters
-        ----------
-        timeout_s : float
-            Longest wait [s]; 0 takes what is there. The kernel rounds it up to its tick, up to 10 ms.
-        arrived : tuple or None
-            Length, source and time [ns] of a datagram that has been received into ``buffer`` already.
-
-        Returns
-        -------
-        np.ndarray or None
-            ``self.msr``, or None after `timeout_s`.
+        timeout_s : longest wait [s]; 0 does not wait. The kernel rounds it up to its tick, up to 10 ms.
+        arrived : length, source and time [ns] of a datagram already in ``buffer``, or None
+        Returns ``self.msr``, or None after `timeout_s`.
         """
         self._unanswered = False
         deadline = monotonic() + max(timeout_s, _SHORTEST_FLOOD_S)
@@ -316,7 +296,7 @@ class RemoteEnd:
             flags = self._set_timeout(remaining if timeout_s > 0.0 else 0.0)
 
     def pending(self) -> bool:
-        """Whether another datagram is waiting, which makes the one in hand a stale one."""
+        """Whether another datagram is waiting; the present packet is stale then."""
         return bool(self._poll.poll(0))
 
     def answer(
@@ -327,32 +307,17 @@ class RemoteEnd:
         insist: bool = False,
         sent: bool = False,
     ) -> bool:
-        """Answer the packet that ``receive`` returned; once.
+        """Answer the packet of the last ``receive``, once.
 
-        Parameters
-        ----------
-        jnt_pos : array_like or None
-            (7,) setpoint [rad]. It is used only while `commanding`; otherwise, and with None, the mirror goes
-            out.
-        add_jnt_trq : array_like or None
-            (7,) additional torque [Nm], likewise; None is zero.
-        insist : bool
-            Send the setpoint although the packet says that the arm does not follow: it may be damaged. A
-            controller that does not follow ignores it.
-        sent : bool
-            The answer, as ``foresee`` wrote it, has left by another hand: only take it into account.
+        jnt_pos : (7,) setpoint [rad], used only while `commanding`. Otherwise, and with None, the mirror is sent.
+        add_jnt_trq : (7,) additional torque [Nm], likewise; None is zero
+        insist : send the setpoint although, by the packet, the arm does not follow: the packet may be damaged, and
+        a controller in monitor mode ignores the setpoint
+        sent : the datagram of ``foresee`` has been sent already: only count it
 
-        Returns
-        -------
-        bool
-            True if `jnt_pos` was sent, False if the mirror was, or if the network refused the datagram.
-
-        Raises
-        ------
-        RuntimeError
-            There is no packet to answer, or it has been answered.
-        ValueError
-            A value is not finite as float32; nothing is sent.
+        Returns True if `jnt_pos` was sent, False if the mirror was, or if the network refused the datagram. Raises
+        RuntimeError without a packet to answer or for a second answer, ValueError for a value not finite as
+        float32; nothing is sent then.
         """
         if not self._unanswered:
             raise RuntimeError(
@@ -398,10 +363,10 @@ class RemoteEnd:
         return used
 
     def remind(self) -> None:
-        """In lock step only: the last answer once more, to say that nothing came after the packet it was for.
+        """Send the last answer once more: no packet has come since. In lock step only.
 
-        A controller that waits for an answer which was lost, or whose packet was, sends its packet again. A
-        real controller never waits, and must not get this.
+        After a lost packet or a lost answer the emulator waits, and this makes it send its packet again. A real
+        controller never waits, and must not get this.
         """
         if self.controller is None:
             return
@@ -412,7 +377,7 @@ class RemoteEnd:
             self.send_errors += 1
 
     def set_krl_bool(self, index: int, value: bool) -> None:
-        """Set bit `index` (0..15), which is ``$FRI_FRM_BOOL[index + 1]``, in the answers from now on."""
+        """Set bit `index` (0..15), ``$FRI_FRM_BOOL[index + 1]``, in the answers from now on."""
         if not 0 <= index < 16:
             raise ValueError(f"KRL boolean index {index} is outside 0..15")
         bits = int(self.command["krl_bool"])
@@ -430,12 +395,7 @@ class RemoteEnd:
     def __enter__(self) -> RemoteEnd:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _set_timeout(self, timeout_s: float) -> int:
@@ -464,8 +424,7 @@ class RemoteEnd:
             self.malformed_by[fault] += 1
             return False
         if new_source:
-            # A session that was opened again begins in monitor mode; command mode never moves to another
-            # port.
+            # A new session begins in monitor mode; command mode never moves to another port.
             if self.controller is not None and msr.state == _CMD:
                 self._count_foreign(source)
                 return False

@@ -1,10 +1,10 @@
-"""The controller's 16-bit packet counter as a 64-bit one, and what became of the packets in between.
+"""The controller's 16-bit packet counter without wraps, and the counts of lost, late and repeated packets.
 
-A jump of the counter is either a gap (packets were lost), a late packet (the network changed the order), a
-damaged packet, or a controller that was started again. The controller's timestamp tells them apart: over a
-gap, counter and clock advance together; a clock that went back by more than a second is a restart. A jump
-that fits nothing, or spans more than half the counter's range, is held back until the next packet confirms
-it, so that a single damaged packet is not taken for a restart or a long silence.
+A jump of the counter has one of four causes: a gap (lost packets), a late packet (the network changed the
+order), a damaged packet, or a restart of the controller. The controller's timestamp tells them apart. Over a
+gap, counter and clock advance together; a clock more than a second behind is a restart. Any other jump, or one
+of more than half the counter's range, is held back until the next packet confirms it. A single damaged packet
+is thus never taken for a restart or a long silence.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from enum import Enum
 __all__ = ["Arrival", "SequenceTracker"]
 
 _WRAP = 0x10000
-# Disagreement of counter and clock over a jump that still counts as agreement [packets], plus 2 % of it.
+# Tolerance between counter and clock over a jump [packets], in addition to 2 % of the jump.
 _SLACK = 16
 # A packet older than this [s] is not late: the controller's clock began anew.
 _LATEST_S = 1.0
-# A clock that is wrong at a jump of the counter by no more than this is damage, not a restart.
+# Up to this jump of the counter [packets] a wrong clock is damage, not a restart.
 _SHORT_JUMP = 64
-# So many old packets in a row, in order, are a controller that counts from an earlier number.
+# So many old packets in a row, in order, are a restart with an earlier count.
 _OLD_RUN = 40
 _FLOAT32_EPS = 1.2e-7
 
 
 class Arrival(Enum):
-    """What a packet's counter says about it."""
+    """Classes of packets by their counter."""
 
     NEW = "new"
     REPEATED = "repeated"
@@ -38,15 +38,10 @@ class Arrival(Enum):
 class SequenceTracker:
     """Unwraps `send_seq` and counts.
 
-    Attributes
-    ----------
-    sequence : int
-        Number of the newest packet. It starts with the first packet's own count and always increases; after a
-        restart of the controller it goes on with the next number.
-    lost : int
-        Packets that never arrived, or arrived after a newer one.
-    repeated, reordered, suspect, restarts : int
-        Packets that came again; that came after a newer one; whose counter fitted nothing; restarts seen.
+    sequence : number of the newest packet. It starts with the first packet's own count and always increases; after
+    a restart of the controller it goes on with the next number.
+    lost : packets missing, or arrived after a newer one. repeated, reordered, suspect, restarts : repeated packets;
+    packets after a newer one; packets with an implausible counter; restarts
     """
 
     __slots__ = (
@@ -80,14 +75,13 @@ class SequenceTracker:
 
     @property
     def expected(self) -> int | None:
-        """Counter of the packet that is NEW whatever else it says; None before the first, and in doubt."""
+        """Counter of the next packet; None before the first, and in doubt."""
         return (self._last + 1) & 0xFFFF if self._last >= 0 > self._suspect else None
 
     def feed(self, send_seq: int, timestamp: float, sample_time: float, new_source: bool = False) -> Arrival:
         """Take in one packet's counter (0..65535), timestamp [s] and sample time [s].
 
-        `new_source` says that it came from another port than the last one: an older count is then a restart
-        at once.
+        new_source : the packet has another port than the last one, so an older count is a restart at once
         """
         last = self._last
         if last < 0:
@@ -132,12 +126,12 @@ class SequenceTracker:
         return self._doubt(step if agrees and step > 0 else 0, send_seq, timestamp, sample_time)
 
     def _slack(self, cycles: float, timestamp: float, sample_time: float) -> float:
-        """Disagreement of counter and clock [packets] that still counts as agreement."""
+        """Tolerance between counter and clock [packets]."""
         resolution = _FLOAT32_EPS * max(abs(timestamp), abs(self._timestamp)) / sample_time
         return _SLACK + 0.02 * abs(cycles) + 2.0 * resolution
 
     def _old_packet(self, send_seq: int, timestamp: float) -> Arrival:
-        """Count late packets in a row: in order, they may be a controller that counts anew."""
+        """Count late packets in a row: in order, they may be a restarted count."""
         follows = self._old_run > 0 and ((send_seq - self._old) & 0xFFFF) <= 1
         self._old_run = self._old_run + 1 if follows else 1
         self._old = send_seq

@@ -1,7 +1,7 @@
-"""Enumerations of FRI 1.0 and its session state machine, as data.
+"""Enumerations of FRI 1.0, its session state machine as data, and the events of a session.
 
-The numbers are the protocol's. The members that exist only inside a KUKA client (state and quality "invalid")
-are left out: a packet that carries anything else than these values is malformed.
+The numbers are the protocol's, without the "invalid" members of a KUKA client: a packet with any other value
+is malformed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Enum, IntEnum, IntFlag
 from types import MappingProxyType
+from typing import NamedTuple
 
 __all__ = [
     "ALLOWED_FLAGS",
@@ -19,6 +20,8 @@ __all__ = [
     "TRANSITIONS",
     "CommandFlag",
     "Control",
+    "Event",
+    "EventKind",
     "Quality",
     "State",
     "Trigger",
@@ -55,7 +58,7 @@ class Control(IntEnum):
 
 
 class CommandFlag(IntFlag):
-    """Which fields of a command the controller shall use; may change in monitor mode only."""
+    """Fields of a command in use; may change in monitor mode only."""
 
     JNTPOS = 0x0001
     JNTTRQ = 0x0004
@@ -68,7 +71,7 @@ class CommandFlag(IntFlag):
 
 
 class Trigger(Enum):
-    """What moves the session from one state to another."""
+    """Causes of a change of state."""
 
     FRI_OPEN = "friOpen"
     FRI_START = "friStart with the timing in sync"
@@ -77,7 +80,7 @@ class Trigger(Enum):
     FAULT = "fault"
 
 
-#: The session state machine: what is not listed does not change the state.
+#: The session state machine; any other trigger leaves the state unchanged.
 TRANSITIONS: Mapping[tuple[State, Trigger], State] = MappingProxyType(
     {
         (State.OFF, Trigger.FRI_OPEN): State.MON,
@@ -91,7 +94,7 @@ TRANSITIONS: Mapping[tuple[State, Trigger], State] = MappingProxyType(
 _JOINT = CommandFlag.JNTPOS | CommandFlag.JNTTRQ | CommandFlag.JNTSTIFF | CommandFlag.JNTDAMP
 _CARTESIAN = CommandFlag.CARTPOS | CommandFlag.TCPFT | CommandFlag.CARTSTIFF | CommandFlag.CARTDAMP
 
-#: The full flag set that a client sends in each control mode: 0x0001, 0x0035, 0x3500.
+#: Full flag set of a client for each control mode: 0x0001, 0x0035, 0x3500.
 FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
     {
         Control.OTHER: CommandFlag(0),
@@ -101,7 +104,7 @@ FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
     }
 )
 
-#: Flags that make sense in each control mode. In Cartesian impedance JNTPOS asks for a null-space posture.
+#: Flags allowed in each control mode. In Cartesian impedance JNTPOS asks for a null-space posture.
 ALLOWED_FLAGS: Mapping[Control, CommandFlag] = MappingProxyType(
     {
         Control.OTHER: _JOINT | _CARTESIAN,
@@ -119,3 +122,34 @@ STRATEGY_BY_CONTROL: Mapping[Control, int] = MappingProxyType(
 CONTROL_BY_STRATEGY: Mapping[int, Control] = MappingProxyType(
     {strategy: control for control, strategy in STRATEGY_BY_CONTROL.items()}
 )
+
+
+class EventKind(Enum):
+    """Kinds of events; those after REFUSED end command mode."""
+
+    OPENED = "opened"
+    STARTED = "started"
+    STOPPED = "stopped"
+    CLOSED = "closed"
+    REFUSED = "start refused"
+    MISSES = "answers missing"
+    MALFORMED = "malformed datagram"
+    WRONG_FLAGS = "wrong command flags"
+    FLAGS_CHANGED = "command flags changed"
+    NOT_FINITE = "value not finite"
+    NOT_MIRRORED = "command away from the mirror"
+    POSITION = "position limit"
+    VELOCITY = "velocity limit"
+    ACCELERATION = "acceleration limit"
+    QUALITY = "quality"
+    DRIVES_OFF = "drives off"
+    DRIVE_ERROR = "drive error"
+    EXTERNAL = "external"
+
+
+class Event(NamedTuple):
+    """An event of the session: its cycle, its kind, and a sentence about it."""
+
+    cycle: int
+    kind: EventKind
+    text: str

@@ -31,18 +31,9 @@ def classify(
 class AnswerStatistics:
     """Sliding window over the last packets, updated in constant time with exact integer sums.
 
-    Call ``close(latency_ns)`` once per packet, with the latency of its answer or None if none came in time.
-
-    Attributes
-    ----------
-    packets : int
-        Packets in the window, at most `window`.
-    answer_rate, miss_rate : float
-        Shares of the window.
-    latency, jitter : float
-        Mean and standard deviation of the round trip [s] over the answers of the window, late ones included.
-    miss_counter : int
-        Missing answers since the start.
+    packets : packets in the window, at most `window`. answer_rate, miss_rate : shares of the window. latency, jitter :
+    mean and standard deviation of the round trip [s] over the answers of the window, late ones included.
+    miss_counter : missing answers since the start
     """
 
     def __init__(self, window: int) -> None:

@@ -1,6 +1,11 @@
-"""The total setpoint of the arm and how it goes on: commanded, extrapolated, braking, or moved by KRL.
+"""The total setpoint of the arm over time: commanded, extrapolated, braking, or moved by KRL.
 
-Periods are cut into milliseconds: a setpoint is approached linearly over the period and reached at its end.
+Within a period the setpoint moves linearly, in steps of 1 ms, to its new value. The controller's own stop
+brakes each joint with bounded deceleration and jerk: the deceleration rises linearly to its bound, stays, and
+falls linearly to zero (second half of a seven-segment profile). For a speed v, a bound a and a jerk j the
+segments end at
+
+    t_j = min(a / j, sqrt(v / j)),   t_j + max(0, v / a - t_j),   and t_j later.
 """
 
 from __future__ import annotations
@@ -9,27 +14,58 @@ import numpy as np
 
 from fri.packets import JOINTS
 from fri.policy import KrcLimits, KrcPolicy
-from fri.ramp import StopRamp
 
-__all__ = ["SetpointTrack"]
+__all__ = ["SetpointTrack", "StopRamp"]
+
+
+class StopRamp:
+    """Positions of seven joints braking from (q, v), each joint at its own bounds.
+
+    q, v : (7,) position [rad] and velocity [rad/s] at the beginning of the stop. a, j : (7,) bounds of
+    deceleration [rad/s^2] and jerk [rad/s^3]. q_min, q_max : (7,) ends of travel [rad]; the ramp stays inside, or
+    goes no further out if it begins outside.
+    """
+
+    def __init__(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        a: np.ndarray,
+        j: np.ndarray,
+        q_min: np.ndarray,
+        q_max: np.ndarray,
+    ) -> None:
+        self._q = np.array(q, dtype=float)
+        self._sign = np.sign(v)
+        speed = np.abs(v)
+        self._speed = speed
+        self._jerk = np.array(j, dtype=float)
+        self._rise = np.minimum(a / j, np.sqrt(speed / j))
+        self._hold = np.maximum(0.0, speed / a - self._rise)
+        self._peak = self._jerk * self._rise
+        self._low = np.minimum(q_min, self._q)
+        self._high = np.maximum(q_max, self._q)
+        self.duration_s = float(np.max(2.0 * self._rise + self._hold))
+
+    def position(self, t: np.ndarray) -> np.ndarray:
+        """Positions (n, 7) [rad] at the times `t` (n,) [s]; at rest from `duration_s` on."""
+        t = np.asarray(t, dtype=float)[:, np.newaxis]
+        rising = np.clip(t, 0.0, self._rise)
+        holding = np.clip(t - self._rise, 0.0, self._hold)
+        falling = np.clip(t - self._rise - self._hold, 0.0, self._rise)
+        speed_1 = self._speed - 0.5 * self._jerk * self._rise**2
+        speed_2 = speed_1 - self._peak * self._hold
+        path = self._speed * rising - self._jerk * rising**3 / 6.0
+        path += speed_1 * holding - 0.5 * self._peak * holding**2
+        path += speed_2 * falling - 0.5 * self._peak * falling**2 + self._jerk * falling**3 / 6.0
+        return np.clip(self._q + self._sign * path, self._low, self._high)
 
 
 class SetpointTrack:
-    """Setpoint of seven joints over time.
+    """Setpoint of seven joints over time, from `q` (7,) [rad] on; limits and policy bound the braking.
 
-    Parameters
-    ----------
-    limits, policy : KrcLimits, KrcPolicy
-        Bounds of the braking.
-    q : np.ndarray
-        (7,) setpoint at the beginning [rad].
-
-    Attributes
-    ----------
-    target : np.ndarray
-        (7,) setpoint at the end of the present period [rad]; never written in place.
-    missed : int
-        Commands missing since the last one.
+    target : (7,) setpoint at the end of the present period [rad]; never written in place. missed : commands missing
+    since the last one
     """
 
     def __init__(self, limits: KrcLimits, policy: KrcPolicy, q: np.ndarray) -> None:
@@ -66,7 +102,7 @@ class SetpointTrack:
 
     def rest(self) -> None:
         """Forget the velocity of the commands."""
-        # The last command, its mean step per cycle, and the cycles over which that is the mean.
+        # The last command, its mean step per cycle, and the number of cycles in this mean.
         self._previous = self._goal = self._accepted = self.target
         self._step = np.zeros(JOINTS)
         self._span = 1
@@ -107,7 +143,7 @@ class SetpointTrack:
         self._ramp_ms = 0
 
     def coast(self) -> np.ndarray:
-        """The setpoints of a period without commands, (n, 7): braking, or as ``shift`` said."""
+        """The setpoints of a period without commands, (n, 7): braking, or moved by ``shift``."""
         if self._ramp is None:
             positions = self._line(self.target, self._goal)
             self.target = self._goal

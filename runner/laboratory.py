@@ -18,7 +18,7 @@ from runner.operator import EmulatedOperator, Operator, Person
 from runner.status import StatusLine
 from sim_backend.configuration import load_configuration
 from sim_backend.process import EmulatorProcess
-from sim_backend.truth import robot_file
+from sim_backend.robot import robot_file
 
 __all__ = ["Laboratory"]
 

@@ -30,8 +30,7 @@ from sim_backend.configuration import EmulatorConfig, LoadData, load_configurati
 from sim_backend.controller import ControllerModel, PositionController
 from sim_backend.model_arm import arm_of, is_possible, model_effects
 from sim_backend.plant import CYCLE_S, ElasticArm, Reading
-from sim_backend.rigid_body import chain
-from sim_backend.truth import robot_file, true_arm
+from sim_backend.robot import chain, robot_file, true_arm
 
 __all__ = ["Replay", "Replayed", "replay"]
 

@@ -24,7 +24,7 @@ from runner.characteristics import characteristics
 from runner.experiment import LinkReport, Record
 from runner.experiment_file import Experiment
 from runner.versions import software, versions
-from sim_backend.truth import truth
+from sim_backend.robot import truth
 
 __all__ = ["agreement", "estimate", "identified_model", "summarise", "true_base", "write_results"]
 

@@ -15,43 +15,7 @@ from fri.errors import ConfigurationError, LwrError
 from sim_backend.configuration import load_configuration
 from sim_backend.service import Service
 
-__all__ = ["main", "run"]
-
-
-def run(
-    config: str,
-    *,
-    lock_step: bool,
-    fri_host: str = "127.0.0.1",
-    fri_port: int = 49938,
-    pendant_port: int = 0,
-    overrides: dict[str, Any] | None = None,
-    follow_stdin: bool = False,
-    announce: bool = False,
-) -> None:
-    """Run an emulator in this process until it is told to end; see `main` for the arguments."""
-    service = Service(
-        load_configuration(config, overrides),
-        (fri_host, fri_port),
-        pendant_port,
-        follow=sys.stdin.fileno() if follow_stdin else None,
-    )
-    try:
-        signal.signal(signal.SIGTERM, lambda *_: service.stop())
-        # Ctrl-C at a terminal reaches all its processes; an emulator that follows another ends with that one,
-        # not under an arm that is being braked.
-        signal.signal(signal.SIGINT, signal.SIG_IGN if follow_stdin else lambda *_: service.stop())
-        if announce:
-            sys.stdout.write(json.dumps({"pendant_port": service.pendant.port}) + "\n")
-            sys.stdout.flush()
-        else:
-            click.echo(
-                f"emulator: FRI to {fri_host}:{fri_port} in {'lock step' if lock_step else 'real time'}, "
-                f"pendant on 127.0.0.1:{service.pendant.port}, Ctrl-C ends it"
-            )
-        service.run(lock_step)
-    finally:
-        service.close()
+__all__ = ["main"]
 
 
 @click.command()
@@ -88,16 +52,26 @@ def main(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
     try:
-        run(
-            config,
-            lock_step=lock_step,
-            fri_host=fri_host,
-            fri_port=fri_port,
-            pendant_port=pendant_port,
-            overrides=_overrides(settings, period_ms, seed),
-            follow_stdin=follow_stdin,
-            announce=announce,
+        overrides = _overrides(settings, period_ms, seed)
+        follow = sys.stdin.fileno() if follow_stdin else None
+        service = Service(
+            load_configuration(config, overrides), (fri_host, fri_port), pendant_port, follow=follow
         )
+        try:
+            signal.signal(signal.SIGTERM, lambda *_: service.stop())
+            # Ctrl-C at a terminal goes to all its processes. A child ends with its parent instead, after the
+            # parent has braked the arm.
+            signal.signal(signal.SIGINT, signal.SIG_IGN if follow_stdin else lambda *_: service.stop())
+            if announce:
+                click.echo(json.dumps({"pendant_port": service.pendant.port}))
+            else:
+                click.echo(
+                    f"emulator: FRI to {fri_host}:{fri_port} in {'lock step' if lock_step else 'real time'}, "
+                    f"pendant on 127.0.0.1:{service.pendant.port}, Ctrl-C ends it"
+                )
+            service.run(lock_step)
+        finally:
+            service.close()
     except LwrError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(error.exit_code)

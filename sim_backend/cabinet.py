@@ -1,9 +1,8 @@
 """The control cabinet: arm, sensors, position controller, FRI session and KRL program, without any socket.
 
-Deterministic: what it does follows from the configuration, the seed, the datagrams and the operator's
-actions, each at its cycle. One FRI cycle is `packet`, any number of `receive`, and `close`, which simulates
-the cycle's milliseconds. The packet carries the sensors' values of the millisecond that has just ended, all
-of one instant.
+Deterministic: its behaviour follows from the configuration, the seed, the datagrams and the operator's actions,
+each at its cycle. One FRI cycle is `packet`, any number of `receive`, and `close`, the simulation of the cycle's
+milliseconds. The packet carries the sensor values at one instant, the end of the last millisecond.
 """
 
 from __future__ import annotations
@@ -20,15 +19,12 @@ from fri.krl import Interpreter, KrlProgram
 from fri.packets import CMD_OFFSETS, CMD_SIZE
 from fri.states import ALL_DRIVES, State
 from lwr_driver.arm import Arm
-from sim_backend.configuration import EmulatorConfig, LoadData, Plugin
+from sim_backend.configuration import OWN_PROGRAM, EmulatorConfig, LoadData, Plugin, krl_program
 from sim_backend.controller import ControllerModel, PositionController
-from sim_backend.krl_program import OWN_PROGRAM, krl_program
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
-from sim_backend.recording import ControllerTrace, KrlReals
-from sim_backend.rigid_body import chain
-from sim_backend.sensors import Sensors
-from sim_backend.truth import robot_file, robot_model, true_arm
+from sim_backend.robot import chain, robot_file, robot_model, true_arm
+from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
 __all__ = ["Cabinet"]
 
@@ -42,7 +38,7 @@ _STILL_MS = 100
 
 
 def _load(plugin: Plugin, *arguments: Any, **named: Any) -> Any:
-    """Make the object that `plugin` names."""
+    """Make the object of `plugin`."""
     module, _, name = plugin.type.partition(":")
     try:
         cls = getattr(importlib.import_module(module), name)
@@ -54,12 +50,12 @@ def _load(plugin: Plugin, *arguments: Any, **named: Any) -> Any:
 class Cabinet:
     """See the module. `milliseconds` and `cycle` count since the start and never go back.
 
-    under_way : whether the packet of this cycle is made, so that what is done now shows in the next one
+    under_way : whether the packet of this cycle is made; an action then shows in the next packet
     """
 
     def __init__(self, config: EmulatorConfig) -> None:
         self.config = config
-        # Each consumer has its own stream: switching one off leaves the noise of the others as it was.
+        # One stream each: switching one off leaves the noise of the others unchanged.
         plant_seed, sensor_seed, self.wire_seed = np.random.SeedSequence(config.seed).spawn(3)
         self.arm = Arm.load(str(config.beside(config.limits)))
         self.file = robot_file(config)
@@ -114,7 +110,7 @@ class Cabinet:
                 raise ConfigurationError(
                     f"{robot.plant.type!r} lacks methods or arrays of sim_backend.plant.Plant"
                 )
-            # Such a plant has its own physics; of the effects only what the sensors do to it is left.
+            # Such a plant has its own physics; the effects act on its sensors only.
             for effect, stream in zip(self.effects, others.spawn(len(self.effects)), strict=True):
                 effect.start(model.nv, np.random.default_rng(stream))
         else:
@@ -133,7 +129,7 @@ class Cabinet:
             self._millisecond(position)
 
     def _compile(self, scratch: ControllerModel) -> None:
-        """Have compiled, the first time on a computer, what is first needed when somebody waits for it."""
+        """Compile on the first run of a computer, before the PC waits for an answer."""
         scratch.update_model(self.reading.position)
         scratch.update_external(self.reading.position, self.reading.joint_torque, CYCLE_S)
         command = np.frombuffer(bytes(4 * self.joints), "<f4", self.joints)
@@ -161,7 +157,7 @@ class Cabinet:
         self.monitor.period_s = self.session.sample_time_s
 
     def start_program(self, name: str | None = None, period_ms: int | None = None) -> None:
-        """Select and start a KRL program; None keeps what was configured or chosen last."""
+        """Select and start a KRL program; None keeps the last choice or the configured values."""
         name = self.program_name if name is None else name
         period_ms = self.period_ms if period_ms is None else period_ms
         if not 1 <= period_ms <= 100:
@@ -199,7 +195,7 @@ class Cabinet:
         self.model.set_load(LoadData(mass, centre, (xx, 0.0, 0.0, yy, 0.0, zz)))
 
     def power(self, on: bool) -> None:
-        """Drives on: brakes open, the setpoint is where the arm stands. Off: brakes closed.
+        """Drives on: brakes open, the setpoint is at the position of the arm. Off: brakes closed.
 
         Raises RobotError when the drives are to come on while the setpoint still moves.
         """
@@ -219,9 +215,9 @@ class Cabinet:
                 self.model.update_gravity(self._last_setpoint),
                 self.reading.motor_position,
             )
-        self.tell_drives()
+        self.report_drives()
 
-    def tell_drives(self) -> None:
+    def report_drives(self) -> None:
         """Drive bits into the session."""
         self.session.set_drives(ALL_DRIVES if self.powered else 0, self.error_bits, self.warning_bits)
 
@@ -253,13 +249,13 @@ class Cabinet:
         return datagram
 
     def arrived(self, datagram: bytes) -> None:
-        """A command has come over the network, before any fault of ours; judges it, does not act on it."""
+        """Count and judge a command from the network, before any fault on the wire; it has no effect yet."""
         self.received += 1
         if self._commanding and len(datagram) == CMD_SIZE and datagram[2:4] == self._sequence:
             self.monitor.take(np.frombuffer(datagram, "<f4", self.joints, _JNT_POS), self.cycle)
 
     def receive(self, datagram: bytes, age_s: float) -> None:
-        """A command reaches the session `age_s` after its packet left."""
+        """Hand a command to the session, `age_s` [s] after its packet."""
         self.session.receive(datagram, age_s)
 
     def close(self) -> None:

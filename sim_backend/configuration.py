@@ -5,19 +5,19 @@ A file may name another one under `base`; its keys then replace those of the bas
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from fri.errors import ConfigurationError
-from fri.krc import KrcPolicy
+from fri.handshake import HANDSHAKES
+from fri.krl import KrlProgram, Machinery
+from fri.policy import KrcPolicy
 from lwr_driver.configuration import find, parse, read_mapping
 
 __all__ = [
+    "OWN_PROGRAM",
     "ControllerConfig",
     "EmulatorConfig",
     "FriConfig",
@@ -26,32 +26,39 @@ __all__ = [
     "RobotConfig",
     "SensorConfig",
     "TraceConfig",
+    "krl_program",
     "load_configuration",
 ]
+
+OWN_PROGRAM = "lwr_identification"
+"""The KRL program of this project."""
 
 JOINTS = 7
 Joints = tuple[float, float, float, float, float, float, float]
 
 
-def _non_negative(owner: object, *names: str) -> None:
+def _numbers(owner: object, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
     for name in names:
         value = getattr(owner, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if number < 0.0:
-                raise ConfigurationError(f"{name} {number} is negative")
+            yield name, number
+
+
+def _non_negative(owner: object, *names: str) -> None:
+    for name, number in _numbers(owner, names):
+        if number < 0.0:
+            raise ConfigurationError(f"{name} {number} is negative")
 
 
 def _positive(owner: object, *names: str) -> None:
-    for name in names:
-        value = getattr(owner, name)
-        for number in value if isinstance(value, tuple) else (value,):
-            if number <= 0.0:
-                raise ConfigurationError(f"{name} {number} must be above zero")
+    for name, number in _numbers(owner, names):
+        if number <= 0.0:
+            raise ConfigurationError(f"{name} {number} must be above zero")
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """A class from outside, `package.module:Class`, and the keyword arguments it is made with."""
+    """A class from outside, `package.module:Class`, and its keyword arguments."""
 
     type: str
     options: dict[str, Any] = field(default_factory=dict)
@@ -64,15 +71,15 @@ class Plugin:
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """The arm as it really is.
+    """The true arm.
 
-    urdf : kinematics. parameters : file with the standard parameters and the payloads known by name, or an
-    identified `model.yaml`, whose effects act as well
+    urdf : kinematics. parameters : file with the standard parameters and the named payloads, or an identified
+    `model.yaml` together with its effects
     stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
     substeps : steps of the joint dynamics within 1 ms
     effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
     plant : other physics altogether, called with `model, drive, random, **options` (see
-    `sim_backend.plant.Plant`); of `effects` it gets what they do to the sensors
+    `sim_backend.plant.Plant`); the `effects` act on its sensors only
     """
 
     urdf: str = "lwr4plus.urdf"
@@ -107,16 +114,15 @@ class LoadData:
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """The joint position controller and the model it believes in.
+    """The joint position controller and its model of the arm.
 
     urdf : the controller's model of the arm, CAD-like; its inertias differ from the truth
-    load : load data at the start. stiffness : what the controller takes the joint stiffness for [Nm/rad]
+    load : load data at the start. stiffness : the controller's value of the joint stiffness [Nm/rad]
     position_gain [Nm/rad], velocity_gain [Nm s/rad], torque_gain [-] : feedback of motor position and
-    velocity and of the joint torque. viscous [Nm s/rad], coulomb [Nm] : friction it compensates, from the
-    commanded velocity, which counts as slow below coulomb_speed [rad/s]. torque_limit [Nm] of the motors,
-    referred to the joint
+    velocity and of the joint torque. viscous [Nm s/rad], coulomb [Nm] : friction compensation by the commanded
+    velocity, linear below coulomb_speed [rad/s]. torque_limit [Nm] of the motors, referred to the joint
     velocity_cutoff_hz : filter on the motor velocity; command_cutoff_hz : filter on the commanded velocity
-    model_period_ms : how often the Jacobian and the mass matrix in the packet are renewed
+    model_period_ms : period of the Jacobian and the mass matrix in the packet
     external_cutoff_hz : filter of the estimated external torque
     settle_s : time under control before the first packet
     """
@@ -138,24 +144,16 @@ class ControllerConfig:
     settle_s: float = 1.0
 
     def __post_init__(self) -> None:
-        _positive(
-            self,
-            "stiffness",
-            "torque_limit",
-            "coulomb_speed",
-            "velocity_cutoff_hz",
-            "command_cutoff_hz",
-            "model_period_ms",
-            "external_cutoff_hz",
-        )
+        _positive(self, "stiffness", "torque_limit", "coulomb_speed", "velocity_cutoff_hz")
+        _positive(self, "command_cutoff_hz", "model_period_ms", "external_cutoff_hz")
         _non_negative(self, "position_gain", "velocity_gain", "torque_gain", "viscous", "coulomb", "settle_s")
 
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """What the arm measures. Noise is white at 1 kHz, given as its standard deviation.
+    """The sensors. Noise is white at 1 kHz, given as its standard deviation.
 
-    position_sensor : side of the elastic joint on which the published position is measured
+    position_sensor : side of the elastic joint of the published position
     """
 
     position_sensor: Literal["link", "motor"] = "link"
@@ -170,16 +168,7 @@ class SensorConfig:
     temperature: float = 35.0
 
     def __post_init__(self) -> None:
-        names = (
-            "position_resolution",
-            "position_noise",
-            "motor_position_resolution",
-            "joint_torque_noise",
-            "joint_torque_resolution",
-            "motor_torque_noise",
-            "motor_torque_resolution",
-        )
-        _non_negative(self, *names)
+        _non_negative(self, *(f.name for f in fields(self) if f.name.endswith(("_resolution", "_noise"))))
 
 
 @dataclass(frozen=True)
@@ -211,7 +200,7 @@ class KrlRealsConfig:
 class TraceConfig:
     """The controller's own recording, 1 kHz, on its own clock.
 
-    clock_offset : what its clock shows at time zero [s]. clock_rate_error : seconds it gains per second
+    clock_offset : its clock at time zero [s]. clock_rate_error : gain of its clock per second
     delay_ms : age of the motor torques in it
     longest_s : older samples are dropped
     """
@@ -228,13 +217,12 @@ class TraceConfig:
 
 @dataclass(frozen=True)
 class FriConfig:
-    """The link: `friSetup` and `friOpen`, the KRL program, and the limits the controller enforces.
+    """The link: `friSetup` and `friOpen`, the KRL program, and the controller's limits.
 
-    program : KRL program by its name in `fri.krl.PROGRAMS`, or `lwr_identification`: the text of
-    configs/krl/lwr_identification.src itself. autostart : it runs from the beginning
-    velocity [rad/s], acceleration [rad/s^2] : limits beyond which the controller drops the session
+    program : KRL program by its name in configs/krl. autostart : it runs from the beginning
+    velocity [rad/s], acceleration [rad/s^2] : limits; beyond them the controller drops the session
     answer_delay_s : age of an undisturbed answer in lock step
-    patience_s : in lock step and command mode, wall time after which an answer counts as missing
+    patience_s : in lock step and command mode, wall time before an answer counts as missing
     """
 
     program: Literal["lwr_identification", "stanford", "ros_control", "rcprg"] = "stanford"
@@ -251,7 +239,8 @@ class FriConfig:
     patience_s: float = 10.0
 
     def __post_init__(self) -> None:
-        _check_period(self.period_ms)
+        if not 1 <= self.period_ms <= 100:
+            raise ConfigurationError(f"period_ms {self.period_ms} is outside 1 to 100")
         _positive(self, "velocity", "acceleration", "patience_s")
         _non_negative(self, "answer_delay_s", "uptime_s")
 
@@ -260,8 +249,8 @@ class FriConfig:
 class EmulatorConfig:
     """A whole emulator configuration.
 
-    limits : arm file whose limits the command monitor holds the commands against
-    faults : faults on the wire, present from the start. schedule : what the operator does by himself
+    limits : arm file with the limits of the command monitor
+    faults : faults on the wire from the start. schedule : the operator's actions without request
     """
 
     schema_version: int = 1
@@ -287,13 +276,23 @@ class EmulatorConfig:
             raise ConfigurationError(f"seed {self.seed} is negative")
 
     def beside(self, name: str) -> Path:
-        """Path of a file that this configuration names."""
+        """Path of the file `name` of this configuration."""
         return find(name, beside=self.source.parent)
 
 
-def _check_period(period_ms: int) -> None:
-    if not 1 <= period_ms <= 100:
-        raise ConfigurationError(f"period_ms {period_ms} is outside 1 to 100")
+def krl_program(
+    name: str, period_ms: int, machinery: Machinery | None = None, **settings: float
+) -> KrlProgram:
+    """Program `name` of configs/krl, ready to start with an FRI cycle of `period_ms`.
+
+    machinery : motor currents and load data, None leaves both at zero; settings : values for its data list
+    """
+    if name not in HANDSHAKES:
+        raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(HANDSHAKES)}")
+    text = find(f"krl/{name}.src")
+    data = text.with_suffix(".dat").read_text(encoding="utf-8")
+    values = {"LWR_CYCLE": period_ms, **settings}
+    return KrlProgram(text.read_text(encoding="utf-8"), data, values, machinery, name)
 
 
 def load_configuration(
@@ -301,7 +300,7 @@ def load_configuration(
 ) -> EmulatorConfig:
     """Read and check an emulator configuration.
 
-    overrides : values by dotted key (`robot.payload`), put over what the file says
+    overrides : values by dotted key (`robot.payload`) in place of those of the file
     Raises ConfigurationError with file, key, value and advice.
     """
     path = find(name)
@@ -343,18 +342,3 @@ def _put(content: dict[str, Any], key: str, value: Any) -> None:
         place[name] = dict(inner) if isinstance(inner, Mapping) else {}
         place = place[name]
     place[last] = value
-
-
-def as_yaml(config: EmulatorConfig) -> str:
-    """The configuration with every default filled in, as text."""
-    content = dataclasses.asdict(config)
-    content.pop("source")
-    return yaml.safe_dump(_plain(content), sort_keys=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return value

@@ -1,14 +1,14 @@
-"""The controller's joint position control and the model that it believes in.
+"""The controller's joint position control and its model of the arm.
 
 Every millisecond, per joint, from the setpoint `q_d` and the controller's own gravity torque `g`::
 
     theta_d = q_d + g / K                                               (torsion under load)
     tau_m   = g + friction(theta_d') + Kp (theta_d - theta) + Kd (theta_d' - theta') + Kt (g - tau_j)
 
-limited to what the motor gives. This is the state feedback of motor position, motor velocity and joint torque
-of Albu-Schaeffer, Ott and Hirzinger (2007): `Kt` makes the motor inertia appear smaller by `1 + Kt`, which
-lets the motor side damp the oscillation of the link on its elastic joint. Friction compensation follows the
-commanded speed.
+within the torque limits of the motors. This is the state feedback of motor position, motor velocity and joint
+torque of Albu-Schaeffer, Ott and Hirzinger (2007). `Kt` reduces the apparent motor inertia by `1 + Kt`, so the
+motor side damps the oscillation of the link on its elastic joint. Friction compensation follows the commanded
+speed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numba import njit
 
 from sim_backend.configuration import ControllerConfig, LoadData
 from sim_backend.plant import CYCLE_S
-from sim_backend.rigid_body import Payload, with_payload
+from sim_backend.robot import Payload, with_payload
 
 __all__ = ["ControllerModel", "PositionController"]
 
@@ -92,7 +92,7 @@ def _difference(position: np.ndarray, period: float, keep: float, memory: np.nda
 
 
 def _keep(cutoff_hz: float) -> float:
-    """Share of its old value that a first-order low-pass keeps in one cycle."""
+    """Weight of the old value in a first-order low-pass, per cycle."""
     return math.exp(-2.0 * math.pi * cutoff_hz * CYCLE_S)
 
 
@@ -118,7 +118,7 @@ class PositionController:
         self.torque = np.zeros(self._gains.shape[1])
 
     def reset(self, setpoint: np.ndarray, gravity: np.ndarray, motor_position: np.ndarray) -> None:
-        """Begin from rest: no speed remembered."""
+        """Begin from rest."""
         self._memory[0] = setpoint + gravity / self._gains[0]
         self._memory[1] = motor_position
         self._memory[2:] = 0.0
@@ -166,7 +166,7 @@ class ControllerModel:
         self.set_load(load)
 
     def set_load(self, load: LoadData) -> None:
-        """Use `load` from now on, whatever hangs on the flange."""
+        """Use `load` from now on, independent of the mounted payload."""
         self.load = load
         body = Payload.from_centre_of_mass(load.mass, load.com, load.inertia) if load.mass > 0.0 else None
         self.model = with_payload(self._bare, body)
@@ -187,7 +187,7 @@ class ControllerModel:
         self.jacobian[3:] = jacobian[:2:-1]
 
     def update_external(self, position: np.ndarray, joint_torque: np.ndarray, period_s: float) -> None:
-        """Estimated external torque: what the joint sensors hold beyond the model, through a low-pass."""
+        """Estimated external torque: measured joint torque minus the model, low-pass filtered."""
         if not self._begun:
             self._memory[0] = position
             self._begun = True

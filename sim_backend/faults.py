@@ -1,8 +1,8 @@
 """Faults on the wire, made by the emulator on its own side of the socket, from seeded streams.
 
 Two directions: measurements on their way `to_pc`, commands on their way `to_krc`. Times are in FRI cycles, so
-lock step and real time misbehave alike. What a measurement suffers decides whether its answer can come at
-all; lock step needs to know that (`Parcel.awaited`).
+the faults are the same in lock step and in real time. Lock step waits for an answer only if the fault of the
+measurement leaves it possible (`Parcel.awaited`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class WireFault:
     """One fault on the wire.
 
     loss : a datagram disappears. burst : so do the `length` - 1 after it
-    delay : it comes `length` cycles later. jitter : to_krc it ages by up to `length` cycles, evenly
-    distributed; to_pc it comes 1 to `length` cycles later. reorder : the next one overtakes it. duplicate :
-    it comes twice
+    delay : it arrives `length` cycles later. jitter : to_krc it ages by up to `length` cycles, evenly
+    distributed; to_pc it arrives 1 to `length` cycles later. reorder : the next one overtakes it. duplicate :
+    it arrives twice
     truncate : its end is missing. corrupt : `bits` random bits are flipped
     foreign : another host (`host`) sends a datagram of its own beside it, `imitate`: a changed copy of ours
     probability : per datagram. cycles : the fault ends after so many, None never
@@ -57,8 +57,8 @@ class Parcel(NamedTuple):
     """One datagram to the PC. `host` sends it, None ourselves; `sequence` is its unwrapped counter, -1 if
     foreign.
 
-    awaited : `yes`: a measurement that the PC has not seen, so an answer can come; `perhaps`: a damaged one
-    that the PC may or may not take for good; `no`: one that it has seen, or a foreign one
+    awaited : `yes`: a measurement new to the PC, so an answer can come; `perhaps`: a damaged one, perhaps valid
+    to the PC; `no`: a repeated or foreign one
     """
 
     host: str | None
@@ -68,7 +68,7 @@ class Parcel(NamedTuple):
 
 
 class Incoming(NamedTuple):
-    """A command that reaches the session: the datagram and its age [s]."""
+    """A command on arrival at the session: the datagram and its age [s]."""
 
     datagram: bytes
     age_s: float
@@ -111,16 +111,14 @@ class FaultyWire:
         return {number: active.fault for number, active in self._active.items()}
 
     def inject(self, fault: WireFault, cycle: int) -> int:
-        """Begin `fault` at `cycle`; returns its number. The nth fault has the nth random stream of the
-        seed.
-        """
+        """Begin `fault` at `cycle`; returns its number, also that of its random stream."""
         number = next(self._numbers)
         stream = np.random.default_rng(self._random.spawn(1)[0])
         self._active[number] = _Active(fault, stream, cycle)
         return number
 
     def clear(self) -> None:
-        """End all faults; what is under way still arrives."""
+        """End all faults; datagrams under way still arrive."""
         self._active.clear()
 
     def restart(self) -> None:
@@ -136,10 +134,10 @@ class FaultyWire:
         return [a for a in self._active.values() if a.fault.direction in (direction, "both")]
 
     def outgoing(self, datagram: bytes, sequence: int, cycle: int) -> list[Parcel]:
-        """What leaves in `cycle`, in order, given the measurement made for it and its unwrapped send counter.
+        """Datagrams to send in `cycle`, in order, for its measurement and the unwrapped send counter.
 
-        Repeated, damaged and foreign datagrams go ahead of a measurement that will be answered, and wait for
-        one: so all that they cause at the PC is over when its answer comes, and lock step repeats itself.
+        Repeated, damaged and foreign datagrams wait for an answerable measurement and go ahead of it. Their
+        effects at the PC are thus over when its answer comes, and lock step stays repeatable.
         """
         own, beside = self._spoil("to_pc", datagram, cycle)
         for late, copy in own:
@@ -163,11 +161,7 @@ class FaultyWire:
         return parcels
 
     def incoming(self, datagram: bytes, age_s: float, cycle: int) -> list[tuple[str | None, bytes]]:
-        """Take a command that has arrived in `cycle`; returns what foreign hosts send to the controller
-        beside it.
-
-        `due` gives what reaches the session.
-        """
+        """Take in a command of `cycle` for `due`; returns the datagrams of foreign hosts to the controller."""
         own, sidelong = self._spoil("to_krc", datagram, cycle)
         for late, copy in own:
             self._store(copy, cycle, age_s + late * self.period_s)
@@ -179,12 +173,12 @@ class FaultyWire:
     def _store(self, datagram: bytes, cycle: int, age_s: float) -> None:
         whole = int(age_s // self.period_s)
         rest_s = age_s - whole * self.period_s
-        # A late one comes after the punctual one of its cycle, so that it is overtaken.
+        # A late command sorts after the punctual one of its cycle and is overtaken.
         entry = (cycle + whole, whole > 0, next(self._order), datagram, rest_s)
         heapq.heappush(self._to_krc, entry)
 
     def due(self, cycle: int) -> list[Incoming]:
-        """Commands that reach the session in `cycle`, in order."""
+        """Commands arriving at the session in `cycle`, in order."""
         arrived = []
         while self._to_krc and self._to_krc[0][0] <= cycle:
             _, _, _, datagram, age_s = heapq.heappop(self._to_krc)
@@ -194,7 +188,7 @@ class FaultyWire:
     def _spoil(
         self, direction: str, datagram: bytes, cycle: int
     ) -> tuple[list[tuple[float, bytes]], list[tuple[str | None, bytes]]]:
-        """(lateness in cycles, clean copy) of the datagram, and (host, datagram) of what comes beside it."""
+        """(lateness in cycles, clean copy) of the datagram, and (host, datagram) of foreign and damaged ones."""
         late: float | None = 0.0
         clean = True
         copies = 1
@@ -222,8 +216,7 @@ class FaultyWire:
                 case "jitter":
                     late = None if late is None else late + float(random.uniform(0.0, fault.length))
                 case "reorder":
-                    # Ours always come first in their cycle, so the one overtaken must be two cycles late to
-                    # the PC.
+                    # Own datagrams come first in their cycle: the overtaken one must be two cycles late to the PC.
                     late = None if late is None else late + (2.0 if direction == "to_pc" else 1.0)
                 case "duplicate":
                     copies = 2
@@ -241,7 +234,7 @@ class FaultyWire:
             return [], beside
         if copies == 2:
             if direction == "to_pc":
-                # The copy must come after the original, that is before the next one.
+                # The copy must arrive between the original and the next one.
                 return [(late, datagram), (late + 1.0, datagram)], beside
             return [(late, datagram), (late, datagram)], beside
         return [(late, datagram)], beside

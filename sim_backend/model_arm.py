@@ -1,9 +1,8 @@
-"""The emulated arm from an identified model: what of a `model.yaml` a simulated arm needs.
+"""The emulated arm from an identified model (`model.yaml`).
 
-Torque, mass matrix and gravity depend on the base parameters only, so any standard parameters with the model's
-torque will do; those next to the URDF's are taken, which look most like an arm. Where an estimate is that of no
-arm at all where the arm will be (its mass matrix is not positive definite), the nearest bodies that can exist
-stand for it.
+Torque, mass matrix and gravity depend on the base parameters only. Of all standard parameters with the model's
+torque, those next to the URDF's are taken. An estimate can be unphysical: a mass matrix without positive
+definiteness in the poses of the arm. The nearest physical bodies then replace it.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from ident.effects.model_torque import parameter_values
 from ident.export import consistent_parameters
 from ident.model import DynamicModel
 from ident.parameters import INERTIAL, PER_LINK
-from sim_backend.plant import Drive, Effect
-from sim_backend.rigid_body import with_inertias
+from sim_backend.plant import Effect
+from sim_backend.robot import Drive, with_inertias
 
 __all__ = [
     "Cause",
@@ -47,9 +46,9 @@ _POSES = 100
 def model_parameters(model: DynamicModel, poses: Floats | None = None) -> dict[str, float]:
     """All standard parameters of the links by name, `XX1` ... `offm7`, with the model's torque.
 
-    poses : (k, n) where the arm will be [rad]; default anywhere. What an estimate may be and an arm cannot is
-    moved to the next possible value: friction below zero, drives without inertia, and, where the mass matrix is
-    not positive definite in the poses, all bodies together.
+    poses : (k, n) poses of the arm [rad]; default random ones. Unphysical values are moved to the next physical
+    ones: friction below zero, drives without inertia, and all bodies together if the mass matrix is not positive
+    definite in the poses.
     """
     table = _standard(model, poses)[: len(PER_LINK) * model.structure.chain.n].reshape(-1, len(PER_LINK))
     found = {}
@@ -86,9 +85,9 @@ def arm_of(
 ) -> tuple[pin.Model, Drive]:
     """`bare` with the inertias of the model and of its payload, and the model's drives and frictions.
 
-    stiffness, damping : of the joints, (n,) [Nm/rad], [Nm s/rad]. poses : (k, n) where the arm will be [rad].
-    motors : drives that stand for those of a model that knows the joint torques only.
-    Raises DataError where no simulated arm can have them.
+    stiffness, damping : of the joints, (n,) [Nm/rad], [Nm s/rad]. poses : (k, n) poses of the arm [rad].
+    motors : drives for a model of the joint torques only.
+    Raises DataError for parameters of no simulated arm.
     """
     parameters = model_parameters(model, poses)
     n = model.structure.chain.n
@@ -105,7 +104,7 @@ def arm_of(
 
 
 class ModelEffect(Effect):
-    """An effect of a model as the plant calls it. begin_s : time of the session when the plant's begins [s]."""
+    """An effect of a model for the plant. begin_s : time of the session at time zero of the plant [s]."""
 
     def __init__(self, part: Simulated, begin_s: float = 0.0) -> None:
         self.part = part
@@ -120,16 +119,16 @@ class ModelEffect(Effect):
         self.part.load(max(0.0, time_s + self.begin_s), plant, loads)
 
     def sense(self, time_s: float, plant: Any, reading: Any) -> None:
-        """Change position and joint torque as reported."""
+        """Change the reported position and joint torque."""
         self.part.sense(max(0.0, time_s + self.begin_s), plant, reading)
 
     def sense_motor(self, time_s: float, plant: Any, reading: Any) -> None:
-        """Change the motor torque as reported."""
+        """Change the reported motor torque."""
         self.part.sense_motor(max(0.0, time_s + self.begin_s), plant, reading)
 
 
 class Cause(ModelEffect):
-    """An effect of the dictionary as a plug-in of the emulator's configuration: something to be found.
+    """An effect of the dictionary as a plug-in of the emulator's configuration, for the identification to find.
 
     cause : its name. joint : from 1; of no meaning for the whole arm. form : of an effect of several forms.
     parameters : all values of the form by name, SI units. Raises ConfigurationError for an unknown cause or form, and
@@ -150,9 +149,8 @@ def model_effects(
 ) -> tuple[ModelEffect, ...]:
     """The model's effects for a simulated arm.
 
-    session : number (from 0) of the session that is simulated, in the order of those that the model was made
-    from; None for any other. Effects that belong to a moment of one session act in that session only. begin_s :
-    time in it when the simulation begins.
+    session : number (from 0) of the simulated session among those of the model; None for any other. An effect at a
+    moment of one session acts in this session only. begin_s : time in it at the beginning of the simulation [s].
     """
     found = []
     for entry in model.effects:
@@ -169,8 +167,9 @@ def model_effects(
 
 
 def is_possible(model: DynamicModel, poses: Floats | None = None) -> bool:
-    """Whether the mass matrix of the model is positive definite in `poses` (k, n), default random ones, with
-    each of its payloads; where it is not, the nearest bodies that can exist are simulated.
+    """Whether the mass matrix is positive definite in `poses` (k, n), default random ones, with each payload.
+
+    Otherwise the nearest physical bodies are simulated.
     """
     if poses is None:
         random = np.random.default_rng(0)
@@ -199,10 +198,10 @@ def _nearest(model: DynamicModel) -> Floats:
 
 @lru_cache(maxsize=8)
 def _consistent(model: DynamicModel) -> Floats:
-    """Standard parameters of bodies that can exist, with offsets and frictions moved along with the bodies'.
+    """Standard parameters of physical bodies, with offsets and frictions moved along with them.
 
-    An offset that the data hardly tell from a moment follows it, as their covariance says: the conditional mean
-    ``y + C_yx C_xx^-1 (x' - x)`` of what is no inertia given what is.
+    An offset highly correlated with a moment follows it: the conditional mean ``y + C_yx C_xx^-1 (x' - x)`` of the
+    other parameters y, given the inertial ones x.
     """
     vector = np.array(consistent_parameters(model).vector)
     if model.base is None or model.covariance is None:

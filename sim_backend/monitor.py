@@ -1,9 +1,8 @@
-"""The command monitor: every position command that arrived in command mode, as float32, against the arm's
-limits.
+"""The command monitor: every position command in command mode, as float32, against the arm's limits.
 
-Velocity, acceleration and jerk are divided differences over the cycles in which commands arrived, so a
-missing one does not count against the sender: by the mean value theorem a motion within limits stays within
-them. What float32 rounding alone can produce is subtracted before a value is compared with its limit.
+Velocity, acceleration and jerk are divided differences over the cycles with commands. A missing command does
+not count against the sender: by the mean value theorem a motion within limits stays within them. The largest
+effect of float32 rounding is subtracted before a value is compared with its limit.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ def _judge(
     time_s: float,
     times: np.ndarray,
     values: np.ndarray,
-    q_min: np.ndarray,
-    q_max: np.ndarray,
+    middle: np.ndarray,
     limits: np.ndarray,
     worst: np.ndarray,
     ratio: np.ndarray,
     violations: np.ndarray,
 ) -> int:
-    """Take in `command` (n,) at `time_s` after the last four `values` (4, n) at `times` (4,) [s]; counts
-    violations.
+    """Number of violations of `command` (n,) at `time_s` after the last `values` (4, n) at `times` (4,) [s].
+
+    middle : (n,) of the position range. limits : (4, n) half the range, velocity, acceleration, jerk
     """
     n = values.shape[1]
     if time_s > times[3]:
@@ -53,72 +52,45 @@ def _judge(
             difference[k] = values[k, i]
             # Half a unit in the last place of float32, with the exponent of the value.
             rounding[k] = 2.0**-25 * 2.0 ** np.ceil(np.log2(max(abs(values[k, i]), 1e-30)))
-        middle = 0.5 * (q_min[i] + q_max[i])
-        half = 0.5 * (q_max[i] - q_min[i])
-        count += _keep(
-            0, i, values[3, i], abs(values[3, i] - middle) - rounding[3], half, worst, ratio, violations
-        )
         scale = 1.0
-        for order in range(1, 4):
-            scale *= order
-            for k in range(3, order - 1, -1):
+        for order in range(4):
+            scale *= max(order, 1)
+            end = order - 1 if order > 0 else 3
+            for k in range(3, end, -1):
                 span = times[k] - times[k - order]
                 difference[k] = (difference[k] - difference[k - 1]) / span
                 rounding[k] = (rounding[k] + rounding[k - 1]) / span
             value = scale * difference[3]
-            count += _keep(
-                order,
-                i,
-                value,
-                abs(value) - scale * rounding[3],
-                limits[order - 1, i],
-                worst,
-                ratio,
-                violations,
-            )
+            size = abs(value - middle[i]) if order == 0 else abs(value)
+            if not np.isfinite(value):
+                ratio[order, i] = np.inf
+                violations[order, i] += 1
+                count += 1
+                continue
+            if abs(value) > abs(worst[order, i]):
+                worst[order, i] = value
+            share = max(0.0, size - scale * rounding[3]) / limits[order, i]
+            ratio[order, i] = max(ratio[order, i], share)
+            if share > 1.0 + 1e-9:
+                violations[order, i] += 1
+                count += 1
     return count
-
-
-@njit(cache=True)
-def _keep(
-    row: int,
-    i: int,
-    value: float,
-    certain: float,
-    limit: float,
-    worst: np.ndarray,
-    ratio: np.ndarray,
-    violations: np.ndarray,
-) -> int:
-    if not np.isfinite(value):
-        ratio[row, i] = np.inf
-        violations[row, i] += 1
-        return 1
-    if abs(value) > abs(worst[row, i]):
-        worst[row, i] = value
-    share = max(0.0, certain) / limit
-    ratio[row, i] = max(ratio[row, i], share)
-    if share > 1.0 + 1e-9:
-        violations[row, i] += 1
-        return 1
-    return 0
 
 
 class CommandMonitor:
     """Worst values per joint since the last `reset`.
 
-    ratio : (4, 7) worst value beyond rounding as a share of its limit, rows as in `QUANTITIES`; above 1 is
-    outside
+    ratio : (4, 7) worst value beyond rounding divided by its limit, rows as in `QUANTITIES`
     worst : (4, 7) the worst values themselves, sign kept. violations : (4, 7) counts
     """
 
     def __init__(self, arm: Arm, period_s: float) -> None:
-        self._q_min = np.ascontiguousarray(arm.q_min, dtype=float)
-        self._q_max = np.ascontiguousarray(arm.q_max, dtype=float)
-        self._limits = np.array([arm.v_max, arm.a_max, arm.j_max], dtype=float)
+        q_min, q_max = np.array(arm.q_min, dtype=float), np.array(arm.q_max, dtype=float)
+        self._middle = 0.5 * (q_min + q_max)
+        self._limits = np.array([0.5 * (q_max - q_min), arm.v_max, arm.a_max, arm.j_max], dtype=float)
         self.joint_names = arm.joint_names
         self.period_s = period_s
-        joints = self._q_min.size
+        joints = self._middle.size
         self.worst = np.zeros((4, joints))
         self.ratio = np.zeros((4, joints))
         self.violations = np.zeros((4, joints), dtype=np.int64)
@@ -143,7 +115,7 @@ class CommandMonitor:
         self._begun = True
 
     def take(self, command: np.ndarray, cycle: int) -> None:
-        """The command (7,) float32 that arrived in `cycle`. Of two in one cycle the later counts."""
+        """Judge the command (7,) float32 of `cycle`; of two in one cycle the later counts."""
         if not self._begun:
             self.rest(command, cycle - 1)
         self.commands += 1
@@ -152,8 +124,7 @@ class CommandMonitor:
             cycle * self.period_s,
             self._times,
             self._values,
-            self._q_min,
-            self._q_max,
+            self._middle,
             self._limits,
             self.worst,
             self.ratio,
@@ -170,9 +141,7 @@ class CommandMonitor:
         )
 
     def summary(self) -> dict[str, Any]:
-        """For the status reply: per quantity the worst values (7,), their shares of the limits, and the
-        counts.
-        """
+        """For the status reply: per quantity the worst values (7,), their ratios to the limits, and counts."""
         return {
             "commands": self.commands,
             "violations": int(self.violations.sum()),

@@ -1,8 +1,7 @@
-"""The emulated operator: everything that can be done at the cabinet, by hand over the pendant or by schedule.
+"""The emulated operator: all actions at the cabinet, by hand over the pendant or by schedule.
 
-A command is a public method of `Operator` whose name is in `COMMANDS`. The same commands can be scheduled by
-cycle or by state in the configuration (`schedule`), so that a fault strikes in a chosen phase and repeats
-with the seed.
+The public methods of `Operator` are the commands (`COMMANDS`). The `schedule` of the configuration triggers them
+by cycle or by state: a fault strikes in a chosen phase and repeats with the seed.
 """
 
 from __future__ import annotations
@@ -17,14 +16,13 @@ from typing import Any, Literal
 import numpy as np
 
 from fri.errors import ConfigurationError, LwrError, RobotError
-from fri.event import EventKind
-from fri.states import Quality, State
+from fri.states import EventKind, Quality, State
 from lwr_driver.configuration import parse
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import LoadData
 from sim_backend.faults import FaultyWire, WireFault
 from sim_backend.plant import CYCLE_S
-from sim_backend.rigid_body import Payload
+from sim_backend.robot import Payload
 
 __all__ = ["COMMANDS", "Operator", "ScheduleEntry"]
 
@@ -37,11 +35,11 @@ _SILENCE_CYCLES = 2000
 
 @dataclass(frozen=True)
 class ScheduleEntry:
-    """A command to be done later, once.
+    """A command for later, once.
 
     when : `start` of the emulator, `now` (as it is scheduled), FRI state `monitor` or `command` entered, or
     the commanded position begins `moving` in command mode; `occurrence` : for the nth time
-    after_cycles : so many FRI cycles after that
+    after_cycles : delay in FRI cycles
     """
 
     command: str
@@ -108,9 +106,9 @@ class Operator:
 
     @property
     def busy(self) -> bool:
-        """Whether time has to go on although nothing is sent."""
+        """Whether time goes on without packets."""
         if self._silent_since is not None and self._silent_until is None:
-            # Long enough for the controller to notice and the arm to stand; then nothing more can happen.
+            # Long enough for the controller to notice and for the arm to stand.
             return self.cabinet.cycle < self._silent_since + _SILENCE_CYCLES
         return self.cabinet.running or self._restart_at is not None or self._silent_since is not None
 
@@ -154,19 +152,19 @@ class Operator:
                     log.warning("scheduled `%s` was refused: %s", pending.entry.command, error)
 
     def handle(self, command: str, arguments: Mapping[str, Any]) -> Any:
-        """Do `command`; the result is what the pendant gets. Raises LwrError where it cannot be done."""
+        """Do `command` and return its result for the pendant; LwrError if it is refused."""
         if command not in COMMANDS:
             raise ConfigurationError(f"command {command!r} is unknown; known: {', '.join(COMMANDS)}")
         _check_arguments(command, arguments)
         return getattr(self, command)(**arguments)
 
     def status(self) -> dict[str, Any]:
-        """Everything the pendant shows.
+        """Contents of the pendant.
 
         time_s, cycle : virtual clock since the start. state, quality, control : names. power, error, warning
-        : drive bits. position, motor_position, joint_torque, motor_torque, setpoint : (7,). payload, load :
-        what hangs there, what the controller believes. monitor : see `CommandMonitor.summary`. session :
-        counters. events : last ones
+        : drive bits. position, motor_position, joint_torque, motor_torque, setpoint : (7,). payload : mounted
+        payload. load : load data of the controller. monitor : see `CommandMonitor.summary`. session : counters.
+        events : last ones
         """
         cabinet = self.cabinet
         session, reading = cabinet.session, cabinet.reading
@@ -239,24 +237,24 @@ class Operator:
         """Load data of the controller."""
         self.cabinet.model.set_load(_load(mass, com, inertia))
 
-    def drives_on(self) -> None:
-        """Drives on; acknowledges drive errors, as on the real pendant."""
-        if self.estopped:
-            raise RobotError("drives stay off: the emergency stop is pressed; release it first")
-        self.cabinet.error_bits = 0
-        self.cabinet.power(True)
-        self.cabinet.tell_drives()
-
-    def drives_off(self) -> None:
-        """Drives off, brakes closed."""
-        self.cabinet.power(False)
-
     def drives(self, on: bool) -> None:
         """Drives on or off; in YAML write `drives_on` or `drives_off`, for `on` is a truth value there."""
         if on:
             self.drives_on()
         else:
             self.drives_off()
+
+    def drives_on(self) -> None:
+        """Drives on; acknowledges drive errors, as on the real pendant."""
+        if self.estopped:
+            raise RobotError("drives stay off: the emergency stop is pressed; release it first")
+        self.cabinet.error_bits = 0
+        self.cabinet.power(True)
+        self.cabinet.report_drives()
+
+    def drives_off(self) -> None:
+        """Drives off, brakes closed."""
+        self.cabinet.power(False)
 
     def emergency_stop(self) -> None:
         """Emergency stop: command mode ends, brakes close."""
@@ -285,11 +283,11 @@ class Operator:
             raise ConfigurationError(f"joint {joint} is outside 0 to {self.cabinet.joints - 1}")
         if error:
             self.cabinet.error_bits |= 1 << joint
-            self.cabinet.tell_drives()
+            self.cabinet.report_drives()
             self.cabinet.power(False)
         else:
             self.cabinet.warning_bits |= 1 << joint
-        self.cabinet.tell_drives()
+        self.cabinet.report_drives()
 
     def start_program(self, name: str | None = None, period_ms: float | None = None) -> None:
         """Start a KRL program."""
@@ -302,9 +300,7 @@ class Operator:
         self.cabinet.stop_program()
 
     def restart(self, silent_cycles: int = 1000, drives_on: bool = True) -> None:
-        """Cold start: drives off, silence, then a new session, program and (unless told otherwise) the
-        drives.
-        """
+        """Cold start: drives off, silence, then a new session, program and (`drives_on`) the drives."""
         cabinet = self.cabinet
         cabinet.session.drop(EventKind.EXTERNAL, "controller restarted")
         cabinet.power(False)
@@ -381,38 +377,11 @@ def _check_arguments(command: str, arguments: Mapping[str, Any]) -> None:
 
 
 def _load(mass: Any, com: Any, inertia: Any) -> LoadData:
-    content = {
-        "mass": mass,
-        "com": list(com),
-        "inertia": list(inertia),
-    }
-    return parse(LoadData, content, "load")
+    return parse(LoadData, {"mass": mass, "com": list(com), "inertia": list(inertia)}, "load")
 
 
-COMMANDS = (
-    "status",
-    "mount",
-    "unmount",
-    "set_load",
-    "drives",
-    "drives_on",
-    "drives_off",
-    "emergency_stop",
-    "release_emergency_stop",
-    "mode",
-    "drive_fault",
-    "start_program",
-    "stop_program",
-    "restart",
-    "silence",
-    "degrade_quality",
-    "inject",
-    "clear_faults",
-    "schedule",
-    "displace",
-    "push",
-    "start_trace",
-    "save_trace",
-    "reset_monitor",
-    "shutdown",
+COMMANDS = tuple(
+    name
+    for name, method in vars(Operator).items()
+    if inspect.isfunction(method) and not name.startswith("_") and name not in ("step", "handle")
 )

@@ -1,8 +1,8 @@
-"""The teach pendant over UDP: what an operator at the emulated controller can see and do.
+"""The teach pendant over UDP: status and actions of an operator at the emulated controller.
 
 Requests and replies are JSON datagrams on 127.0.0.1. Request: ``{"id": n, "command": name, "arguments":
 {...}}``; reply: ``{"id": n, "ok": true, "result": ...}`` or ``{"id": n, "ok": false, "error": text}``. A
-request that is repeated because its reply was late is answered again but carried out once.
+repeated request (late reply) is answered again but carried out once.
 
 `Pendant` is the client. The commands are the methods of `sim_backend.operator.Operator`.
 """
@@ -17,7 +17,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from fri.errors import ConfigurationError, NetworkError, RobotError
@@ -41,15 +40,13 @@ class Pendant:
         self.timeout_s = timeout_s
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(self.address)
-        # Ids of different clients must differ: a reply to another's request is not ours.
+        # Ids of different clients must differ.
         self._ids = itertools.count((os.getpid() << 20) + (time.monotonic_ns() & 0xFFFFF))
 
     def __enter__(self) -> Pendant:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -117,7 +114,7 @@ class Pendant:
     def set_load(
         self, mass: float, com: Sequence[float] = (0.0, 0.0, 0.0), inertia: Sequence[float] = (0.0,) * 6
     ) -> None:
-        """Load data of the controller (`$LOAD`), which need not be what hangs on the flange."""
+        """Load data of the controller (`$LOAD`), independent of the mounted payload."""
         self.request("set_load", mass=mass, com=list(com), inertia=list(inertia))
 
     def drives(self, on: bool) -> None:
@@ -199,9 +196,7 @@ class Pendant:
         self.request("start_trace")
 
     def save_trace(self, path: Path | str) -> int:
-        """End the controller trace and write it to `path`; returns its number of samples when it is
-        written.
-        """
+        """End the controller trace and write it to `path`; returns its number of samples."""
         samples = int(self.request("save_trace", path=str(Path(path).resolve())))
         deadline = time.monotonic() + _TRACE_S
         while self.status()["saving_trace"]:
@@ -211,7 +206,7 @@ class Pendant:
         return samples
 
     def reset_monitor(self) -> None:
-        """Forget the extremes that the command monitor has seen."""
+        """Forget the extremes of the command monitor."""
         self.request("reset_monitor")
 
     def shutdown(self) -> None:
@@ -242,7 +237,7 @@ class PendantServer:
         self.socket.close()
 
     def serve(self) -> None:
-        """Answer all requests that have arrived."""
+        """Answer all waiting requests."""
         while True:
             try:
                 datagram, sender = self.socket.recvfrom(MAX_DATAGRAM)
@@ -256,8 +251,7 @@ class PendantServer:
         try:
             self.socket.sendto(reply, sender)
         except OSError:
-            # The client is gone; nobody is left to tell.
-            return
+            return  # the client is gone
 
     def _answer(self, datagram: bytes, sender: Any) -> bytes | None:
         try:

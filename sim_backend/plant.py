@@ -1,23 +1,23 @@
 """The arm itself: elastic joints, friction and rigid links, advanced 1 ms at a time.
 
-`Plant` is all that the rest of the emulator knows of the physics, so a test can put other physics in its
-place. `ElasticArm` is the plant of the default emulator; an `Effect` adds to it what its equations leave out.
+`Plant` is the interface of the physics to the rest of the emulator; tests put other physics in its place.
+`ElasticArm` is the plant of the default emulator, an `Effect` an addition to its equations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
 from numba import njit
 
-from sim_backend.rigid_body import Payload, with_payload
+from sim_backend.robot import Drive, Payload, with_payload
 from sim_backend.stiction import advance
 
-__all__ = ["CYCLE_S", "Drive", "Effect", "ElasticArm", "Loads", "Plant", "Reading"]
+__all__ = ["CYCLE_S", "Effect", "ElasticArm", "Loads", "Plant", "Reading"]
 
 CYCLE_S = 1e-3
 
@@ -27,8 +27,8 @@ class Plant(Protocol):
     """An arm of n joints with motors; arrays are (n,) float64 in SI units and keep their identity.
 
     `position`, `velocity`: links; `motor_position`, `motor_velocity`: motors, referred to the joint;
-    `joint_torque`: through the joint, positive where it holds the link against gravity; `motor_torque`: what
-    the motor really gives, referred to the joint.
+    `joint_torque`: through the joint, positive if it holds the link against gravity; `motor_torque`: true torque
+    of the motor, referred to the joint.
     """
 
     position: np.ndarray
@@ -45,7 +45,7 @@ class Plant(Protocol):
         """Advance by 1 ms under the motor torque (n,) [Nm], held."""
 
     def mount(self, payload: Payload | None) -> None:
-        """Weld `payload` to the last link (None: take it off), motors where they are, links at rest."""
+        """Weld `payload` to the last link (None: take it off); motors unmoved, links at rest."""
 
     def brake(self, engaged: bool) -> None:
         """Close or open the brakes on the motor side."""
@@ -56,11 +56,11 @@ class Plant(Protocol):
 
 @dataclass
 class Loads:
-    """What an effect may change for the coming cycle; (n,) each.
+    """Torques and friction of the coming cycle, open to the effects; (n,) each.
 
     `motor_torque` and `link_torque` [Nm] are added on the two sides of the elastic joint, positive in the
-    direction of motion (a resisting torque is negative). The friction rows are those of the equations,
-    already holding the nominal values; changing them keeps exact sticking.
+    direction of motion (a resisting torque is negative). The friction rows begin with the nominal values;
+    sticking stays exact after a change.
     """
 
     motor_torque: np.ndarray
@@ -75,7 +75,7 @@ class Loads:
 
 @dataclass
 class Reading:
-    """What the sensors report in a cycle, (n,) each; an effect on a sensor changes it in place."""
+    """Sensor values of a cycle, (n,) each; an effect on a sensor changes them in place."""
 
     position: np.ndarray
     motor_position: np.ndarray
@@ -84,42 +84,22 @@ class Reading:
 
 
 class Effect:
-    """Physics beyond the nominal equations: a subclass overrides what it needs.
+    """Physics beyond the nominal equations; a subclass overrides some of the methods.
 
-    Called once per 1 ms cycle. What it keeps must follow from its random stream and from what it is given.
+    Called once per 1 ms cycle. Its state must follow from its random stream and its arguments only.
     """
 
     def start(self, joints: int, random: np.random.Generator) -> None:
         """Begin a run of an arm with `joints` joints; `random` is this effect's own stream."""
 
     def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
-        """Change the torques and the friction of the cycle that begins at `time_s`."""
+        """Change the torques and the friction of the cycle from `time_s` on."""
 
     def sense(self, time_s: float, plant: Plant, reading: Reading) -> None:
-        """Change position and joint torque as the sensors report them at `time_s`; the controller sees them
-        too.
-        """
+        """Change the reported position and joint torque at `time_s`, for the controller too."""
 
     def sense_motor(self, time_s: float, plant: Plant, reading: Reading) -> None:
-        """Change the motor torque as it is reported at `time_s`."""
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Joint and friction parameters, (n,) each: the last seven of a link's standard parameters, and the
-    elasticity.
-    """
-
-    Ia: np.ndarray
-    Fvl: np.ndarray
-    Fcl: np.ndarray
-    offl: np.ndarray
-    Fvm: np.ndarray
-    Fcm: np.ndarray
-    offm: np.ndarray
-    stiffness: np.ndarray
-    damping: np.ndarray
-    brake_torque: np.ndarray = field(default_factory=lambda: np.full(7, 200.0))
+        """Change the reported motor torque at `time_s`."""
 
 
 @njit(cache=True)
@@ -139,8 +119,8 @@ def _predict(
 class ElasticArm:
     """Two masses per joint (see `stiction`), rigid links and payload by pinocchio.
 
-    The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at the
-    midpoint that the present motion leads to; the joints advance in `substeps` steps within the cycle.
+    The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at its
+    extrapolated midpoint; the joints advance in `substeps` steps within the cycle.
     """
 
     def __init__(
@@ -191,9 +171,7 @@ class ElasticArm:
         self._data = model.createData()
 
     def reset(self, position: np.ndarray) -> None:
-        """Links at rest at `position` (n,); the motors where the joints' torsion carries gravity and
-        offset.
-        """
+        """Links at rest at `position` (n,), with gravity and offset carried by the torsion of the joints."""
         self.position[:] = position
         self.velocity[:] = 0.0
         self.motor_velocity[:] = 0.0
@@ -205,7 +183,7 @@ class ElasticArm:
         self.joint_torque[:] = self._joint[1] * (self.motor_position - self.position)
 
     def mount(self, payload: Payload | None) -> None:
-        """Weld `payload` to the last link; the links settle at rest on motors that stay where they are."""
+        """Weld `payload` to the last link; the links settle at rest, the motors stay."""
         self.payload = payload
         self._use(with_payload(self.bare, payload))
         self.velocity[:] = 0.0

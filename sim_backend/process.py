@@ -11,8 +11,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
+from ipaddress import IPv4Address
+from math import inf, nan
+from numbers import Real
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from fri.errors import ConfigurationError, LwrError, NetworkError, RobotError
@@ -20,27 +22,27 @@ from lwr_driver.configuration import find
 from lwr_driver.undisturbed import undisturbed
 from sim_backend.pendant import Pendant
 
-__all__ = ["EmulatorProcess"]
+__all__ = ["Emulator", "EmulatorProcess"]
 
 log = logging.getLogger(__name__)
 
 _STOP_S = 5.0
 
 
-class EmulatorProcess:
-    """Runs ``python -m sim_backend CONFIG`` as a child; a context manager.
+class Emulator:
+    """The emulated arm and controller as a child process (``python -m sim_backend CONFIG``); a context manager.
 
     config : path or name of an emulator configuration (`emulator/default.yaml`)
     lock_step : own clock, one cycle for each answer; otherwise real time
-    fri_host, fri_port : where the PC's end of the FRI listens
+    fri_host, fri_port : IPv4 address and UDP port of the PC's end of the FRI
     pendant_port : 0 takes a free one; see `pendant_port` afterwards
-    period_ms : FRI cycle, None as configured
+    period_ms : FRI cycle, whole milliseconds from 1 to 100; None as configured
     seed : seed of everything random in the emulator, None as configured
     settings : overrides of configuration keys by their dotted names, e.g. ``{"robot.payload": "paper_load"}``
-    start_s : longest time until the emulator answers on its pendant
+    start_s : time limit for the start of the emulator [s]
 
-    The child ends when `stop` is called, when the `with` block is left, and when this process dies in any
-    way: it watches a pipe that the operating system closes then.
+    The child ends with `stop`, with the `with` block, and with this process: it watches a pipe from its parent.
+    Raises ConfigurationError for a wrong argument.
     """
 
     def __init__(
@@ -58,28 +60,60 @@ class EmulatorProcess:
     ) -> None:
         self.config = find(config)
         self.lock_step = lock_step
-        self.fri_host, self.fri_port = fri_host, fri_port
-        self.pendant_port = pendant_port
+        try:
+            self.fri_host = str(IPv4Address(fri_host))
+        except ValueError as error:
+            raise ConfigurationError(f"fri_host: {error}; give an IPv4 address such as 127.0.0.1") from error
+        self.fri_port = _whole("fri_port", fri_port, 1, 65535)
+        self.pendant_port = _whole("pendant_port", pendant_port, 0, 65535)
         self.start_s = start_s
-        self._options: list[str] = []
-        if period_ms is not None:
-            self._options += ["--period-ms", repr(float(period_ms))]
-        if seed is not None:
-            self._options += ["--seed", str(seed)]
-        for key, value in (settings or {}).items():
-            self._options += ["--set", f"{key}={json.dumps(value)}"]
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
         self._pendant: Pendant | None = None
+        if not isinstance(settings or {}, Mapping):
+            raise ConfigurationError(
+                f"settings {settings!r} is no mapping; give values by dotted key, "
+                'such as {"robot.payload": "paper_load"}'
+            )
+        self.settings = dict(settings or {})
+        self._options: list[str] = []
+        if period_ms is not None:
+            self._options += ["--period-ms", str(_whole("period_ms", period_ms, 1, 100))]
+        if seed is not None:
+            self._options += ["--seed", str(_whole("seed", seed, 0))]
+        for key, value in self.settings.items():
+            try:
+                self._options += ["--set", f"{key}={json.dumps(value)}"]
+            except TypeError as error:
+                raise ConfigurationError(
+                    f"settings[{key!r}]: {error}; give numbers, texts or lists"
+                ) from error
 
-    def __enter__(self) -> EmulatorProcess:
-        self.start()
-        return self
+    def __repr__(self) -> str:
+        """Configuration, state and addresses."""
+        state = f"running (process {self.pid})" if self.running else "not running; `start` it or use `with`"
+        clock = "lock step" if self.lock_step else "real time"
+        lines = [
+            f"Emulator {self.config.name}: {state}",
+            f"  FRI      to {self.fri_host}:{self.fri_port} in {clock}",
+            f"  pendant  on 127.0.0.1:{self.pendant_port or 'a free port'}",
+        ]
+        shown = list(self.settings.items())[:5]
+        lines += [f"  {key} = {str(value)[:60]}" for key, value in shown]
+        if len(self.settings) > len(shown):
+            lines.append(f"  and {len(self.settings) - len(shown)} more settings")
+        return "\n".join(lines)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __enter__(self) -> Emulator:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
         self.stop()
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Address and UDP port of the PC's end of the FRI, for the driver."""
+        return self.fri_host, self.fri_port
 
     @property
     def pendant(self) -> Pendant:
@@ -102,22 +136,19 @@ class EmulatorProcess:
         """Status from the pendant."""
         return self.pendant.status()
 
-    def start(self) -> None:
-        """Start the process and wait until its pendant answers."""
+    def start(self) -> Emulator:
+        """Start the process, wait until its pendant answers, and return the emulator itself."""
         if self.running:
-            return
+            return self
         command = [
             sys.executable,
             "-m",
             "sim_backend",
             str(self.config),
             "--lock-step" if self.lock_step else "--real-time",
-            "--fri-host",
-            self.fri_host,
-            "--fri-port",
-            str(self.fri_port),
-            "--pendant-port",
-            str(self.pendant_port),
+            f"--fri-host={self.fri_host}",
+            f"--fri-port={self.fri_port}",
+            f"--pendant-port={self.pendant_port}",
             "--follow-stdin",
             "--announce",
             *self._options,
@@ -134,9 +165,10 @@ class EmulatorProcess:
             self.stop()
             raise
         log.info("emulator %d started, pendant on port %d", self._process.pid, self.pendant_port)
+        return self
 
     def _announced(self) -> int:
-        """Pendant port that the child announces in one line of JSON on its output."""
+        """Pendant port from the child's output, one line of JSON."""
         assert self._process is not None
         assert self._process.stdout is not None
         deadline = time.monotonic() + self.start_s
@@ -156,7 +188,7 @@ class EmulatorProcess:
         return kind(f"emulator {self.config.name} ended with status {status}: {reason}")
 
     def messages(self) -> str:
-        """What the process has written to its error output so far."""
+        """Error output of the process so far."""
         if self._errors is None:
             return ""
         # The child writes at the same file offset, so it must not be moved.
@@ -194,3 +226,16 @@ class EmulatorProcess:
             self._errors.close()
             self._errors = None
         return status
+
+
+def _whole(name: str, value: object, low: int, high: int | None = None) -> int:
+    """`value` as a whole number from `low` to `high`, or ConfigurationError."""
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else nan
+    if number.is_integer() and low <= number <= (inf if high is None else high):
+        return int(number)
+    bounds = f"from {low} to {high}" if high is not None else f"of at least {low}"
+    raise ConfigurationError(f"{name} {value!r} is no whole number {bounds}")
+
+
+#: The emulator by its former name.
+EmulatorProcess = Emulator

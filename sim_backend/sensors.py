@@ -1,14 +1,22 @@
-"""Sensors: resolution, offset and noise, each sensor with a random stream of its own."""
+"""Sensors with resolution, offset and noise, and the two ways of the motor torques out of the controller.
+
+The FRI packet has no motor torque. A KRL loop can write one per joint into `$FRI_TO_REA`, with a loop counter
+beside it; the values hold between two ticks of the loop. Or the controller records a trace at 1 kHz on its own
+clock, and the file is fetched after the motion.
+"""
 
 from __future__ import annotations
+
+import os
+from pathlib import Path
 
 import numpy as np
 from numba import njit
 
-from sim_backend.configuration import SensorConfig
-from sim_backend.plant import Plant, Reading
+from sim_backend.configuration import KrlRealsConfig, SensorConfig, TraceConfig
+from sim_backend.plant import CYCLE_S, Plant, Reading
 
-__all__ = ["Sensors"]
+__all__ = ["ControllerTrace", "KrlReals", "Sensors", "trace_columns"]
 
 _BLOCK = 1000
 
@@ -48,9 +56,9 @@ def _read_motor(
 class Sensors:
     """Reads a plant once per millisecond, in two steps.
 
-    The controller needs position and joint torque to decide the motor torque of the next millisecond; only
-    with that is the motor torque at this instant known, midway between the torques held before and after it.
-    `reading` holds the last values; its arrays keep their identity.
+    Position and joint torque come first: the controller needs them for the motor torque of the next millisecond.
+    The motor torque at this instant is midway between the torques held before and after it. `reading` holds the
+    last values; its arrays keep their identity.
     """
 
     def __init__(self, config: SensorConfig, joints: int, random: np.random.SeedSequence) -> None:
@@ -75,9 +83,7 @@ class Sensors:
         self.reading = Reading(*self._rows)
 
     def read(self, plant: Plant) -> Reading:
-        """Position, motor position and joint torque at this instant; the motor torque is still the last
-        one.
-        """
+        """Position, motor position and joint torque at this instant; the motor torque is still the last."""
         if self._next == _BLOCK:
             for row, stream in enumerate(self._streams):
                 self._noise[:, row] = stream.standard_normal(self._noise.shape[::2])
@@ -89,7 +95,142 @@ class Sensors:
         return self.reading
 
     def read_motor(self, before: np.ndarray, after: np.ndarray) -> None:
-        """Motor torque at this instant, from the torques (n,) held in the milliseconds before and after
-        it.
-        """
+        """Motor torque at this instant, from the torques (n,) of the milliseconds before and after it."""
         _read_motor(before, after, self._settings, self._row, self._rows)
+
+
+def trace_columns(joint_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Header of a trace file: time [s], motor torques referred to the joint [Nm], positions [rad]."""
+    return ("time_s", *(f"tau_m_{name}" for name in joint_names), *(f"q_{name}" for name in joint_names))
+
+
+class _Delay:
+    """Last values of a vector, to be read some milliseconds late."""
+
+    def __init__(self, milliseconds: int, size: int) -> None:
+        self._rows = np.zeros((milliseconds + 1, size))
+        self._next = 0
+
+    def put(self, values: np.ndarray) -> np.ndarray:
+        """Take in `values` (size,), return those of `milliseconds` ago; do not keep them."""
+        rows = self._rows
+        if len(rows) == 1:
+            return values
+        rows[self._next] = values
+        self._next = (self._next + 1) % len(rows)
+        # The row to be overwritten next is the oldest.
+        return rows[self._next]
+
+
+class KrlReals:
+    """The KRL loop for the motor torques; `millisecond` runs at 1 kHz."""
+
+    def __init__(self, config: KrlRealsConfig, joints: int) -> None:
+        self.config = config
+        self._indices = np.array(config.reals) - 1
+        self._counter = config.counter_int - 1
+        self._delay = _Delay(config.delay_ms, joints)
+        self._count = 0
+        self._elapsed = 0
+
+    def millisecond(self, motor_torque: np.ndarray, to_real: np.ndarray, to_int: np.ndarray) -> None:
+        """One millisecond: `motor_torque` (7,) as measured; the KRL variables (16,) are written at a tick."""
+        late = self.late(motor_torque)
+        self._elapsed += 1
+        if self._elapsed < self.config.tick_ms:
+            return
+        self._elapsed = 0
+        self._count = (self._count + 1) & 0x7FFFFFFF
+        to_real[self._indices] = late
+        to_int[self._counter] = self._count
+
+    def late(self, motor_torque: np.ndarray) -> np.ndarray:
+        """Take in `motor_torque` (7,), return the one of `delay_ms` ago; do not keep it."""
+        return self._delay.put(motor_torque)
+
+
+class ControllerTrace:
+    """The controller's recording at 1 kHz: time on its own clock, motor torque and position of each joint."""
+
+    def __init__(self, config: TraceConfig, joint_names: tuple[str, ...]) -> None:
+        self.config = config
+        self.columns = trace_columns(joint_names)
+        self.recording = False
+        self._joints = len(joint_names)
+        self._delay = _Delay(config.delay_ms, self._joints)
+        self._longest = int(config.longest_s / CYCLE_S)
+        self._blocks: list[np.ndarray] = []
+        self._block = np.empty((0, 0))
+        self._filled = 0
+        self._writer: int | None = None
+
+    def start(self) -> None:
+        """Begin anew."""
+        self._blocks = []
+        self._new_block()
+        self.recording = True
+
+    def _new_block(self) -> None:
+        self._block = np.empty((60_000, 1 + 2 * self._joints))
+        self._blocks.append(self._block)
+        self._filled = 0
+        if (len(self._blocks) - 1) * len(self._block) > self._longest:
+            del self._blocks[0]
+
+    def millisecond(self, time_s: float, motor_torque: np.ndarray, position: np.ndarray) -> None:
+        """One sample, if recording."""
+        if not self.recording and not self.config.delay_ms:
+            return
+        late = self._delay.put(motor_torque)
+        if not self.recording:
+            return
+        if self._filled == len(self._block):
+            self._new_block()
+        row = self._block[self._filled]
+        row[0] = self.config.clock_offset + time_s * (1.0 + self.config.clock_rate_error)
+        row[1 : 1 + self._joints] = late
+        row[1 + self._joints :] = position
+        self._filled += 1
+
+    def samples(self) -> np.ndarray:
+        """The recorded samples, (n, 15), with the columns of `columns`."""
+        if not self._blocks:
+            return np.empty((0, len(self.columns)))
+        return np.concatenate([*self._blocks[:-1], self._block[: self._filled]])[-self._longest :]
+
+    def save(self, path: Path) -> int:
+        """End the recording and write it as CSV in a process of its own; returns the number of samples.
+
+        The file appears under its name when it is complete, see `saving`.
+        """
+        rows = self.samples()
+        self.recording = False
+        self._blocks = []
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".part")
+        partial.touch()
+        self._writer = os.fork()
+        if self._writer == 0:
+            # The controller's cycle must not wait for a disk.
+            status = 1
+            try:
+                header = ",".join(self.columns)
+                formats = ["%.6f"] + ["%.6g"] * self._joints + ["%.9f"] * self._joints
+                np.savetxt(partial, rows, fmt=formats, delimiter=",", header=header, comments="")
+                os.replace(partial, path)
+                status = 0
+            finally:
+                os._exit(status)
+        return len(rows)
+
+    def saving(self) -> bool:
+        """Whether a file is still being written. Raises OSError once after a failure."""
+        if self._writer is None:
+            return False
+        done, status = os.waitpid(self._writer, os.WNOHANG)
+        if done == 0:
+            return True
+        self._writer = None
+        if status != 0:
+            raise OSError("the trace file could not be written")
+        return False

@@ -1,6 +1,4 @@
-"""The emulator's main loop: the FRI socket, the pendant, and the clock, which is either its own or the
-wall's.
-"""
+"""The emulator's main loop: the FRI socket, the pendant, and the clock (virtual time or real time)."""
 
 from __future__ import annotations
 
@@ -26,10 +24,10 @@ __all__ = ["Service"]
 log = logging.getLogger(__name__)
 
 _RESEND_S = 0.2
-# A PC that was heard and is silent thinks, or another one has taken its place and waits for its first packet.
+# After an answer the PC may think for long; a restarted PC waits for its first packet.
 _RESEND_HEARD_S = 5.0
 _IDLE_S = 0.2
-# A damaged datagram that the PC takes for good is answered at once or not at all.
+# A damaged datagram is answered at once or not at all.
 _PERHAPS_S = 0.02
 _PACED_AFTER = 2000
 _PENDANT_EVERY = 50
@@ -38,7 +36,7 @@ _PENDANT_EVERY = 50
 class Service:
     """One emulator: cabinet, operator, FRI socket and pendant.
 
-    follow : file descriptor whose end of file ends the emulator (a pipe from the parent), None without one
+    follow : file descriptor of a pipe from the parent; its end of file ends the emulator
     """
 
     def __init__(
@@ -88,8 +86,8 @@ class Service:
             other.close()
 
     def run(self, lock_step: bool) -> None:
-        """Run until told to end."""
-        # What start-up made stays; collecting it again would only cost time within a cycle.
+        """Run until `stop`, or the end by pendant or parent."""
+        # Objects of the start-up stay; collecting them again would cost time within a cycle.
         gc.collect()
         gc.freeze()
         self._stepping = lock_step
@@ -101,11 +99,11 @@ class Service:
     def _serve(self, timeout_s: float) -> bool:
         """Wait for something at most `timeout_s`, serve pendant and parent; True if an FRI datagram is there.
 
-        FRI goes first: what was sent before a request to the pendant has then been acted on before it.
+        FRI goes first: a command sent before a request to the pendant acts before it.
         """
         ready = self._poller.poll(timeout_s * 1000.0)
         if not ready:
-            # A parent that died may have left its end of the pipe to a forked child.
+            # A forked child of a dead parent may hold the pipe open.
             if self._follow is not None and os.getppid() != self._parent:
                 self._ended = True
             return False
@@ -138,7 +136,7 @@ class Service:
             operator.step()
 
     def _silent_cycle(self) -> None:
-        """A cycle in which nothing is sent: time goes on only where something waits for it."""
+        """A cycle without a packet; time stands still unless the operator is busy."""
         cabinet, operator = self.cabinet, self.operator
         if not operator.busy:
             self._serve_silently(_IDLE_S)
@@ -146,13 +144,13 @@ class Service:
         if cabinet.cycle % _PENDANT_EVERY == 0:
             self._serve_silently(0.0)
         if cabinet.session.state is not State.OFF:
-            # Made as ever, but it does not leave: the PC will find the gap in the counter.
+            # Made but not sent: the PC finds the gap in the counter.
             cabinet.packet()
         cabinet.close()
         operator.step()
 
     def _serve_silently(self, timeout_s: float) -> None:
-        """Serve while no answer is expected; what comes from the PC nevertheless is late."""
+        """Serve while no answer is expected; any command from the PC is late."""
         while self._serve(timeout_s):
             self._take(self.config.fri.answer_delay_s)
             timeout_s = 0.0
@@ -171,7 +169,7 @@ class Service:
                 self._await(parcel.datagram, age_s, limit_s=_PERHAPS_S)
         self._unanswerable = 0 if answerable else self._unanswerable + 1
         if not answerable:
-            # Nothing to wait for; a link that is dead for good must not race through its time.
+            # Nothing to wait for, but a dead link must not race through its time.
             paced = self._unanswerable > _PACED_AFTER
             if paced or cabinet.cycle % _PENDANT_EVERY == 0:
                 self._serve_silently(CYCLE_S if paced else 0.0)
@@ -190,7 +188,7 @@ class Service:
         self._foreign[host].sendto(datagram, to)
 
     def _take(self, age_s: float) -> bytes | None:
-        """One datagram of the PC, handed on; in lock step a reminder is noted instead (`Loop.remind`)."""
+        """One datagram of the PC, handed on; in lock step a reminder is noted instead."""
         datagram = self.end.receive(0.0)
         if datagram is None:
             return None
@@ -212,10 +210,10 @@ class Service:
     def _await(self, sent: bytes, age_s: float, limit_s: float | None = None) -> None:
         """Lock step: wait until the PC has answered `sent`.
 
-        In monitor mode for as long as it takes, in command mode for the configured patience. The first packet
-        is repeated until the PC is heard, and any now and then, for a PC that was started anew. An answer
-        that reflects something else is followed by a short wait only. A PC that says that it has answered all
-        it has seen gets the packet again, which may have been lost, and as much time again: it is alive.
+        The wait has no end in monitor mode; in command mode it ends with the configured patience. The first
+        packet is repeated until the PC is heard, any other now and then, for a restarted PC. After an answer to
+        another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was perhaps
+        lost: it is sent again, and the wait begins anew.
         """
         wanted = sent[:2]
         commanding = self.cabinet.session.state is State.CMD

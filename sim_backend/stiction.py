@@ -6,12 +6,12 @@ Per joint, with motor position `theta` referred to the joint and link position `
     M(q) q''   = tau_j - bias   - Fvl q'     - offl - Fcl Sgn(q')        (row-wise over the joints)
     tau_j      = K (theta - q) + D (theta' - q')
 
-`Sgn` is the set-valued sign: any value in [-1, 1] at rest, so a joint sticks exactly and stays bit for bit
-where it is while the other torques remain below breakaway. The smooth terms are taken at the midpoint (second
-order, conserves the energy of the undamped system), the Coulomb terms at the end of the step (Moreau 1988;
-Acary and Brogliato 2008, Moreau-Jean scheme). One step is a convex problem with a unique solution; it is
-found by the primal-dual active set method, in almost every step at the first try with the signs of the step
-before, and by coordinate descent where the active sets cycle.
+`Sgn` is the set-valued sign: any value in [-1, 1] at rest. A joint therefore sticks exactly, bit for bit, while
+the other torques remain below breakaway. The smooth terms are taken at the midpoint (second order, conserves the
+energy of the undamped system), the Coulomb terms at the end of the step (Moreau 1988; Acary and Brogliato 2008,
+Moreau-Jean scheme). One step is a convex problem with a unique solution. The primal-dual active set method finds
+it, almost always at the first try with the signs of the step before; coordinate descent replaces it if the active
+sets cycle.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["ENERGY_DISSIPATED", "ENERGY_INPUT", "ENERGY_OFFSET", "advance"]
+__all__ = ["advance"]
 
-ENERGY_INPUT, ENERGY_DISSIPATED, ENERGY_OFFSET = 0, 1, 2
 _ACTIVE_SET_TRIES = 40
 _DESCENT_SWEEPS = 20_000
 
@@ -56,24 +55,21 @@ def _solve(matrix: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
 @njit(cache=True)
 def _try_modes(
     mass: np.ndarray,
-    motor_diagonal: np.ndarray,
-    link_diagonal: np.ndarray,
-    coupling: np.ndarray,
-    motor_right: np.ndarray,
-    link_right: np.ndarray,
-    motor_grip: np.ndarray,
-    link_grip: np.ndarray,
-    motor_mode: np.ndarray,
-    link_mode: np.ndarray,
+    terms: np.ndarray,
+    modes: np.ndarray,
     matrix: np.ndarray,
     right: np.ndarray,
-    motor_speed: np.ndarray,
-    link_speed: np.ndarray,
+    speeds: np.ndarray,
 ) -> bool:
-    """End speeds under the assumed modes (-1, 0, +1); corrects the modes and tells whether they were
-    right.
+    """End speeds under the assumed modes (-1, 0, +1); corrects the modes and returns whether they held.
+
+    terms : rows of `advance`: diagonals, coupling, right sides, friction bounds. modes, speeds : rows motor, link
     """
     n = mass.shape[0]
+    motor_diagonal, link_diagonal, coupling = terms[0], terms[1], terms[2]
+    motor_right, link_right, motor_grip, link_grip = terms[3], terms[4], terms[5], terms[6]
+    motor_mode, link_mode = modes[0], modes[1]
+    motor_speed, link_speed = speeds[0], speeds[1]
     for i in range(n):
         if link_mode[i] == 0:
             for j in range(i):
@@ -131,22 +127,13 @@ def _try_modes(
 
 
 @njit(cache=True)
-def _descend(
-    mass: np.ndarray,
-    motor_diagonal: np.ndarray,
-    link_diagonal: np.ndarray,
-    coupling: np.ndarray,
-    motor_right: np.ndarray,
-    link_right: np.ndarray,
-    motor_grip: np.ndarray,
-    link_grip: np.ndarray,
-    motor_mode: np.ndarray,
-    link_mode: np.ndarray,
-    motor_speed: np.ndarray,
-    link_speed: np.ndarray,
-) -> None:
+def _descend(mass: np.ndarray, terms: np.ndarray, modes: np.ndarray, speeds: np.ndarray) -> None:
     """End speeds by exact coordinate descent on the convex problem; slow, but it cannot cycle."""
     n = mass.shape[0]
+    motor_diagonal, link_diagonal, coupling = terms[0], terms[1], terms[2]
+    motor_right, link_right, motor_grip, link_grip = terms[3], terms[4], terms[5], terms[6]
+    motor_mode, link_mode = modes[0], modes[1]
+    motor_speed, link_speed = speeds[0], speeds[1]
     for _ in range(_DESCENT_SWEEPS):
         change = 0.0
         for i in range(n):
@@ -209,12 +196,12 @@ def advance(
     motor_mode, link_mode = modes[0], modes[1]
     inertia, stiffness, damping = joint[0], joint[1], joint[2]
     matrix = np.empty((n, n))
-    right = np.empty(n)
-    motor_diagonal, link_diagonal, coupling = np.empty(n), np.empty(n), np.empty(n)
-    motor_right, link_right = np.empty(n), np.empty(n)
-    motor_grip, link_grip = np.empty(n), np.empty(n)
-    motor_end, link_end = np.zeros(n), np.zeros(n)
-    momentum = np.empty(n)
+    right, momentum = np.empty(n), np.empty(n)
+    terms = np.empty((7, n))
+    motor_diagonal, link_diagonal, coupling = terms[0], terms[1], terms[2]
+    motor_right, link_right, motor_grip, link_grip = terms[3], terms[4], terms[5], terms[6]
+    speeds = np.zeros((2, n))
+    motor_end, link_end = speeds[0], speeds[1]
     for i in range(n):
         series = 0.5 * h * stiffness[i] + damping[i]
         motor_diagonal[i] = inertia[i] + 0.5 * h * (series + friction[0, i])
@@ -222,7 +209,7 @@ def advance(
         coupling[i] = 0.5 * h * series
         motor_grip[i] = h * friction[1, i]
         link_grip[i] = h * friction[4, i]
-        # Without Coulomb friction there is nothing to stick: the mode only has to be other than zero.
+        # A joint without Coulomb friction never sticks: any mode but zero will do.
         if motor_grip[i] <= 0.0:
             motor_mode[i] = 1
         if link_grip[i] <= 0.0:
@@ -245,40 +232,12 @@ def advance(
             )
         settled = False
         for _ in range(_ACTIVE_SET_TRIES):
-            settled = _try_modes(
-                mass,
-                motor_diagonal,
-                link_diagonal,
-                coupling,
-                motor_right,
-                link_right,
-                motor_grip,
-                link_grip,
-                motor_mode,
-                link_mode,
-                matrix,
-                right,
-                motor_end,
-                link_end,
-            )
+            settled = _try_modes(mass, terms, modes, matrix, right, speeds)
             if settled:
                 break
         if not settled:
             descents += 1
-            _descend(
-                mass,
-                motor_diagonal,
-                link_diagonal,
-                coupling,
-                motor_right,
-                link_right,
-                motor_grip,
-                link_grip,
-                motor_mode,
-                link_mode,
-                motor_end,
-                link_end,
-            )
+            _descend(mass, terms, modes, speeds)
         for i in range(n):
             motor_mean = 0.5 * (theta_speed[i] + motor_end[i])
             link_mean = 0.5 * (q_speed[i] + link_end[i])

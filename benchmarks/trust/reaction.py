@@ -11,8 +11,7 @@ import numpy as np
 
 from benchmarks.trust.stand import Stand, shared_ring, the_motion
 from benchmarks.trust.table import Ledger
-from fri.event import EventKind
-from fri.states import Control, Quality, State
+from fri.states import Control, EventKind, Quality, State
 from lwr_driver.control import Job, Mode, Word
 from lwr_driver.ring import Ring
 

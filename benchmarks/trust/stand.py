@@ -22,11 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.controller_end import ControllerEnd
-from fri.krc import KrcSession
+from fri.krc import KrcSession, Sample
 from fri.krl import Interpreter
 from fri.packets import CMD, CMD_SIZE
 from fri.policy import KrcLimits, KrcPolicy
-from fri.sample import Sample
 from fri.states import State
 from lwr_driver.arm import Arm
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
@@ -37,8 +36,8 @@ from lwr_driver.ring import Ring
 from lwr_driver.session import session_metadata
 from lwr_driver.turnaround import Turnaround
 from runner.route import dwell
+from sim_backend.configuration import krl_program
 from sim_backend.faults import FaultyWire, Parcel, WireFault
-from sim_backend.krl_program import krl_program
 from sim_backend.monitor import CommandMonitor
 
 __all__ = ["LABEL", "START", "Stand", "the_arm", "the_motion"]

@@ -15,10 +15,9 @@ import numpy as np
 
 from benchmarks.trust.stand import START, the_arm
 from fri.errors import LwrError
-from fri.krc import KrcSession
+from fri.krc import KrcSession, Sample
 from fri.packets import CMD_SIZE, MSR_SIZE, MsrBuffer
 from fri.policy import KrcLimits, KrcPolicy
-from fri.sample import Sample
 from fri.sequence import SequenceTracker
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell

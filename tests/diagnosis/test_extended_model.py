@@ -18,8 +18,7 @@ from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig, load_configuration
 from sim_backend.model_arm import Cause, model_effects
 from sim_backend.plant import ElasticArm
-from sim_backend.rigid_body import chain
-from sim_backend.truth import robot_file, true_arm, truth
+from sim_backend.robot import chain, robot_file, true_arm, truth
 
 HEALTHY = Path(__file__).parents[1] / "hidden_physics" / "reference.yaml"
 HOSE_NM_RAD, PULL_NM = 2.0, 0.7

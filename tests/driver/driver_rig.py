@@ -12,18 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.controller_end import ControllerEnd
-from fri.krc import KrcSession, Setpoint
+from fri.krc import KrcSession, Sample, Setpoint
 from fri.krl import Interpreter
 from fri.packets import CMD, CMD_SIZE
 from fri.policy import KrcLimits, KrcPolicy
-from fri.sample import Sample
 from fri.states import State
 from lwr_driver.arm import Arm, Limits
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
-from sim_backend.krl_program import krl_program
+from sim_backend.configuration import krl_program
 
 DEG = np.pi / 180.0
 START = np.array([0.1, 0.5, -0.2, -1.3, 0.3, 0.8, -0.1])

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from driver_rig import START, Rig, arm
 
-from fri.event import EventKind
-from fri.states import ALL_DRIVES, Control, Quality, State
+from fri.states import ALL_DRIVES, Control, EventKind, Quality, State
 from lwr_driver.control import Job, Mode, Result, Text, Word
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE, ROW, Ring

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fri.krc import KrcLimits, KrcPolicy, KrcSession, Setpoint
+from fri.krc import KrcLimits, KrcPolicy, KrcSession, Sample, Setpoint
 from fri.packets import MSR, new_cmd
-from fri.sample import Sample
 from fri.states import FLAGS, Control, State
 
 DEG = np.pi / 180.0

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from fri_rig import LIMITS, Q_MAX, Q_START, QUICK, V_MAX, Rig
 
-from fri.krc import EventKind, KrcPolicy, KrcSession
+from fri.krc import EventKind, KrcPolicy, KrcSession, Sample
 from fri.packets import MSR
-from fri.sample import Sample
 from fri.states import ALL_DRIVES, Control, Quality, State
 
 # The largest step that the velocity limits allow in one millisecond.

@@ -7,12 +7,13 @@ from fri_rig import V_MAX, Rig
 from fri.errors import ConfigurationError
 from fri.handshake import HANDSHAKES, find_handshake
 from fri.krc import EventKind
-from fri.krl import PROGRAMS, Interpreter, StanfordProgram
+from fri.krl import Interpreter, KrlProgram
 from fri.packets import new_cmd, new_msr
 from fri.states import ALL_DRIVES, Control, State
-from sim_backend.krl_program import OWN_PROGRAM, krl_program
+from sim_backend.configuration import krl_program
 
-NAMES = sorted((OWN_PROGRAM, *PROGRAMS))
+NAMES = ["lwr_identification", "rcprg", "ros_control", "stanford"]
+COUNTING = "DEF p( )\nLOOP\n$FRI_TO_INT[1]=$FRI_TO_INT[1]+1\nWAIT SEC 0.012\nENDLOOP\nEND"
 # Cycles of 2 ms within which every granted request must be visible.
 BOUND = 400
 
@@ -137,7 +138,7 @@ def test_stanford_values_on_the_wire():
 @pytest.mark.parametrize("abort_code", [30, 40])
 def test_stanford_close_needs_the_code_of_this_run(abort_code):
     cell = Cell("stanford")
-    cell.program = StanfordProgram(2, abort_code)
+    cell.program = krl_program("stanford", 2, LWR_ABORT=abort_code)
     cell.interpreter = Interpreter(cell.session, cell.program)
     cell.start()
     cell.krl["krl_int"][15] = 70 - abort_code
@@ -152,8 +153,6 @@ def test_stanford_close_needs_the_code_of_this_run(abort_code):
     assert seen_closed
     assert cell.program.finished
     assert cell.session.state is State.OFF
-    with pytest.raises(ValueError, match="neither 30 nor 40"):
-        StanfordProgram(2, 10)
 
 
 def test_ros_values_on_the_wire():
@@ -239,28 +238,16 @@ def test_command_mode_with_drives_off_is_granted(name):
 )
 def test_interpreter_ticks_every_12_ms(period_ms, calls, ticks):
     # A tick falls due at 0, 12, 24, ... ms; a call runs those due at its beginning.
-    count = 0
-
-    def background(session: object) -> None:
-        nonlocal count
-        count += 1
-
-    interpreter = Interpreter(Rig().session, None, background)
+    session = Rig().session
+    interpreter = Interpreter(session, KrlProgram(COUNTING))
     for _ in range(calls):
         interpreter.advance(period_ms)
-    assert count == (calls - 1) * period_ms // 12 + 1 == ticks
+    assert session.to_int[0] == (calls - 1) * period_ms // 12 + 1 == ticks
 
 
-def test_background_publishes_sample_and_hold():
+def test_a_variable_holds_between_two_ticks():
     rig = Rig(sample_time_ms=1).open()
-    count = 0
-
-    def publish(session: object) -> None:
-        nonlocal count
-        count += 1
-        rig.session.to_int[0] = count
-
-    interpreter = Interpreter(rig.session, None, publish)
+    interpreter = Interpreter(rig.session, KrlProgram(COUNTING))
     seen = []
     for _ in range(60):
         interpreter.advance(1)

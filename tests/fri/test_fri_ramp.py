@@ -5,7 +5,7 @@ from fri_rig import A_MAX, Q_MAX, V_MAX
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fri.ramp import StopRamp
+from fri.track import StopRamp
 
 JERK = A_MAX / 0.02
 DT = 1e-4

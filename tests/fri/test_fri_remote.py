@@ -145,7 +145,7 @@ def test_answer_that_depends_on_more_than_the_packet_is_not_foreseen(end, contro
         controller.send(20_000, timestamp=5.0)
         assert end.receive(0.0) is None
     assert end.foreseen is None
-    with pytest.raises(RuntimeError, match="beforehand"):
+    with pytest.raises(RuntimeError, match="no answer can be prepared"):
         end.foresee(q, ahead)
 
 

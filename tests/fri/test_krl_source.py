@@ -9,17 +9,16 @@ from fri_rig import Rig
 from fri.errors import ConfigurationError
 from fri.handshake import IdentificationHandshake
 from fri.krc import EventKind
-from fri.krl import Interpreter
-from fri.krl_machine import AXES, NoMachinery, SourceProgram
+from fri.krl import AXES, Interpreter, KrlProgram, NoMachinery
 from fri.packets import JOINT_NAMES, new_cmd, new_msr
 from fri.states import Control, State
 from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
-from sim_backend.krl_program import krl_program
+from sim_backend.configuration import krl_program
 
 
-def run(body: str, ticks: int = 5, data: str = "", **settings: int) -> tuple[SourceProgram, Rig]:
+def run(body: str, ticks: int = 5, data: str = "", **settings: int) -> tuple[KrlProgram, Rig]:
     rig = Rig()
-    program = SourceProgram(f"DEF p( )\n{body}\nEND\n", data, settings)
+    program = KrlProgram(f"DEF p( )\n{body}\nEND\n", data, settings)
     for _ in range(ticks):
         if not program.finished:
             program.step(rig.session)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from hidden_physics.bristles import FILM_ROW, HOUSING_ROW, STATES, advance
 from hidden_physics.traits import TRAITS, trait_rows
-from sim_backend.plant import CYCLE_S, Drive
-from sim_backend.rigid_body import Payload, with_payload
+from sim_backend.plant import CYCLE_S
+from sim_backend.robot import Drive, Payload, with_payload
 
 __all__ = ["Contact", "HiddenArm", "Load"]
 

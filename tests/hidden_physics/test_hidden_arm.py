@@ -11,7 +11,7 @@ from hidden_physics.arm import Contact, HiddenArm
 from hidden_physics.bristles import FILM_ROW, _spring
 from sim_backend.configuration import load_configuration
 from sim_backend.plant import ElasticArm
-from sim_backend.truth import robot_file, true_arm
+from sim_backend.robot import robot_file, true_arm
 
 HOME = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
 

@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from sim_backend.configuration import load_configuration
-from sim_backend.plant import Drive, ElasticArm
-from sim_backend.truth import robot_file, true_arm
+from sim_backend.plant import ElasticArm
+from sim_backend.robot import Drive, robot_file, true_arm
 
 
 def drive(joints=1, **values):

@@ -8,8 +8,7 @@ import pytest
 from fri.errors import ConfigurationError
 from sim_backend.configuration import load_configuration
 from sim_backend.plant import Effect, Plant
-from sim_backend.rigid_body import Payload, chain, with_inertias
-from sim_backend.truth import robot_file, truth
+from sim_backend.robot import Payload, chain, robot_file, truth, with_inertias
 
 POSE = np.array([0.3, 0.8, -0.4, -1.1, 0.5, 0.9, 0.2])
 PUSH = np.array([60.0, 60.0, 36.0, 36.0, 18.0, 18.0, 12.0])

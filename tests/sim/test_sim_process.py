@@ -10,12 +10,12 @@ import pytest
 from pc import QUICK, Pc, free_port, gentle
 
 from fri.errors import ConfigurationError, NetworkError
-from sim_backend.process import EmulatorProcess
+from sim_backend import Emulator
 
 
 def emulator(port, **options):
     options["settings"] = QUICK | options.get("settings", {})
-    return EmulatorProcess(fri_port=port, **options)
+    return Emulator(fri_port=port, **options)
 
 
 def test_two_processes_with_one_seed_send_the_same_bytes():
@@ -51,8 +51,8 @@ def test_shutdown_over_the_pendant_ends_it():
 
 def test_it_dies_with_a_parent_that_was_killed():
     script = (
-        "from sim_backend.process import EmulatorProcess; import sys, time\n"
-        f"machine = EmulatorProcess(fri_port={free_port()}, settings={QUICK!r}); machine.start()\n"
+        "from sim_backend import Emulator; import sys, time\n"
+        f"machine = Emulator(fri_port={free_port()}, settings={QUICK!r}); machine.start()\n"
         "print(machine.pid, flush=True); time.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
@@ -77,4 +77,48 @@ def test_it_dies_with_a_parent_that_was_killed():
 )
 def test_wrong_configuration_is_reported_by_the_parent(settings, message):
     with pytest.raises(ConfigurationError, match=message):
-        EmulatorProcess(fri_port=free_port(), settings=settings).start()
+        Emulator(fri_port=free_port(), settings=settings).start()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"fri_port": 99999}, "fri_port 99999 is no whole number from 1 to 65535"),
+        ({"fri_port": "49938"}, "fri_port '49938' is no whole number"),
+        ({"fri_host": "localhost"}, "fri_host: .*give an IPv4 address such as 127.0.0.1"),
+        ({"period_ms": 1.5}, "period_ms 1.5 is no whole number from 1 to 100"),
+        ({"seed": -1}, "seed -1 is no whole number of at least 0"),
+        ({"settings": ["robot.payload"]}, "is no mapping; give values by dotted key"),
+        ({"settings": {"robot.payload": object()}}, "'robot.payload'.*give numbers, texts or lists"),
+        ({"config": "nowhere.yaml"}, "nowhere.yaml"),
+    ],
+)
+def test_wrong_arguments_are_refused_before_a_process_starts(arguments, message):
+    with pytest.raises(ConfigurationError, match=message):
+        Emulator(**arguments)
+
+
+def test_the_emulator_describes_itself_in_at_most_ten_lines():
+    settings = QUICK | {f"sensors.temperature{k}": k for k in range(20)}
+    machine = Emulator(fri_port=49951, settings=settings)
+    lines = repr(machine).splitlines()
+    assert lines[0] == "Emulator default.yaml: not running; `start` it or use `with`"
+    assert lines[1] == "  FRI      to 127.0.0.1:49951 in lock step"
+    assert lines[-1] == "  and 16 more settings"
+    assert len(lines) <= 10
+    assert machine.address == ("127.0.0.1", 49951)
+    with emulator(free_port()) as running:
+        assert f"running (process {running.pid})" in repr(running)
+        assert str(running.pendant_port) in repr(running)
+
+
+def test_importing_the_package_is_cheap_and_gives_the_emulator():
+    script = (
+        "import sys, sim_backend\n"
+        "assert not {'numpy', 'numba', 'sim_backend.process'} & set(sys.modules)\n"
+        "from sim_backend import Emulator\n"
+        "assert 'Emulator' in dir(sim_backend) and 'pinocchio' not in sys.modules\n"
+        "sim_backend.Simulator"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert "AttributeError: module 'sim_backend' has no attribute 'Simulator'" in done.stderr

@@ -16,9 +16,8 @@ from sim_backend.configuration import (
     load_configuration,
 )
 from sim_backend.controller import ControllerModel
-from sim_backend.recording import ControllerTrace, KrlReals
-from sim_backend.rigid_body import chain
-from sim_backend.sensors import Sensors
+from sim_backend.robot import chain
+from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
 NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 FLOOR = np.array([0.05, 0.05, 0.03, 0.03, 0.03, 0.011, 0.011])
