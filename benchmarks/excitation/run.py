@@ -47,10 +47,10 @@ from ident.excitation import (
     trade_off,
 )
 from ident.excitation.check import Limits
-from ident.excitation.motion import Samples
-from ident.excitation.objectives import TorqueLevel
+from ident.excitation.criteria import TorqueLevel
+from ident.excitation.information import samples_view
+from ident.excitation.motions import Samples
 from ident.excitation.search import begin, random_start
-from ident.excitation.views import samples_view
 from lwr_driver.arm import Arm
 
 HERE = Path(__file__).resolve().parent

@@ -18,26 +18,23 @@ The result depends on the seed and the counts of the problem file, not on the ba
 processes.
 """
 
+from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise
 from ident.excitation.assembly import Assembled, assemble
-from ident.excitation.bspline import SplineBasis, SplineMotion
 from ident.excitation.check import Check, Limits, Margin, Workspace, check_motion
-from ident.excitation.estimate import ArmEstimate, Noise
-from ident.excitation.feasible import arm_limits, feasible_fourier
-from ident.excitation.fourier import FourierBasis, FourierSeries
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.pareto import FrontPoint, hypervolume, not_dominated, trade_off
-from ident.excitation.plan import ExcitationPlan
-from ident.excitation.planner import Progress, plan
-from ident.excitation.point_to_point import PointToPoint, random_points
-from ident.excitation.problem import (
-    Knowledge,
-    MotionForm,
-    Objective,
-    PlanProblem,
-    Prior,
-    Search,
+from ident.excitation.comparison import (
+    FrontPoint,
+    TableRow,
+    hypervolume,
+    not_dominated,
+    random_points,
+    table,
+    table_row,
+    trade_off,
 )
-from ident.excitation.table import TableRow, plan_report, table, table_row
+from ident.excitation.motions import FourierBasis, FourierSeries, PointToPoint, SplineBasis, SplineMotion
+from ident.excitation.plan import ExcitationPlan, plan_report
+from ident.excitation.planner import Progress, arm_limits, feasible_fourier, plan
+from ident.excitation.problem import Knowledge, MotionForm, Objective, PlanProblem, Prior, Search
 
 __all__ = [
     "ArmEstimate",

@@ -1,5 +1,7 @@
-"""A planning problem made concrete: the arm, its limits, the criteria, and the checks, built from the
-problem file.
+"""The planning problem with its files read: arm, limits, criteria, prior information, optimiser set-up, checks.
+
+Prior sessions count by their information: the criteria act on the sum of prior and planned information (sequential
+design), so a new motion is strong where earlier motions were weak.
 """
 
 from __future__ import annotations
@@ -11,35 +13,45 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.base import BaseSet, closed_form_base
-from ident.excitation.bspline import SplineBasis
-from ident.excitation.capsules import space_of
+from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise, split_name
 from ident.excitation.check import Check, Limits, PathChecker, check_motion
-from ident.excitation.estimate import ArmEstimate, Noise, split_name
-from ident.excitation.fourier import FourierBasis
-from ident.excitation.information import Columns
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.motion import Array, Basis, ParametricMotion
-from ident.excitation.objectives import (
+from ident.excitation.clearance import space_of
+from ident.excitation.criteria import (
+    ConditionNumber,
     Criterion,
+    DOptimality,
     GoalAttainment,
-    View,
+    MeanTorque,
+    RelativeDeviation,
 )
-from ident.excitation.problem import PlanProblem
-from ident.excitation.search import Setup
-from ident.excitation.views import motion_view
-from ident.excitation.wanted import Criteria, reported_criteria, wanted_target
+from ident.excitation.information import Assembly, Columns, Rows, View, motion_view, samples_view
+from ident.excitation.motions import Array, Basis, FourierBasis, ParametricMotion, Samples, SplineBasis
+from ident.excitation.plan import ExcitationPlan
+from ident.excitation.problem import PlanProblem, Prior
+from ident.excitation.program import Bound, Setup
 from ident.model_file import read_model
+from ident.signals.prepare import prepare
 from ident.structure import Condition, ModelStructure
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.collision import CollisionChecker
 from lwr_driver.configuration import find, read_mapping
+from lwr_driver.session import read_session
 
-__all__ = ["Assembled", "assemble"]
+__all__ = [
+    "Assembled",
+    "Criteria",
+    "assemble",
+    "goal_attainment",
+    "prior_information",
+    "reported_criteria",
+    "wanted_target",
+]
 
 _FLANGE_RESERVE = 2e-3
 _CLEARANCE_RESERVE = 3e-3
 _PAYLOAD_NAME = "load"
+_NEGLIGIBLE = 1e-9  # parameters this small are zero up to arithmetic
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,3 +246,186 @@ def _parameters(
         wanted = tuple(problem.parameters)
     index = [base.index(name) for name in wanted]
     return tuple(base.names[k] for k in index), all_values[index]
+
+
+@dataclass(frozen=True, eq=False)
+class Criteria:
+    """Every criterion that is reported, whatever is optimised."""
+
+    condition: ConditionNumber
+    condition_columns: ConditionNumber
+    d_optimality: DOptimality
+    rsd_mean: RelativeDeviation
+    rsd_worst: RelativeDeviation
+
+    def all(self) -> tuple[Criterion, ...]:
+        """In the order of the report."""
+        return (self.condition, self.condition_columns, self.d_optimality, self.rsd_mean, self.rsd_worst)
+
+
+def reported_criteria(
+    problem: PlanProblem,
+    mechanism: Mechanism,
+    estimate: ArmEstimate,
+    columns: Columns,
+    names: tuple[str, ...],
+    values: Array,
+    sessions: tuple[bool, ...],
+) -> Criteria:
+    """Every reported criterion for the named parameters and their values."""
+    noise = estimate.noise
+    assert noise is not None
+    label = {"base": "base"}.get(str(problem.parameters), "essential")
+    plain = Assembly(columns, names, Rows.unweighted(mechanism.joints, problem.model, sessions))
+    weighted = Assembly(columns, names, Rows(problem.model, sessions, noise.joint**-2.0, noise.motor**-2.0))
+    prior_plain = prior_information(problem, mechanism, estimate, columns, names, None)
+    prior_weighted = prior_information(problem, mechanism, estimate, columns, names, noise)
+    # a parameter near zero has no meaningful relative deviation; its own noise floor would rule the mean
+    known = np.where(np.abs(values) > _NEGLIGIBLE, np.abs(values), np.inf)
+    usable = np.isfinite(known)
+    judged, judged_prior = weighted, prior_weighted
+    if not usable.all():
+        kept = tuple(name for name, use in zip(names, usable, strict=True) if use)
+        judged = Assembly(columns, kept, weighted.rows)
+        if prior_weighted is not None:
+            judged_prior = prior_weighted[np.ix_(usable, usable)]
+        known = known[usable]
+    condition = ConditionNumber(plain, label, "none", None, prior_plain)
+    return Criteria(
+        condition=condition,
+        condition_columns=ConditionNumber(plain, label, "columns", None, prior_plain),
+        d_optimality=DOptimality(weighted, label, noise.samples, prior_weighted),
+        rsd_mean=RelativeDeviation(judged, known, label, "mean", noise.samples, judged_prior),
+        rsd_worst=RelativeDeviation(judged, known, label, "worst", noise.samples, judged_prior),
+    )
+
+
+def wanted_target(
+    problem: PlanProblem, criteria: Criteria, limits: Limits, mechanism: Mechanism
+) -> tuple[Criterion, tuple[Bound, ...]]:
+    """The criterion to minimise and the bounds on others, as the problem asks."""
+    wanted = problem.objective
+    condition: ConditionNumber = criteria.condition
+    if wanted.scaling == "columns":
+        condition = criteria.condition_columns
+    elif wanted.scaling == "parameters":
+        condition = ConditionNumber(
+            condition.assembly, condition.label, "parameters", _scale(criteria), condition.prior
+        )
+    single: dict[str, Criterion] = {
+        "condition_number": condition,
+        "d_optimality": criteria.d_optimality,
+        "mean_rsd": criteria.rsd_mean,
+        "worst_rsd": criteria.rsd_worst,
+    }
+    target: Criterion
+    if wanted.criterion == "goal_attainment":
+        if wanted.goal_condition is None:
+            raise ConfigurationError(
+                "objective: `goal_condition` is not known yet; `plan` finds it by a search for the condition number "
+                "alone"
+            )
+        target = goal_attainment(
+            condition, limits, mechanism, wanted.goal_condition, wanted.goal_wrist, wanted.wrist
+        )
+    else:
+        target = single[wanted.criterion]
+    bounds = []
+    for criterion, limit in (
+        (condition, wanted.condition_at_most),
+        (criteria.rsd_mean, wanted.mean_rsd_at_most),
+        (criteria.rsd_worst, wanted.worst_rsd_at_most),
+    ):
+        if limit is not None:
+            if limit <= 0.0 or (criterion is condition and limit < 1.0):
+                raise ConfigurationError(f"objective: bound {limit} on the {criterion.name} can never be met")
+            bounds.append(Bound(criterion, float(np.log(limit))))
+    return target, tuple(bounds)
+
+
+def goal_attainment(
+    condition: ConditionNumber,
+    limits: Limits,
+    mechanism: Mechanism,
+    goal: float,
+    share: float,
+    joints: tuple[int, ...],
+) -> GoalAttainment:
+    """Equation (10): goals `goal` for the condition number and `share` * tau_max for each listed joint (from
+    1).
+    """
+    criteria: list[Criterion] = [condition]
+    goals = [goal]
+    for number in joints:
+        if not 1 <= number <= mechanism.joints:
+            raise ConfigurationError(f"objective: wrist joint {number} does not exist")
+        peak = float(limits.tau_max[number - 1])
+        criteria.append(MeanTorque(number - 1, peak, mechanism.joint_names[number - 1]))
+        goals.append(share * peak)
+    return GoalAttainment(tuple(criteria), tuple(goals))
+
+
+def _scale(criteria: Criteria) -> Array:
+    if criteria.rsd_mean.values.size != len(criteria.condition.assembly.names):
+        raise ConfigurationError("scaling by parameters needs a value for each parameter; some are zero")
+    return criteria.rsd_mean.values
+
+
+def prior_information(
+    problem: PlanProblem,
+    mechanism: Mechanism,
+    estimate: ArmEstimate,
+    columns: Columns,
+    names: tuple[str, ...],
+    noise: Noise | None,
+) -> Array | None:
+    """Information (p, p) of all priors, None without any.
+
+    With `noise` it is weighted and counts independent samples at the rate of the planned sessions; without,
+    it is unweighted and counts in multiples of one planned session, as the condition number needs it.
+    """
+    if not problem.prior:
+        return None
+    n = mechanism.joints
+    planned = problem.motion.periods * problem.motion.period_s
+    total = np.zeros((len(names), len(names)))
+    for entry in problem.prior:
+        for loaded, view, duration in _motions(problem, entry, mechanism, estimate, columns):
+            if noise is None:
+                rows, share = Rows.unweighted(n, problem.model, (loaded,)), duration / planned
+            else:
+                rows = Rows(problem.model, (loaded,), noise.joint**-2.0, noise.motor**-2.0)
+                share = noise.samples * duration / planned
+            total += share * Assembly(columns, names, rows).information(view.gram)
+    return total
+
+
+def _motions(
+    problem: PlanProblem, entry: Prior, mechanism: Mechanism, estimate: ArmEstimate, columns: Columns
+) -> list[tuple[bool, View, float]]:
+    """Loaded or not, the view, and the duration [s] of each session of one prior."""
+    beside = problem.source.parent if problem.source is not None else None
+    if entry.plan is not None:
+        done = ExcitationPlan.load(find(entry.plan, beside=beside))
+        if done.joint_names != mechanism.joint_names:
+            raise ConfigurationError(f"prior plan {entry.plan} is for joints {' '.join(done.joint_names)}")
+        view = motion_view(done.motion, mechanism, estimate, columns)
+        return [(session == "loaded", view, done.duration_s) for session in entry.sessions]
+    assert entry.session is not None
+    return [_recorded(find(entry.session, beside=beside), mechanism, estimate, columns)]
+
+
+def _recorded(
+    path: Path, mechanism: Mechanism, estimate: ArmEstimate, columns: Columns
+) -> tuple[bool, View, float]:
+    session = read_session(path).select(mechanism.joint_names)
+    prepared = prepare(session, motor=False)
+    parts = [[getattr(passage.joint, key) for passage in prepared.passages] for key in ("q", "qd", "qdd")]
+    q, qd, qdd = (np.ascontiguousarray(np.vstack(part)) for part in parts)
+    duration = sum(len(passage.rows) for passage in prepared.passages) * prepared.row_time_s
+    loaded = session.metadata.get("payload", "none").strip() not in ("", "none")
+    return (
+        loaded,
+        samples_view(Samples(q, qd, qdd, np.zeros_like(q)), mechanism, estimate, columns),
+        float(duration),
+    )

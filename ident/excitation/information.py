@@ -1,27 +1,31 @@
-"""Information matrices of any set of named parameters, assembled from one small Gram matrix per joint.
+"""Information matrices of a motion, assembled from one small Gram matrix per joint.
 
-The observation matrix itself is never built. Joint j sees the same signals z_j (the regressor entries of the
-bodies it carries, then qdd_j, qd_j, sign(qd_j), 1) in its joint row and in its motor row, without and with
-payload; every entry of Omega^T W Omega is therefore a weighted sum of entries of the Gram matrices z_j^T z_j,
-and so is its derivative.
+The observation matrix itself is never built. Joint j has the same signals z_j (regressor entries of the bodies it
+carries, then qdd_j, qd_j, sign(qd_j), 1) in its joint row and in its motor row, without and with payload. Every entry
+of Omega^T W Omega is therefore a weighted sum of entries of the Gram matrices z_j^T z_j, and so is its derivative.
+
+`Evaluator` samples a motion for the optimiser: kinematics on a fine grid, Gram matrices and torques, which vary
+slowly, on every `refine`-th sample. It carries derivatives back to the coefficients.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 
 from fri.errors import ConfigurationError
-from ident.excitation.estimate import BODY, split_name
-from ident.excitation.motion import Array
+from ident.excitation.arm_model import BODY, ArmEstimate, Mechanism, split_name
+from ident.excitation.motions import Array, Basis, ParametricMotion, Samples
+from ident.excitation.sweep import backward, forward
 
-__all__ = ["Assembly", "Columns", "Rows"]
+__all__ = ["Assembly", "Columns", "Evaluator", "Rows", "View", "motion_view", "samples_view"]
 
 _DRIVE_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
 _JOINT_SIDE = ("Fvl", "Fcl", "offl")
+_FVL, _FCL, _OFFL = 1, 2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,3 +184,149 @@ def _scatter(bar, parameter, signal, weight, offset, block, gram_bar):  # type: 
             for b in range(start, stop):
                 gram_bar[joint, signal[a], signal[b]] += weight[k] * bar[parameter[a], parameter[b]]
                 k += 1
+
+
+@dataclass(eq=False)
+class View:
+    """One motion as the criteria see it, and the adjoints that they fill.
+
+    gram (n, c, c): mean over the samples of z_j z_j^T
+    torque (m, n): joint torque under the last load case [Nm]
+    """
+
+    gram: Array
+    torque: Array
+    gram_bar: Array = field(init=False)
+    torque_bar: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.gram_bar = np.zeros_like(self.gram)
+        self.torque_bar = np.zeros_like(self.torque)
+
+    def clear(self) -> None:
+        """Set the adjoints to zero."""
+        self.gram_bar[:] = 0.0
+        self.torque_bar[:] = 0.0
+
+
+class Evaluator:
+    """Scratch memory and grids for one mechanism, basis and set of columns; not to be shared between
+    threads.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        basis: Basis,
+        estimate: ArmEstimate,
+        columns: Columns,
+        *,
+        samples: int = 64,
+        refine: int = 5,
+        sign_speed: float = 0.02,
+    ) -> None:
+        self.mechanism, self.basis, self.estimate, self.columns = mechanism, basis, estimate, columns
+        self.samples, self.refine, self.sign_speed = samples, refine, sign_speed
+        self.fine = samples * refine
+        self.times = np.arange(self.fine) * (basis.duration / self.fine)
+        self.matrices = [np.ascontiguousarray(basis.matrix(self.times, order)) for order in range(4)]
+        self.loads = np.ascontiguousarray(estimate.loads)
+        n = mechanism.joints
+        self.z = np.zeros((n, samples, columns.width))
+        self.tau = np.zeros((self.loads.shape[0], samples, n))
+        self._zbar = np.zeros_like(self.z)
+        self._gram = np.zeros((n, columns.width, columns.width))
+        self._coarse: tuple[Array, Array, Array]
+
+    def signals(self, x: Array) -> list[Array]:
+        """q, qd, qdd, qddd on the fine grid for the coefficients x (n, free); each (fine, n)."""
+        return [matrix @ x.T for matrix in self.matrices]
+
+    def view(self, signals: Sequence[Array], *, exact_sign: bool = False) -> View:
+        """Gram matrices and loaded joint torque; `z`, `tau` keep the coarse signals for the pullback."""
+        q, qd, qdd = (np.ascontiguousarray(signal[:: self.refine]) for signal in signals[:3])
+        self._coarse = (q, qd, qdd)
+        arm, columns = self.mechanism, self.columns
+        speed = 1e-9 if exact_sign else self.sign_speed
+        forward(arm.dynamics, self._coarse, columns.tables, self.loads, speed, self.z, self.tau)
+        for joint in range(self.mechanism.joints):
+            first = columns.first[joint]
+            part = self.z[joint, :, first:]
+            self._gram[joint, first:, first:] = part.T @ part
+        drives = self.estimate.drives
+        sign = self.z[:, :, -2].T
+        torque = self.tau[-1] + qd * drives[:, _FVL] + sign * drives[:, _FCL] + drives[:, _OFFL]
+        return View(self._gram / self.samples, torque)
+
+    def gradient(self, view: View) -> Array:
+        """Derivative with respect to the coefficients (n, free) of whatever filled the view's adjoints."""
+        drives, columns = self.estimate.drives, self.columns
+        sign = self.z[:, :, -2].T
+        rate = view.torque_bar * (drives[:, _FVL] + (1.0 - sign**2) / self.sign_speed * drives[:, _FCL])
+        for joint in range(self.mechanism.joints):
+            first = columns.first[joint]
+            bar = view.gram_bar[joint, first:, first:]
+            np.matmul(
+                self.z[joint, :, first:], (bar + bar.T) / self.samples, out=self._zbar[joint, :, first:]
+            )
+        taubar = np.zeros_like(self.tau)
+        taubar[-1] = view.torque_bar
+        return self._pull(self._zbar, taubar, rate, None)
+
+    def torque_gradient(self, taubar: Array, rate: Array, acceleration: Array) -> Array:
+        """Derivative of a function of the rigid torques (k, m, n), coarse velocities and accelerations (m,
+        n).
+        """
+        return self._pull(np.zeros_like(self._zbar), taubar, rate, acceleration)
+
+    def _pull(self, zbar: Array, taubar: Array, rate: Array, acceleration: Array | None) -> Array:
+        columns, arm = self.columns, self.mechanism
+        bars = (np.zeros_like(taubar[0]), np.ascontiguousarray(rate), np.zeros_like(taubar[0]))
+        if acceleration is not None:
+            bars[2][:] = acceleration
+        backward(arm.dynamics, self._coarse, columns.tables, self.loads, self.sign_speed, zbar, taubar, bars)
+        total = np.zeros((arm.joints, self.basis.free))
+        for bar, matrix in zip(bars, self.matrices, strict=False):
+            total += bar.T @ matrix[:: self.refine]
+        return total
+
+
+def motion_view(
+    motion: ParametricMotion,
+    mechanism: Mechanism,
+    estimate: ArmEstimate,
+    columns: Columns,
+    step_s: float = 0.01,
+) -> View:
+    """A parametric motion sampled every `step_s`, with the true sign of the velocities."""
+    count = max(200, round(motion.duration / step_s))
+    times = np.arange(count) * (motion.duration / count)
+    return samples_view(motion.sample(times), mechanism, estimate, columns)
+
+
+def samples_view(samples: Samples, mechanism: Mechanism, estimate: ArmEstimate, columns: Columns) -> View:
+    """Samples of any motion, measured ones included; jerks are not used."""
+    evaluator = Evaluator(mechanism, _NoBasis(), estimate, columns, samples=len(samples.q), refine=1)
+    return evaluator.view(list(samples[:3]), exact_sign=True)
+
+
+class _NoBasis:
+    """A basis without functions, for evaluating samples that are given."""
+
+    duration, free = 1.0, 0
+
+    def matrix(self, t: np.typing.ArrayLike, derivative: int = 0) -> Array:
+        """No functions."""
+        return np.zeros((np.size(t), 0))
+
+    def motion(self, x: Array) -> ParametricMotion:
+        """There is none."""
+        raise ConfigurationError("samples are no parametric motion")
+
+    def coefficients(self, motion: ParametricMotion) -> Array:
+        """None."""
+        return np.zeros((motion.joints, 0))
+
+    def grid_factor(self, n: int, derivative: int) -> float:
+        """Nothing is known between the samples."""
+        return np.inf

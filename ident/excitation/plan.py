@@ -1,6 +1,4 @@
-"""The result of planning: one exciting motion with everything that is needed to run it, repeat it and trust
-it.
-"""
+"""The result of planning: one exciting motion with its margins, predicted deviations and provenance."""
 
 from __future__ import annotations
 
@@ -15,14 +13,18 @@ import numpy.typing as npt
 import yaml
 
 from fri.errors import ConfigurationError
-from ident.excitation.bspline import SplineMotion
 from ident.excitation.check import Check, Margin
-from ident.excitation.fourier import FourierSeries
-from ident.excitation.motion import Array, ParametricMotion, Samples
-from ident.excitation.point_to_point import PointToPoint
+from ident.excitation.motions import (
+    Array,
+    FourierSeries,
+    ParametricMotion,
+    PointToPoint,
+    Samples,
+    SplineMotion,
+)
 from lwr_driver.configuration import read_mapping
 
-__all__ = ["ExcitationPlan"]
+__all__ = ["ExcitationPlan", "plan_report"]
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
@@ -212,3 +214,17 @@ def _margin_from_mapping(entry: Any) -> Margin:
         float(entry["time_s"]),
         bool(entry.get("proven", True)),
     )
+
+
+def plan_report(plan: ExcitationPlan) -> str:
+    """Summary of a plan for people: criteria, tightest margins, largest predicted deviations."""
+    lines = [f"period {plan.period_s:g} s, {plan.periods} period(s)", "", "criteria"]
+    width = max((len(name) for name in plan.objectives), default=0)
+    lines += [f"  {name.ljust(width)}  {value:10.4f}" for name, value in plan.objectives.items()]
+    lines += ["", "tightest margins"]
+    lines += [f"  {margin}" for margin in plan.check.tightest()]
+    worst = sorted(plan.rsd_percent.items(), key=lambda item: -item[1])[:8]
+    if worst:
+        lines += ["", "largest predicted relative deviations"]
+        lines += [f"  {name:8s} {value:8.2f} %" for name, value in worst]
+    return "\n".join(lines)

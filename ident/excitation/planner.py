@@ -1,5 +1,6 @@
-"""From a problem to a checked plan: set-up, search, polish, proof. The library function behind `lwr-run
-plan`.
+"""From a problem to a checked plan: early refusal, search, polish, proof. The function behind `lwr-run plan`.
+
+`feasible_fourier` is the quick alternative: a safe motion in a second, without optimisation of a criterion.
 """
 
 from __future__ import annotations
@@ -14,22 +15,49 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
 
-from fri.errors import OperatorError, RefusedError
+from fri.errors import ConfigurationError, OperatorError, RefusedError
+from ident.excitation.arm_model import ArmEstimate, Mechanism
 from ident.excitation.assembly import Assembled, assemble
-from ident.excitation.check import Check
-from ident.excitation.infeasible import explain, refuse_impossible
-from ident.excitation.motion import ParametricMotion
+from ident.excitation.check import Check, Limits, PathChecker, Workspace, check_motion
+from ident.excitation.clearance import space_of
+from ident.excitation.information import Columns
+from ident.excitation.motions import Array, FourierBasis, ParametricMotion
 from ident.excitation.plan import ExcitationPlan
-from ident.excitation.polish import polish
 from ident.excitation.problem import PlanProblem
-from ident.excitation.search import Candidate, begin, hop
+from ident.excitation.program import Row, Setup
+from ident.excitation.search import (
+    Candidate,
+    Outcome,
+    begin,
+    hop,
+    polish,
+    random_start,
+    restore,
+    shortfall,
+    tighten,
+)
+from ident.excitation.sqp import minimise
+from lwr_driver.arm import Arm
 
-__all__ = ["Progress", "plan", "search_candidates"]
+__all__ = [
+    "Progress",
+    "arm_limits",
+    "explain",
+    "feasible_fourier",
+    "plan",
+    "refuse_impossible",
+    "search_candidates",
+]
 
 _log = logging.getLogger(__name__)
-
 _HOPS_PER_TASK = 5
+_STATIC_STARTS = 12
+_STARTS = 12
+_ROUNDS = 4
+_RESERVE = 3e-3
+_NEAR = 5e-3
 
 
 @dataclass(frozen=True)
@@ -243,3 +271,231 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value
+
+
+def refuse_impossible(assembled: Assembled) -> None:
+    """Raise at once for problems that no motion can solve.
+
+    Checked: the highest frequency against the arm's lowest resonance (n_f w0 < w_r), workspace bounds against
+    the arm's reach, and whether any posture at all can be held within every limit (a motion of small size
+    around a posture that can is always feasible).
+    """
+    _refuse_resonance(assembled)
+    _refuse_reach(assembled)
+    _refuse_static(assembled)
+
+
+def _refuse_resonance(assembled: Assembled) -> None:
+    basis = assembled.setup.basis
+    if isinstance(basis, FourierBasis) and basis.highest_frequency_hz >= assembled.resonance_hz:
+        raise ConfigurationError(
+            f"n_f w0 = {basis.harmonics} / {basis.period_s} s = {basis.highest_frequency_hz:.3g} Hz reaches "
+            f"the arm's lowest resonance, {assembled.resonance_hz:.3g} Hz; lower `harmonics` or lengthen "
+            "`period_s`"
+        )
+
+
+def _refuse_reach(assembled: Assembled) -> None:
+    mechanism, work = assembled.setup.mechanism, assembled.problem.workspace
+    lengths = np.linalg.norm(mechanism.translation[1:], axis=1)
+    reach = float(lengths.sum() + np.linalg.norm(mechanism.tip))
+    for name, bound in (("radius_m", work.radius_m), ("height_m", work.height_m)):
+        if bound is not None and bound >= reach:
+            raise RefusedError(
+                f"workspace: {name} {bound:.3f} m is {bound - reach:.3f} m beyond reach, {reach:.3f} m"
+            )
+
+
+class _Still:
+    """Postures held still: the basis of one constant."""
+
+    free = 1
+
+    def __init__(self, duration: float) -> None:
+        self.duration = duration
+
+    def matrix(self, t: np.typing.ArrayLike, derivative: int = 0) -> Array:
+        """One, and zero for every derivative."""
+        return np.full((np.size(t), 1), 1.0 if derivative == 0 else 0.0)
+
+    def motion(self, x: Array) -> ParametricMotion:
+        """Not asked for."""
+        raise ConfigurationError("a posture is no motion")
+
+    def coefficients(self, motion: ParametricMotion) -> Array:
+        """The posture at the start."""
+        return motion.sample(0.0).q.T
+
+    def grid_factor(self, n: int, derivative: int) -> float:
+        """A constant has its extremum everywhere."""
+        return 1.0
+
+
+def _refuse_static(assembled: Assembled) -> None:
+    setup = assembled.setup
+    still = Setup(
+        mechanism=setup.mechanism,
+        basis=_Still(setup.basis.duration),
+        limits=setup.limits,
+        space=setup.space,
+        floor=setup.floor,
+        estimate=setup.estimate,
+        columns=setup.columns,
+        target=None,
+        coverage=setup.coverage,
+        samples=1,
+        refine=1,
+    )
+    rng = np.random.default_rng(0)
+    middle = 0.5 * (setup.limits.q_low + setup.limits.q_high)
+    half = 0.5 * (setup.limits.q_high - setup.limits.q_low)
+    best, blame = np.inf, ""
+    for _ in range(_STATIC_STARTS):
+        posture = middle + half * rng.uniform(-0.7, 0.7, size=middle.size)
+        program = still.program(target=None)
+        program.anchor = posture
+        program.constraints.refresh_deviation(program.signals(posture))
+        found = restore(still, posture, iterations=60)
+        if found.violation < 1e-3:
+            return
+        if found.violation < best:
+            best = found.violation
+            program.values(found.x)
+            blame = _blame(assembled, program.constraints.rows, program.constraints.latest)
+    raise RefusedError(
+        f"no posture can be held within the limits: {blame}; widen that limit or lighten the payload"
+    )
+
+
+def _blame(assembled: Assembled, rows: Sequence[Row], values: Array) -> str:
+    worst = int(np.argmin(values))
+    row = rows[worst]
+    setup, excess = assembled.setup, -float(values[worst])
+    if row.constraint == "distance":
+        name = assembled.row_names[row.index]
+        scale = 0.3 if row.index < 2 else 0.1
+        return f"{name} falls short by {excess * scale:.3g} m"
+    joint = setup.mechanism.joint_names[row.index]
+    if row.constraint == "torque":
+        limit = setup.limits.tau_max[row.index]
+        return f"{joint} torque exceeds {limit:.4g} Nm by {excess * limit:.3g} Nm"
+    return f"{joint} {row.constraint} exceeds its limit by {100.0 * excess:.3g} %"
+
+
+def explain(assembled: Assembled, outcomes: Sequence[Outcome]) -> str:
+    """Why no candidate passed: the violations of the one that came nearest."""
+    if not outcomes:
+        return "no motion was found; raise `search.starts`"
+
+    nearest = min(outcomes, key=shortfall)
+    reasons = [str(margin) for margin in nearest.check.violations[:3]]
+    if not nearest.bounds_kept:
+        view = assembled.view(nearest.motion)
+        for bound in assembled.setup.bounds:
+            value = bound.criterion.evaluate(view, np.inf)[0]
+            if value > bound.limit:
+                reasons.append(
+                    f"{bound.criterion.name} {bound.criterion.report(value):.4g} exceeds the bound "
+                    f"{bound.criterion.report(bound.limit):.4g}"
+                )
+    return (
+        "no motion within every limit was found; the nearest one: "
+        + "; ".join(reasons)
+        + "; widen that limit, lengthen `period_s`, or raise `search.starts`"
+    )
+
+
+def arm_limits(arm: Arm, speed_scale: float = 1.0) -> Limits:
+    """The limits of an arm, less its position margin, with speeds scaled in time."""
+    return Limits(arm.q_low, arm.q_high, arm.v_max, arm.a_max, arm.j_max, arm.tau_max).scaled(speed_scale)
+
+
+def feasible_fourier(
+    arm: Arm,
+    checker: PathChecker | None,
+    *,
+    period_s: float = 20.0,
+    harmonics: int = 5,
+    periods: int = 1,
+    seed: int = 1,
+    speed_scale: float = 1.0,
+    workspace: Workspace | None = None,
+    estimate: ArmEstimate | None = None,
+    clearance_m: float = 0.02,
+) -> ExcitationPlan:
+    """Random Fourier motion of moderate size, moved as little as the limits ask for, that passes every check.
+
+    `estimate` defaults to the URDF's inertias without friction. Raises RefusedError where none of a dozen
+    random starts leads to a motion that passes, naming the limit that stands in the way most often.
+    """
+    mechanism = Mechanism.from_urdf(arm.urdf)
+    space, _ = space_of(mechanism, getattr(checker, "geometry", None))
+    work = workspace if workspace is not None else Workspace()
+    floor = np.full(space.rows, clearance_m + _RESERVE)
+    floor[0] = -np.inf if work.radius_m is None else work.radius_m + _RESERVE
+    floor[1] = -np.inf if work.height_m is None else work.height_m + _RESERVE
+    setup = Setup(
+        mechanism=mechanism,
+        basis=FourierBasis(period_s, harmonics),
+        limits=arm_limits(arm, speed_scale),
+        space=space,
+        floor=floor,
+        estimate=estimate if estimate is not None else ArmEstimate.nominal(mechanism),
+        columns=Columns.of(mechanism.joints, ()),
+        target=None,
+        samples=max(64, 10 * harmonics),
+        refine=max(3, int(np.ceil(period_s / 0.0625 / max(64, 10 * harmonics)))),
+    )
+    blocked: dict[str, int] = {}
+    for start in range(_STARTS):
+        plan, check = _from_start(setup, seed, start, work, checker, clearance_m)
+        if plan is not None:
+            _log.info("feasible excitation found from start %d of %d", start + 1, _STARTS)
+            provenance = {
+                "method": "feasible_fourier",
+                "seed": seed,
+                "speed_scale": speed_scale,
+                "arm": arm.name,
+            }
+            return ExcitationPlan(plan, arm.joint_names, periods, check=check, provenance=provenance)
+        worst = (check.violations or check.tightest())[0]
+        blame = f"{worst.subject} {worst.constraint}"
+        blocked[blame] = blocked.get(blame, 0) + 1
+    culprit = max(blocked, key=lambda key: blocked[key])
+    raise RefusedError(
+        f"no feasible exciting motion found from {_STARTS} random starts; {culprit} stands in the way most "
+        "often; widen that limit or choose another seed"
+    )
+
+
+def _from_start(
+    setup: Setup, seed: int, start: int, work: Workspace, checker: PathChecker | None, clearance_m: float
+) -> tuple[ParametricMotion | None, Check]:
+    """The motion nearest to one random start, tightened until it passes; None if it does not."""
+    with threadpool_limits(1):
+        program = setup.program()
+        program.constraints.rate = 200.0
+        x = random_start(setup, np.random.default_rng([seed, start]))
+        program.anchor = x.copy()
+        for _ in range(_ROUNDS):
+            program.constraints.refresh_deviation(program.signals(x))
+            solution = minimise(program, x, iterations=40, tolerance=1e-6)
+            x = solution.x
+            near = float(solution.constraints.min()) > -_NEAR
+            motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
+            check = check_motion(
+                motion,
+                setup.mechanism,
+                setup.limits,
+                workspace=work,
+                estimate=setup.estimate,
+                checker=checker,
+                clearance_m=clearance_m,
+                step_s=1e-3 if near else 0.05,
+                collision_step_s=1e-2 if near else 0.1,
+                continuous=near,
+            )
+            if (check.ok and near) or not near:
+                break
+            tighten(program.constraints, check, setup.mechanism.joint_names)
+        return (motion if check.ok and near else None), check

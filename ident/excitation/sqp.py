@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from ident.excitation.motion import Array
+from ident.excitation.motions import Array
 
 __all__ = ["SmoothProblem", "Solution", "minimise"]
 

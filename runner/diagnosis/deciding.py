@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, LwrError, RefusedError
 from ident.discrepancy import Diagnosis, Finding
 from ident.excitation import ExcitationPlan
-from ident.excitation.motion import ParametricMotion
+from ident.excitation.motions import ParametricMotion
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.configuration import parse

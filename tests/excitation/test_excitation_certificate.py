@@ -3,11 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.excitation.certificate import prove, reach, speed_bound, torque_rate
-from ident.excitation.estimate import ArmEstimate
-from ident.excitation.fourier import FourierBasis, FourierSeries
-from ident.excitation.mechanism import Mechanism, tip_path
-from ident.excitation.torque import torque_bounds
+from ident.excitation.arm_model import ArmEstimate, Mechanism, tip_path, torque_bounds
+from ident.excitation.check import prove, reach, speed_bound, torque_rate
+from ident.excitation.motions import FourierBasis, FourierSeries
 
 
 @pytest.fixture

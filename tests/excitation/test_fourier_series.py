@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.excitation.fourier import FourierBasis, FourierSeries
+from ident.excitation.motions import FourierBasis, FourierSeries
 
 
 def test_every_choice_of_free_coefficients_is_at_rest_at_both_ends(rng: np.random.Generator) -> None:
