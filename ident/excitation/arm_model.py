@@ -32,11 +32,20 @@ from lwr_driver.configuration import read_mapping
 
 __all__ = [
     "BODY",
+    "DRIVE_SIGNAL",
+    "FCL",
+    "FCM",
+    "FVL",
+    "FVM",
+    "IA",
+    "JOINT_SIDE",
+    "OFFL",
+    "OFFM",
     "ArmEstimate",
     "Mechanism",
     "Noise",
     "TorqueBounds",
-    "joint_torque",
+    "rigid_torque",
     "split_name",
     "tip_path",
     "torque_bounds",
@@ -45,8 +54,10 @@ __all__ = [
 
 BODY = INERTIAL
 _NO_COLUMNS = np.zeros(0, dtype=np.int64)
-_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
-_IA, _FVL, _FCL, _OFFL, _FVM, _FCM, _OFFM = range(7)
+# drive parameters: place of the signal among qdd, qd, sign(qd), 1; those in the joint row; columns of `drives`
+DRIVE_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
+JOINT_SIDE = ("Fvl", "Fcl", "offl")
+IA, FVL, FCL, OFFL, FVM, FCM, OFFM = range(7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +80,9 @@ class Mechanism:
     joint_names: tuple[str, ...]
     chain: Chain
 
+    def __repr__(self) -> str:
+        return f"Mechanism({self.joints} joints: {', '.join(self.joint_names)})"
+
     @property
     def joints(self) -> int:
         """Number of joints."""
@@ -86,9 +100,9 @@ class Mechanism:
 
     @classmethod
     def from_urdf(cls, urdf: str, tip: str = "flange") -> Mechanism:
-        """Read the arm from URDF text; ConfigurationError if it is no serial chain of revolute joints.
+        """Read the arm from URDF text; ConfigurationError for anything but a serial chain of revolute joints.
 
-        tip : link whose position the workspace bounds; where the URDF lacks `flange`, the last link's origin.
+        tip : link bounded by the workspace; in a URDF without `flange`, the origin of the last link
         """
         chain = Chain.from_urdf(urdf)
         for name, sliding in zip(chain.joint_names, chain.prismatic, strict=True):
@@ -120,8 +134,8 @@ class Mechanism:
 def tip_path(mechanism: Mechanism, q: Array) -> Array:
     """Flange position (n, 3) [m] at the postures q (n, joints).
 
-    Axes of frame 0, origin where the first joint's frame is: for the LWR4+ the shoulder, 0.31 m above the
-    base plate, which is the base frame of the paper's Denavit-Hartenberg table.
+    Axes of frame 0, origin of the first joint's frame: for the LWR4+ the shoulder, 0.31 m above the base plate, the
+    base frame of the paper's Denavit-Hartenberg table.
     """
     out = np.empty((q.shape[0], 3))
     _tip(mechanism.geometry, np.ascontiguousarray(q), out)
@@ -158,10 +172,10 @@ def split_name(name: str) -> tuple[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviation of the torque rows, and how many independent samples a session gives.
+    """Standard deviation of the torque rows, and the number of independent samples.
 
-    motor, joint (n,): [Nm]; samples: independent samples (after decimation) in one session of the planned
-    motion.
+    motor, joint (n,): [Nm]
+    samples: independent samples (after decimation) in one session of the planned motion
     """
 
     motor: Array
@@ -181,9 +195,7 @@ class Noise:
 
     @classmethod
     def published(cls) -> Noise:
-        """Row noise that explains the published relative deviations of Table 2: 5 Hz after decimation, 100
-        samples.
-        """
+        """Row noise consistent with the published deviations of Table 2: 5 Hz after decimation, 100 samples."""
         return cls(
             motor=np.array([1.05, 2.04, 0.78, 1.44, 0.83, 0.46, 0.25]),
             joint=np.array([0.28, 0.12, 0.06, 0.11, 0.11, 0.11, 0.36]),
@@ -196,8 +208,8 @@ class ArmEstimate:
 
     bodies (n, 10): XX XY XZ YY YZ ZZ MX MY MZ M of each link in its own frame
     drives (n, 7): Ia Fvl Fcl offl Fvm Fcm offm of each joint
-    payload (10,): the payload in the last frame, None where every session is unloaded
-    covariance_names, covariance: uncertainty of (base) parameters by name, (p, p); empty where none is known
+    payload (10,): the payload in the last frame, None if every session is unloaded
+    covariance_names, covariance: uncertainty of (base) parameters by name, (p, p); empty and None if unknown
     noise: row noise for weights and predicted deviations
     """
 
@@ -219,6 +231,11 @@ class ArmEstimate:
             p = len(self.covariance_names)
             if self.covariance.shape != (p, p):
                 raise ConfigurationError(f"covariance of shape {self.covariance.shape} for {p} parameters")
+
+    def __repr__(self) -> str:
+        load = "no payload" if self.payload is None else f"payload {self.payload[-1]:.3g} kg"
+        known = "no covariance" if self.covariance is None else f"covariance of {len(self.covariance_names)}"
+        return f"ArmEstimate({self.joints} joints, {load}, {known})"
 
     @property
     def joints(self) -> int:
@@ -248,9 +265,7 @@ class ArmEstimate:
         )
 
     def with_relative_uncertainty(self, fraction: float) -> ArmEstimate:
-        """The same values, each parameter independently uncertain by a fraction of itself (one standard
-        deviation).
-        """
+        """The same values with independent standard deviations, each a fraction of its parameter."""
         if not 0.0 <= fraction < 1.0:
             raise ConfigurationError(f"relative uncertainty {fraction} is outside 0 to 1")
         names = self.standard_names()
@@ -262,24 +277,21 @@ class ArmEstimate:
         return replace(self, covariance_names=kept, covariance=np.diag(sigma[keep] ** 2))
 
     def standard_names(self) -> tuple[str, ...]:
-        """Names of all standard parameters that this estimate has values for."""
+        """Names of all standard parameters with a value in this estimate."""
         links = self.joints + (self.payload is not None)
         body = [f"{kind}{link}" for link in range(1, links + 1) for kind in BODY]
         return tuple(body + [f"{kind}{link}" for link in range(1, self.joints + 1) for kind in DRIVE])
 
     @classmethod
     def nominal(cls, mechanism: Mechanism, payload: Array | None = None) -> ArmEstimate:
-        """The URDF's inertias, no friction, no drive inertia: what is known before the first experiment."""
+        """The URDF's inertias, no friction, no drive inertia: the knowledge before the first experiment."""
         return cls(mechanism.bodies.copy(), np.zeros((mechanism.joints, 7)), payload)
 
     @classmethod
     def from_model(
         cls, model: DynamicModel, payload: str | None = None, noise: Noise | None = None
     ) -> ArmEstimate:
-        """Values and covariance of an identified model, with one of its payloads mounted.
-
-        After each re-identification this closes the loop: plan, estimate, plan again.
-        """
+        """Values and covariance of an identified model, with one of its payloads mounted."""
         joints = model.structure.chain.n
         bodies = model.inertial(None)
         load = None if payload is None else model.inertial(payload)[-1] - bodies[-1]
@@ -299,9 +311,7 @@ class ArmEstimate:
 
     @classmethod
     def from_file(cls, path: Path, joints: int, payload: str | None = None) -> ArmEstimate:
-        """Read `parameters` (name: value) and `payloads` from a YAML file, such as the emulator's true
-        parameters.
-        """
+        """Read `parameters` (name: value) and `payloads` from a YAML file such as `emulator/table2.yaml`."""
         content = read_mapping(path)
         values = content.get("parameters")
         if not isinstance(values, dict):
@@ -332,7 +342,7 @@ class ArmEstimate:
 
 
 def _number(value: object, where: str) -> float:
-    """A finite number; YAML reads `1e-05` (no dot) as text, which is meant as a number here."""
+    """A finite number; `1e-05` (no dot), text for YAML, counts as a number."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -343,7 +353,7 @@ def _number(value: object, where: str) -> float:
 
 
 class TorqueBounds(NamedTuple):
-    """Largest magnitude that each torque can have, over load cases and uncertainty; (n, joints) [Nm]."""
+    """Largest possible magnitude of each torque over load cases and uncertainty; (n, joints) [Nm]."""
 
     joint: Array
     motor: Array
@@ -360,23 +370,16 @@ def rigid_torque(mechanism: Mechanism, samples: Samples, bodies: Array) -> Array
     return tau
 
 
-def joint_torque(mechanism: Mechanism, samples: Samples, estimate: ArmEstimate) -> Array:
-    """Joint torque tau_l of equation (1) for each load case, (k, n, joints) [Nm]."""
-    drives = estimate.drives
-    friction = samples.qd * drives[:, _FVL] + np.sign(samples.qd) * drives[:, _FCL] + drives[:, _OFFL]
-    return rigid_torque(mechanism, samples, estimate.loads) + friction
-
-
 def torque_bounds(
     mechanism: Mechanism, samples: Samples, estimate: ArmEstimate, coverage: float = 3.0
 ) -> TorqueBounds:
     """Worst magnitude of joint and motor torque at each sample over load cases and uncertainty."""
     drives = estimate.drives
     rigid = rigid_torque(mechanism, samples, estimate.loads)
-    joint = rigid + samples.qd * drives[:, _FVL] + drives[:, _OFFL]
-    motor = joint + samples.qdd * drives[:, _IA] + samples.qd * drives[:, _FVM] + drives[:, _OFFM]
-    joint_bound = np.abs(joint) + np.abs(drives[:, _FCL])
-    motor_bound = np.abs(motor) + np.abs(drives[:, _FCL]) + np.abs(drives[:, _FCM])
+    joint = rigid + samples.qd * drives[:, FVL] + drives[:, OFFL]
+    motor = joint + samples.qdd * drives[:, IA] + samples.qd * drives[:, FVM] + drives[:, OFFM]
+    joint_bound = np.abs(joint) + np.abs(drives[:, FCL])
+    motor_bound = np.abs(motor) + np.abs(drives[:, FCL]) + np.abs(drives[:, FCM])
     if estimate.covariance is not None and coverage > 0.0:
         for load in range(rigid.shape[0]):
             deviation = torque_deviation(mechanism, samples, estimate, loaded=load == 1)
@@ -409,10 +412,10 @@ def torque_deviation(
                 signals.append(z[joint, :, 10 * (min(link, joints) - 1) + BODY.index(kind)])
                 joint_side.append(True)
             elif kind not in BODY and link == joint + 1:
-                column = _SIGNAL[kind]
+                column = DRIVE_SIGNAL[kind]
                 # Coulomb friction and offset count with a magnitude of one at every instant
                 signals.append(np.ones(n) if column >= 2 else z[joint, :, 10 * joints + column])
-                joint_side.append(kind in ("Fvl", "Fcl", "offl"))
+                joint_side.append(kind in JOINT_SIDE)
             else:
                 continue
             used.append(index)

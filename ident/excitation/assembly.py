@@ -6,15 +6,15 @@ design), so a new motion is strong where earlier motions were weak.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.base import BaseSet, closed_form_base
-from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise, split_name
-from ident.excitation.check import Check, Limits, PathChecker, check_motion
+from ident.excitation.arm_model import BODY, ArmEstimate, Mechanism, Noise, split_name
+from ident.excitation.check import Check, Limits, check_motion
 from ident.excitation.clearance import space_of
 from ident.excitation.criteria import (
     ConditionNumber,
@@ -41,10 +41,12 @@ from lwr_driver.session import read_session
 __all__ = [
     "Assembled",
     "Criteria",
+    "arm_limits",
     "assemble",
     "goal_attainment",
     "prior_information",
     "reported_criteria",
+    "sampling",
     "wanted_target",
 ]
 
@@ -56,16 +58,21 @@ _NEGLIGIBLE = 1e-9  # parameters this small are zero up to arithmetic
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """The problem, the optimiser's set-up, and what the final check needs."""
+    """The problem, the optimiser's set-up, the criteria, and the inputs of the final check."""
 
     problem: PlanProblem
     setup: Setup
     criteria: Criteria
     arm_name: str
     resonance_hz: float
-    checker: PathChecker | None
+    checker: CollisionChecker | None
     clearance_m: float
     row_names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return (
+            f"Assembled problem {self.problem.name}: {self.arm_name}, {len(self.criteria.names)} parameters"
+        )
 
     def check(self, motion: ParametricMotion, *, continuous: bool = True) -> Check:
         """Every limit, at the exact extrema, on the 1 ms grid and proven in between."""
@@ -87,7 +94,7 @@ class Assembled:
         return motion_view(motion, setup.mechanism, setup.estimate, setup.columns, step_s)
 
     def bound_excess(self, motion: ParametricMotion) -> float:
-        """By how much the worst bound on another criterion is exceeded, on its logarithmic scale."""
+        """Largest excess over a bound on another criterion, on its logarithmic scale."""
         if not self.setup.bounds:
             return 0.0
         view = self.view(motion)
@@ -104,27 +111,26 @@ class Assembled:
         elif target is not None and all(target.name != criterion.name for criterion in listed):
             listed.append(target)
         for criterion in listed:
-            values[criterion.name] = criterion.report(criterion.evaluate(view, np.inf)[0])
+            values[criterion.name] = criterion.exact(view)
         for joint, name in enumerate(self.setup.mechanism.joint_names):
             values[f"mean |joint torque| {name} [Nm]"] = float(np.mean(np.abs(view.torque[:, joint])))
         deviations = self.criteria.rsd_mean.deviations(view)
-        return values, {
-            name: float(value)
-            for name, value in zip(self.criteria.rsd_mean.assembly.names, deviations, strict=True)
-        }
+        names = self.criteria.rsd_mean.assembly.names
+        return values, {name: float(value) for name, value in zip(names, deviations, strict=True)}
+
+
+def arm_limits(arm: Arm, speed_scale: float = 1.0) -> Limits:
+    """The limits of an arm, less its position margin, with speeds scaled in time."""
+    return Limits(arm.q_low, arm.q_high, arm.v_max, arm.a_max, arm.j_max, arm.tau_max).scaled(speed_scale)
 
 
 def assemble(problem: PlanProblem) -> Assembled:
-    """Read every file that the problem names and build the criteria; ConfigurationError where they do not
-    fit.
-    """
+    """Read every file named by the problem and build the criteria; ConfigurationError for contradictions."""
     beside = problem.source.parent if problem.source is not None else None
     arm = Arm.load(problem.arm, beside=beside)
     cell = Cell.load(problem.cell, beside=beside)
     mechanism = Mechanism.from_urdf(arm.urdf)
-    limits = Limits(arm.q_low, arm.q_high, arm.v_max, arm.a_max, arm.j_max, arm.tau_max).scaled(
-        problem.speed_scale
-    )
+    limits = arm_limits(arm, problem.speed_scale)
     checker = CollisionChecker(arm, cell, problem.payload_shape)
     clearance = cell.margin_m if problem.clearance_m is None else problem.clearance_m
     estimate, model_names = _estimate(problem, mechanism, beside)
@@ -137,10 +143,8 @@ def assemble(problem: PlanProblem) -> Assembled:
     criteria = reported_criteria(problem, mechanism, estimate, columns, names, values, sessions)
     target, bounds = wanted_target(problem, criteria, limits, mechanism)
     space, row_names = space_of(mechanism, checker.geometry)
-    floor = np.full(space.rows, clearance + _CLEARANCE_RESERVE)
     work = problem.workspace
-    floor[0] = -np.inf if work.radius_m is None else work.radius_m + _FLANGE_RESERVE
-    floor[1] = -np.inf if work.height_m is None else work.height_m + _FLANGE_RESERVE
+    floor = space.floor(clearance + _CLEARANCE_RESERVE, (work.radius_m, work.height_m), _FLANGE_RESERVE)
     form = problem.motion
     basis: Basis = (
         FourierBasis(form.period_s, form.harmonics)
@@ -158,12 +162,12 @@ def assemble(problem: PlanProblem) -> Assembled:
         target=target,
         bounds=bounds,
         coverage=problem.knowledge.coverage,
-        **_grid(basis),
+        **sampling(basis),
     )
     return Assembled(problem, setup, criteria, arm.name, arm.resonance_hz, checker, clearance, row_names)
 
 
-def _grid(basis: Basis) -> dict[str, int]:
+def sampling(basis: Basis) -> dict[str, int]:
     """Samples for the Gram matrices (a few per shortest period) and refinement for everything kinematic."""
     functions = getattr(basis, "harmonics", None)
     samples = 64 if functions is None else max(64, 10 * int(functions))
@@ -187,29 +191,18 @@ def _estimate(
         raise ConfigurationError(f"{path}: {estimate.joints} joints; the arm has {mechanism.joints}")
     if estimate.covariance is None and knowledge.relative_uncertainty > 0.0:
         estimate = estimate.with_relative_uncertainty(knowledge.relative_uncertainty)
-    noise = Noise.published() if mechanism.joints == 7 else None
     if knowledge.noise_motor or knowledge.noise_joint:
         noise = Noise(np.array(knowledge.noise_motor), np.array(knowledge.noise_joint))
-    if noise is None:
+    elif mechanism.joints == 7:
+        noise = Noise.published()
+    else:
         noise = Noise(np.ones(mechanism.joints), np.ones(mechanism.joints))
     for side in (noise.motor, noise.joint):
         if side.size != mechanism.joints:
             raise ConfigurationError(
                 f"knowledge: noise of {side.size} rows; the arm has {mechanism.joints} joints"
             )
-    noise = Noise(noise.motor, noise.joint, knowledge.samples)
-    return _with_noise(estimate, noise), names
-
-
-def _with_noise(estimate: ArmEstimate, noise: Noise) -> ArmEstimate:
-    return ArmEstimate(
-        estimate.bodies,
-        estimate.drives,
-        estimate.payload,
-        estimate.covariance_names,
-        estimate.covariance,
-        noise,
-    )
+    return replace(estimate, noise=replace(noise, samples=knowledge.samples)), names
 
 
 def _base(problem: PlanProblem, mechanism: Mechanism) -> BaseSet:
@@ -226,12 +219,12 @@ def _base(problem: PlanProblem, mechanism: Mechanism) -> BaseSet:
 def _parameters(
     problem: PlanProblem, mechanism: Mechanism, estimate: ArmEstimate, model_names: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Array]:
-    """Names of the parameters that the criteria are about, and their (regrouped) values."""
+    """Names and (regrouped) values of the parameters in the criteria."""
     base = _base(problem, mechanism)
     standard = np.zeros(base.structure.n_columns)
     for column, name in enumerate(base.structure.names):
         kind, link = split_name(name)
-        if link <= mechanism.joints or kind not in ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm"):
+        if link <= mechanism.joints or kind in BODY:
             standard[column] = estimate.value(name)
     all_values = base.reduce(standard)
     if problem.parameters == "base":
@@ -250,7 +243,7 @@ def _parameters(
 
 @dataclass(frozen=True, eq=False)
 class Criteria:
-    """Every criterion that is reported, whatever is optimised."""
+    """The reported criteria, independent of the objective."""
 
     condition: ConditionNumber
     condition_columns: ConditionNumber
@@ -261,6 +254,11 @@ class Criteria:
     def all(self) -> tuple[Criterion, ...]:
         """In the order of the report."""
         return (self.condition, self.condition_columns, self.d_optimality, self.rsd_mean, self.rsd_worst)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.condition.assembly.names
 
 
 def reported_criteria(
@@ -275,12 +273,12 @@ def reported_criteria(
     """Every reported criterion for the named parameters and their values."""
     noise = estimate.noise
     assert noise is not None
-    label = {"base": "base"}.get(str(problem.parameters), "essential")
+    label = "base" if problem.parameters == "base" else "essential"
     plain = Assembly(columns, names, Rows.unweighted(mechanism.joints, problem.model, sessions))
     weighted = Assembly(columns, names, Rows(problem.model, sessions, noise.joint**-2.0, noise.motor**-2.0))
     prior_plain = prior_information(problem, mechanism, estimate, columns, names, None)
     prior_weighted = prior_information(problem, mechanism, estimate, columns, names, noise)
-    # a parameter near zero has no meaningful relative deviation; its own noise floor would rule the mean
+    # a parameter near zero has no meaningful relative deviation, and its noise would dominate the mean
     known = np.where(np.abs(values) > _NEGLIGIBLE, np.abs(values), np.inf)
     usable = np.isfinite(known)
     judged, judged_prior = weighted, prior_weighted
@@ -290,28 +288,29 @@ def reported_criteria(
         if prior_weighted is not None:
             judged_prior = prior_weighted[np.ix_(usable, usable)]
         known = known[usable]
-    condition = ConditionNumber(plain, label, "none", None, prior_plain)
+    condition = ConditionNumber(assembly=plain, label=label, prior=prior_plain)
+    rsd_mean = RelativeDeviation(
+        assembly=judged, label=label, samples=noise.samples, prior=judged_prior, values=known
+    )
     return Criteria(
         condition=condition,
-        condition_columns=ConditionNumber(plain, label, "columns", None, prior_plain),
-        d_optimality=DOptimality(weighted, label, noise.samples, prior_weighted),
-        rsd_mean=RelativeDeviation(judged, known, label, "mean", noise.samples, judged_prior),
-        rsd_worst=RelativeDeviation(judged, known, label, "worst", noise.samples, judged_prior),
+        condition_columns=replace(condition, scaling="columns"),
+        d_optimality=DOptimality(assembly=weighted, label=label, samples=noise.samples, prior=prior_weighted),
+        rsd_mean=rsd_mean,
+        rsd_worst=replace(rsd_mean, statistic="worst"),
     )
 
 
 def wanted_target(
     problem: PlanProblem, criteria: Criteria, limits: Limits, mechanism: Mechanism
 ) -> tuple[Criterion, tuple[Bound, ...]]:
-    """The criterion to minimise and the bounds on others, as the problem asks."""
+    """The criterion to minimise and the bounds on others."""
     wanted = problem.objective
     condition: ConditionNumber = criteria.condition
     if wanted.scaling == "columns":
         condition = criteria.condition_columns
     elif wanted.scaling == "parameters":
-        condition = ConditionNumber(
-            condition.assembly, condition.label, "parameters", _scale(criteria), condition.prior
-        )
+        condition = replace(condition, scaling="parameters", values=_scale(criteria))
     single: dict[str, Criterion] = {
         "condition_number": condition,
         "d_optimality": criteria.d_optimality,
@@ -351,9 +350,7 @@ def goal_attainment(
     share: float,
     joints: tuple[int, ...],
 ) -> GoalAttainment:
-    """Equation (10): goals `goal` for the condition number and `share` * tau_max for each listed joint (from
-    1).
-    """
+    """Equation (10): goals `goal` for the condition number and `share` * tau_max for each joint (from 1)."""
     criteria: list[Criterion] = [condition]
     goals = [goal]
     for number in joints:
@@ -381,8 +378,8 @@ def prior_information(
 ) -> Array | None:
     """Information (p, p) of all priors, None without any.
 
-    With `noise` it is weighted and counts independent samples at the rate of the planned sessions; without,
-    it is unweighted and counts in multiples of one planned session, as the condition number needs it.
+    With `noise`: weighted, in independent samples at the rate of the planned sessions. Without: unweighted, in
+    multiples of one planned session, for the condition number.
     """
     if not problem.prior:
         return None
@@ -403,7 +400,7 @@ def prior_information(
 def _motions(
     problem: PlanProblem, entry: Prior, mechanism: Mechanism, estimate: ArmEstimate, columns: Columns
 ) -> list[tuple[bool, View, float]]:
-    """Loaded or not, the view, and the duration [s] of each session of one prior."""
+    """Loaded or not, view and duration [s] of each session of one prior."""
     beside = problem.source.parent if problem.source is not None else None
     if entry.plan is not None:
         done = ExcitationPlan.load(find(entry.plan, beside=beside))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -22,58 +21,33 @@ from fri.errors import ConfigurationError
 from ident.excitation.arm_model import ArmEstimate, Mechanism, split_name, tip_path, torque_bounds
 from ident.excitation.clearance import space_of
 from ident.excitation.motions import Array, ParametricMotion, Samples
+from lwr_driver.collision import CollisionChecker
 
 __all__ = [
     "Check",
     "Limits",
     "Margin",
-    "PathChecker",
     "Proof",
     "Workspace",
     "check_motion",
     "prove",
-    "reach",
     "speed_bound",
+    "swept_radius",
     "torque_rate",
 ]
 
 _ROUNDING = 1e-12
+_Measure = Callable[[Array], Array]
 KINEMATIC = (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"), ("jerk", "rad/s³"))
 _SMALLEST = 1e-6  # shortest half-width as a share of the motion: microseconds
 
 
-class Nearest(Protocol):
-    """Tightest moment of a path: distance [m], the two bodies, the row."""
-
-    @property
-    def distance(self) -> float:
-        """Clearance [m], below zero in collision."""
-
-    @property
-    def pair(self) -> tuple[str, str]:
-        """Names of the two bodies."""
-
-    @property
-    def row(self) -> int:
-        """Row of the path."""
-
-
-class PathChecker(Protocol):
-    """What the check needs of a collision checker (`lwr_driver.collision.CollisionChecker`)."""
-
-    def clearance(self, q: Array) -> Nearest:
-        """Smallest distance in one posture (joints,)."""
-
-    def check_path(self, q: Array, *, period_s: float = 0.0) -> Nearest:
-        """Tightest moment of the path q (n, joints)."""
-
-
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the motion may use of the arm; arrays (joints,).
+    """Limits of the motion; arrays (joints,).
 
-    q_low, q_high [rad]; v_max [rad/s]; a_max [rad/s²]; j_max [rad/s³]; tau_max [Nm], for the joint torque
-    and for the motor torque (both on the joint side of the gear).
+    q_low, q_high [rad]; v_max [rad/s]; a_max [rad/s²]; j_max [rad/s³]; tau_max [Nm], for the joint torque and for the
+    motor torque (both on the joint side of the gear).
     """
 
     q_low: Array
@@ -84,7 +58,7 @@ class Limits:
     tau_max: Array
 
     def __post_init__(self) -> None:
-        for name in ("q_low", "q_high", "v_max", "a_max", "j_max", "tau_max"):
+        for name in vars(self):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != np.shape(self.q_low) or values.ndim != 1:
                 raise ConfigurationError(
@@ -100,19 +74,14 @@ class Limits:
         """The same limits with velocity, acceleration and jerk at `speed`, speed², speed³ of themselves."""
         if not 0.0 < speed <= 1.0:
             raise ConfigurationError(f"speed_scale {speed} is outside 0 to 1")
-        return Limits(
-            self.q_low,
-            self.q_high,
-            self.v_max * speed,
-            self.a_max * speed**2,
-            self.j_max * speed**3,
-            self.tau_max,
+        return replace(
+            self, v_max=self.v_max * speed, a_max=self.a_max * speed**2, j_max=self.j_max * speed**3
         )
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where the flange may be: at least `radius_m` from the axis of joint 1, at least `height_m` high.
+    """Bounds of the flange: at least `radius_m` from the axis of joint 1, at least `height_m` high.
 
     Heights count from the origin of the first joint's frame, the base frame of the Denavit-Hartenberg table
     (for the LWR4+ 0.31 m above the base plate). None switches a bound off.
@@ -124,9 +93,9 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Margin:
-    """How far a motion stays from one limit. `slack` = room left, negative if violated, in `unit`.
+    """Distance of a motion from one limit: `slack` in `unit`, negative if violated.
 
-    proven : False if a proof for the instants between the samples was asked for and not found.
+    proven : False if a requested proof for the instants between the samples failed
     """
 
     constraint: str
@@ -142,6 +111,11 @@ class Margin:
     def ok(self) -> bool:
         """True if the limit is kept, to rounding."""
         return self.slack >= -_ROUNDING * abs(self.limit) and self.proven
+
+    @property
+    def share(self) -> float:
+        """Slack as a share of the limit."""
+        return self.slack / max(abs(self.limit), 1e-9)
 
     def __str__(self) -> str:
         state = "keeps" if self.ok else "violates" if self.proven else "is not proven to keep"
@@ -164,22 +138,28 @@ class Check:
 
     @property
     def violations(self) -> tuple[Margin, ...]:
-        """Limits that are not kept, worst share of the limit first."""
-        broken = [margin for margin in self.margins if not margin.ok]
-        return tuple(sorted(broken, key=lambda margin: margin.slack / max(abs(margin.limit), 1e-9)))
+        """Margins of violated limits, worst share of the limit first."""
+        return tuple(sorted((m for m in self.margins if not m.ok), key=lambda margin: margin.share))
 
     def tightest(self) -> tuple[Margin, ...]:
         """The tightest margin of each constraint."""
         best: dict[str, Margin] = {}
         for margin in self.margins:
-            share = margin.slack / max(abs(margin.limit), 1e-9)
             known = best.get(margin.constraint)
-            if known is None or share < known.slack / max(abs(known.limit), 1e-9):
+            if known is None or margin.share < known.share:
                 best[margin.constraint] = margin
         return tuple(best.values())
 
     def __str__(self) -> str:
         return "\n".join(str(margin) for margin in self.tightest())
+
+    def __repr__(self) -> str:
+        broken = self.violations
+        verdict = f"{len(broken)} violated" if broken else "all kept"
+        shown = broken[:3] or sorted(self.tightest(), key=lambda margin: margin.share)[:3]
+        return "\n".join(
+            [f"Check: {len(self.margins)} limits, {verdict}", *(f"  {margin}" for margin in shown)]
+        )
 
 
 def check_motion(
@@ -190,7 +170,7 @@ def check_motion(
     workspace: Workspace | None = None,
     estimate: ArmEstimate | None = None,
     coverage: float = 3.0,
-    checker: PathChecker | None = None,
+    checker: CollisionChecker | None = None,
     clearance_m: float = 0.0,
     step_s: float = 1e-3,
     collision_step_s: float = 1e-2,
@@ -242,31 +222,35 @@ def _torque_proof(
 
 
 def _workspace_proofs(motion: ParametricMotion, mechanism: Mechanism, workspace: Workspace) -> set[str]:
-    """Constraints of the workspace that could not be proven."""
+    """Bounds of the workspace without a proof."""
     extents = np.zeros(mechanism.joints)
     extents[-1] = np.linalg.norm(mechanism.tip)
-    rate = speed_bound(motion, reach(mechanism, extents))
-
-    def radius(times: Array) -> Array:
-        points = tip_path(mechanism, motion.sample(times).q)
-        return np.hypot(points[:, 0], points[:, 1]) - float(workspace.radius_m or 0.0)
-
-    def height(times: Array) -> Array:
-        return tip_path(mechanism, motion.sample(times).q)[:, 2] - float(workspace.height_m or 0.0)
-
+    rate = speed_bound(motion, swept_radius(mechanism, extents))
     unproven = set()
-    if workspace.radius_m is not None and not prove(motion, radius, rate).proven:
-        unproven.add("distance from axis 1")
-    if workspace.height_m is not None and not prove(motion, height, rate).proven:
-        unproven.add("height")
+    for constraint, limit, measure in _flange_bounds(workspace):
+
+        def slack(times: Array, measure: _Measure = measure, limit: float = limit) -> Array:
+            return measure(tip_path(mechanism, motion.sample(times).q)) - limit
+
+        if not prove(motion, slack, rate).proven:
+            unproven.add(constraint)
     return unproven
 
 
+def _flange_bounds(workspace: Workspace) -> list[tuple[str, float, _Measure]]:
+    """Constraint, limit [m] and quantity of each bound of the workspace."""
+    bounds: list[tuple[str, float | None, _Measure]] = [
+        ("distance from axis 1", workspace.radius_m, lambda points: np.hypot(points[:, 0], points[:, 1])),
+        ("height", workspace.height_m, lambda points: points[:, 2]),
+    ]
+    return [(constraint, limit, measure) for constraint, limit, measure in bounds if limit is not None]
+
+
 def _clearance_proof(
-    motion: ParametricMotion, mechanism: Mechanism, checker: PathChecker, clearance_m: float
+    motion: ParametricMotion, mechanism: Mechanism, checker: CollisionChecker, clearance_m: float
 ) -> Proof:
     space, _ = space_of(mechanism, getattr(checker, "geometry", None))
-    rate = speed_bound(motion, reach(mechanism, space.extents(mechanism.joints)))
+    rate = speed_bound(motion, swept_radius(mechanism, space.extents(mechanism.joints)))
 
     def slack(times: Array) -> Array:
         postures = motion.sample(times).q
@@ -317,20 +301,16 @@ def _workspace_margins(
 ) -> list[Margin]:
     margins = []
     points = tip_path(mechanism, samples.q)
-    radius = np.hypot(points[:, 0], points[:, 1])
-    for constraint, values, limit in (
-        ("distance from axis 1", radius, workspace.radius_m),
-        ("height", points[:, 2], workspace.height_m),
-    ):
-        if limit is not None:
-            row = int(np.argmin(values))
-            value = float(values[row])
-            margins.append(Margin(constraint, "flange", value, limit, value - limit, "m", float(times[row])))
+    for constraint, limit, measure in _flange_bounds(workspace):
+        values = measure(points)
+        row = int(np.argmin(values))
+        value = float(values[row])
+        margins.append(Margin(constraint, "flange", value, limit, value - limit, "m", float(times[row])))
     return margins
 
 
 def _clearance_margin(
-    motion: ParametricMotion, checker: PathChecker, clearance_m: float, step_s: float
+    motion: ParametricMotion, checker: CollisionChecker, clearance_m: float, step_s: float
 ) -> Margin:
     count = max(2, int(np.ceil(motion.duration / step_s)))
     times = np.linspace(0.0, motion.duration, count, endpoint=False)
@@ -344,9 +324,7 @@ def _clearance_margin(
 
 @dataclass(frozen=True)
 class Proof:
-    """Outcome: the smallest sampled value and its time, whether it is proven for all instants, samples
-    used.
-    """
+    """Outcome: the smallest sampled value and its time, proven for all instants or not, samples used."""
 
     least: float
     time_s: float
@@ -387,26 +365,26 @@ def prove(
     return Proof(least, when, True, used)
 
 
-def reach(mechanism: Mechanism, extents: Array) -> Array:
-    """Longest distance from each joint axis to any point that it moves, (n,) [m].
+def swept_radius(mechanism: Mechanism, extents: Array) -> Array:
+    """Longest distance from each joint axis to any point moved by it, (n,) [m].
 
     extents (n,): distance of the farthest point of each body from its own frame's origin [m].
     """
     n = mechanism.joints
     lengths = np.linalg.norm(mechanism.translation, axis=1)
-    lever = np.array(extents, dtype=np.float64)
+    radius = np.array(extents, dtype=np.float64)
     for joint in range(n - 2, -1, -1):
-        lever[joint] = max(lever[joint], lengths[joint + 1] + lever[joint + 1])
-    return lever
+        radius[joint] = max(radius[joint], lengths[joint + 1] + radius[joint + 1])
+    return radius
 
 
-def speed_bound(motion: ParametricMotion, lever: Array) -> Callable[[Array, float], Array]:
-    """Bound of the speed of any point that the joints carry at most `lever` (n,) away; see `prove`."""
+def speed_bound(motion: ParametricMotion, radius: Array) -> Callable[[Array, float], Array]:
+    """Bound of the speed of any point within `radius` (n,) of the joint axes; see `prove`."""
     extrema = motion.extrema(2)
     acceleration = np.maximum(np.abs(extrema.low), np.abs(extrema.high))
 
     def rate(times: Array, half: float) -> Array:
-        return (np.abs(motion.sample(times).qd) + acceleration * half) @ lever
+        return (np.abs(motion.sample(times).qd) + acceleration * half) @ radius
 
     return rate
 
@@ -414,11 +392,10 @@ def speed_bound(motion: ParametricMotion, lever: Array) -> Callable[[Array, floa
 def torque_rate(
     motion: ParametricMotion, mechanism: Mechanism, estimate: ArmEstimate, coverage: float
 ) -> Callable[[Array, float], Array]:
-    """Bound of the rate of the joint and motor torque bounds of `torque.torque_bounds`, (n, joints) [Nm/s].
+    """Bound of the rate of the bounds of `torque_bounds`, (n, joints) [Nm/s].
 
-    Norms are carried along the chain: angular velocity, acceleration and jerk add up joint by joint, origins
-    and wrenches follow. Uncertainty adds the same bound with standard deviations in place of the parameters'
-    sizes.
+    Norms are carried along the chain: angular velocity, acceleration and jerk add up joint by joint, origins and
+    wrenches follow. Uncertainty adds the same bound, with standard deviations instead of parameter magnitudes.
     """
     found = [motion.extrema(order) for order in (2, 3)]
     peaks = [np.maximum(np.abs(extrema.low), np.abs(extrema.high)) for extrema in found] + [_snap(motion)]
@@ -435,9 +412,7 @@ def torque_rate(
 
 
 def _snap(motion: ParametricMotion) -> Array:
-    """Largest rate of the jerk, from its samples if the motion does not tell: only multiplies h, so it
-    hardly matters.
-    """
+    """Largest rate of the jerk, estimated from samples: only multiplied by h, so a small part of the bound."""
     times = np.linspace(0.0, motion.duration, 2001)
     jerk = motion.sample(times).qddd
     return 2.0 * np.max(np.abs(np.diff(jerk, axis=0)), axis=0) / (times[1] - times[0])
@@ -502,11 +477,11 @@ def _wrench_rate(mechanism: Mechanism, sizes: _Sizes, v: Array, a: Array, j: Arr
         spin.append(w)
     out = np.empty_like(v)
     for joint in range(n):
-        total, lever = zero, 0.0
+        total, lever_arm = zero, 0.0
         for b in range(joint, n):
             if b > joint:
-                lever += lengths[b]
+                lever_arm += lengths[b]
             total = total + couple_rate[b] + spin[b] * couple[b]
-            total = total + lever * (force_rate[b] + 2.0 * spin[b] * force[b])
+            total = total + lever_arm * (force_rate[b] + 2.0 * spin[b] * force[b])
         out[:, joint] = total + sizes.drive_inertia[joint] * j[:, joint] + sizes.viscous[joint] * a[:, joint]
     return out

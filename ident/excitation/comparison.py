@@ -15,11 +15,12 @@ from joblib import Parallel, delayed
 from fri.errors import ConfigurationError, RefusedError
 from ident.excitation.arm_model import Mechanism, tip_path
 from ident.excitation.assembly import Assembled
-from ident.excitation.check import Check, Limits, PathChecker, Workspace
+from ident.excitation.check import Check, Limits, Workspace
 from ident.excitation.criteria import Criterion
 from ident.excitation.motions import Array, ParametricMotion, PointToPoint
 from ident.excitation.program import Bound, Setup
 from ident.excitation.search import Candidate, begin, hop, judge, polish
+from lwr_driver.collision import CollisionChecker
 
 __all__ = [
     "FrontPoint",
@@ -38,9 +39,7 @@ _TRIES = 400
 
 @dataclass(frozen=True, eq=False)
 class TableRow:
-    """One motion's line: limits kept, condition number, mean and worst predicted deviation [%], mean torques
-    [Nm].
-    """
+    """One motion: limits kept, condition number, mean and worst predicted deviation [%], mean |torque| [Nm]."""
 
     label: str
     complies: bool
@@ -49,6 +48,9 @@ class TableRow:
     rsd_mean: float
     rsd_worst: float
     torque: Array
+
+    def __repr__(self) -> str:
+        return table([self])
 
 
 def table_row(
@@ -62,17 +64,15 @@ def table_row(
         label=label,
         complies=verdict.ok,
         duration_s=motion.duration,
-        condition=float(np.exp(criteria.condition.evaluate(view, np.inf)[0])),
-        rsd_mean=float(np.exp(criteria.rsd_mean.evaluate(view, np.inf)[0])),
-        rsd_worst=float(np.exp(criteria.rsd_worst.evaluate(view, np.inf)[0])),
+        condition=criteria.condition.exact(view),
+        rsd_mean=criteria.rsd_mean.exact(view),
+        rsd_worst=criteria.rsd_worst.exact(view),
         torque=np.mean(np.abs(view.torque), axis=0),
     )
 
 
 def table(rows: Sequence[TableRow], title: str = "") -> str:
-    """Aligned text: trajectory, limits kept, duration, condition number, predicted deviations, mean |torque|
-    by joint.
-    """
+    """Aligned text, one line per motion; torques by joint."""
     head = ["trajectory", "limits", "T [s]", "cond", "mean RSD %", "worst RSD %", "mean |torque| [Nm]"]
     body = [
         [
@@ -107,17 +107,18 @@ def random_points(
     speed_scale: float = 1.0,
     a_max: Array | None = None,
     workspace: Workspace | None = None,
-    checker: PathChecker | None = None,
+    checker: CollisionChecker | None = None,
     clearance_m: float = 0.0,
     duration_s: float | None = None,
 ) -> PointToPoint:
-    """Motion through `count` random postures and back to the first; every straight line keeps every limit in
-    space.
+    """Motion through `count` random postures and back to the first, within workspace and clearance on every line.
+
+    The baseline for optimal excitation.
 
     speed_scale : share of the velocity limits; a_max : acceleration limits instead of the arm's [rad/s²]
-    duration_s : total time, reached by a pause in each posture; None: no pauses
+    duration_s : total time, filled by a pause in each posture; None: no pauses
 
-    Raises RefusedError where no next posture can be found, ConfigurationError if the time is too short.
+    Raises RefusedError without a next posture, ConfigurationError if the time is too short.
     """
     rng = np.random.default_rng(seed)
     space = workspace if workspace is not None else Workspace()
@@ -176,7 +177,7 @@ def _reachable(
 
 @dataclass(frozen=True, eq=False)
 class FrontPoint:
-    """One motion of a front: the bound that it was found under, and both criteria in reported units."""
+    """One motion of a front: its bound, and both criteria in reported units."""
 
     limit: float
     minimised: float
@@ -196,11 +197,10 @@ def trade_off(
     jobs: int = 1,
     first: Sequence[Candidate] = (),
 ) -> list[FrontPoint]:
-    """Minimise one criterion with another kept at or below each of `limits` (on the bounded criterion's own
-    scale).
+    """Minimise one criterion under an upper bound on another, for each of `limits` (on the bounded criterion's scale).
 
-    Limits are worked from the loosest to the tightest and back; each takes over what its neighbours found, so
-    the front has no dents that a neighbour could fill. Only motions that pass every check are returned.
+    The limits are worked from the loosest to the tightest and back. Each one also starts from the motions of its
+    neighbours, against dents in the front. Only motions within every limit are returned.
     """
     order = sorted(range(len(limits)), key=lambda k: -limits[k])
     setups = {
@@ -231,8 +231,8 @@ def trade_off(
         outcome = polish(problem, pool[k])
         if outcome.check.ok and outcome.bounds_kept:
             view = problem.view(outcome.motion)
-            values = [c.report(c.evaluate(view, np.inf)[0]) for c in (minimise, against)]
-            points.append(FrontPoint(against.report(float(limits[k])), values[0], values[1], outcome.motion))
+            limit = against.report(float(limits[k]))
+            points.append(FrontPoint(limit, minimise.exact(view), against.exact(view), outcome.motion))
     return points
 
 
@@ -247,7 +247,7 @@ def _first(setup: Setup, known: Sequence[Candidate], seed: tuple[int, ...], star
 
 
 def not_dominated(values: Array) -> Array:
-    """Rows of values (n, k), all to be made small, that no other row beats in everything; boolean (n,)."""
+    """Pareto-optimal rows of values (n, k), all to be made small; boolean (n,)."""
     values = np.asarray(values, dtype=np.float64)
     keep = np.ones(len(values), dtype=bool)
     for row, value in enumerate(values):
@@ -257,9 +257,7 @@ def not_dominated(values: Array) -> Array:
 
 
 def hypervolume(values: Array, reference: Array) -> float:
-    """Volume between a front (n, k), all to be made small, and a reference point that is worse in
-    everything.
-    """
+    """Volume between a front (n, k), all to be made small, and a reference point, worse in every column."""
     points = np.asarray(values, dtype=np.float64)
     corner = np.asarray(reference, dtype=np.float64)
     points = points[np.all(points < corner, axis=1)]

@@ -11,9 +11,10 @@ grows: Schatten norms of the matrix and of its inverse for the condition number,
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
@@ -43,11 +44,12 @@ __all__ = [
 _HUGE = 50.0
 _LEAST_EIGENVALUE = 1e-13
 Pullback = Callable[[float], None]
-_SMALLEST = -0.999  # of (F - goal) / goal, so that its logarithm exists
+_SMALLEST = -0.999  # floor of (F - goal) / goal for a finite logarithm
+_SOFTNESS = 0.02  # [Nm]
 
 
 def log_condition(information: Array, sharpness: float = np.inf) -> tuple[float, Array]:
-    """log cond(Omega) = (log of the eigenvalue ratio) / 2 of Omega^T Omega, and its derivative (p, p)."""
+    """log cond(Omega), half the log of the eigenvalue ratio of Omega^T Omega, and its derivative (p, p)."""
     if np.isinf(sharpness):
         return _log_condition_exact(information)
     power = int(sharpness)
@@ -86,7 +88,7 @@ def _log_condition_powers(information: Array, power: int) -> tuple[float, Array]
 def _log_norm(matrix: Array, power: int) -> tuple[float, Array]:
     """log of the Schatten norm of even order `power` of a positive definite matrix, and its derivative."""
     below, square = matrix, matrix
-    log_square = log_below = 0.0  # what `square` and `below` have been divided by, against underflow
+    log_square = log_below = 0.0  # logs of the divisors of `square` and `below`, against underflow
     for _ in range(power.bit_length() - 2):
         square = square @ square
         size = float(np.trace(square))
@@ -120,7 +122,7 @@ def d_optimality(information: Array) -> tuple[float, Array]:
 
 
 def relative_deviations(information: Array, values: Array) -> Array:
-    """Relative standard deviations (15) in percent, (p,); infinite where the information is singular."""
+    """Relative standard deviations (15) in percent, (p,); infinite for singular information."""
     inverse, _ = _inverse(information)
     if inverse is None:
         return np.full(values.shape, np.inf)
@@ -140,9 +142,7 @@ def rsd_mean(information: Array, values: Array) -> tuple[float, Array]:
 
 
 def rsd_worst(information: Array, values: Array, sharpness: float = np.inf) -> tuple[float, Array]:
-    """log of the largest relative standard deviation [%] (a norm of order `sharpness`), and its
-    derivative.
-    """
+    """log of the largest relative standard deviation [%] (a norm of order `sharpness`), and its derivative."""
     inverse, _ = _inverse(information)
     if inverse is None:
         return _HUGE, np.zeros_like(information)
@@ -169,7 +169,7 @@ def scaled(information: Array) -> tuple[Array, Array]:
 
 
 def unscale(bar: Array, normalised: Array, scale: Array) -> Array:
-    """Derivative with respect to the information from that with respect to its normalised form."""
+    """Derivative with respect to the information, from the derivative with respect to its normalised form."""
     through = bar * np.outer(scale, scale)
     correction = np.sum(bar * normalised, axis=1) * scale**2
     through[np.diag_indices_from(through)] -= correction
@@ -177,7 +177,7 @@ def unscale(bar: Array, normalised: Array, scale: Array) -> Array:
 
 
 def _inverse(information: Array) -> tuple[Array | None, float]:
-    """Inverse by Cholesky with unit diagonal scaling, and log det; None where not positive definite."""
+    """Inverse by Cholesky with unit diagonal scaling, and log det; None if not positive definite."""
     normalised, scale = scaled(information)
     try:
         factor = cho_factor(normalised, lower=True, check_finite=False)
@@ -191,36 +191,67 @@ def _inverse(information: Array) -> tuple[Array | None, float]:
     return inverse * np.outer(scale, scale), logdet
 
 
-class Criterion(Protocol):
-    """Something to be made small."""
+class Criterion(ABC):
+    """A quantity to be made small."""
+
+    logarithmic: ClassVar[bool] = False
 
     @property
+    @abstractmethod
     def name(self) -> str:
-        """What is measured, in full: `condition number, essential 49, unscaled`."""
+        """The quantity in full: `condition number, essential 49, unscaled`."""
 
+    @abstractmethod
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
-        """Value, smoothed by norms of order `sharpness` (inf: exact), and a function adding weight *
-        derivative.
+        """Value, smoothed by norms of order `sharpness` (inf: exact), and its pullback (adds weight * derivative).
+
+        The logarithm of the quantity for a `logarithmic` criterion, else the quantity itself.
         """
 
     def report(self, value: float) -> float:
-        """The number a person wants to read."""
+        """The quantity in its own units, from a value of `evaluate`."""
+        return float(np.exp(value)) if self.logarithmic else value
+
+    def exact(self, view: View) -> float:
+        """The quantity in its own units, without smoothing."""
+        return self.report(self.evaluate(view, np.inf)[0])
 
 
-@dataclass(frozen=True, eq=False)
-class ConditionNumber:
-    """Condition number of the stacked observation matrix of some parameters.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _InformationCriterion(Criterion):
+    """A function of the information of some parameters.
 
-    scaling : "none", "columns" (each column to length one) or "parameters" (each column times its parameter's
-    value)
-    prior : information of earlier sessions in the same weighting, per sample of the planned motion; (p, p)
+    samples : independent samples of each session
+    prior : information of earlier sessions in the same weighting, (p, p)
     """
 
     assembly: Assembly
     label: str
+    samples: float = 1.0
+    prior: Array | None = None
+
+    def information(self, view: View) -> Array:
+        """Information of the planned sessions and the prior ones, (p, p)."""
+        information = self.samples * self.assembly.information(view.gram)
+        return information if self.prior is None else information + self.prior
+
+    def pullback(self, view: View, bar: Array) -> Pullback:
+        """Pullback of a criterion with the derivative `bar` (p, p) with respect to the information."""
+        bar = bar * self.samples
+        return lambda weight: self.assembly.adjoint(weight * bar, view.gram_bar)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ConditionNumber(_InformationCriterion):
+    """Condition number of the stacked observation matrix of some parameters.
+
+    scaling : "none", "columns" (each column to length one) or "parameters" (each column times its parameter's value)
+    """
+
     scaling: Literal["none", "columns", "parameters"] = "none"
     values: Array | None = None
-    prior: Array | None = None
+
+    logarithmic = True
 
     def __post_init__(self) -> None:
         if self.scaling == "parameters" and self.values is None:
@@ -234,9 +265,7 @@ class ConditionNumber:
 
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
         """Logarithm of the condition number."""
-        information = self.assembly.information(view.gram)
-        if self.prior is not None:
-            information = information + self.prior
+        information = self.information(view)
         if self.scaling == "columns":
             normalised, scale = scaled(information)
             value, bar = log_condition(normalised, sharpness)
@@ -247,21 +276,12 @@ class ConditionNumber:
             bar = bar * outer
         else:
             value, bar = log_condition(information, sharpness)
-        return value, lambda weight: self.assembly.adjoint(weight * bar, view.gram_bar)
-
-    def report(self, value: float) -> float:
-        """The condition number itself."""
-        return float(np.exp(value))
+        return value, self.pullback(view, bar)
 
 
-@dataclass(frozen=True, eq=False)
-class DOptimality:
-    """-log det of the information per parameter: the size of the confidence ellipsoid, whatever the units."""
-
-    assembly: Assembly
-    label: str
-    samples: float = 1.0
-    prior: Array | None = None
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DOptimality(_InformationCriterion):
+    """-log det of the information per parameter: the size of the confidence ellipsoid, in any units."""
 
     @property
     def name(self) -> str:
@@ -270,41 +290,26 @@ class DOptimality:
 
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
         """-log det(information) / p."""
-        information = self.samples * self.assembly.information(view.gram)
-        if self.prior is not None:
-            information = information + self.prior
-        value, bar = d_optimality(information)
-        bar = bar * self.samples
-        return value, lambda weight: self.assembly.adjoint(weight * bar, view.gram_bar)
-
-    def report(self, value: float) -> float:
-        """The value as it is."""
-        return value
+        value, bar = d_optimality(self.information(view))
+        return value, self.pullback(view, bar)
 
 
-@dataclass(frozen=True, eq=False)
-class RelativeDeviation:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RelativeDeviation(_InformationCriterion):
     """Mean or largest predicted relative standard deviation (15) of the named parameters [%].
 
-    The assembly carries the weights 1/sigma² of the rows, `samples` the independent samples of each session.
+    The assembly carries the weights 1/sigma² of the rows. values (p,): magnitudes of the parameters.
     """
 
-    assembly: Assembly
     values: Array
-    label: str
     statistic: Literal["mean", "worst"] = "mean"
-    samples: float = 100.0
-    prior: Array | None = None
+
+    logarithmic = True
 
     @property
     def name(self) -> str:
         """Statistic and set of parameters."""
         return f"{self.statistic} predicted relative deviation, {self.label} {len(self.assembly.names)} [%]"
-
-    def information(self, view: View) -> Array:
-        """Weighted information of the planned sessions and the prior ones."""
-        information = self.samples * self.assembly.information(view.gram)
-        return information if self.prior is None else information + self.prior
 
     def deviations(self, view: View) -> Array:
         """Relative standard deviation of each parameter [%]."""
@@ -317,35 +322,26 @@ class RelativeDeviation:
             value, bar = rsd_mean(information, self.values)
         else:
             value, bar = rsd_worst(information, self.values, sharpness)
-        bar = bar * self.samples
-        return value, lambda weight: self.assembly.adjoint(weight * bar, view.gram_bar)
-
-    def report(self, value: float) -> float:
-        """The deviation in percent."""
-        return float(np.exp(value))
+        return value, self.pullback(view, bar)
 
 
 @dataclass(frozen=True)
-class MeanTorque:
-    """Mean over time of tau_max - |joint torque| of one joint, the wrist's criterion of equation (10)
-    [Nm].
-    """
+class MeanTorque(Criterion):
+    """Mean over time of tau_max - |joint torque| of one joint, the wrist's criterion of equation (10) [Nm]."""
 
     joint: int
     tau_max: float
     joint_name: str
-    softness: float = 0.02
 
     @property
     def name(self) -> str:
-        """Which joint."""
+        """Quantity and joint."""
         return f"mean of tau_max - |joint torque|, {self.joint_name} [Nm]"
 
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
-        """tau_max - mean |tau|; the magnitude is rounded off near zero unless exact."""
+        """tau_max - mean |tau|."""
         torque = view.torque[:, self.joint]
-        soft = 0.0 if np.isinf(sharpness) else self.softness
-        magnitude = np.sqrt(torque**2 + soft**2)
+        magnitude = _magnitude(torque, sharpness)
         slope = -torque / np.maximum(magnitude, 1e-300) / torque.size
 
         def pull(weight: float) -> None:
@@ -353,35 +349,27 @@ class MeanTorque:
 
         return self.tau_max - float(magnitude.mean()), pull
 
-    def report(self, value: float) -> float:
-        """The value as it is."""
-        return value
-
 
 @dataclass(frozen=True)
-class TorqueLevel:
-    """-sum of weighted logs of the mean |joint torque| of some joints: raises all of them, the low ones
-    first.
-    """
+class TorqueLevel(Criterion):
+    """-sum of weighted logs of the mean |joint torque| of some joints: raises all of them, the low ones first."""
 
     joints: tuple[int, ...]
     weights: tuple[float, ...]
     joint_names: tuple[str, ...]
-    softness: float = 0.02
 
     @property
     def name(self) -> str:
-        """Which joints, with which weights."""
+        """Joints and weights."""
         parts = ", ".join(f"{w:g} log {name}" for w, name in zip(self.weights, self.joint_names, strict=True))
         return f"- level of mean |joint torque| ({parts})"
 
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
-        """The weighted sum; magnitudes are rounded off near zero unless exact."""
-        soft = 0.0 if np.isinf(sharpness) else self.softness
+        """The weighted sum."""
         value, slopes = 0.0, []
         for joint, weight in zip(self.joints, self.weights, strict=True):
             torque = view.torque[:, joint]
-            magnitude = np.sqrt(torque**2 + soft**2)
+            magnitude = _magnitude(torque, sharpness)
             level = float(magnitude.mean())
             value -= weight * float(np.log(level))
             slopes.append((joint, -weight / level * torque / np.maximum(magnitude, 1e-300) / torque.size))
@@ -392,13 +380,14 @@ class TorqueLevel:
 
         return value, pull
 
-    def report(self, value: float) -> float:
-        """The value as it is."""
-        return value
+
+def _magnitude(torque: Array, sharpness: float) -> Array:
+    """|tau|, rounded off near zero unless exact (infinite sharpness)."""
+    return np.sqrt(torque**2 + (0.0 if np.isinf(sharpness) else _SOFTNESS) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
-class GoalAttainment:
+class GoalAttainment(Criterion):
     """gamma of equation (10): the largest (F_i - goal_i) / |goal_i|, with F_i in reported units."""
 
     criteria: tuple[Criterion, ...]
@@ -410,9 +399,8 @@ class GoalAttainment:
                 f"{len(self.criteria)} criteria with {len(self.goals)} goals; one goal each is needed"
             )
         if any(not goal > 0.0 for goal in self.goals):
-            raise ConfigurationError(
-                f"goals {', '.join(f'{goal:g}' for goal in self.goals)}: each must be positive, it is its own weight"
-            )
+            goals = ", ".join(f"{goal:g}" for goal in self.goals)
+            raise ConfigurationError(f"goals {goals}: each must be positive, it is its own weight")
 
     @property
     def name(self) -> str:
@@ -423,33 +411,34 @@ class GoalAttainment:
         )
 
     def attainment(self, view: View) -> Array:
-        """(F_i - goal_i) / |goal_i| of each criterion, exact."""
-        parts = [self._part(k, view, np.inf)[0] for k in range(len(self.criteria))]
-        return np.array(parts)
+        """(F_i - goal_i) / |goal_i| of each criterion, exact, (k,)."""
+        return np.array([value for value, _ in self._parts(view, np.inf)])
 
     def log_ratios(self, view: View, sharpness: float) -> tuple[Array, list[Pullback]]:
         """log(F_i / goal_i) of each criterion, (k,), with its pullback; the largest is log(1 + gamma)."""
-        parts = [self._part(k, view, sharpness) for k in range(len(self.criteria))]
+        parts = self._parts(view, sharpness)
         values = np.array([np.log1p(max(value, _SMALLEST)) for value, _ in parts])
 
-        def scaled(k: int) -> Pullback:
+        def divided(k: int) -> Pullback:
             pull, ratio = parts[k][1], float(np.exp(values[k]))
             return lambda weight: pull(weight / ratio)
 
-        return values, [scaled(k) for k in range(len(parts))]
+        return values, [divided(k) for k in range(len(parts))]
 
-    def _part(self, k: int, view: View, sharpness: float) -> tuple[float, Pullback]:
-        criterion, goal = self.criteria[k], self.goals[k]
+    def _parts(self, view: View, sharpness: float) -> list[tuple[float, Pullback]]:
+        """(F_i - goal_i) / |goal_i| of each criterion with its pullback."""
+        return [self._part(*pair, view, sharpness) for pair in zip(self.criteria, self.goals, strict=True)]
+
+    @staticmethod
+    def _part(criterion: Criterion, goal: float, view: View, sharpness: float) -> tuple[float, Pullback]:
         value, pull = criterion.evaluate(view, sharpness)
         size = criterion.report(value)
-        slope = (size if not isinstance(criterion, (MeanTorque, TorqueLevel, DOptimality)) else 1.0) / abs(
-            goal
-        )
+        slope = (size if criterion.logarithmic else 1.0) / abs(goal)
         return (size - goal) / abs(goal), lambda weight: pull(weight * slope)
 
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
         """Largest part; smoothed by a log-sum-exp of rate 20 * sharpness."""
-        parts = [self._part(k, view, sharpness) for k in range(len(self.criteria))]
+        parts = self._parts(view, sharpness)
         values = np.array([value for value, _ in parts])
         peak = float(values.max())
         if np.isinf(sharpness):
@@ -468,7 +457,3 @@ class GoalAttainment:
                     part[1](weight * float(part_share))
 
         return value, pull
-
-    def report(self, value: float) -> float:
-        """Gamma as it is."""
-        return value

@@ -14,26 +14,33 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from fri.errors import ConfigurationError
-from ident.excitation.arm_model import BODY, ArmEstimate, Mechanism, split_name
+from ident.excitation.arm_model import (
+    BODY,
+    DRIVE_SIGNAL,
+    FCL,
+    FVL,
+    JOINT_SIDE,
+    OFFL,
+    ArmEstimate,
+    Mechanism,
+    split_name,
+)
 from ident.excitation.motions import Array, Basis, ParametricMotion, Samples
 from ident.excitation.sweep import backward, forward
 
-__all__ = ["Assembly", "Columns", "Evaluator", "Rows", "View", "motion_view", "samples_view"]
-
-_DRIVE_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
-_JOINT_SIDE = ("Fvl", "Fcl", "offl")
-_FVL, _FCL, _OFFL = 1, 2, 3
+__all__ = ["Assembly", "Columns", "ConstantBasis", "Evaluator", "Rows", "View", "motion_view", "samples_view"]
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Distinct regressor columns that some set of parameters needs, sorted by body.
+    """Distinct regressor columns needed by a set of parameters, sorted by body.
 
-    parameter (c,): 0 to 9 within the body; first (n + 1,): the columns of body b are first[b] to first[b +
-    1]. A payload shares the frame, and so the columns, of the last body.
+    parameter (c,): 0 to 9 within the body; first (n + 1,): the columns of body b are first[b] to first[b + 1].
+    A payload shares the frame, and so the columns, of the last body.
     """
 
     joints: int
@@ -43,13 +50,13 @@ class Columns:
 
     @classmethod
     def of(cls, joints: int, names: Iterable[str]) -> Columns:
-        """Columns that the named parameters need; names of links 1 .. n and of the payload n + 1."""
+        """Columns of the named parameters; links are 1 .. n, the payload is n + 1."""
         wanted = set()
         for name in names:
             kind, link = split_name(name)
             if link > joints + 1 or (link == joints + 1 and kind not in BODY):
                 raise ConfigurationError(
-                    f"parameter {name}: an arm of {joints} joints and its payload have no such one"
+                    f"parameter {name} does not exist in an arm of {joints} joints and a payload"
                 )
             if kind in BODY:
                 wanted.add((min(link, joints) - 1, BODY.index(kind)))
@@ -60,7 +67,7 @@ class Columns:
 
     @property
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """First column of each body and parameter of each column, as the sweeps take them."""
+        """First column of each body and parameter of each column, in the form of the sweeps."""
         return self.first, self.parameter
 
     @property
@@ -71,7 +78,7 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Which rows are stacked, and their weights.
+    """Rows of the stacked observation matrix, and their weights.
 
     model : 1 joint rows, 2 motor and joint rows, 3 their difference
     sessions : for each session of the planned motion, whether the payload is mounted
@@ -117,7 +124,7 @@ class Assembly:
                         place.append(columns.place[min(link, joints) - 1, BODY.index(kind)])
                 elif link == joint + 1:
                     active.append(index)
-                    place.append(rigid + _DRIVE_SIGNAL[kind])
+                    place.append(rigid + DRIVE_SIGNAL[kind])
             table = np.zeros((len(active), len(active)))
             for loaded in rows.sessions:
                 for side, value in self._sides(joint):
@@ -149,7 +156,7 @@ class Assembly:
     def _seen(kind: str, link: int, joints: int, side: str, loaded: bool) -> bool:
         if kind in BODY:
             return side != "difference" and (link <= joints or loaded)
-        if kind in _JOINT_SIDE:
+        if kind in JOINT_SIDE:
             return side != "difference"
         return side != "joint"
 
@@ -188,7 +195,7 @@ def _scatter(bar, parameter, signal, weight, offset, block, gram_bar):  # type: 
 
 @dataclass(eq=False)
 class View:
-    """One motion as the criteria see it, and the adjoints that they fill.
+    """One motion in the form read by the criteria, and the adjoints filled by them.
 
     gram (n, c, c): mean over the samples of z_j z_j^T
     torque (m, n): joint torque under the last load case [Nm]
@@ -210,9 +217,7 @@ class View:
 
 
 class Evaluator:
-    """Scratch memory and grids for one mechanism, basis and set of columns; not to be shared between
-    threads.
-    """
+    """Grids and scratch memory for one mechanism, basis and set of columns; not to be shared between threads."""
 
     def __init__(
         self,
@@ -255,14 +260,14 @@ class Evaluator:
             self._gram[joint, first:, first:] = part.T @ part
         drives = self.estimate.drives
         sign = self.z[:, :, -2].T
-        torque = self.tau[-1] + qd * drives[:, _FVL] + sign * drives[:, _FCL] + drives[:, _OFFL]
+        torque = self.tau[-1] + qd * drives[:, FVL] + sign * drives[:, FCL] + drives[:, OFFL]
         return View(self._gram / self.samples, torque)
 
     def gradient(self, view: View) -> Array:
-        """Derivative with respect to the coefficients (n, free) of whatever filled the view's adjoints."""
+        """Derivative with respect to the coefficients (n, free), from the adjoints of the view."""
         drives, columns = self.estimate.drives, self.columns
         sign = self.z[:, :, -2].T
-        rate = view.torque_bar * (drives[:, _FVL] + (1.0 - sign**2) / self.sign_speed * drives[:, _FCL])
+        rate = view.torque_bar * (drives[:, FVL] + (1.0 - sign**2) / self.sign_speed * drives[:, FCL])
         for joint in range(self.mechanism.joints):
             first = columns.first[joint]
             bar = view.gram_bar[joint, first:, first:]
@@ -274,9 +279,7 @@ class Evaluator:
         return self._pull(self._zbar, taubar, rate, None)
 
     def torque_gradient(self, taubar: Array, rate: Array, acceleration: Array) -> Array:
-        """Derivative of a function of the rigid torques (k, m, n), coarse velocities and accelerations (m,
-        n).
-        """
+        """Derivative of a function of rigid torques (k, m, n), coarse velocities and accelerations (m, n)."""
         return self._pull(np.zeros_like(self._zbar), taubar, rate, acceleration)
 
     def _pull(self, zbar: Array, taubar: Array, rate: Array, acceleration: Array | None) -> Array:
@@ -306,27 +309,31 @@ def motion_view(
 
 def samples_view(samples: Samples, mechanism: Mechanism, estimate: ArmEstimate, columns: Columns) -> View:
     """Samples of any motion, measured ones included; jerks are not used."""
-    evaluator = Evaluator(mechanism, _NoBasis(), estimate, columns, samples=len(samples.q), refine=1)
+    evaluator = Evaluator(
+        mechanism, ConstantBasis(1.0, free=0), estimate, columns, samples=len(samples.q), refine=1
+    )
     return evaluator.view(list(samples[:3]), exact_sign=True)
 
 
-class _NoBasis:
-    """A basis without functions, for evaluating samples that are given."""
+@dataclass(frozen=True)
+class ConstantBasis:
+    """Postures held still: the basis of one constant; without it (free = 0) for samples given directly."""
 
-    duration, free = 1.0, 0
+    duration: float
+    free: int = 1
 
-    def matrix(self, t: np.typing.ArrayLike, derivative: int = 0) -> Array:
-        """No functions."""
-        return np.zeros((np.size(t), 0))
+    def matrix(self, t: npt.ArrayLike, derivative: int = 0) -> Array:
+        """One, and zero for every derivative."""
+        return np.full((np.size(t), self.free), 1.0 if derivative == 0 else 0.0)
 
     def motion(self, x: Array) -> ParametricMotion:
-        """There is none."""
-        raise ConfigurationError("samples are no parametric motion")
+        """ConfigurationError: a posture is not a motion."""
+        raise ConfigurationError("a posture is no motion")
 
     def coefficients(self, motion: ParametricMotion) -> Array:
-        """None."""
-        return np.zeros((motion.joints, 0))
+        """The posture at the start, (joints, free)."""
+        return motion.sample(0.0).q.T[:, : self.free]
 
     def grid_factor(self, n: int, derivative: int) -> float:
-        """Nothing is known between the samples."""
-        return np.inf
+        """One: the extremum of a constant is everywhere."""
+        return 1.0

@@ -71,11 +71,11 @@ class Extrema(NamedTuple):
 
 
 class ParametricMotion(Protocol):
-    """A motion that is known at every instant: Fourier series, B-spline, point to point."""
+    """A motion defined at every instant: Fourier series, B-spline, point to point."""
 
     @property
     def duration(self) -> float:
-        """Length of one run [s]; a periodic motion can be repeated after it."""
+        """Length of one run [s], the period of a periodic motion."""
 
     @property
     def joints(self) -> int:
@@ -109,7 +109,7 @@ class Basis(Protocol):
         """The motion with the free coefficients x (joints, free)."""
 
     def coefficients(self, motion: ParametricMotion) -> Array:
-        """Free coefficients (joints, free) of a motion that this basis can represent."""
+        """Free coefficients (joints, free) of a motion of this form; ConfigurationError for any other motion."""
 
     def grid_factor(self, n: int, derivative: int) -> float:
         """Upper bound of (true maximum) / (maximum on n equidistant samples), centred signals."""
@@ -119,7 +119,7 @@ class Basis(Protocol):
 class FourierSeries:
     """Equation (9) with numbers: bias q0 (joints,), a and b (joints, n_f) [rad], base period T0 [s].
 
-    Nothing here forces rest at the ends; `at_rest` tells, `FourierBasis` builds it in.
+    Rest at the ends is not enforced here but by `FourierBasis`; see `at_rest`.
     """
 
     period_s: float
@@ -129,8 +129,7 @@ class FourierSeries:
 
     def __post_init__(self) -> None:
         bias, a, b = (np.array(part, dtype=np.float64) for part in (self.bias, self.a, self.b))
-        if not (np.isfinite(self.period_s) and self.period_s > 0):
-            raise ConfigurationError(f"base period {self.period_s} s is not a positive number")
+        _require_positive("base period", self.period_s)
         if bias.ndim != 1 or a.shape != b.shape or a.ndim != 2 or a.shape[0] != bias.size or a.shape[1] < 1:
             raise ConfigurationError(
                 f"Fourier coefficients of shapes {bias.shape}, {a.shape}, {b.shape}; "
@@ -141,6 +140,9 @@ class FourierSeries:
                 raise ConfigurationError(f"Fourier coefficients `{name}` contain a number that is not finite")
             part.flags.writeable = False
             object.__setattr__(self, name, part)
+
+    def __repr__(self) -> str:
+        return f"FourierSeries({self.joints} joints, n_f = {self.harmonics}, T0 = {self.period_s:g} s)"
 
     @property
     def duration(self) -> float:
@@ -158,13 +160,8 @@ class FourierSeries:
         return int(self.a.shape[1])
 
     @property
-    def highest_frequency_hz(self) -> float:
-        """n_f / T0, the highest frequency in the positions [Hz]."""
-        return self.harmonics / self.period_s
-
-    @property
     def at_rest(self) -> bool:
-        """True where velocity and acceleration vanish at t = 0 (and so at every multiple of T0)."""
+        """True if velocity and acceleration vanish at t = 0 (and so at every multiple of T0)."""
         k = np.arange(1, self.harmonics + 1)
         scale = 1.0 + np.max(np.abs(self.a)) + np.max(np.abs(self.b))
         residual = max(float(np.max(np.abs(self.a @ k))), float(np.max(np.abs(self.b @ k**2))))
@@ -184,9 +181,8 @@ class FourierSeries:
         """Exact extreme values of a derivative on the whole period.
 
         The stationary points of a trigonometric polynomial of order n are the roots on the unit circle of an
-        algebraic polynomial of degree 2n. The angles of all roots are tried (those off the circle do no
-        harm), with 8 n equidistant points besides, so that a root that arithmetic moved off the circle costs
-        second order only.
+        algebraic polynomial of degree 2n. The angles of all roots are tried, and 8 n equidistant points besides:
+        a root moved off the circle by rounding then costs an error of second order only.
         """
         order, joints = self.harmonics, self.joints
         w0 = 2.0 * np.pi / self.period_s
@@ -208,17 +204,13 @@ class FourierSeries:
         return Extrema(*found)
 
     def grid_bound(self, derivative: int, n: int) -> Array:
-        """Upper bound of |derivative - bias| from n > 2 n_f samples alone (Ehlich and Zeller 1964),
-        (joints,).
-
-        max |p| <= max_grid |p| / cos(pi n_f / n) for a trigonometric polynomial p of order n_f.
-        """
+        """Upper bound of |derivative - bias| from n > 2 n_f samples alone, (joints,); see `_ehlich_zeller`."""
         values = self.derivative(np.arange(n) * (self.period_s / n), derivative)
         centred = values - self.bias if derivative == 0 else values
         return np.max(np.abs(centred), axis=0) * _ehlich_zeller(self.harmonics, n)
 
     def _harmonics(self, joint: int, order: int) -> tuple[Array, Array]:
-        """Sine and cosine coefficients of a derivative of one joint, (n_f,) each."""
+        """Sine and cosine coefficients of the derivative of one joint, (n_f,) each."""
         k = 2.0 * np.pi / self.period_s * np.arange(1, self.harmonics + 1)
         sine, cosine = np.array(self.a[joint]), np.array(self.b[joint])
         for _ in range(order):
@@ -228,7 +220,7 @@ class FourierSeries:
 
 @dataclass(frozen=True)
 class FourierBasis:
-    """Fourier series of order n_f and period T0 whose velocity and acceleration vanish at both ends.
+    """Fourier series of order n_f and period T0 with zero velocity and acceleration at both ends.
 
     Each joint has 2 n_f - 1 free coefficients: bias, n_f - 1 sines, n_f - 1 cosines.
     """
@@ -238,8 +230,7 @@ class FourierBasis:
     _null: tuple[Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.period_s) and self.period_s > 0):
-            raise ConfigurationError(f"base period {self.period_s} s is not a positive number")
+        _require_positive("base period", self.period_s)
         if self.harmonics < 2:
             raise ConfigurationError(
                 f"harmonics {self.harmonics} is below 2; rest at both ends takes one sine and one cosine, "
@@ -284,7 +275,7 @@ class FourierBasis:
         )
 
     def coefficients(self, motion: ParametricMotion) -> Array:
-        """Free coefficients of a series; ConfigurationError if it has another period, order, or no rest."""
+        """Free coefficients of a series; ConfigurationError for another period or order, or without rest."""
         if not isinstance(motion, FourierSeries):
             raise ConfigurationError(f"a {type(motion).__name__} is not a Fourier series")
         if motion.harmonics != self.harmonics or not np.isclose(motion.period_s, self.period_s, rtol=1e-12):
@@ -297,7 +288,7 @@ class FourierBasis:
         return np.hstack([motion.bias[:, None], motion.a @ self._null[0], motion.b @ self._null[1]])
 
     def grid_factor(self, n: int, derivative: int) -> float:
-        """True maximum over grid maximum of |q - bias| or a derivative, at most (Ehlich and Zeller 1964)."""
+        """Upper bound of (true maximum) / (grid maximum) of |q - bias| or a derivative."""
         return _ehlich_zeller(self.harmonics, n)
 
 
@@ -313,7 +304,10 @@ def _trigonometric(period_s: float, order: int, t: npt.ArrayLike, derivative: in
 
 
 def _ehlich_zeller(order: int, n: int) -> float:
-    """1 / cos(pi order / n), the factor from a grid maximum to a true maximum; n > 2 order."""
+    """Factor from a grid maximum to a bound of the true maximum (Ehlich and Zeller 1964).
+
+    max |p| <= max_grid |p| / cos(pi order / n) for a trigonometric polynomial p, n > 2 order.
+    """
     if n <= 2 * order:
         raise ConfigurationError(
             f"{n} samples are too few for {order} harmonics; more than {2 * order} are needed"
@@ -334,10 +328,13 @@ class SplineMotion:
             raise ConfigurationError(
                 f"spline control points of shape {points.shape}; expected (joints, {2 * _REST + 1} or more)"
             )
-        if not (np.isfinite(self.duration_s) and self.duration_s > 0):
-            raise ConfigurationError(f"spline duration {self.duration_s} s is not a positive number")
+        _require_positive("spline duration", self.duration_s)
         points.flags.writeable = False
         object.__setattr__(self, "points", points)
+
+    def __repr__(self) -> str:
+        joints, count = self.points.shape
+        return f"SplineMotion({joints} joints, {count} control points, {self.duration_s:g} s)"
 
     @property
     def duration(self) -> float:
@@ -355,9 +352,7 @@ class SplineMotion:
         )
 
     def sample(self, t: npt.ArrayLike) -> Samples:
-        """Positions, velocities, accelerations and jerks at the times t (n,) [s]; times wrap at the
-        duration.
-        """
+        """Positions, velocities, accelerations and jerks at t (n,) [s]; times wrap at the duration."""
         times = np.atleast_1d(np.asarray(t, dtype=np.float64))
         inside = np.where(times == self.duration_s, times, np.mod(times, self.duration_s))
         spline = self._spline()
@@ -387,8 +382,7 @@ class SplineBasis:
     _expand: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.duration_s) and self.duration_s > 0):
-            raise ConfigurationError(f"spline duration {self.duration_s} s is not a positive number")
+        _require_positive("spline duration", self.duration_s)
         if self.control_points < 2:
             raise ConfigurationError(f"control_points {self.control_points} is below 2; nothing would move")
         inner = self.control_points - 1
@@ -434,8 +428,13 @@ class SplineBasis:
         return np.asarray(np.linalg.lstsq(self._expand, motion.points.T, rcond=None)[0].T)
 
     def grid_factor(self, n: int, derivative: int) -> float:
-        """No bound is known from samples alone, so a small reserve; the exact extrema decide afterwards."""
+        """A small reserve instead of a bound, for lack of one; the exact extrema decide in the final check."""
         return 1.002
+
+
+def _require_positive(subject: str, seconds: float) -> None:
+    if not (np.isfinite(seconds) and seconds > 0):
+        raise ConfigurationError(f"{subject} {seconds} s is not a positive number")
 
 
 def _knots(duration: float, count: int) -> Array:
@@ -467,7 +466,7 @@ class _Profile:
         times = np.array([-blend - 1.0, 0.0, ramp, end - ramp, end, end + blend + 1.0])
         slope = self.cruise / ramp
         coefficients = np.array([[0.0, slope, 0.0, -slope, 0.0], [0.0, 0.0, self.cruise, self.cruise, 0.0]])
-        if end - 2.0 * ramp <= _INSTANT * end:  # a triangle: full speed is reached for an instant only
+        if end - 2.0 * ramp <= _INSTANT * end:  # a triangle: full speed for an instant only
             times, coefficients = np.delete(times, 3), np.delete(coefficients, 2, axis=1)
         return PPoly(coefficients, times)
 
@@ -476,7 +475,7 @@ class _Profile:
 class PointToPoint:
     """Rest-to-rest straight lines in joint space through postures (k, joints), with a dwell at each [s].
 
-    v_max, a_max, j_max (joints,): limits that the profiles keep [rad/s], [rad/s²], [rad/s³]
+    v_max, a_max, j_max (joints,): limits of the profiles [rad/s], [rad/s²], [rad/s³], one of them attained
     """
 
     postures: Array
@@ -509,6 +508,9 @@ class PointToPoint:
         begins = np.cumsum([0.0] + [profile.duration + self.dwell_s for profile in profiles])
         object.__setattr__(self, "_profiles", tuple(profiles))
         object.__setattr__(self, "_begins", begins)
+
+    def __repr__(self) -> str:
+        return f"PointToPoint({self.joints} joints, {len(self.postures)} postures, {self.duration:.1f} s)"
 
     @property
     def duration(self) -> float:

@@ -19,10 +19,10 @@ from threadpoolctl import threadpool_limits
 
 from fri.errors import ConfigurationError, OperatorError, RefusedError
 from ident.excitation.arm_model import ArmEstimate, Mechanism
-from ident.excitation.assembly import Assembled, assemble
-from ident.excitation.check import Check, Limits, PathChecker, Workspace, check_motion
+from ident.excitation.assembly import Assembled, arm_limits, assemble, sampling
+from ident.excitation.check import Check, Workspace, check_motion
 from ident.excitation.clearance import space_of
-from ident.excitation.information import Columns
+from ident.excitation.information import Columns, ConstantBasis
 from ident.excitation.motions import Array, FourierBasis, ParametricMotion
 from ident.excitation.plan import ExcitationPlan
 from ident.excitation.problem import PlanProblem
@@ -40,10 +40,10 @@ from ident.excitation.search import (
 )
 from ident.excitation.sqp import minimise
 from lwr_driver.arm import Arm
+from lwr_driver.collision import CollisionChecker
 
 __all__ = [
     "Progress",
-    "arm_limits",
     "explain",
     "feasible_fourier",
     "plan",
@@ -62,9 +62,7 @@ _NEAR = 5e-3
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the search stands: stage, tasks done and planned, best value in reported units, seconds since
-    start.
-    """
+    """State of the search: stage, tasks done and planned, best value in reported units, seconds since the start."""
 
     stage: str
     done: int
@@ -75,13 +73,13 @@ class Progress:
 
 
 def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = None) -> ExcitationPlan:
-    """Search for the best motion that keeps every limit, and return it with margins, values and provenance.
+    """Search for the best motion within every limit, and return it with margins, values and provenance.
 
-    Interrupted by Ctrl-C, the search ends and the best motion found so far is polished, checked and returned.
+    Ctrl-C ends the search; the best motion found so far is polished, checked and returned. A motion outside a limit is
+    never returned.
 
-    Raises ConfigurationError for a problem that contradicts itself, RefusedError for one without a feasible
-    motion (naming the limit and by how much), OperatorError if interrupted before anything feasible was
-    found. A motion that violates anything is never returned.
+    Raises ConfigurationError for a contradictory problem, RefusedError for a problem without a feasible motion (with
+    limit and excess), OperatorError for an interruption before the first motion.
     """
     problem, interrupted = _with_goal(problem, progress)
     assembled = assemble(problem)
@@ -97,9 +95,9 @@ def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = Non
 
 
 def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None) -> tuple[PlanProblem, bool]:
-    """The problem with a goal for the condition number: given, or what a search for it alone reaches (Remark 4).
+    """The problem with a goal for the condition number, and whether its search was interrupted.
 
-    Also tells whether that search was interrupted.
+    The goal is given or comes from a search for the condition number alone (Remark 4).
     """
     wanted = problem.objective
     if wanted.criterion != "goal_attainment" or wanted.goal_condition is not None:
@@ -117,7 +115,7 @@ def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None
 
 
 class _Tracker:
-    """Counts tasks, keeps the best value, tells the listener, and knows whether time is up."""
+    """Counts tasks, keeps the best value, reports to the listener, and checks the time limit."""
 
     def __init__(self, assembled: Assembled, listener: Callable[[Progress], None] | None) -> None:
         self.assembled, self.listener = assembled, listener
@@ -130,7 +128,7 @@ class _Tracker:
     def stage(self, name: str, total: int) -> None:
         """Begin a stage of `total` tasks."""
         self.name, self.done, self.total = name, 0, total
-        self._tell()
+        self._report()
 
     def advance(self, candidate: Candidate | None) -> None:
         """One task is done."""
@@ -139,7 +137,7 @@ class _Tracker:
             self.evaluations += candidate.evaluations
             if self.best is None or candidate.better_than(self.best):
                 self.best = candidate
-        self._tell()
+        self._report()
 
     @property
     def out_of_time(self) -> bool:
@@ -147,7 +145,7 @@ class _Tracker:
         limit = self.assembled.problem.search.time_limit_s
         return self.interrupted or (limit is not None and time.monotonic() - self.begun > limit)
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         if self.listener is None:
             return
         best = self.best
@@ -159,9 +157,7 @@ class _Tracker:
 
 
 def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate]:
-    """Starts, then hops with successive halving of the lanes; best first. Ends early on Ctrl-C or out of
-    time.
-    """
+    """Starts, then hops with successive halving of the lanes; best first. Ends early on Ctrl-C or out of time."""
     search, setup = assembled.problem.search, assembled.setup
     found: list[Candidate] = []
     try:
@@ -200,7 +196,7 @@ def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate
 def _run(
     tasks: Sequence[Any], jobs: int, tracker: _Tracker, sizes: Sequence[int] | None = None
 ) -> list[Candidate]:
-    """Results in order, reported one by one; stops handing out tasks when time is up."""
+    """Results in order, reported one by one."""
     results: list[Candidate] = []
     for index, candidate in enumerate(Parallel(n_jobs=jobs, return_as="generator")(tasks)):
         results.append(candidate)
@@ -274,11 +270,10 @@ def _plain(value: Any) -> Any:
 
 
 def refuse_impossible(assembled: Assembled) -> None:
-    """Raise at once for problems that no motion can solve.
+    """Raise at once for problems without a solution.
 
-    Checked: the highest frequency against the arm's lowest resonance (n_f w0 < w_r), workspace bounds against
-    the arm's reach, and whether any posture at all can be held within every limit (a motion of small size
-    around a posture that can is always feasible).
+    Checked: the highest frequency against the arm's lowest resonance (n_f w0 < w_r), workspace bounds against the arm's
+    reach, and the existence of a posture within every limit (small motions around it are always feasible).
     """
     _refuse_resonance(assembled)
     _refuse_reach(assembled)
@@ -306,53 +301,17 @@ def _refuse_reach(assembled: Assembled) -> None:
             )
 
 
-class _Still:
-    """Postures held still: the basis of one constant."""
-
-    free = 1
-
-    def __init__(self, duration: float) -> None:
-        self.duration = duration
-
-    def matrix(self, t: np.typing.ArrayLike, derivative: int = 0) -> Array:
-        """One, and zero for every derivative."""
-        return np.full((np.size(t), 1), 1.0 if derivative == 0 else 0.0)
-
-    def motion(self, x: Array) -> ParametricMotion:
-        """Not asked for."""
-        raise ConfigurationError("a posture is no motion")
-
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """The posture at the start."""
-        return motion.sample(0.0).q.T
-
-    def grid_factor(self, n: int, derivative: int) -> float:
-        """A constant has its extremum everywhere."""
-        return 1.0
-
-
 def _refuse_static(assembled: Assembled) -> None:
     setup = assembled.setup
-    still = Setup(
-        mechanism=setup.mechanism,
-        basis=_Still(setup.basis.duration),
-        limits=setup.limits,
-        space=setup.space,
-        floor=setup.floor,
-        estimate=setup.estimate,
-        columns=setup.columns,
-        target=None,
-        coverage=setup.coverage,
-        samples=1,
-        refine=1,
-    )
+    basis = ConstantBasis(setup.basis.duration)
+    still = replace(setup, basis=basis, target=None, bounds=(), samples=1, refine=1)
     rng = np.random.default_rng(0)
     middle = 0.5 * (setup.limits.q_low + setup.limits.q_high)
     half = 0.5 * (setup.limits.q_high - setup.limits.q_low)
     best, blame = np.inf, ""
     for _ in range(_STATIC_STARTS):
         posture = middle + half * rng.uniform(-0.7, 0.7, size=middle.size)
-        program = still.program(target=None)
+        program = still.program(feasibility=True)
         program.anchor = posture
         program.constraints.refresh_deviation(program.signals(posture))
         found = restore(still, posture, iterations=60)
@@ -383,19 +342,17 @@ def _blame(assembled: Assembled, rows: Sequence[Row], values: Array) -> str:
 
 
 def explain(assembled: Assembled, outcomes: Sequence[Outcome]) -> str:
-    """Why no candidate passed: the violations of the one that came nearest."""
+    """Reasons for the failure of every candidate: the violations of the nearest one."""
     if not outcomes:
         return "no motion was found; raise `search.starts`"
-
     nearest = min(outcomes, key=shortfall)
     reasons = [str(margin) for margin in nearest.check.violations[:3]]
     if not nearest.bounds_kept:
         view = assembled.view(nearest.motion)
         for bound in assembled.setup.bounds:
-            value = bound.criterion.evaluate(view, np.inf)[0]
-            if value > bound.limit:
+            if bound.criterion.evaluate(view, np.inf)[0] > bound.limit:
                 reasons.append(
-                    f"{bound.criterion.name} {bound.criterion.report(value):.4g} exceeds the bound "
+                    f"{bound.criterion.name} {bound.criterion.exact(view):.4g} exceeds the bound "
                     f"{bound.criterion.report(bound.limit):.4g}"
                 )
     return (
@@ -405,14 +362,9 @@ def explain(assembled: Assembled, outcomes: Sequence[Outcome]) -> str:
     )
 
 
-def arm_limits(arm: Arm, speed_scale: float = 1.0) -> Limits:
-    """The limits of an arm, less its position margin, with speeds scaled in time."""
-    return Limits(arm.q_low, arm.q_high, arm.v_max, arm.a_max, arm.j_max, arm.tau_max).scaled(speed_scale)
-
-
 def feasible_fourier(
     arm: Arm,
-    checker: PathChecker | None,
+    checker: CollisionChecker | None,
     *,
     period_s: float = 20.0,
     harmonics: int = 5,
@@ -423,28 +375,25 @@ def feasible_fourier(
     estimate: ArmEstimate | None = None,
     clearance_m: float = 0.02,
 ) -> ExcitationPlan:
-    """Random Fourier motion of moderate size, moved as little as the limits ask for, that passes every check.
+    """Random Fourier motion of moderate size, shifted as little as possible to pass every check.
 
-    `estimate` defaults to the URDF's inertias without friction. Raises RefusedError where none of a dozen
-    random starts leads to a motion that passes, naming the limit that stands in the way most often.
+    `estimate` defaults to the URDF's inertias without friction. Raises RefusedError after a dozen random starts
+    without a passing motion, naming the most frequent obstacle.
     """
     mechanism = Mechanism.from_urdf(arm.urdf)
     space, _ = space_of(mechanism, getattr(checker, "geometry", None))
     work = workspace if workspace is not None else Workspace()
-    floor = np.full(space.rows, clearance_m + _RESERVE)
-    floor[0] = -np.inf if work.radius_m is None else work.radius_m + _RESERVE
-    floor[1] = -np.inf if work.height_m is None else work.height_m + _RESERVE
+    basis = FourierBasis(period_s, harmonics)
     setup = Setup(
         mechanism=mechanism,
-        basis=FourierBasis(period_s, harmonics),
+        basis=basis,
         limits=arm_limits(arm, speed_scale),
         space=space,
-        floor=floor,
+        floor=space.floor(clearance_m + _RESERVE, (work.radius_m, work.height_m), _RESERVE),
         estimate=estimate if estimate is not None else ArmEstimate.nominal(mechanism),
         columns=Columns.of(mechanism.joints, ()),
         target=None,
-        samples=max(64, 10 * harmonics),
-        refine=max(3, int(np.ceil(period_s / 0.0625 / max(64, 10 * harmonics)))),
+        **sampling(basis),
     )
     blocked: dict[str, int] = {}
     for start in range(_STARTS):
@@ -469,9 +418,9 @@ def feasible_fourier(
 
 
 def _from_start(
-    setup: Setup, seed: int, start: int, work: Workspace, checker: PathChecker | None, clearance_m: float
+    setup: Setup, seed: int, start: int, work: Workspace, checker: CollisionChecker | None, clearance_m: float
 ) -> tuple[ParametricMotion | None, Check]:
-    """The motion nearest to one random start, tightened until it passes; None if it does not."""
+    """The motion nearest to one random start, tightened until it passes; None without success."""
     with threadpool_limits(1):
         program = setup.program()
         program.constraints.rate = 200.0

@@ -24,7 +24,18 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from ident.excitation.arm_model import ArmEstimate, Mechanism, torque_deviation
+from ident.excitation.arm_model import (
+    FCL,
+    FCM,
+    FVL,
+    FVM,
+    IA,
+    OFFL,
+    OFFM,
+    ArmEstimate,
+    Mechanism,
+    torque_deviation,
+)
 from ident.excitation.check import Limits
 from ident.excitation.clearance import Space, distances, row_gradient
 from ident.excitation.criteria import Criterion, GoalAttainment, Pullback
@@ -33,7 +44,6 @@ from ident.excitation.motions import Array, Basis, Samples
 
 __all__ = ["Bound", "Constraints", "Program", "Row", "Setup"]
 
-_IA, _FVL, _FCL, _OFFL, _FVM, _FCM, _OFFM = range(7)
 _NAMES = ("position", "velocity", "acceleration", "jerk")
 _FAR = 0.6
 _FAR_TORQUE = 0.2
@@ -44,9 +54,7 @@ _RATIO_SLOPE = 0.03  # typical change of a wrist torque's log ratio per radian o
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """A criterion that must stay at or below a limit, in its own (logarithmic) scale, while another is
-    minimised.
-    """
+    """Upper limit of a criterion, in its own (logarithmic) scale, while another one is minimised."""
 
     criterion: Criterion
     limit: float
@@ -54,7 +62,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class Row:
-    """Which limit a row of c stands for: constraint and joint index, or index of the distance."""
+    """Limit behind a row of c: constraint and joint index, or index of the distance."""
 
     constraint: str
     index: int
@@ -102,14 +110,9 @@ class Constraints:
         self._kinematic_weight = np.zeros((4, self.evaluator.fine, n))
         for order in range(4):
             middle = self._middle if order == 0 else np.zeros(n)
-            _ks_two_sided(
-                signals[order],
-                middle,
-                self.half[order],
-                rate,
-                self._kinematic_value[order],
-                self._kinematic_weight[order],
-            )
+            share = (signals[order] - middle) / self.half[order]
+            _ks(np.abs(share), rate, self._kinematic_value[order], self._kinematic_weight[order])
+            self._kinematic_weight[order][share <= 0.0] *= -1.0
         torque = self._torque_rows()
         self._q = np.ascontiguousarray(signals[0])
         mechanism = self.evaluator.mechanism
@@ -130,12 +133,11 @@ class Constraints:
         evaluator = self.evaluator
         drives, tau = evaluator.estimate.drives, evaluator.tau
         qd, qdd = evaluator.z[:, :, -3].T, evaluator.z[:, :, -4].T
-        joint = tau + qd * drives[:, _FVL] + drives[:, _OFFL]
-        motor = joint + qdd * drives[:, _IA] + qd * drives[:, _FVM] + drives[:, _OFFM]
+        joint = tau + qd * drives[:, FVL] + drives[:, OFFL]
+        motor = joint + qdd * drives[:, IA] + qd * drives[:, FVM] + drives[:, OFFM]
         both = np.stack([joint, motor])
         coulomb = (
-            np.abs(drives[:, _FCL])
-            + np.stack([np.zeros(len(drives)), np.abs(drives[:, _FCM])])[:, None, None]
+            np.abs(drives[:, FCL]) + np.stack([np.zeros(len(drives)), np.abs(drives[:, FCM])])[:, None, None]
         )
         share = (np.abs(both) + coulomb + self.deviation) / self.torque_limit
         n = evaluator.mechanism.joints
@@ -146,9 +148,7 @@ class Constraints:
         return value
 
     def jacobian(self, view: View) -> Array:
-        """dc/dx of the latest values, (rows, n * free); rows far from their limit are zero. Clears the
-        view's adjoints.
-        """
+        """dc/dx of the latest values, (rows, n * free); zero for rows far from their limit. Clears the adjoints."""
         evaluator = self.evaluator
         n, free = evaluator.mechanism.joints, evaluator.basis.free
         out = np.zeros((len(self.rows), n, free))
@@ -180,13 +180,11 @@ class Constraints:
         weight = np.zeros_like(self._torque_weight)
         weight[..., joint] = self._torque_weight[..., joint]
         sides = weight.sum(axis=1)
-        rate = sides.sum(axis=0) * drives[:, _FVL] + sides[1] * drives[:, _FVM]
-        return evaluator.torque_gradient(weight.sum(axis=0), rate, sides[1] * drives[:, _IA])
+        rate = sides.sum(axis=0) * drives[:, FVL] + sides[1] * drives[:, FVM]
+        return evaluator.torque_gradient(weight.sum(axis=0), rate, sides[1] * drives[:, IA])
 
     def refresh_deviation(self, signals: Sequence[Array]) -> None:
-        """Recompute the torque uncertainty along the motion; it is held fixed within an inner
-        optimisation.
-        """
+        """Recompute the torque uncertainty along the motion, fixed within an inner optimisation."""
         evaluator = self.evaluator
         if evaluator.estimate.covariance is None or self.coverage <= 0.0:
             return
@@ -199,7 +197,7 @@ class Constraints:
 
 @njit(cache=True, error_model="numpy")
 def _ks(u, rate, value, weight):  # type: ignore[no-untyped-def]
-    """KS over the samples of each column of u (m, k), and its weights."""
+    """Fill value (k,) with KS over the samples of each column of u (m, k), weight (m, k) with its weights."""
     m, k = u.shape
     for j in range(k):
         peak = -np.inf
@@ -216,32 +214,10 @@ def _ks(u, rate, value, weight):  # type: ignore[no-untyped-def]
             weight[i, j] /= total
 
 
-@njit(cache=True, error_model="numpy")
-def _ks_two_sided(signal, middle, half, rate, value, weight):  # type: ignore[no-untyped-def]
-    """KS of |signal - middle| / half over the samples, both signs; weights carry the sign."""
-    m, n = signal.shape
-    for j in range(n):
-        peak = 0.0
-        for i in range(m):
-            peak = max(peak, abs(signal[i, j] - middle[j]))
-        peak /= half[j]
-        total = 0.0
-        for i in range(m):
-            u = (signal[i, j] - middle[j]) / half[j]
-            power = rate * (abs(u) - peak)
-            if power > -25.0:
-                grown = np.exp(power)
-                weight[i, j] = grown if u > 0.0 else -grown
-                total += grown
-        value[j] = peak + np.log(total) / rate
-        for i in range(m):
-            weight[i, j] /= total
-
-
 class Program:
-    """Objective and constraints of one evaluator. `sharpness` and `constraints.rate` set how smooth both are.
+    """Objective and constraints of one evaluator; `sharpness` and `constraints.rate` set their smoothness.
 
-    Without a target the objective is a weak pull to the start, for finding a feasible motion near it.
+    Without a target the objective is the squared distance to `anchor`, for a feasible motion near it.
     """
 
     def __init__(self, evaluator: Evaluator, constraints: Constraints, target: Criterion | None) -> None:
@@ -261,7 +237,7 @@ class Program:
         return np.append(x, np.max(self._goals.log_ratios(view, np.inf)[0]))
 
     def curvature(self) -> Array | None:
-        """A first guess of the Hessian for the solver; None where the gradient tells its size."""
+        """A first guess of the Hessian for the solver; None to take its size from the gradient."""
         if self._goals is None:
             return None
         count = self.evaluator.mechanism.joints * self.evaluator.basis.free + 1
@@ -309,7 +285,7 @@ class Program:
         return self.evaluator.signals(x.reshape(self.evaluator.mechanism.joints, -1))
 
     def calibrate(self, x: Array, reserve: float = 0.0) -> None:
-        """Shift bounds and goals by what smoothing adds to their criteria at x, less a reserve (bounds only).
+        """Shift bounds and goals by the smoothing error of their criteria at x, less a reserve (bounds only).
 
         The smooth condition number lies a few percent above the exact one; a bound on it would cost as much.
         """
@@ -338,7 +314,7 @@ class Program:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that defines the optimisation problem; can be sent to another process."""
+    """The complete optimisation problem; can be sent to another process."""
 
     mechanism: Mechanism
     basis: Basis
@@ -353,14 +329,14 @@ class Setup:
     samples: int = 64
     refine: int = 5
 
-    def program(self, target: Criterion | str | None = "own") -> Program:
-        """A fresh optimisation program; `target=None` asks for feasibility only."""
+    def program(self, *, feasibility: bool = False) -> Program:
+        """A fresh optimisation program; with `feasibility` without target and bounds."""
         evaluator = Evaluator(
             self.mechanism, self.basis, self.estimate, self.columns, samples=self.samples, refine=self.refine
         )
-        wanted = self.target if isinstance(target, str) else target
-        bounds = self.bounds if wanted is not None else ()
+        target = None if feasibility else self.target
+        bounds = () if target is None else self.bounds
         constraints = Constraints(
             evaluator, self.limits, self.space, self.floor, bounds, coverage=self.coverage
         )
-        return Program(evaluator, constraints, wanted)
+        return Program(evaluator, constraints, target)

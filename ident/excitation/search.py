@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ident.excitation.assembly import Assembled
-from ident.excitation.check import Check, Margin
+from ident.excitation.check import Check
 from ident.excitation.motions import Array, ParametricMotion
 from ident.excitation.program import Constraints, Program, Setup
 from ident.excitation.sqp import minimise
@@ -41,9 +41,7 @@ _BOUND_RESERVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A motion on its way: coefficients, exact target value, worst scaled violation on the optimiser's
-    grids.
-    """
+    """A motion in the search: coefficients, exact target value, worst scaled violation on the optimiser's grids."""
 
     x: Array
     value: float
@@ -52,7 +50,7 @@ class Candidate:
 
     @property
     def feasible(self) -> bool:
-        """True if nothing is violated beyond what the final polish removes."""
+        """True if every violation is small enough for the final polish."""
         return self.violation <= _FEASIBLE and np.isfinite(self.value)
 
     def better_than(self, other: Candidate) -> bool:
@@ -77,7 +75,7 @@ def random_start(setup: Setup, rng: np.random.Generator) -> Array:
         scale = np.minimum(scale, bound / np.maximum(np.abs(signal).max(axis=0), 1e-12))
     x *= _AMPLITUDE * scale[:, None]
     posture = middle + half * rng.uniform(-0.5, 0.5, size=joints)
-    # the constant motion is in every basis; its coefficients shift the series to the wanted mean
+    # the constant motion is in every basis; its coefficients shift the series to the posture
     constant = np.linalg.lstsq(basis.matrix(times), np.ones(times.size), rcond=None)[0]
     mean = (basis.matrix(times) @ x.T).mean(axis=0)
     return (x + np.outer(posture - mean, constant)).ravel()
@@ -113,8 +111,8 @@ def hop(setup: Setup, start: Candidate, seed: Sequence[int], hops: int) -> Candi
 
 
 def restore(setup: Setup, x: Array, iterations: int = 80) -> Candidate:
-    """The nearest motion that keeps every limit, whatever its value."""
-    program = setup.program(target=None)
+    """The nearest motion within every limit, at any value of the target."""
+    program = setup.program(feasibility=True)
     program.anchor = x.copy()
     program.constraints.rate = 200.0
     solution = minimise(program, x, iterations=iterations, tolerance=1e-6)
@@ -122,7 +120,7 @@ def restore(setup: Setup, x: Array, iterations: int = 80) -> Candidate:
 
 
 def judge(setup: Setup, x: Array) -> Candidate:
-    """The motion with coefficients x as the target and the bounds of a set-up see it; nothing is optimised."""
+    """Target value and violation of the coefficients x under a set-up, without optimisation."""
     program = setup.program()
     program.sharpness, program.constraints.rate = 64.0, 300.0
     program.constraints.refresh_deviation(program.signals(x))
@@ -132,9 +130,7 @@ def judge(setup: Setup, x: Array) -> Candidate:
 
 
 def _restored(setup: Setup, program: Program, found: Candidate) -> Candidate:
-    """Second try for a start that ended infeasible: go to the nearest feasible motion and optimise from
-    there.
-    """
+    """Second try for an infeasible result: optimise from the nearest feasible motion."""
     near = restore(setup, found.x)
     again = _solve(program, near.x, _SHORT)
     return again if again.better_than(found) else found
@@ -158,7 +154,7 @@ def _violation(constraints: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A polished motion with its check; `bounds_kept` tells whether the bounds on other criteria hold."""
+    """A polished motion with its check; `bounds_kept`: the bounds on other criteria hold."""
 
     motion: ParametricMotion
     check: Check
@@ -168,9 +164,7 @@ class Outcome:
 
 
 def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -> Outcome:
-    """Optimise with sharp criteria and tight aggregation, then check and tighten until every limit is
-    proven.
-    """
+    """Optimise with sharp criteria and tight aggregation, then check and tighten until every limit is proven."""
     setup = assembled.setup
     with threadpool_limits(1):
         program = setup.program()
@@ -204,7 +198,7 @@ def polish(assembled: Assembled, candidate: Candidate, *, quick: bool = False) -
 
 
 def _nearest(assembled: Assembled, program: Program, best: Outcome, x: np.ndarray) -> Outcome:
-    """The motion nearest to x that keeps every limit, whatever it costs in value; `best` where none is found."""
+    """The motion nearest to x within every limit, at any cost in value; `best` if there is none."""
     near = Program(program.evaluator, program.constraints, None)
     near.sharpness, near.anchor = program.sharpness, x.copy()
     for _ in range(_ROUNDS):
@@ -220,8 +214,7 @@ def _nearest(assembled: Assembled, program: Program, best: Outcome, x: np.ndarra
 
 def shortfall(outcome: Outcome) -> float:
     """Worst violation of a limit or bound, as a share of it."""
-    shares = [-margin.slack / max(abs(margin.limit), 1e-9) for margin in outcome.check.violations]
-    return max([outcome.bound_excess, 0.0, *shares])
+    return max([outcome.bound_excess, 0.0, *(-margin.share for margin in outcome.check.violations)])
 
 
 def _outcome(assembled: Assembled, program: Program, x: np.ndarray) -> Outcome:
@@ -245,11 +238,7 @@ def tighten(constraints: Constraints, check: Check, joint_names: tuple[str, ...]
             share = short / constraints.limits.tau_max[joint]
             constraints.torque_limit[joint] *= 1.0 - _SHARE_STEP - 1.2 * share
         else:
-            _raise_floor(constraints, margin, short)
-
-
-def _raise_floor(constraints: Constraints, margin: Margin, short: float) -> None:
-    rows = {"distance from axis 1": [0], "height": [1]}.get(margin.constraint)
-    if rows is None:
-        rows = list(range(2, constraints.space.rows))
-    constraints.floor[rows] += _SPACE_STEP + 1.2 * short
+            rows = {"distance from axis 1": [0], "height": [1]}.get(margin.constraint)
+            if rows is None:
+                rows = list(range(2, constraints.space.rows))
+            constraints.floor[rows] += _SPACE_STEP + 1.2 * short

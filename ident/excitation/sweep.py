@@ -10,8 +10,8 @@ joint j per parameter of body b is
     inertia:      sym(a wd^T) + sym(e w^T),   e = a x w
 
 so the regressor is polynomial in the propagated vectors and the reverse sweep is the same recursion run
-backwards. Rotations are differentiated through d(R^T u)/dq = -z x (R^T u). Nothing is stored between the
-sweeps but the samples themselves.
+backwards. Rotations are differentiated through d(R^T u)/dq = -z x (R^T u). Between the sweeps only the samples
+are stored.
 """
 
 from __future__ import annotations
