@@ -32,15 +32,6 @@ from lwr_driver.configuration import read_mapping
 
 __all__ = [
     "BODY",
-    "DRIVE_SIGNAL",
-    "FCL",
-    "FCM",
-    "FVL",
-    "FVM",
-    "IA",
-    "JOINT_SIDE",
-    "OFFL",
-    "OFFM",
     "ArmEstimate",
     "Mechanism",
     "Noise",
@@ -254,15 +245,13 @@ class ArmEstimate:
     def value(self, name: str) -> float:
         """Standard parameter by name; link n + 1 is the payload."""
         kind, link = split_name(name)
-        if kind in DRIVE and 1 <= link <= self.joints:
-            return float(self.drives[link - 1, DRIVE.index(kind)])
-        if kind in BODY and 1 <= link <= self.joints:
-            return float(self.bodies[link - 1, BODY.index(kind)])
-        if kind in BODY and link == self.joints + 1 and self.payload is not None:
-            return float(self.payload[BODY.index(kind)])
-        raise ConfigurationError(
-            f"parameter {name} does not exist in an arm of {self.joints} joints with this payload"
-        )
+        bodies = self.bodies if self.payload is None else np.vstack([self.bodies, self.payload])
+        table, kinds = (self.drives, DRIVE) if kind in DRIVE else (bodies, BODY)
+        if link > len(table):
+            raise ConfigurationError(
+                f"parameter {name} does not exist in an arm of {self.joints} joints with this payload"
+            )
+        return float(table[link - 1, kinds.index(kind)])
 
     def with_relative_uncertainty(self, fraction: float) -> ArmEstimate:
         """The same values with independent standard deviations, each a fraction of its parameter."""
@@ -396,7 +385,7 @@ def torque_deviation(
     n, joints = q.shape
     sigma = np.zeros((2, n, joints))
     if estimate.covariance is None:
-        return TorqueBounds(sigma[0], sigma[1])
+        return TorqueBounds(*sigma)
     columns = np.tile(np.arange(10), joints).astype(np.int64)
     first = np.arange(0, 10 * joints + 1, 10).astype(np.int64)
     z = np.zeros((joints, n, 10 * joints + 4))

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.base import BaseSet, closed_form_base
+from ident.base import closed_form_base
 from ident.excitation.arm_model import BODY, ArmEstimate, Mechanism, Noise, split_name
 from ident.excitation.check import Check, Limits, check_motion
 from ident.excitation.clearance import space_of
@@ -27,7 +28,7 @@ from ident.excitation.criteria import (
 from ident.excitation.information import Assembly, Columns, Rows, View, motion_view, samples_view
 from ident.excitation.motions import Array, Basis, FourierBasis, ParametricMotion, Samples, SplineBasis
 from ident.excitation.plan import ExcitationPlan
-from ident.excitation.problem import PlanProblem, Prior
+from ident.excitation.problem import Objective, PlanProblem, Prior
 from ident.excitation.program import Bound, Setup
 from ident.model_file import read_model
 from ident.signals.prepare import prepare
@@ -43,11 +44,10 @@ __all__ = [
     "Criteria",
     "arm_limits",
     "assemble",
-    "goal_attainment",
     "prior_information",
     "reported_criteria",
     "sampling",
-    "wanted_target",
+    "target_and_bounds",
 ]
 
 _FLANGE_RESERVE = 2e-3
@@ -141,7 +141,7 @@ def assemble(problem: PlanProblem) -> Assembled:
         names, values = tuple(names[k] for k in kept), values[kept]
     columns = Columns.of(mechanism.joints, names)
     criteria = reported_criteria(problem, mechanism, estimate, columns, names, values, sessions)
-    target, bounds = wanted_target(problem, criteria, limits, mechanism)
+    target, bounds = target_and_bounds(problem, criteria, limits, mechanism)
     space, row_names = space_of(mechanism, checker.geometry)
     work = problem.workspace
     floor = space.floor(clearance + _CLEARANCE_RESERVE, (work.radius_m, work.height_m), _FLANGE_RESERVE)
@@ -167,7 +167,7 @@ def assemble(problem: PlanProblem) -> Assembled:
     return Assembled(problem, setup, criteria, arm.name, arm.resonance_hz, checker, clearance, row_names)
 
 
-def sampling(basis: Basis) -> dict[str, int]:
+def sampling(basis: Basis) -> dict[str, Any]:
     """Samples for the Gram matrices (a few per shortest period) and refinement for everything kinematic."""
     functions = getattr(basis, "harmonics", None)
     samples = 64 if functions is None else max(64, 10 * int(functions))
@@ -205,22 +205,16 @@ def _estimate(
     return replace(estimate, noise=replace(noise, samples=knowledge.samples)), names
 
 
-def _base(problem: PlanProblem, mechanism: Mechanism) -> BaseSet:
-    loaded = "loaded" in problem.sessions
-    structure = ModelStructure(mechanism.chain, problem.model, payloads=(_PAYLOAD_NAME,) if loaded else ())
-    conditions = tuple(
-        dict.fromkeys(
-            Condition(_PAYLOAD_NAME if session == "loaded" else None) for session in problem.sessions
-        )
-    )
-    return closed_form_base(structure, conditions)
-
-
 def _parameters(
     problem: PlanProblem, mechanism: Mechanism, estimate: ArmEstimate, model_names: tuple[str, ...]
 ) -> tuple[tuple[str, ...], Array]:
     """Names and (regrouped) values of the parameters in the criteria."""
-    base = _base(problem, mechanism)
+    payloads = (_PAYLOAD_NAME,) if "loaded" in problem.sessions else ()
+    conditions = {
+        session: Condition(_PAYLOAD_NAME if session == "loaded" else None) for session in problem.sessions
+    }
+    structure = ModelStructure(mechanism.chain, problem.model, payloads=payloads)
+    base = closed_form_base(structure, tuple(conditions.values()))
     standard = np.zeros(base.structure.n_columns)
     for column, name in enumerate(base.structure.names):
         kind, link = split_name(name)
@@ -234,10 +228,10 @@ def _parameters(
             raise ConfigurationError(
                 "parameters `model` needs a model.yaml as `knowledge.file`; use base or a list"
             )
-        wanted = model_names
+        chosen = model_names
     else:
-        wanted = tuple(problem.parameters)
-    index = [base.index(name) for name in wanted]
+        chosen = tuple(problem.parameters)
+    index = [base.index(name) for name in chosen]
     return tuple(base.names[k] for k in index), all_values[index]
 
 
@@ -276,8 +270,7 @@ def reported_criteria(
     label = "base" if problem.parameters == "base" else "essential"
     plain = Assembly(columns, names, Rows.unweighted(mechanism.joints, problem.model, sessions))
     weighted = Assembly(columns, names, Rows(problem.model, sessions, noise.joint**-2.0, noise.motor**-2.0))
-    prior_plain = prior_information(problem, mechanism, estimate, columns, names, None)
-    prior_weighted = prior_information(problem, mechanism, estimate, columns, names, noise)
+    prior_plain, prior_weighted = prior_information(problem, mechanism, estimate, columns, names)
     # a parameter near zero has no meaningful relative deviation, and its noise would dominate the mean
     known = np.where(np.abs(values) > _NEGLIGIBLE, np.abs(values), np.inf)
     usable = np.isfinite(known)
@@ -301,16 +294,19 @@ def reported_criteria(
     )
 
 
-def wanted_target(
+def target_and_bounds(
     problem: PlanProblem, criteria: Criteria, limits: Limits, mechanism: Mechanism
 ) -> tuple[Criterion, tuple[Bound, ...]]:
     """The criterion to minimise and the bounds on others."""
-    wanted = problem.objective
+    objective = problem.objective
     condition: ConditionNumber = criteria.condition
-    if wanted.scaling == "columns":
+    if objective.scaling == "columns":
         condition = criteria.condition_columns
-    elif wanted.scaling == "parameters":
-        condition = replace(condition, scaling="parameters", values=_scale(criteria))
+    elif objective.scaling == "parameters":
+        values = criteria.rsd_mean.values
+        if values.size != len(criteria.names):
+            raise ConfigurationError("scaling by parameters needs a value for each parameter; some are zero")
+        condition = replace(condition, scaling="parameters", values=values)
     single: dict[str, Criterion] = {
         "condition_number": condition,
         "d_optimality": criteria.d_optimality,
@@ -318,22 +314,15 @@ def wanted_target(
         "worst_rsd": criteria.rsd_worst,
     }
     target: Criterion
-    if wanted.criterion == "goal_attainment":
-        if wanted.goal_condition is None:
-            raise ConfigurationError(
-                "objective: `goal_condition` is not known yet; `plan` finds it by a search for the condition number "
-                "alone"
-            )
-        target = goal_attainment(
-            condition, limits, mechanism, wanted.goal_condition, wanted.goal_wrist, wanted.wrist
-        )
+    if objective.criterion == "goal_attainment":
+        target = _goals(condition, limits, mechanism, objective)
     else:
-        target = single[wanted.criterion]
+        target = single[objective.criterion]
     bounds = []
     for criterion, limit in (
-        (condition, wanted.condition_at_most),
-        (criteria.rsd_mean, wanted.mean_rsd_at_most),
-        (criteria.rsd_worst, wanted.worst_rsd_at_most),
+        (condition, objective.condition_at_most),
+        (criteria.rsd_mean, objective.mean_rsd_at_most),
+        (criteria.rsd_worst, objective.worst_rsd_at_most),
     ):
         if limit is not None:
             if limit <= 0.0 or (criterion is condition and limit < 1.0):
@@ -342,30 +331,23 @@ def wanted_target(
     return target, tuple(bounds)
 
 
-def goal_attainment(
-    condition: ConditionNumber,
-    limits: Limits,
-    mechanism: Mechanism,
-    goal: float,
-    share: float,
-    joints: tuple[int, ...],
+def _goals(
+    condition: ConditionNumber, limits: Limits, mechanism: Mechanism, objective: Objective
 ) -> GoalAttainment:
-    """Equation (10): goals `goal` for the condition number and `share` * tau_max for each joint (from 1)."""
+    """Equation (10): goals for the condition number and, as a share of tau_max, for each wrist joint."""
+    if objective.goal_condition is None:
+        raise ConfigurationError(
+            "objective: `goal_condition` is missing; `plan` finds it by a search for the condition number alone"
+        )
     criteria: list[Criterion] = [condition]
-    goals = [goal]
-    for number in joints:
+    goals = [objective.goal_condition]
+    for number in objective.wrist:
         if not 1 <= number <= mechanism.joints:
             raise ConfigurationError(f"objective: wrist joint {number} does not exist")
         peak = float(limits.tau_max[number - 1])
         criteria.append(MeanTorque(number - 1, peak, mechanism.joint_names[number - 1]))
-        goals.append(share * peak)
+        goals.append(objective.goal_wrist * peak)
     return GoalAttainment(tuple(criteria), tuple(goals))
-
-
-def _scale(criteria: Criteria) -> Array:
-    if criteria.rsd_mean.values.size != len(criteria.condition.assembly.names):
-        raise ConfigurationError("scaling by parameters needs a value for each parameter; some are zero")
-    return criteria.rsd_mean.values
 
 
 def prior_information(
@@ -374,27 +356,26 @@ def prior_information(
     estimate: ArmEstimate,
     columns: Columns,
     names: tuple[str, ...],
-    noise: Noise | None,
-) -> Array | None:
-    """Information (p, p) of all priors, None without any.
+) -> tuple[Array, Array] | tuple[None, None]:
+    """Information (p, p) of all priors, unweighted and weighted by the noise; None without any.
 
-    With `noise`: weighted, in independent samples at the rate of the planned sessions. Without: unweighted, in
-    multiples of one planned session, for the condition number.
+    Unweighted in multiples of one planned session, for the condition number; weighted in independent samples at the
+    rate of the planned sessions.
     """
     if not problem.prior:
-        return None
-    n = mechanism.joints
+        return None, None
+    noise = estimate.noise
+    assert noise is not None
     planned = problem.motion.periods * problem.motion.period_s
-    total = np.zeros((len(names), len(names)))
+    plain, weighted = np.zeros((2, len(names), len(names)))
     for entry in problem.prior:
         for loaded, view, duration in _motions(problem, entry, mechanism, estimate, columns):
-            if noise is None:
-                rows, share = Rows.unweighted(n, problem.model, (loaded,)), duration / planned
-            else:
-                rows = Rows(problem.model, (loaded,), noise.joint**-2.0, noise.motor**-2.0)
-                share = noise.samples * duration / planned
-            total += share * Assembly(columns, names, rows).information(view.gram)
-    return total
+            rows = Rows.unweighted(mechanism.joints, problem.model, (loaded,))
+            plain += duration / planned * Assembly(columns, names, rows).information(view.gram)
+            rows = Rows(problem.model, (loaded,), noise.joint**-2.0, noise.motor**-2.0)
+            share = noise.samples * duration / planned
+            weighted += share * Assembly(columns, names, rows).information(view.gram)
+    return plain, weighted
 
 
 def _motions(
@@ -421,8 +402,5 @@ def _recorded(
     q, qd, qdd = (np.ascontiguousarray(np.vstack(part)) for part in parts)
     duration = sum(len(passage.rows) for passage in prepared.passages) * prepared.row_time_s
     loaded = session.metadata.get("payload", "none").strip() not in ("", "none")
-    return (
-        loaded,
-        samples_view(Samples(q, qd, qdd, np.zeros_like(q)), mechanism, estimate, columns),
-        float(duration),
-    )
+    view = samples_view(Samples(q, qd, qdd, np.zeros_like(q)), mechanism, estimate, columns)
+    return loaded, view, float(duration)

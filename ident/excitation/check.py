@@ -18,7 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.excitation.arm_model import ArmEstimate, Mechanism, split_name, tip_path, torque_bounds
+from ident.excitation.arm_model import (
+    ArmEstimate,
+    Mechanism,
+    TorqueBounds,
+    split_name,
+    tip_path,
+    torque_bounds,
+)
 from ident.excitation.clearance import space_of
 from ident.excitation.motions import Array, ParametricMotion, Samples
 from lwr_driver.collision import CollisionChecker
@@ -30,6 +37,7 @@ __all__ = [
     "Proof",
     "Workspace",
     "check_motion",
+    "flange_bounds",
     "prove",
     "speed_bound",
     "swept_radius",
@@ -188,7 +196,8 @@ def check_motion(
     times = np.linspace(0.0, motion.duration, count, endpoint=False)
     samples = motion.sample(times)
     if estimate is not None:
-        margins += _torque_margins(samples, times, mechanism, limits, estimate, coverage)
+        bounds = torque_bounds(mechanism, samples, estimate, coverage)
+        margins += _torque_margins(bounds, times, mechanism, limits)
     if workspace is not None:
         margins += _workspace_margins(samples, times, mechanism, workspace)
     if checker is not None:
@@ -227,7 +236,7 @@ def _workspace_proofs(motion: ParametricMotion, mechanism: Mechanism, workspace:
     extents[-1] = np.linalg.norm(mechanism.tip)
     rate = speed_bound(motion, swept_radius(mechanism, extents))
     unproven = set()
-    for constraint, limit, measure in _flange_bounds(workspace):
+    for constraint, limit, measure in flange_bounds(workspace):
 
         def slack(times: Array, measure: _Measure = measure, limit: float = limit) -> Array:
             return measure(tip_path(mechanism, motion.sample(times).q)) - limit
@@ -237,7 +246,7 @@ def _workspace_proofs(motion: ParametricMotion, mechanism: Mechanism, workspace:
     return unproven
 
 
-def _flange_bounds(workspace: Workspace) -> list[tuple[str, float, _Measure]]:
+def flange_bounds(workspace: Workspace) -> list[tuple[str, float, _Measure]]:
     """Constraint, limit [m] and quantity of each bound of the workspace."""
     bounds: list[tuple[str, float | None, _Measure]] = [
         ("distance from axis 1", workspace.radius_m, lambda points: np.hypot(points[:, 0], points[:, 1])),
@@ -261,33 +270,23 @@ def _clearance_proof(
 
 def _kinematic_margins(motion: ParametricMotion, mechanism: Mechanism, limits: Limits) -> list[Margin]:
     margins = []
-    for order, (constraint, unit) in enumerate(KINEMATIC):
+    lows = (limits.q_low, -limits.v_max, -limits.a_max, -limits.j_max)
+    highs = (limits.q_high, limits.v_max, limits.a_max, limits.j_max)
+    for order, ((constraint, unit), low, high) in enumerate(zip(KINEMATIC, lows, highs, strict=True)):
         extrema = motion.extrema(order)
         for joint, name in enumerate(mechanism.joint_names):
-            if order == 0:
-                low, high = float(limits.q_low[joint]), float(limits.q_high[joint])
-            else:
-                bound = (limits.v_max, limits.a_max, limits.j_max)[order - 1]
-                low, high = -float(bound[joint]), float(bound[joint])
-            below, above = float(extrema.low[joint]) - low, high - float(extrema.high[joint])
+            below, above = extrema.low[joint] - low[joint], high[joint] - extrema.high[joint]
             if below < above:
-                found = (float(extrema.low[joint]), low, below, float(extrema.t_low[joint]))
+                found = (extrema.low[joint], low[joint], below, extrema.t_low[joint])
             else:
-                found = (float(extrema.high[joint]), high, above, float(extrema.t_high[joint]))
-            margins.append(Margin(constraint, name, found[0], found[1], found[2], unit, found[3]))
+                found = (extrema.high[joint], high[joint], above, extrema.t_high[joint])
+            value, limit, slack, when = map(float, found)
+            margins.append(Margin(constraint, name, value, limit, slack, unit, when))
     return margins
 
 
-def _torque_margins(
-    samples: Samples,
-    times: Array,
-    mechanism: Mechanism,
-    limits: Limits,
-    estimate: ArmEstimate,
-    coverage: float,
-) -> list[Margin]:
+def _torque_margins(bounds: TorqueBounds, times: Array, mechanism: Mechanism, limits: Limits) -> list[Margin]:
     margins = []
-    bounds = torque_bounds(mechanism, samples, estimate, coverage)
     for constraint, values in (("joint torque", bounds.joint), ("motor torque", bounds.motor)):
         for joint, name in enumerate(mechanism.joint_names):
             row = int(np.argmax(values[:, joint]))
@@ -301,7 +300,7 @@ def _workspace_margins(
 ) -> list[Margin]:
     margins = []
     points = tip_path(mechanism, samples.q)
-    for constraint, limit, measure in _flange_bounds(workspace):
+    for constraint, limit, measure in flange_bounds(workspace):
         values = measure(points)
         row = int(np.argmin(values))
         value = float(values[row])

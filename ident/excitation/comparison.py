@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -15,7 +16,7 @@ from joblib import Parallel, delayed
 from fri.errors import ConfigurationError, RefusedError
 from ident.excitation.arm_model import Mechanism, tip_path
 from ident.excitation.assembly import Assembled
-from ident.excitation.check import Check, Limits, Workspace
+from ident.excitation.check import Check, Limits, Workspace, flange_bounds
 from ident.excitation.criteria import Criterion
 from ident.excitation.motions import Array, ParametricMotion, PointToPoint
 from ident.excitation.program import Bound, Setup
@@ -125,15 +126,23 @@ def random_points(
 
     def free(path: Array) -> bool:
         points = tip_path(mechanism, path)
-        if space.radius_m is not None and np.hypot(points[:, 0], points[:, 1]).min() < space.radius_m:
-            return False
-        if space.height_m is not None and points[:, 2].min() < space.height_m:
+        if any(measure(points).min() < limit for _, limit, measure in flange_bounds(space)):
             return False
         return checker is None or checker.check_path(path).distance >= clearance_m
 
-    postures = [_draw(rng, limits, free)]
+    share = np.linspace(0.0, 1.0, _LINE)[:, None]
+
+    def connected(posture: Array) -> bool:
+        lines = [(1.0 - share) * postures[-1] + share * posture]
+        if len(postures) == count - 1:
+            lines.append((1.0 - share) * posture + share * postures[0])
+        return all(free(line) for line in lines)
+
+    refusal = f"no posture within the workspace and clear of collisions in {_TRIES} draws"
+    postures = [_draw(rng, limits, lambda posture: free(posture[None, :]), refusal)]
+    refusal = f"no further posture can be reached in a straight line in {_TRIES} draws; try another seed"
     while len(postures) < count:
-        postures.append(_reachable(rng, limits, free, postures, last=len(postures) == count - 1))
+        postures.append(_draw(rng, limits, connected, refusal))
     postures.append(postures[0])
     acceleration = limits.a_max if a_max is None else np.minimum(a_max, limits.a_max)
     motion = PointToPoint(np.array(postures), speed_scale * limits.v_max, acceleration, limits.j_max)
@@ -146,33 +155,12 @@ def random_points(
     return replace(motion, dwell_s=(duration_s - motion.duration) / count)
 
 
-def _draw(rng: np.random.Generator, limits: Limits, free: Callable[[Array], bool]) -> Array:
+def _draw(rng: np.random.Generator, limits: Limits, suits: Callable[[Array], bool], refusal: str) -> Array:
     for _ in range(_TRIES):
         posture = rng.uniform(limits.q_low, limits.q_high)
-        if free(posture[None, :]):
+        if suits(posture):
             return posture
-    raise RefusedError(f"no posture within the workspace and clear of collisions in {_TRIES} draws")
-
-
-def _reachable(
-    rng: np.random.Generator,
-    limits: Limits,
-    free: Callable[[Array], bool],
-    postures: list[Array],
-    *,
-    last: bool,
-) -> Array:
-    share = np.linspace(0.0, 1.0, _LINE)[:, None]
-    for _ in range(_TRIES):
-        posture = rng.uniform(limits.q_low, limits.q_high)
-        lines = [(1.0 - share) * postures[-1] + share * posture]
-        if last:
-            lines.append((1.0 - share) * posture + share * postures[0])
-        if all(free(line) for line in lines):
-            return posture
-    raise RefusedError(
-        f"no further posture can be reached in a straight line in {_TRIES} draws; try another seed"
-    )
+    raise RefusedError(refusal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,14 +191,10 @@ def trade_off(
     neighbours, against dents in the front. Only motions within every limit are returned.
     """
     order = sorted(range(len(limits)), key=lambda k: -limits[k])
-    setups = {
-        k: replace(assembled.setup, target=minimise, bounds=(Bound(against, float(limits[k])),))
-        for k in order
-    }
-    pool: dict[int, Candidate] = {}
+    bounds = [(Bound(against, float(limit)),) for limit in limits]
+    setups = [replace(assembled.setup, target=minimise, bounds=bound) for bound in bounds]
     tasks = [delayed(_first)(setups[k], list(first), (seed, k), starts) for k in order]
-    for k, found in zip(order, Parallel(n_jobs=jobs)(tasks), strict=True):
-        pool[k] = found
+    pool: dict[int, Candidate] = dict(zip(order, Parallel(n_jobs=jobs)(tasks), strict=True))
     for sweep, sequence in enumerate((order, order[::-1])):
         for position, k in enumerate(sequence):
             candidates = [pool[k]]
@@ -239,11 +223,7 @@ def trade_off(
 def _first(setup: Setup, known: Sequence[Candidate], seed: tuple[int, ...], starts: int) -> Candidate:
     found = [begin(setup, (*seed, index)) for index in range(starts)]
     found += [judge(setup, candidate.x) for candidate in known]
-    best = found[0]
-    for candidate in found[1:]:
-        if candidate.better_than(best):
-            best = candidate
-    return best
+    return reduce(lambda best, other: other if other.better_than(best) else best, found)
 
 
 def not_dominated(values: Array) -> Array:

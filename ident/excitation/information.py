@@ -51,7 +51,7 @@ class Columns:
     @classmethod
     def of(cls, joints: int, names: Iterable[str]) -> Columns:
         """Columns of the named parameters; links are 1 .. n, the payload is n + 1."""
-        wanted = set()
+        keys = set()
         for name in names:
             kind, link = split_name(name)
             if link > joints + 1 or (link == joints + 1 and kind not in BODY):
@@ -59,8 +59,8 @@ class Columns:
                     f"parameter {name} does not exist in an arm of {joints} joints and a payload"
                 )
             if kind in BODY:
-                wanted.add((min(link, joints) - 1, BODY.index(kind)))
-        ordered = sorted(wanted)
+                keys.add((min(link, joints) - 1, BODY.index(kind)))
+        ordered = sorted(keys)
         first = np.array([sum(body < b for body, _ in ordered) for b in range(joints + 1)], dtype=np.int64)
         parameter = np.array([index for _, index in ordered], dtype=np.int64)
         return cls(joints, parameter, first, {key: position for position, key in enumerate(ordered)})
@@ -137,20 +137,12 @@ class Assembly:
             weight.append(table.ravel())
             offset.append(offset[-1] + len(active))
             block.append(block[-1] + table.size)
-        self._tables = (
-            np.array(parameter, dtype=np.int64),
-            np.array(signal, dtype=np.int64),
-            np.concatenate(weight),
-            np.array(offset, dtype=np.int64),
-            np.array(block, dtype=np.int64),
-        )
+        places = [np.array(part, dtype=np.int64) for part in (parameter, signal, offset, block)]
+        self._tables = (*places[:2], np.concatenate(weight), *places[2:])
 
     def _sides(self, joint: int) -> list[tuple[str, float]]:
-        joint_row, motor_row = (
-            ("joint", float(self.rows.joint[joint])),
-            ("motor", float(self.rows.motor[joint])),
-        )
-        return {1: [joint_row], 2: [joint_row, motor_row], 3: [("difference", motor_row[1])]}[self.rows.model]
+        row, motor = ("joint", float(self.rows.joint[joint])), float(self.rows.motor[joint])
+        return {1: [row], 2: [row, ("motor", motor)], 3: [("difference", motor)]}[self.rows.model]
 
     @staticmethod
     def _seen(kind: str, link: int, joints: int, side: str, loaded: bool) -> bool:
@@ -251,9 +243,8 @@ class Evaluator:
         """Gram matrices and loaded joint torque; `z`, `tau` keep the coarse signals for the pullback."""
         q, qd, qdd = (np.ascontiguousarray(signal[:: self.refine]) for signal in signals[:3])
         self._coarse = (q, qd, qdd)
-        arm, columns = self.mechanism, self.columns
-        speed = 1e-9 if exact_sign else self.sign_speed
-        forward(arm.dynamics, self._coarse, columns.tables, self.loads, speed, self.z, self.tau)
+        columns, speed = self.columns, 1e-9 if exact_sign else self.sign_speed
+        forward(self.mechanism.dynamics, self._coarse, columns.tables, self.loads, speed, self.z, self.tau)
         for joint in range(self.mechanism.joints):
             first = columns.first[joint]
             part = self.z[joint, :, first:]
@@ -276,17 +267,15 @@ class Evaluator:
             )
         taubar = np.zeros_like(self.tau)
         taubar[-1] = view.torque_bar
-        return self._pull(self._zbar, taubar, rate, None)
+        return self._pull(self._zbar, taubar, rate, np.zeros_like(rate))
 
     def torque_gradient(self, taubar: Array, rate: Array, acceleration: Array) -> Array:
         """Derivative of a function of rigid torques (k, m, n), coarse velocities and accelerations (m, n)."""
         return self._pull(np.zeros_like(self._zbar), taubar, rate, acceleration)
 
-    def _pull(self, zbar: Array, taubar: Array, rate: Array, acceleration: Array | None) -> Array:
+    def _pull(self, zbar: Array, taubar: Array, rate: Array, acceleration: Array) -> Array:
         columns, arm = self.columns, self.mechanism
-        bars = (np.zeros_like(taubar[0]), np.ascontiguousarray(rate), np.zeros_like(taubar[0]))
-        if acceleration is not None:
-            bars[2][:] = acceleration
+        bars = (np.zeros_like(taubar[0]), np.array(rate, order="C"), np.array(acceleration, order="C"))
         backward(arm.dynamics, self._coarse, columns.tables, self.loads, self.sign_speed, zbar, taubar, bars)
         total = np.zeros((arm.joints, self.basis.free))
         for bar, matrix in zip(bars, self.matrices, strict=False):

@@ -203,12 +203,6 @@ class FourierSeries:
             found[:, joint] = values[low], values[high], times[low], times[high]
         return Extrema(*found)
 
-    def grid_bound(self, derivative: int, n: int) -> Array:
-        """Upper bound of |derivative - bias| from n > 2 n_f samples alone, (joints,); see `_ehlich_zeller`."""
-        values = self.derivative(np.arange(n) * (self.period_s / n), derivative)
-        centred = values - self.bias if derivative == 0 else values
-        return np.max(np.abs(centred), axis=0) * _ehlich_zeller(self.harmonics, n)
-
     def _harmonics(self, joint: int, order: int) -> tuple[Array, Array]:
         """Sine and cosine coefficients of the derivative of one joint, (n_f,) each."""
         k = 2.0 * np.pi / self.period_s * np.arange(1, self.harmonics + 1)
@@ -249,11 +243,6 @@ class FourierBasis:
     def free(self) -> int:
         """Free coefficients of each joint, 2 n_f - 1."""
         return 2 * self.harmonics - 1
-
-    @property
-    def highest_frequency_hz(self) -> float:
-        """n_f / T0 [Hz]."""
-        return self.harmonics / self.period_s
 
     def matrix(self, t: npt.ArrayLike, derivative: int = 0) -> Array:
         """Basis functions at t: constant, n_f - 1 sine, n_f - 1 cosine combinations; (n, free)."""
@@ -346,16 +335,13 @@ class SplineMotion:
         """Number of joints."""
         return int(self.points.shape[0])
 
-    def _spline(self) -> BSpline:
-        return BSpline(
-            _knots(self.duration_s, self.points.shape[1]), self.points.T, DEGREE, extrapolate=False
-        )
-
     def sample(self, t: npt.ArrayLike) -> Samples:
         """Positions, velocities, accelerations and jerks at t (n,) [s]; times wrap at the duration."""
         times = np.atleast_1d(np.asarray(t, dtype=np.float64))
         inside = np.where(times == self.duration_s, times, np.mod(times, self.duration_s))
-        spline = self._spline()
+        spline = BSpline(
+            _knots(self.duration_s, self.points.shape[1]), self.points.T, DEGREE, extrapolate=False
+        )
         return Samples(*(np.asarray(spline(inside, nu=order)) for order in range(4)))
 
     def extrema(self, derivative: int) -> Extrema:

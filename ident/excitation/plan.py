@@ -147,26 +147,17 @@ class ExcitationPlan:
 
 
 def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
+    def lists(*keys: str) -> dict[str, Any]:
+        return {key: np.asarray(getattr(motion, key)).tolist() for key in keys}
+
     if isinstance(motion, FourierSeries):
-        return {
-            "type": "fourier",
-            "period_s": float(motion.period_s),
-            "harmonics": motion.harmonics,
-            "bias": motion.bias.tolist(),
-            "a": motion.a.tolist(),
-            "b": motion.b.tolist(),
-        }
+        head = {"type": "fourier", "period_s": float(motion.period_s), "harmonics": motion.harmonics}
+        return head | lists("bias", "a", "b")
     if isinstance(motion, SplineMotion):
-        return {"type": "bspline", "duration_s": float(motion.duration_s), "points": motion.points.tolist()}
+        return {"type": "bspline", "duration_s": float(motion.duration_s)} | lists("points")
     if isinstance(motion, PointToPoint):
-        return {
-            "type": "point to point",
-            "postures": motion.postures.tolist(),
-            "v_max": np.asarray(motion.v_max).tolist(),
-            "a_max": np.asarray(motion.a_max).tolist(),
-            "j_max": np.asarray(motion.j_max).tolist(),
-            "dwell_s": float(motion.dwell_s),
-        }
+        limits = lists("postures", "v_max", "a_max", "j_max")
+        return {"type": "point to point"} | limits | {"dwell_s": float(motion.dwell_s)}
     raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
 
 
@@ -179,7 +170,7 @@ def _motion_from_mapping(content: Any) -> ParametricMotion:
     if content["type"] == "bspline":
         return SplineMotion(float(content["duration_s"]), *arrays("points"))
     if content["type"] == "point to point":
-        return PointToPoint(*arrays("postures", "v_max", "a_max", "j_max"), float(content["dwell_s"]))
+        return PointToPoint(*arrays("postures", "v_max", "a_max", "j_max"), dwell_s=float(content["dwell_s"]))
     raise ConfigurationError(f"motion type {content['type']!r} is unknown")
 
 

@@ -9,8 +9,10 @@ import dataclasses
 import importlib.metadata
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,14 +44,7 @@ from ident.excitation.sqp import minimise
 from lwr_driver.arm import Arm
 from lwr_driver.collision import CollisionChecker
 
-__all__ = [
-    "Progress",
-    "explain",
-    "feasible_fourier",
-    "plan",
-    "refuse_impossible",
-    "search_candidates",
-]
+__all__ = ["Progress", "explain", "feasible_fourier", "plan", "refuse_impossible", "search_candidates"]
 
 _log = logging.getLogger(__name__)
 _HOPS_PER_TASK = 5
@@ -84,12 +79,11 @@ def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = Non
     problem, interrupted = _with_goal(problem, progress)
     assembled = assemble(problem)
     refuse_impossible(assembled)
-    tracker = _Tracker(assembled, progress)
-    tracker.interrupted = interrupted
+    tracker = _Tracker(assembled, progress, interrupted)
     candidates = search_candidates(assembled, tracker)
     tracker.stage("polish", 1)
-    motion, check, value = _first_that_passes(assembled, candidates, tracker.interrupted)
-    result = _describe(assembled, motion, check, tracker, value)
+    outcome = _first_that_passes(assembled, candidates, tracker.interrupted)
+    result = _describe(assembled, outcome, tracker)
     tracker.advance(None)
     return result
 
@@ -99,10 +93,10 @@ def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None
 
     The goal is given or comes from a search for the condition number alone (Remark 4).
     """
-    wanted = problem.objective
-    if wanted.criterion != "goal_attainment" or wanted.goal_condition is not None:
+    objective = problem.objective
+    if objective.criterion != "goal_attainment" or objective.goal_condition is not None:
         return problem, False
-    alone = replace(problem, objective=replace(wanted, criterion="condition_number"))
+    alone = replace(problem, objective=replace(objective, criterion="condition_number"))
     assembled = assemble(alone)
     refuse_impossible(assembled)
     tracker = _Tracker(assembled, progress)
@@ -111,16 +105,17 @@ def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None
         raise RefusedError(explain(assembled, [polish(assembled, best, quick=True)]))
     goal = float(np.exp(best.value))
     _log.info("goal of the condition number from a search for it alone: %.2f", goal)
-    return replace(problem, objective=replace(wanted, goal_condition=goal)), tracker.interrupted
+    return replace(problem, objective=replace(objective, goal_condition=goal)), tracker.interrupted
 
 
 class _Tracker:
     """Counts tasks, keeps the best value, reports to the listener, and checks the time limit."""
 
-    def __init__(self, assembled: Assembled, listener: Callable[[Progress], None] | None) -> None:
-        self.assembled, self.listener = assembled, listener
+    def __init__(
+        self, assembled: Assembled, listener: Callable[[Progress], None] | None, interrupted: bool = False
+    ) -> None:
+        self.assembled, self.listener, self.interrupted = assembled, listener, interrupted
         self.begun = time.monotonic()
-        self.interrupted = False
         self.evaluations = 0
         self.best: Candidate | None = None
         self.name, self.done, self.total = "", 0, 0
@@ -130,9 +125,9 @@ class _Tracker:
         self.name, self.done, self.total = name, 0, total
         self._report()
 
-    def advance(self, candidate: Candidate | None) -> None:
-        """One task is done."""
-        self.done += 1
+    def advance(self, candidate: Candidate | None, done: int = 1) -> None:
+        """Count finished tasks."""
+        self.done += done
         if candidate is not None:
             self.evaluations += candidate.evaluations
             if self.best is None or candidate.better_than(self.best):
@@ -198,11 +193,10 @@ def _run(
 ) -> list[Candidate]:
     """Results in order, reported one by one."""
     results: list[Candidate] = []
-    for index, candidate in enumerate(Parallel(n_jobs=jobs, return_as="generator")(tasks)):
+    finished = Parallel(n_jobs=jobs, return_as="generator")(tasks)
+    for candidate, size in zip(finished, sizes or [1] * len(tasks), strict=True):
         results.append(candidate)
-        if sizes is not None:
-            tracker.done += sizes[index] - 1
-        tracker.advance(candidate)
+        tracker.advance(candidate, size)
     return results
 
 
@@ -217,22 +211,18 @@ def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
     return unique
 
 
-def _first_that_passes(
-    assembled: Assembled, candidates: Sequence[Candidate], interrupted: bool
-) -> tuple[ParametricMotion, Check, float]:
+def _first_that_passes(assembled: Assembled, candidates: Sequence[Candidate], interrupted: bool) -> Outcome:
     tries = 3 if interrupted else 6
     failures = []
     for candidate in candidates[:tries]:
         outcome = polish(assembled, candidate, quick=interrupted)
         if outcome.check.ok and outcome.bounds_kept:
-            return outcome.motion, outcome.check, outcome.value
+            return outcome
         failures.append(outcome)
     raise RefusedError(explain(assembled, failures))
 
 
-def _describe(
-    assembled: Assembled, motion: ParametricMotion, check: Check, tracker: _Tracker, value: float
-) -> ExcitationPlan:
+def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> ExcitationPlan:
     problem = assembled.problem
     settings = dataclasses.asdict(problem)
     settings.pop("source")
@@ -247,14 +237,14 @@ def _describe(
             for name in ("lwr-identification", "numpy", "scipy", "numba")
         },
     }
-    objectives, rsd = assembled.describe(motion)
+    objectives, rsd = assembled.describe(outcome.motion)
     return ExcitationPlan(
-        motion=motion,
+        motion=outcome.motion,
         joint_names=assembled.setup.mechanism.joint_names,
         periods=problem.motion.periods,
         objectives=objectives,
         rsd_percent=rsd,
-        check=check,
+        check=outcome.check,
         provenance=provenance,
     )
 
@@ -275,22 +265,13 @@ def refuse_impossible(assembled: Assembled) -> None:
     Checked: the highest frequency against the arm's lowest resonance (n_f w0 < w_r), workspace bounds against the arm's
     reach, and the existence of a posture within every limit (small motions around it are always feasible).
     """
-    _refuse_resonance(assembled)
-    _refuse_reach(assembled)
-    _refuse_static(assembled)
-
-
-def _refuse_resonance(assembled: Assembled) -> None:
     basis = assembled.setup.basis
-    if isinstance(basis, FourierBasis) and basis.highest_frequency_hz >= assembled.resonance_hz:
+    if isinstance(basis, FourierBasis) and basis.harmonics / basis.period_s >= assembled.resonance_hz:
         raise ConfigurationError(
-            f"n_f w0 = {basis.harmonics} / {basis.period_s} s = {basis.highest_frequency_hz:.3g} Hz reaches "
+            f"n_f w0 = {basis.harmonics} / {basis.period_s} s = {basis.harmonics / basis.period_s:.3g} Hz reaches "
             f"the arm's lowest resonance, {assembled.resonance_hz:.3g} Hz; lower `harmonics` or lengthen "
             "`period_s`"
         )
-
-
-def _refuse_reach(assembled: Assembled) -> None:
     mechanism, work = assembled.setup.mechanism, assembled.problem.workspace
     lengths = np.linalg.norm(mechanism.translation[1:], axis=1)
     reach = float(lengths.sum() + np.linalg.norm(mechanism.tip))
@@ -299,6 +280,7 @@ def _refuse_reach(assembled: Assembled) -> None:
             raise RefusedError(
                 f"workspace: {name} {bound:.3f} m is {bound - reach:.3f} m beyond reach, {reach:.3f} m"
             )
+    _refuse_static(assembled)
 
 
 def _refuse_static(assembled: Assembled) -> None:
@@ -343,8 +325,6 @@ def _blame(assembled: Assembled, rows: Sequence[Row], values: Array) -> str:
 
 def explain(assembled: Assembled, outcomes: Sequence[Outcome]) -> str:
     """Reasons for the failure of every candidate: the violations of the nearest one."""
-    if not outcomes:
-        return "no motion was found; raise `search.starts`"
     nearest = min(outcomes, key=shortfall)
     reasons = [str(margin) for margin in nearest.check.violations[:3]]
     if not nearest.bounds_kept:
@@ -395,9 +375,18 @@ def feasible_fourier(
         target=None,
         **sampling(basis),
     )
-    blocked: dict[str, int] = {}
+    against = partial(
+        check_motion,
+        mechanism=mechanism,
+        limits=setup.limits,
+        workspace=work,
+        estimate=setup.estimate,
+        checker=checker,
+        clearance_m=clearance_m,
+    )
+    blocked: Counter[str] = Counter()
     for start in range(_STARTS):
-        plan, check = _from_start(setup, seed, start, work, checker, clearance_m)
+        plan, check = _from_start(setup, np.random.default_rng([seed, start]), against)
         if plan is not None:
             _log.info("feasible excitation found from start %d of %d", start + 1, _STARTS)
             provenance = {
@@ -408,23 +397,22 @@ def feasible_fourier(
             }
             return ExcitationPlan(plan, arm.joint_names, periods, check=check, provenance=provenance)
         worst = (check.violations or check.tightest())[0]
-        blame = f"{worst.subject} {worst.constraint}"
-        blocked[blame] = blocked.get(blame, 0) + 1
-    culprit = max(blocked, key=lambda key: blocked[key])
+        blocked[f"{worst.subject} {worst.constraint}"] += 1
+    culprit = blocked.most_common(1)[0][0]
     raise RefusedError(
-        f"no feasible exciting motion found from {_STARTS} random starts; {culprit} stands in the way most "
-        "often; widen that limit or choose another seed"
+        f"no feasible exciting motion found from {_STARTS} random starts; most frequent obstacle: {culprit}; widen "
+        "that limit or choose another seed"
     )
 
 
 def _from_start(
-    setup: Setup, seed: int, start: int, work: Workspace, checker: CollisionChecker | None, clearance_m: float
+    setup: Setup, rng: np.random.Generator, against: Callable[..., Check]
 ) -> tuple[ParametricMotion | None, Check]:
     """The motion nearest to one random start, tightened until it passes; None without success."""
     with threadpool_limits(1):
         program = setup.program()
         program.constraints.rate = 200.0
-        x = random_start(setup, np.random.default_rng([seed, start]))
+        x = random_start(setup, rng)
         program.anchor = x.copy()
         for _ in range(_ROUNDS):
             program.constraints.refresh_deviation(program.signals(x))
@@ -432,18 +420,12 @@ def _from_start(
             x = solution.x
             near = float(solution.constraints.min()) > -_NEAR
             motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
-            check = check_motion(
-                motion,
-                setup.mechanism,
-                setup.limits,
-                workspace=work,
-                estimate=setup.estimate,
-                checker=checker,
-                clearance_m=clearance_m,
-                step_s=1e-3 if near else 0.05,
-                collision_step_s=1e-2 if near else 0.1,
-                continuous=near,
+            steps = (
+                {"step_s": 1e-3, "collision_step_s": 1e-2}
+                if near
+                else {"step_s": 0.05, "collision_step_s": 0.1}
             )
+            check = against(motion, **steps, continuous=near)
             if (check.ok and near) or not near:
                 break
             tighten(program.constraints, check, setup.mechanism.joint_names)

@@ -36,7 +36,7 @@ from ident.excitation.arm_model import (
     Mechanism,
     torque_deviation,
 )
-from ident.excitation.check import Limits
+from ident.excitation.check import KINEMATIC, Limits
 from ident.excitation.clearance import Space, distances, row_gradient
 from ident.excitation.criteria import Criterion, GoalAttainment, Pullback
 from ident.excitation.information import Columns, Evaluator, View
@@ -44,7 +44,6 @@ from ident.excitation.motions import Array, Basis, Samples
 
 __all__ = ["Bound", "Constraints", "Program", "Row", "Setup"]
 
-_NAMES = ("position", "velocity", "acceleration", "jerk")
 _FAR = 0.6
 _FAR_TORQUE = 0.2
 _SPACE_SCALE = 0.1
@@ -96,12 +95,11 @@ class Constraints:
         self.scale = np.where(np.arange(space.rows) < 2, _FLANGE_SCALE, _SPACE_SCALE)
         self.deviation = np.zeros((2, evaluator.loads.shape[0], evaluator.samples, n))
         self.rows = (
-            [Row(name, joint) for name in _NAMES for joint in range(n)]
+            [Row(name, joint) for name, _ in KINEMATIC for joint in range(n)]
             + [Row("torque", joint) for joint in range(n)]
             + [Row("distance", row) for row in self.tracked]
             + [Row("bound", index) for index in range(len(self.bounds))]
         )
-        self._weights: dict[int, Array] = {}
 
     def values(self, signals: Sequence[Array], view: View, sharpness: float) -> Array:
         """c, (rows,); the view must be the evaluator's latest."""
@@ -115,9 +113,7 @@ class Constraints:
             self._kinematic_weight[order][share <= 0.0] *= -1.0
         torque = self._torque_rows()
         self._q = np.ascontiguousarray(signals[0])
-        mechanism = self.evaluator.mechanism
-        distance = distances(mechanism, self.space, self._q)
-        tracked = self.tracked
+        distance, tracked = distances(self.evaluator.mechanism, self.space, self._q), self.tracked
         scaled = (self.floor[tracked] - distance[:, tracked]) / self.scale[tracked]
         space, self._space_weight = np.empty(len(tracked)), np.zeros_like(scaled)
         _ks(scaled, rate, space, self._space_weight)
@@ -136,9 +132,8 @@ class Constraints:
         joint = tau + qd * drives[:, FVL] + drives[:, OFFL]
         motor = joint + qdd * drives[:, IA] + qd * drives[:, FVM] + drives[:, OFFM]
         both = np.stack([joint, motor])
-        coulomb = (
-            np.abs(drives[:, FCL]) + np.stack([np.zeros(len(drives)), np.abs(drives[:, FCM])])[:, None, None]
-        )
+        own = np.stack([np.zeros(len(drives)), np.abs(drives[:, FCM])])
+        coulomb = np.abs(drives[:, FCL]) + own[:, None, None]
         share = (np.abs(both) + coulomb + self.deviation) / self.torque_limit
         n = evaluator.mechanism.joints
         flat = np.ascontiguousarray(share.reshape(-1, n))
@@ -161,12 +156,11 @@ class Constraints:
             if self.latest[4 * n + joint] < _FAR_TORQUE:
                 out[4 * n + joint] = -self._torque_gradient(joint)
         qbar = np.empty_like(self._q)
-        mechanism = evaluator.mechanism
         for index, row in enumerate(self.tracked):
             if not near[5 * n + index]:
                 continue
             weight = np.ascontiguousarray(self._space_weight[:, index]) / self.scale[row]
-            row_gradient(mechanism.geometry, self._q, row, weight, qbar, self.space.shapes)
+            row_gradient(evaluator.mechanism.geometry, self._q, row, weight, qbar, self.space.shapes)
             out[5 * n + index] = qbar.T @ evaluator.matrices[0]
         for index, (_, pull) in enumerate(self._bound_pulls):
             view.clear()

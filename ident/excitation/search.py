@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ident.excitation.assembly import Assembled
-from ident.excitation.check import Check
+from ident.excitation.check import KINEMATIC, Check
 from ident.excitation.motions import Array, ParametricMotion
 from ident.excitation.program import Constraints, Program, Setup
 from ident.excitation.sqp import minimise
@@ -32,7 +32,7 @@ _AMPLITUDE = 0.4
 _ROUNDS = 6
 _GRID_TOLERANCE = 5e-3
 _HOPELESS = 0.05
-_ORDERS = {"position": 0, "velocity": 1, "acceleration": 2, "jerk": 3}
+_ORDERS = [name for name, _ in KINEMATIC]
 _SPACE_STEP = 2e-4
 _SHARE_STEP = 2e-4
 _BOUND_TOLERANCE = 1e-9
@@ -82,13 +82,14 @@ def random_start(setup: Setup, rng: np.random.Generator) -> Array:
 
 
 def begin(setup: Setup, seed: Sequence[int]) -> Candidate:
-    """Optimise from one random start."""
+    """Optimise from one random start; after an infeasible result again, from the nearest feasible motion."""
     with threadpool_limits(1):
         rng = np.random.default_rng(list(seed))
         program = setup.program()
         found = _solve(program, random_start(setup, rng), _FIRST)
         if not found.feasible:
-            found = _restored(setup, program, found)
+            again = _solve(program, restore(setup, found.x).x, _SHORT)
+            found = again if again.better_than(found) else found
         return found
 
 
@@ -127,13 +128,6 @@ def judge(setup: Setup, x: Array) -> Candidate:
     _, constraints = program.values(program.variables(x))
     limits = constraints[: len(program.constraints.rows)]
     return Candidate(x, program.exact(x), _violation(limits), program.evaluations)
-
-
-def _restored(setup: Setup, program: Program, found: Candidate) -> Candidate:
-    """Second try for an infeasible result: optimise from the nearest feasible motion."""
-    near = restore(setup, found.x)
-    again = _solve(program, near.x, _SHORT)
-    return again if again.better_than(found) else found
 
 
 def _solve(program: Program, x: Array, schedule: Sequence[tuple[int, float, float]]) -> Candidate:
@@ -231,7 +225,7 @@ def tighten(constraints: Constraints, check: Check, joint_names: tuple[str, ...]
         short = max(-margin.slack, 0.0)
         if margin.constraint in _ORDERS:
             joint = joint_names.index(margin.subject)
-            order = _ORDERS[margin.constraint]
+            order = _ORDERS.index(margin.constraint)
             constraints.half[order, joint] *= 1.0 - _SHARE_STEP - 1.2 * short / constraints.half[order, joint]
         elif margin.constraint in ("joint torque", "motor torque"):
             joint = joint_names.index(margin.subject)

@@ -25,7 +25,7 @@ _BACKTRACKS = 8
 
 
 class SmoothProblem(Protocol):
-    """Objective and constraints; derivatives are asked for at the point of the latest `values` only."""
+    """Objective and constraints; derivatives refer to the point of the latest `values`."""
 
     def values(self, x: Array) -> tuple[float, Array]:
         """f(x), c(x)."""

@@ -107,11 +107,8 @@ def forward(arm, motion, columns, chi, eps, z, tau):  # type: ignore[no-untyped-
     sets = chi.shape[0]
     c = parameter.shape[0]
     cs = np.empty((n, 2))
-    w = np.empty((n, 3))
-    wd = np.empty((n, 3))
-    vd = np.empty((n, 3))
-    lin = np.empty((n, n, 3))
-    ang = np.empty((n, n, 3))
+    w, wd, vd = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lin, ang = np.empty((n, n, 3)), np.empty((n, n, 3))
     y = np.empty(10)
     tau[:] = 0.0
     for i in range(m):
@@ -167,16 +164,10 @@ def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignor
     sets = chi.shape[0]
     c = parameter.shape[0]
     cs = np.empty((n, 2))
-    w = np.empty((n, 3))
-    wd = np.empty((n, 3))
-    vd = np.empty((n, 3))
-    lin = np.empty((n, n, 3))
-    ang = np.empty((n, n, 3))
-    wb = np.empty((n, 3))
-    db = np.empty((n, 3))
-    vb = np.empty((n, 3))
-    lb = np.empty((n, n, 3))
-    ab = np.empty((n, n, 3))
+    w, wd, vd = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lin, ang = np.empty((n, n, 3)), np.empty((n, n, 3))
+    wb, db, vb = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lb, ab = np.empty((n, n, 3)), np.empty((n, n, 3))
     y = np.empty(10)
     for i in range(m):
         _kinematics(rot0, trans, gravity, q[i], qd[i], qdd[i], cs, w, wd, vd, lin, ang)
