@@ -45,7 +45,7 @@ __all__ = [
 
 BODY = INERTIAL
 _NO_COLUMNS = np.zeros(0, dtype=np.int64)
-# drive parameters: place of the signal among qdd, qd, sign(qd), 1; those in the joint row; columns of `drives`
+# drive parameters: place of the signal among qdd, qd, sign(qd), 1; members of the joint row; columns of `drives`
 DRIVE_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
 JOINT_SIDE = ("Fvl", "Fcl", "offl")
 IA, FVL, FCL, OFFL, FVM, FCM, OFFM = range(7)

@@ -187,7 +187,7 @@ def check_motion(
     """Compare a motion with every limit.
 
     step_s, collision_step_s : sampling of torque and flange, and of the collision checker's path
-    continuous : also prove torque, flange and clearance for every instant, if the samples are clean
+    continuous : also prove torque, flange and clearance for every instant, if no sample violates a limit
     """
     if motion.joints != mechanism.joints:
         raise ConfigurationError(f"the motion has {motion.joints} joints, the arm {mechanism.joints}")
@@ -378,7 +378,7 @@ def swept_radius(mechanism: Mechanism, extents: Array) -> Array:
 
 
 def speed_bound(motion: ParametricMotion, radius: Array) -> Callable[[Array, float], Array]:
-    """Bound of the speed of any point within `radius` (n,) of the joint axes; see `prove`."""
+    """Bound of the speed of any point within `radius` (n,) of each joint axis; see `prove`."""
     extrema = motion.extrema(2)
     acceleration = np.maximum(np.abs(extrema.low), np.abs(extrema.high))
 

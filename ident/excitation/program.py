@@ -324,7 +324,7 @@ class Setup:
     refine: int = 5
 
     def program(self, *, feasibility: bool = False) -> Program:
-        """A fresh optimisation program; with `feasibility` without target and bounds."""
+        """A fresh optimisation program; `feasibility`: without target and bounds."""
         evaluator = Evaluator(
             self.mechanism, self.basis, self.estimate, self.columns, samples=self.samples, refine=self.refine
         )

@@ -151,8 +151,7 @@ def forward(arm, motion, columns, chi, eps, z, tau):  # type: ignore[no-untyped-
 
 @njit(cache=True, error_model="numpy")
 def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignore[no-untyped-def]
-    """Add the derivative with respect to q, qd, qdd of a function of `forward`'s results to `bars`, (m, n)
-    each.
+    """Add the derivative of a function of `forward`'s results with respect to q, qd, qdd to `bars`, (m, n) each.
 
     zbar (n, m, c + 4) and taubar (k, m, n) are the function's derivatives with respect to z and tau.
     """
