@@ -137,8 +137,9 @@ class Assembly:
             weight.append(table.ravel())
             offset.append(offset[-1] + len(active))
             block.append(block[-1] + table.size)
-        places = [np.array(part, dtype=np.int64) for part in (parameter, signal, offset, block)]
-        self._tables = (*places[:2], np.concatenate(weight), *places[2:])
+        lists = (parameter, signal, offset, block)
+        parameters, signals, offsets, blocks = (np.array(part, dtype=np.int64) for part in lists)
+        self._tables = (parameters, signals, np.concatenate(weight), offsets, blocks)
 
     def _sides(self, joint: int) -> list[tuple[str, float]]:
         row, motor = ("joint", float(self.rows.joint[joint])), float(self.rows.motor[joint])

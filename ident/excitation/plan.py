@@ -170,7 +170,8 @@ def _motion_from_mapping(content: Any) -> ParametricMotion:
     if content["type"] == "bspline":
         return SplineMotion(float(content["duration_s"]), *arrays("points"))
     if content["type"] == "point to point":
-        return PointToPoint(*arrays("postures", "v_max", "a_max", "j_max"), dwell_s=float(content["dwell_s"]))
+        postures, v_max, a_max, j_max = arrays("postures", "v_max", "a_max", "j_max")
+        return PointToPoint(postures, v_max, a_max, j_max, float(content["dwell_s"]))
     raise ConfigurationError(f"motion type {content['type']!r} is unknown")
 
 
