@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ident.excitation import ExcitationPlan
-from ident.excitation.estimate import split_name
+from ident.excitation.arm_model import split_name
 from ident.excitation.planner import Progress as SearchProgress
 from ident.excitation.planner import plan
 from ident.excitation.problem import Knowledge, PlanProblem, Prior

@@ -3,7 +3,7 @@
     python benchmarks/excitation/confirm.py [--out FOLDER]
 
 Both experiments move for the same time with the same arm, payload, noise, cycle (5 ms) and identification; only the
-motion differs. What is finished in FOLDER is not repeated.
+motion differs. Finished experiments in FOLDER are not repeated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Excitation: what planning reaches, in how much time, and how safely. One command:
+"""Excitation: results of planning, their time and their safety. One command:
 
     python benchmarks/excitation/run.py                  # everything, about an hour on one core
     python benchmarks/excitation/run.py --section table1 --section gradient
@@ -47,10 +47,10 @@ from ident.excitation import (
     trade_off,
 )
 from ident.excitation.check import Limits
-from ident.excitation.motion import Samples
-from ident.excitation.objectives import TorqueLevel
+from ident.excitation.criteria import TorqueLevel
+from ident.excitation.information import samples_view
+from ident.excitation.motions import Samples
 from ident.excitation.search import begin, random_start
-from ident.excitation.views import samples_view
 from lwr_driver.arm import Arm
 
 HERE = Path(__file__).resolve().parent
@@ -62,7 +62,7 @@ FIGAROH_PYTHON: str | None = None
 
 
 class Budget:
-    """Ends a search after some CPU seconds, the way Ctrl-C does, and keeps the course of the best value."""
+    """Ends a search after some CPU seconds, like Ctrl-C, and keeps the course of the best value."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds, self.begun = seconds, time.process_time()
@@ -90,7 +90,7 @@ def base_problem(period_s: float = 20.0, arm: str = "lwr4plus.yaml", **changes: 
 
 
 def solve(problem: PlanProblem, seed: int, seconds: float) -> tuple[ExcitationPlan, float]:
-    """A plan within a CPU budget (the polish at the end comes on top), and the CPU seconds really spent."""
+    """A plan within a CPU budget (the polish at the end comes on top), and its real CPU seconds."""
     begun = time.process_time()
     found = plan(replace(problem, search=replace(problem.search, seed=seed)), Budget(seconds))
     assert found.check.ok
@@ -111,7 +111,7 @@ def condition(seeds: int, budget: float) -> dict[str, Any]:
 
 
 def base(seeds: int, budget: float) -> dict[str, Any]:
-    """Condition number of all 102 base columns; hops are dear here, so one lane gets all of them."""
+    """Condition number of all 102 base columns; hops are expensive here, so one lane gets all of them."""
     problem = base_problem(20.0, parameters="base", search=Search(starts=6, hops=MANY, lanes=1))
     return _conditions_of([("T0 = 20 s, 102 columns", problem, 64.0, max(1, seeds // 3))], budget)
 
@@ -239,7 +239,7 @@ def front(seeds: int, budget: float) -> dict[str, Any]:
 
 
 def robustness(seeds: int, budget: float) -> dict[str, Any]:
-    """Random starts that end feasible, and plans under random limits checked on a 1 ms grid."""
+    """Share of feasible random starts; plans under random limits, checked on a 1 ms grid."""
     assembled = assemble(base_problem(20.0))
     starts = [begin(assembled.setup, (77, index)) for index in range(20)]
     feasible = sum(start.feasible for start in starts)
@@ -383,13 +383,13 @@ def _deviations(assembled: Assembled, motion: Any) -> np.ndarray:
 
 
 def _floor(assembled: Assembled) -> np.ndarray:
-    """Offsets and Coulomb terms: their signals are constants of magnitude one, whatever the motion."""
+    """Offsets and Coulomb terms: their signals are constants of magnitude one for any motion."""
     names = assembled.criteria.rsd_mean.assembly.names
     return np.array([name.startswith(("off", "Fc")) for name in names])
 
 
 def _clean(assembled: Assembled, found: ExcitationPlan) -> bool:
-    """Every limit on the 1 ms grid by plain samples, with nothing of the exact extrema."""
+    """Every limit on the 1 ms grid by plain samples, without the exact extrema."""
     times = np.arange(0.0, found.period_s, 1e-3)
     samples = found.motion.sample(times)
     limits: Limits = assembled.setup.limits
@@ -439,12 +439,12 @@ SECTIONS: dict[str, Callable[[int, float], dict[str, Any]]] = {
 )
 @click.option("--seeds", default=10, show_default=True, help="Searches per case.")
 @click.option("--budget", default=30.0, show_default=True, help="CPU seconds of a search.")
-@click.option("--figaroh-python", help="Interpreter of an environment that has figaroh and cyipopt-wheels.")
+@click.option("--figaroh-python", help="Interpreter of an environment with figaroh and cyipopt-wheels.")
 @click.option(
     "--json",
     "output",
     type=click.Path(path_type=Path),
-    help="Write the figures to a file as well; sections in it that are not run now stay.",
+    help="Write the figures to a file as well; its other sections stay.",
 )
 def main(
     sections: tuple[str, ...], seeds: int, budget: float, figaroh_python: str | None, output: Path | None

@@ -1,11 +1,11 @@
-"""Planning of exciting motions: parametrisations, criteria, constraints, search, and the plan that comes out.
+"""Planning of exciting motions: parametrisations, criteria, constraints, search, and the resulting plan.
 
 `plan(PlanProblem.load("plans/default.yaml"))` does everything. `feasible_fourier` gives a safe motion without
-optimisation, `random_points` the baseline, `trade_off` a front between two criteria, `check_motion` the
-verdict on any motion.
+optimisation, `random_points` the baseline, `trade_off` a front between two criteria, `check_motion` the verdict on any
+motion.
 
-Many processes or computers: the search runs through `joblib`, so its configured backend spreads it without a
-line here. On a Dask cluster, with `search.jobs: -1` in the problem file::
+The search runs through `joblib`; its configured backend spreads it over processes or computers. On a Dask cluster, with
+`search.jobs: -1` in the problem file::
 
     import joblib, distributed
     from ident.excitation import PlanProblem, plan
@@ -14,30 +14,26 @@ line here. On a Dask cluster, with `search.jobs: -1` in the problem file::
     with joblib.parallel_config(backend="dask"):
         result = plan(PlanProblem.load("plans/default.yaml"))
 
-The result depends on the seed and the counts of the problem file, not on the backend or the number of
-processes.
+The result depends on the seed and the counts of the problem file, not on the backend or the number of processes.
 """
 
-from ident.excitation.assembly import Assembled, assemble
-from ident.excitation.bspline import SplineBasis, SplineMotion
+from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise
+from ident.excitation.assembly import Assembled, arm_limits, assemble
 from ident.excitation.check import Check, Limits, Margin, Workspace, check_motion
-from ident.excitation.estimate import ArmEstimate, Noise
-from ident.excitation.feasible import arm_limits, feasible_fourier
-from ident.excitation.fourier import FourierBasis, FourierSeries
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.pareto import FrontPoint, hypervolume, not_dominated, trade_off
-from ident.excitation.plan import ExcitationPlan
-from ident.excitation.planner import Progress, plan
-from ident.excitation.point_to_point import PointToPoint, random_points
-from ident.excitation.problem import (
-    Knowledge,
-    MotionForm,
-    Objective,
-    PlanProblem,
-    Prior,
-    Search,
+from ident.excitation.comparison import (
+    FrontPoint,
+    TableRow,
+    hypervolume,
+    not_dominated,
+    random_points,
+    table,
+    table_row,
+    trade_off,
 )
-from ident.excitation.table import TableRow, plan_report, table, table_row
+from ident.excitation.motions import FourierBasis, FourierSeries, PointToPoint, SplineBasis, SplineMotion
+from ident.excitation.plan import ExcitationPlan, plan_report
+from ident.excitation.planner import Progress, feasible_fourier, plan
+from ident.excitation.problem import Knowledge, MotionForm, Objective, PlanProblem, Prior, Search
 
 __all__ = [
     "ArmEstimate",

@@ -1,10 +1,8 @@
-"""The result of planning: one exciting motion with everything that is needed to run it, repeat it and trust
-it.
-"""
+"""The result of planning: one exciting motion with its margins, predicted deviations and provenance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -15,14 +13,18 @@ import numpy.typing as npt
 import yaml
 
 from fri.errors import ConfigurationError
-from ident.excitation.bspline import SplineMotion
 from ident.excitation.check import Check, Margin
-from ident.excitation.fourier import FourierSeries
-from ident.excitation.motion import Array, ParametricMotion, Samples
-from ident.excitation.point_to_point import PointToPoint
+from ident.excitation.motions import (
+    Array,
+    FourierSeries,
+    ParametricMotion,
+    PointToPoint,
+    Samples,
+    SplineMotion,
+)
 from lwr_driver.configuration import read_mapping
 
-__all__ = ["ExcitationPlan"]
+__all__ = ["ExcitationPlan", "plan_report"]
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
@@ -30,12 +32,12 @@ _CYCLE_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ExcitationPlan:
-    """An exciting motion, checked, with its objective values and where it came from.
+    """A checked exciting motion with its objective values and its origin.
 
-    motion : the parametrised motion; periods : how often it is repeated in one session
+    motion : the parametrised motion; periods : repetitions in one session
     joint_names : in the order of the motion's columns
-    objectives : value of each criterion by name; rsd_percent : predicted relative standard deviation by
-    parameter [%]
+    objectives : value of each criterion by name
+    rsd_percent : predicted relative standard deviation by parameter [%]
     check : margins against every limit at planning time
     provenance : seeds, versions, limits, settings: plain values
     """
@@ -58,6 +60,11 @@ class ExcitationPlan:
         for name in ("objectives", "rsd_percent", "provenance"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
+    def __repr__(self) -> str:
+        values = [f"  {name} {value:.4g}" for name, value in list(self.objectives.items())[:5]]
+        head = f"ExcitationPlan: {self.motion!r}, {self.periods} period(s), {self.duration_s:g} s"
+        return "\n".join([head, *values, repr(self.check)])
+
     @property
     def period_s(self) -> float:
         """Duration of one period [s]."""
@@ -70,7 +77,7 @@ class ExcitationPlan:
 
     @property
     def start(self) -> Array:
-        """Posture in which the motion starts and ends [rad], (joints,)."""
+        """Posture at the start and the end of the motion [rad], (joints,)."""
         return self.motion.sample(0.0).q[0]
 
     def sample(self, t: npt.ArrayLike) -> Samples:
@@ -79,11 +86,10 @@ class ExcitationPlan:
         return self.motion.sample(np.mod(times, self.motion.duration))
 
     def rows(self, period_s: float, periods: int | None = None) -> Array:
-        """Joint positions at every FRI cycle from the start to the end of the last period, both included;
-        (n, joints).
+        """Joint positions at every FRI cycle from the start to the end of the last period, (n, joints).
 
-        Raises ConfigurationError where a period of the motion is not a whole number of cycles: averaging
-        over periods needs samples at the same phase.
+        Raises ConfigurationError unless a period of the motion is a whole number of cycles: averaging over periods
+        needs samples at the same phase.
         """
         repeats = self.periods if periods is None else periods
         if repeats < 1:
@@ -98,14 +104,8 @@ class ExcitationPlan:
         one = self.motion.sample(np.arange(count) * period_s).q
         return np.vstack([np.tile(one, (repeats, 1)), one[:1]])
 
-    def recheck(self, check: Callable[[ParametricMotion], Check]) -> Check:
-        """Check the motion again, under limits that may have changed since planning."""
-        return check(self.motion)
-
     def to_yaml(self) -> str:
-        """Text of the plan file. Numbers keep every digit, so reading it back gives the same motion to the
-        last bit.
-        """
+        """Text of the plan file. Numbers keep every digit, so the motion survives reading bit for bit."""
         content = {
             "schema_version": _SCHEMA,
             "kind": "excitation plan",
@@ -125,7 +125,7 @@ class ExcitationPlan:
 
     @classmethod
     def load(cls, path: Path) -> ExcitationPlan:
-        """Read a plan file; ConfigurationError names what is wrong with it."""
+        """Read a plan file; ConfigurationError with path and fault otherwise."""
         content = read_mapping(path)
         try:
             if content["schema_version"] != _SCHEMA or content["kind"] != "excitation plan":
@@ -147,68 +147,57 @@ class ExcitationPlan:
 
 
 def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
+    def lists(*keys: str) -> dict[str, Any]:
+        return {key: np.asarray(getattr(motion, key)).tolist() for key in keys}
+
     if isinstance(motion, FourierSeries):
-        return {
-            "type": "fourier",
-            "period_s": float(motion.period_s),
-            "harmonics": motion.harmonics,
-            "bias": motion.bias.tolist(),
-            "a": motion.a.tolist(),
-            "b": motion.b.tolist(),
-        }
+        head = {"type": "fourier", "period_s": float(motion.period_s), "harmonics": motion.harmonics}
+        return head | lists("bias", "a", "b")
     if isinstance(motion, SplineMotion):
-        return {"type": "bspline", "duration_s": float(motion.duration_s), "points": motion.points.tolist()}
+        return {"type": "bspline", "duration_s": float(motion.duration_s)} | lists("points")
     if isinstance(motion, PointToPoint):
-        return {
-            "type": "point to point",
-            "postures": motion.postures.tolist(),
-            "v_max": np.asarray(motion.v_max).tolist(),
-            "a_max": np.asarray(motion.a_max).tolist(),
-            "j_max": np.asarray(motion.j_max).tolist(),
-            "dwell_s": float(motion.dwell_s),
-        }
+        limits = lists("postures", "v_max", "a_max", "j_max")
+        return {"type": "point to point"} | limits | {"dwell_s": float(motion.dwell_s)}
     raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
 
 
 def _motion_from_mapping(content: Any) -> ParametricMotion:
+    def arrays(*keys: str) -> list[Array]:
+        return [np.array(content[key], dtype=np.float64) for key in keys]
+
     if content["type"] == "fourier":
-        return FourierSeries(
-            float(content["period_s"]),
-            np.array(content["bias"]),
-            np.array(content["a"]),
-            np.array(content["b"]),
-        )
+        return FourierSeries(float(content["period_s"]), *arrays("bias", "a", "b"))
     if content["type"] == "bspline":
-        return SplineMotion(float(content["duration_s"]), np.array(content["points"]))
+        return SplineMotion(float(content["duration_s"]), *arrays("points"))
     if content["type"] == "point to point":
-        v_max, a_max, j_max = (
-            np.array(content[key], dtype=np.float64) for key in ("v_max", "a_max", "j_max")
-        )
-        return PointToPoint(np.array(content["postures"]), v_max, a_max, j_max, float(content["dwell_s"]))
+        postures, v_max, a_max, j_max = arrays("postures", "v_max", "a_max", "j_max")
+        return PointToPoint(postures, v_max, a_max, j_max, float(content["dwell_s"]))
     raise ConfigurationError(f"motion type {content['type']!r} is unknown")
 
 
 def _margin_to_mapping(margin: Margin) -> dict[str, Any]:
-    return {
-        "constraint": margin.constraint,
-        "subject": margin.subject,
-        "value": float(margin.value),
-        "limit": float(margin.limit),
-        "slack": float(margin.slack),
-        "unit": margin.unit,
-        "time_s": float(margin.time_s),
-        "proven": bool(margin.proven),
-    }
+    numbers = {key: float(getattr(margin, key)) for key in ("value", "limit", "slack")}
+    head = {"constraint": margin.constraint, "subject": margin.subject}
+    return (
+        head | numbers | {"unit": margin.unit, "time_s": float(margin.time_s), "proven": bool(margin.proven)}
+    )
 
 
 def _margin_from_mapping(entry: Any) -> Margin:
-    return Margin(
-        str(entry["constraint"]),
-        str(entry["subject"]),
-        float(entry["value"]),
-        float(entry["limit"]),
-        float(entry["slack"]),
-        str(entry["unit"]),
-        float(entry["time_s"]),
-        bool(entry.get("proven", True)),
-    )
+    value, limit, slack, time_s = (float(entry[key]) for key in ("value", "limit", "slack", "time_s"))
+    names = str(entry["constraint"]), str(entry["subject"])
+    return Margin(*names, value, limit, slack, str(entry["unit"]), time_s, bool(entry.get("proven", True)))
+
+
+def plan_report(plan: ExcitationPlan) -> str:
+    """Summary of a plan for people: criteria, tightest margins, largest predicted deviations."""
+    lines = [f"period {plan.period_s:g} s, {plan.periods} period(s)", "", "criteria"]
+    width = max((len(name) for name in plan.objectives), default=0)
+    lines += [f"  {name.ljust(width)}  {value:10.4f}" for name, value in plan.objectives.items()]
+    lines += ["", "tightest margins"]
+    lines += [f"  {margin}" for margin in plan.check.tightest()]
+    worst = sorted(plan.rsd_percent.items(), key=lambda item: -item[1])[:8]
+    if worst:
+        lines += ["", "largest predicted relative deviations"]
+        lines += [f"  {name:8s} {value:8.2f} %" for name, value in worst]
+    return "\n".join(lines)

@@ -1,5 +1,6 @@
-"""From a problem to a checked plan: set-up, search, polish, proof. The library function behind `lwr-run
-plan`.
+"""From a problem to a checked plan: early refusal, search, polish, proof. The function behind `lwr-run plan`.
+
+`feasible_fourier` is the quick alternative: a safe motion in a second, without optimisation of a criterion.
 """
 
 from __future__ import annotations
@@ -8,35 +9,55 @@ import dataclasses
 import importlib.metadata
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
 
-from fri.errors import OperatorError, RefusedError
-from ident.excitation.assembly import Assembled, assemble
-from ident.excitation.check import Check
-from ident.excitation.infeasible import explain, refuse_impossible
-from ident.excitation.motion import ParametricMotion
+from fri.errors import ConfigurationError, OperatorError, RefusedError
+from ident.excitation.arm_model import ArmEstimate, Mechanism
+from ident.excitation.assembly import Assembled, arm_limits, assemble, sampling
+from ident.excitation.check import Check, Workspace, check_motion
+from ident.excitation.clearance import space_of
+from ident.excitation.information import Columns, ConstantBasis
+from ident.excitation.motions import Array, FourierBasis, ParametricMotion
 from ident.excitation.plan import ExcitationPlan
-from ident.excitation.polish import polish
 from ident.excitation.problem import PlanProblem
-from ident.excitation.search import Candidate, begin, hop
+from ident.excitation.program import Row, Setup
+from ident.excitation.search import (
+    Candidate,
+    Outcome,
+    begin,
+    hop,
+    polish,
+    random_start,
+    restore,
+    shortfall,
+    tighten,
+)
+from ident.excitation.sqp import minimise
+from lwr_driver.arm import Arm
+from lwr_driver.collision import CollisionChecker
 
-__all__ = ["Progress", "plan", "search_candidates"]
+__all__ = ["Progress", "explain", "feasible_fourier", "plan", "refuse_impossible", "search_candidates"]
 
 _log = logging.getLogger(__name__)
-
 _HOPS_PER_TASK = 5
+_STATIC_STARTS = 12
+_STARTS = 12
+_ROUNDS = 4
+_RESERVE = 3e-3
+_NEAR = 5e-3
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where the search stands: stage, tasks done and planned, best value in reported units, seconds since
-    start.
-    """
+    """State of the search: stage, tasks done and planned, best value in reported units, seconds since the start."""
 
     stage: str
     done: int
@@ -47,36 +68,35 @@ class Progress:
 
 
 def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = None) -> ExcitationPlan:
-    """Search for the best motion that keeps every limit, and return it with margins, values and provenance.
+    """Search for the best motion within every limit, and return it with margins, values and provenance.
 
-    Interrupted by Ctrl-C, the search ends and the best motion found so far is polished, checked and returned.
+    Ctrl-C ends the search; the best motion found so far is polished, checked and returned. A motion outside a limit is
+    never returned.
 
-    Raises ConfigurationError for a problem that contradicts itself, RefusedError for one without a feasible
-    motion (naming the limit and by how much), OperatorError if interrupted before anything feasible was
-    found. A motion that violates anything is never returned.
+    Raises ConfigurationError for a contradictory problem, RefusedError for a problem without a feasible motion (with
+    limit and excess), OperatorError for an interruption before the first motion.
     """
     problem, interrupted = _with_goal(problem, progress)
     assembled = assemble(problem)
     refuse_impossible(assembled)
-    tracker = _Tracker(assembled, progress)
-    tracker.interrupted = interrupted
+    tracker = _Tracker(assembled, progress, interrupted)
     candidates = search_candidates(assembled, tracker)
     tracker.stage("polish", 1)
-    motion, check, value = _first_that_passes(assembled, candidates, tracker.interrupted)
-    result = _describe(assembled, motion, check, tracker, value)
+    outcome = _first_that_passes(assembled, candidates, tracker.interrupted)
+    result = _describe(assembled, outcome, tracker)
     tracker.advance(None)
     return result
 
 
 def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None) -> tuple[PlanProblem, bool]:
-    """The problem with a goal for the condition number: given, or what a search for it alone reaches (Remark 4).
+    """The problem with a goal for the condition number, and whether its search was interrupted.
 
-    Also tells whether that search was interrupted.
+    The goal is given or comes from a search for the condition number alone (Remark 4).
     """
-    wanted = problem.objective
-    if wanted.criterion != "goal_attainment" or wanted.goal_condition is not None:
+    objective = problem.objective
+    if objective.criterion != "goal_attainment" or objective.goal_condition is not None:
         return problem, False
-    alone = replace(problem, objective=replace(wanted, criterion="condition_number"))
+    alone = replace(problem, objective=replace(objective, criterion="condition_number"))
     assembled = assemble(alone)
     refuse_impossible(assembled)
     tracker = _Tracker(assembled, progress)
@@ -85,16 +105,17 @@ def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None
         raise RefusedError(explain(assembled, [polish(assembled, best, quick=True)]))
     goal = float(np.exp(best.value))
     _log.info("goal of the condition number from a search for it alone: %.2f", goal)
-    return replace(problem, objective=replace(wanted, goal_condition=goal)), tracker.interrupted
+    return replace(problem, objective=replace(objective, goal_condition=goal)), tracker.interrupted
 
 
 class _Tracker:
-    """Counts tasks, keeps the best value, tells the listener, and knows whether time is up."""
+    """Counts tasks, keeps the best value, reports to the listener, and checks the time limit."""
 
-    def __init__(self, assembled: Assembled, listener: Callable[[Progress], None] | None) -> None:
-        self.assembled, self.listener = assembled, listener
+    def __init__(
+        self, assembled: Assembled, listener: Callable[[Progress], None] | None, interrupted: bool = False
+    ) -> None:
+        self.assembled, self.listener, self.interrupted = assembled, listener, interrupted
         self.begun = time.monotonic()
-        self.interrupted = False
         self.evaluations = 0
         self.best: Candidate | None = None
         self.name, self.done, self.total = "", 0, 0
@@ -102,16 +123,16 @@ class _Tracker:
     def stage(self, name: str, total: int) -> None:
         """Begin a stage of `total` tasks."""
         self.name, self.done, self.total = name, 0, total
-        self._tell()
+        self._report()
 
-    def advance(self, candidate: Candidate | None) -> None:
-        """One task is done."""
-        self.done += 1
+    def advance(self, candidate: Candidate | None, done: int = 1) -> None:
+        """Count finished tasks."""
+        self.done += done
         if candidate is not None:
             self.evaluations += candidate.evaluations
             if self.best is None or candidate.better_than(self.best):
                 self.best = candidate
-        self._tell()
+        self._report()
 
     @property
     def out_of_time(self) -> bool:
@@ -119,7 +140,7 @@ class _Tracker:
         limit = self.assembled.problem.search.time_limit_s
         return self.interrupted or (limit is not None and time.monotonic() - self.begun > limit)
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         if self.listener is None:
             return
         best = self.best
@@ -131,9 +152,7 @@ class _Tracker:
 
 
 def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate]:
-    """Starts, then hops with successive halving of the lanes; best first. Ends early on Ctrl-C or out of
-    time.
-    """
+    """Starts, then hops with successive halving of the lanes; best first. Ends early on Ctrl-C or out of time."""
     search, setup = assembled.problem.search, assembled.setup
     found: list[Candidate] = []
     try:
@@ -172,13 +191,12 @@ def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate
 def _run(
     tasks: Sequence[Any], jobs: int, tracker: _Tracker, sizes: Sequence[int] | None = None
 ) -> list[Candidate]:
-    """Results in order, reported one by one; stops handing out tasks when time is up."""
+    """Results in order, reported one by one."""
     results: list[Candidate] = []
-    for index, candidate in enumerate(Parallel(n_jobs=jobs, return_as="generator")(tasks)):
+    finished = Parallel(n_jobs=jobs, return_as="generator")(tasks)
+    for candidate, size in zip(finished, sizes or [1] * len(tasks), strict=True):
         results.append(candidate)
-        if sizes is not None:
-            tracker.done += sizes[index] - 1
-        tracker.advance(candidate)
+        tracker.advance(candidate, size)
     return results
 
 
@@ -193,22 +211,18 @@ def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
     return unique
 
 
-def _first_that_passes(
-    assembled: Assembled, candidates: Sequence[Candidate], interrupted: bool
-) -> tuple[ParametricMotion, Check, float]:
+def _first_that_passes(assembled: Assembled, candidates: Sequence[Candidate], interrupted: bool) -> Outcome:
     tries = 3 if interrupted else 6
     failures = []
     for candidate in candidates[:tries]:
         outcome = polish(assembled, candidate, quick=interrupted)
         if outcome.check.ok and outcome.bounds_kept:
-            return outcome.motion, outcome.check, outcome.value
+            return outcome
         failures.append(outcome)
     raise RefusedError(explain(assembled, failures))
 
 
-def _describe(
-    assembled: Assembled, motion: ParametricMotion, check: Check, tracker: _Tracker, value: float
-) -> ExcitationPlan:
+def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> ExcitationPlan:
     problem = assembled.problem
     settings = dataclasses.asdict(problem)
     settings.pop("source")
@@ -223,14 +237,14 @@ def _describe(
             for name in ("lwr-identification", "numpy", "scipy", "numba")
         },
     }
-    objectives, rsd = assembled.describe(motion)
+    objectives, rsd = assembled.describe(outcome.motion)
     return ExcitationPlan(
-        motion=motion,
+        motion=outcome.motion,
         joint_names=assembled.setup.mechanism.joint_names,
         periods=problem.motion.periods,
         objectives=objectives,
         rsd_percent=rsd,
-        check=check,
+        check=outcome.check,
         provenance=provenance,
     )
 
@@ -243,3 +257,176 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value
+
+
+def refuse_impossible(assembled: Assembled) -> None:
+    """Raise at once for problems without a solution.
+
+    Checked: the highest frequency against the arm's lowest resonance (n_f w0 < w_r), workspace bounds against the arm's
+    reach, and the existence of a posture within every limit (small motions around it are always feasible).
+    """
+    basis = assembled.setup.basis
+    if isinstance(basis, FourierBasis) and basis.harmonics / basis.period_s >= assembled.resonance_hz:
+        raise ConfigurationError(
+            f"n_f w0 = {basis.harmonics} / {basis.period_s} s = {basis.harmonics / basis.period_s:.3g} Hz reaches "
+            f"the arm's lowest resonance, {assembled.resonance_hz:.3g} Hz; lower `harmonics` or lengthen "
+            "`period_s`"
+        )
+    mechanism, work = assembled.setup.mechanism, assembled.problem.workspace
+    lengths = np.linalg.norm(mechanism.translation[1:], axis=1)
+    reach = float(lengths.sum() + np.linalg.norm(mechanism.tip))
+    for name, bound in (("radius_m", work.radius_m), ("height_m", work.height_m)):
+        if bound is not None and bound >= reach:
+            raise RefusedError(
+                f"workspace: {name} {bound:.3f} m is {bound - reach:.3f} m beyond reach, {reach:.3f} m"
+            )
+    _refuse_static(assembled)
+
+
+def _refuse_static(assembled: Assembled) -> None:
+    setup = assembled.setup
+    basis = ConstantBasis(setup.basis.duration)
+    still = replace(setup, basis=basis, target=None, bounds=(), samples=1, refine=1)
+    rng = np.random.default_rng(0)
+    middle = 0.5 * (setup.limits.q_low + setup.limits.q_high)
+    half = 0.5 * (setup.limits.q_high - setup.limits.q_low)
+    best, blame = np.inf, ""
+    for _ in range(_STATIC_STARTS):
+        posture = middle + half * rng.uniform(-0.7, 0.7, size=middle.size)
+        program = still.program(feasibility=True)
+        program.anchor = posture
+        program.constraints.refresh_deviation(program.signals(posture))
+        found = restore(still, posture, iterations=60)
+        if found.violation < 1e-3:
+            return
+        if found.violation < best:
+            best = found.violation
+            program.values(found.x)
+            blame = _blame(assembled, program.constraints.rows, program.constraints.latest)
+    raise RefusedError(
+        f"no posture can be held within the limits: {blame}; widen that limit or lighten the payload"
+    )
+
+
+def _blame(assembled: Assembled, rows: Sequence[Row], values: Array) -> str:
+    worst = int(np.argmin(values))
+    row = rows[worst]
+    setup, excess = assembled.setup, -float(values[worst])
+    if row.constraint == "distance":
+        name = assembled.row_names[row.index]
+        scale = 0.3 if row.index < 2 else 0.1
+        return f"{name} falls short by {excess * scale:.3g} m"
+    joint = setup.mechanism.joint_names[row.index]
+    if row.constraint == "torque":
+        limit = setup.limits.tau_max[row.index]
+        return f"{joint} torque exceeds {limit:.4g} Nm by {excess * limit:.3g} Nm"
+    return f"{joint} {row.constraint} exceeds its limit by {100.0 * excess:.3g} %"
+
+
+def explain(assembled: Assembled, outcomes: Sequence[Outcome]) -> str:
+    """Reasons for the failure of every candidate: the violations of the nearest one."""
+    nearest = min(outcomes, key=shortfall)
+    reasons = [str(margin) for margin in nearest.check.violations[:3]]
+    if not nearest.bounds_kept:
+        view = assembled.view(nearest.motion)
+        for bound in assembled.setup.bounds:
+            if bound.criterion.evaluate(view, np.inf)[0] > bound.limit:
+                reasons.append(
+                    f"{bound.criterion.name} {bound.criterion.exact(view):.4g} exceeds the bound "
+                    f"{bound.criterion.report(bound.limit):.4g}"
+                )
+    return (
+        "no motion within every limit was found; the nearest one: "
+        + "; ".join(reasons)
+        + "; widen that limit, lengthen `period_s`, or raise `search.starts`"
+    )
+
+
+def feasible_fourier(
+    arm: Arm,
+    checker: CollisionChecker | None,
+    *,
+    period_s: float = 20.0,
+    harmonics: int = 5,
+    periods: int = 1,
+    seed: int = 1,
+    speed_scale: float = 1.0,
+    workspace: Workspace | None = None,
+    estimate: ArmEstimate | None = None,
+    clearance_m: float = 0.02,
+) -> ExcitationPlan:
+    """Random Fourier motion of moderate size, shifted as little as possible to pass every check.
+
+    `estimate` defaults to the URDF's inertias without friction. Raises RefusedError after a dozen random starts
+    without a passing motion, naming the most frequent obstacle.
+    """
+    mechanism = Mechanism.from_urdf(arm.urdf)
+    space, _ = space_of(mechanism, getattr(checker, "geometry", None))
+    work = workspace if workspace is not None else Workspace()
+    basis = FourierBasis(period_s, harmonics)
+    setup = Setup(
+        mechanism=mechanism,
+        basis=basis,
+        limits=arm_limits(arm, speed_scale),
+        space=space,
+        floor=space.floor(clearance_m + _RESERVE, (work.radius_m, work.height_m), _RESERVE),
+        estimate=estimate if estimate is not None else ArmEstimate.nominal(mechanism),
+        columns=Columns.of(mechanism.joints, ()),
+        target=None,
+        **sampling(basis),
+    )
+    against = partial(
+        check_motion,
+        mechanism=mechanism,
+        limits=setup.limits,
+        workspace=work,
+        estimate=setup.estimate,
+        checker=checker,
+        clearance_m=clearance_m,
+    )
+    blocked: Counter[str] = Counter()
+    for start in range(_STARTS):
+        plan, check = _from_start(setup, np.random.default_rng([seed, start]), against)
+        if plan is not None:
+            _log.info("feasible excitation found from start %d of %d", start + 1, _STARTS)
+            provenance = {
+                "method": "feasible_fourier",
+                "seed": seed,
+                "speed_scale": speed_scale,
+                "arm": arm.name,
+            }
+            return ExcitationPlan(plan, arm.joint_names, periods, check=check, provenance=provenance)
+        worst = (check.violations or check.tightest())[0]
+        blocked[f"{worst.subject} {worst.constraint}"] += 1
+    culprit = blocked.most_common(1)[0][0]
+    raise RefusedError(
+        f"no feasible exciting motion found from {_STARTS} random starts; most frequent obstacle: {culprit}; widen "
+        "that limit or choose another seed"
+    )
+
+
+def _from_start(
+    setup: Setup, rng: np.random.Generator, against: Callable[..., Check]
+) -> tuple[ParametricMotion | None, Check]:
+    """The motion nearest to one random start, tightened until it passes; None without success."""
+    with threadpool_limits(1):
+        program = setup.program()
+        program.constraints.rate = 200.0
+        x = random_start(setup, rng)
+        program.anchor = x.copy()
+        for _ in range(_ROUNDS):
+            program.constraints.refresh_deviation(program.signals(x))
+            solution = minimise(program, x, iterations=40, tolerance=1e-6)
+            x = solution.x
+            near = float(solution.constraints.min()) > -_NEAR
+            motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
+            steps = (
+                {"step_s": 1e-3, "collision_step_s": 1e-2}
+                if near
+                else {"step_s": 0.05, "collision_step_s": 0.1}
+            )
+            check = against(motion, **steps, continuous=near)
+            if (check.ok and near) or not near:
+                break
+            tighten(program.constraints, check, setup.mechanism.joint_names)
+        return (motion if check.ok and near else None), check

@@ -1,4 +1,4 @@
-"""The planning problem as a file: arm, surroundings, what is known, what is wanted, how long to search."""
+"""The planning problem as a file: arm, surroundings, present knowledge, objective, extent of the search."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ __all__ = ["Knowledge", "MotionForm", "Objective", "PlanProblem", "Prior", "Sear
 
 @dataclass(frozen=True)
 class MotionForm:
-    """Parametrisation. fourier: equation (9); bspline: degree 5, `control_points` free ones (Rackl et al.
-    2012).
+    """Parametrisation. fourier: equation (9); bspline: degree 5, `control_points` free ones (Rackl et al. 2012).
 
     period_s : base period T0, or duration of the spline [s]
-    periods : how often the motion is run in a session
+    periods : repetitions of the motion in a session
     """
 
     type: Literal["fourier", "bspline"] = "fourier"
@@ -40,11 +39,10 @@ class MotionForm:
 class Knowledge:
     """Present estimate of the dynamics: a `model.yaml`, or a file of standard parameters.
 
-    payload : its name in that file; None if every session is unloaded
-    relative_uncertainty : of each parameter (one standard deviation), where the file has no covariance
-    coverage : standard deviations that the torque limits must hold for
-    noise_motor, noise_joint : standard deviation of each row [Nm]; empty: values that explain the published
-    Table 2
+    payload : its name in this file; None if every session is unloaded
+    relative_uncertainty : of each parameter (one standard deviation), for a file without covariance
+    coverage : number of standard deviations covered by the torque limits
+    noise_motor, noise_joint : standard deviation of each row [Nm]; empty: values consistent with the published Table 2
     samples : independent samples in each session, for the predicted deviations
     """
 
@@ -59,13 +57,13 @@ class Knowledge:
 
 @dataclass(frozen=True)
 class Objective:
-    """What is minimised, and bounds that other criteria must keep meanwhile.
+    """The criterion to minimise, and bounds on other criteria.
 
     criterion : condition_number, d_optimality, mean_rsd, worst_rsd, or goal_attainment (equation (10))
     scaling : of the columns in condition numbers
     condition_at_most, mean_rsd_at_most, worst_rsd_at_most : bounds; None for no bound
-    goal_condition, goal_wrist : g and k_tau of equation (10); without g what a search for the condition number
-    alone reaches is the goal, as the paper's Remark 4 advises
+    goal_condition, goal_wrist : g and k_tau of equation (10); without g the result of a search for the condition number
+    alone is the goal (the paper's Remark 4)
     wrist : the two joints of equation (10), counted from 1
     """
 
@@ -83,11 +81,10 @@ class Objective:
 
 @dataclass(frozen=True)
 class Prior:
-    """A motion that has been run already; the new one adds what it lacks. Either a plan or a recorded
-    session.
+    """A motion run earlier, from a plan or a recorded session; the new motion complements its information.
 
     plan : its plan file; sessions : the sessions recorded with it
-    session : a session log; what was loaded is in the log
+    session : a session log, including its payload
     """
 
     plan: str | None = None
@@ -101,12 +98,10 @@ class Prior:
 
 @dataclass(frozen=True)
 class Search:
-    """How much to search. Seed and counts alone decide the result; a time limit makes it depend on the
-    computer.
+    """Extent of the search. Seed and counts alone decide the result; a time limit makes it depend on the computer.
 
-    starts : random starts; hops : perturbations tried afterwards; lanes : candidates that are hopped from at
-    first
-    jobs : processes, through joblib; its configured backend (loky, dask, ray) is used
+    starts : random starts; hops : perturbations tried afterwards; lanes : candidates perturbed at first
+    jobs : processes, through joblib with its configured backend (loky, dask, ray)
     """
 
     seed: int = 1
@@ -126,10 +121,10 @@ class Search:
 
 @dataclass(frozen=True)
 class PlanProblem:
-    """Everything that `plan` needs; each key of the file has a default but `name`.
+    """The input of `plan`; each key of the file has a default but `name`.
 
     parameters : "base" (all base parameters), "model" (those of the estimate's file), or a list of names
-    sessions : which sessions are recorded with the motion, with what load
+    sessions : sessions recorded with the motion
     model : 1 joint rows, 2 motor and joint rows, 3 difference rows
     clearance_m : distance to keep; None: the cell's own margin. speed_scale : share of the velocity limits
     """
@@ -151,6 +146,21 @@ class PlanProblem:
     prior: tuple[Prior, ...] = ()
     search: Search = field(default_factory=Search)
     source: Path | None = None
+
+    def __repr__(self) -> str:
+        form, search = self.motion, self.search
+        detail = (
+            f"n_f = {form.harmonics}" if form.type == "fourier" else f"{form.control_points} control points"
+        )
+        return "\n".join(
+            [
+                f"PlanProblem {self.name}: {self.arm}, {self.cell}, knowledge {self.knowledge.file}",
+                f"  motion {form.type}, {form.period_s:g} s, {detail}, {form.periods} period(s)",
+                f"  sessions {', '.join(self.sessions)}; model {self.model}; {len(self.prior)} prior motion(s)",
+                f"  objective {self.objective.criterion}",
+                f"  search seed {search.seed}, {search.starts} starts, {search.hops} hops",
+            ]
+        )
 
     def __post_init__(self) -> None:
         if self.schema_version != 1:

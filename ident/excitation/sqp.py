@@ -1,13 +1,12 @@
 """Sequential quadratic programming for a smooth objective under c(x) >= 0, dense and small.
 
 Quasi-Newton SQP with Powell's damped BFGS update and an l1 merit function (Nocedal and Wright, chapter 18).
-The quadratic subproblem is elastic: constraint violation is allowed at a quadratic price, so it is always
-solvable, and its dual is a non-negative least-squares problem of one unknown per constraint, solved by scipy.
+The quadratic subproblem is elastic: constraint violation has a quadratic price, so a solution always exists. Its dual
+is a non-negative least-squares problem with one unknown per constraint, solved by scipy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +14,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from ident.excitation.motion import Array
+from ident.excitation.motions import Array
 
 __all__ = ["SmoothProblem", "Solution", "minimise"]
 
@@ -26,7 +25,7 @@ _BACKTRACKS = 8
 
 
 class SmoothProblem(Protocol):
-    """Objective and constraints; derivatives are asked for at the point of the latest `values` only."""
+    """Objective and constraints; derivatives refer to the point of the latest `values`."""
 
     def values(self, x: Array) -> tuple[float, Array]:
         """f(x), c(x)."""
@@ -37,7 +36,7 @@ class SmoothProblem(Protocol):
 
 @dataclass(eq=False)
 class Solution:
-    """Where the iteration ended. `hessian` can start the next one nearby."""
+    """Final state of the iteration. `hessian` can start the next one nearby."""
 
     x: Array
     value: float
@@ -56,11 +55,8 @@ def minimise(
     iterations: int = 60,
     tolerance: float = 1e-4,
     hessian: Array | None = None,
-    stop: Callable[[], bool] | None = None,
 ) -> Solution:
-    """Minimise from x. Ends when a step promises less than `tolerance`, after `iterations`, or when `stop()`
-    is true.
-    """
+    """Minimise from x until a step promises less than `tolerance`, for at most `iterations`."""
     n = x.size
     x = x.copy()
     value, c = problem.values(x)
@@ -68,7 +64,7 @@ def minimise(
     b = np.eye(n) * max(float(np.linalg.norm(gradient)), 1e-3) if hessian is None else hessian.copy()
     multipliers = np.zeros(c.size)
     price, evaluations, converged, count = 0.0, 1, False, 0
-    while count < iterations and not (stop is not None and stop()):
+    while count < iterations:
         count += 1
         step, multipliers = _subproblem(b, gradient, jacobian, c)
         longest = float(np.max(np.abs(step)))
@@ -132,7 +128,7 @@ def _subproblem(b: Array, gradient: Array, jacobian: Array, c: Array) -> tuple[A
 
 
 def _damped_bfgs(b: Array, moved: Array, change: Array) -> Array:
-    """Powell's update, which keeps B positive definite whatever the curvature along the step."""
+    """Powell's update; B stays positive definite for any curvature along the step."""
     bs = b @ moved
     sbs = float(moved @ bs)
     if sbs < 1e-18:

@@ -10,8 +10,8 @@ joint j per parameter of body b is
     inertia:      sym(a wd^T) + sym(e w^T),   e = a x w
 
 so the regressor is polynomial in the propagated vectors and the reverse sweep is the same recursion run
-backwards. Rotations are differentiated through d(R^T u)/dq = -z x (R^T u). Nothing is stored between the
-sweeps but the samples themselves.
+backwards. Rotations are differentiated through d(R^T u)/dq = -z x (R^T u). Between the sweeps only the samples
+are stored.
 """
 
 from __future__ import annotations
@@ -107,11 +107,8 @@ def forward(arm, motion, columns, chi, eps, z, tau):  # type: ignore[no-untyped-
     sets = chi.shape[0]
     c = parameter.shape[0]
     cs = np.empty((n, 2))
-    w = np.empty((n, 3))
-    wd = np.empty((n, 3))
-    vd = np.empty((n, 3))
-    lin = np.empty((n, n, 3))
-    ang = np.empty((n, n, 3))
+    w, wd, vd = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lin, ang = np.empty((n, n, 3)), np.empty((n, n, 3))
     y = np.empty(10)
     tau[:] = 0.0
     for i in range(m):
@@ -154,8 +151,7 @@ def forward(arm, motion, columns, chi, eps, z, tau):  # type: ignore[no-untyped-
 
 @njit(cache=True, error_model="numpy")
 def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignore[no-untyped-def]
-    """Add the derivative with respect to q, qd, qdd of a function of `forward`'s results to `bars`, (m, n)
-    each.
+    """Add the derivative of a function of `forward`'s results with respect to q, qd, qdd to `bars`, (m, n) each.
 
     zbar (n, m, c + 4) and taubar (k, m, n) are the function's derivatives with respect to z and tau.
     """
@@ -167,16 +163,10 @@ def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignor
     sets = chi.shape[0]
     c = parameter.shape[0]
     cs = np.empty((n, 2))
-    w = np.empty((n, 3))
-    wd = np.empty((n, 3))
-    vd = np.empty((n, 3))
-    lin = np.empty((n, n, 3))
-    ang = np.empty((n, n, 3))
-    wb = np.empty((n, 3))
-    db = np.empty((n, 3))
-    vb = np.empty((n, 3))
-    lb = np.empty((n, n, 3))
-    ab = np.empty((n, n, 3))
+    w, wd, vd = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lin, ang = np.empty((n, n, 3)), np.empty((n, n, 3))
+    wb, db, vb = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    lb, ab = np.empty((n, n, 3)), np.empty((n, n, 3))
     y = np.empty(10)
     for i in range(m):
         _kinematics(rot0, trans, gravity, q[i], qd[i], qdd[i], cs, w, wd, vd, lin, ang)

@@ -9,9 +9,9 @@ import click
 
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan
+from ident.excitation.plan import plan_report
 from ident.excitation.planner import plan
 from ident.excitation.problem import PlanProblem
-from ident.excitation.table import plan_report
 from runner.options import json_option
 from runner.plain import as_json as to_json
 from runner.replanning import show_search

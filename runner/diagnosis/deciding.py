@@ -17,7 +17,7 @@ from ident.diagnosis import Diagnosis, Finding
 from ident.effects import EFFECTS
 from ident.effects import Experiment as Discriminating
 from ident.excitation import ExcitationPlan
-from ident.excitation.motion import ParametricMotion
+from ident.excitation.motions import ParametricMotion
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.configuration import parse

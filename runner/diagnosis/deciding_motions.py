@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.excitation.bspline import SplineMotion
+from ident.excitation.motions import SplineMotion
 from lwr_driver.arm import Arm
 
 __all__ = ["GRAIN_S", "chirp", "poses", "reversal_ladder", "slow_sweep"]

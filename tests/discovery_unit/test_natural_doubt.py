@@ -11,7 +11,7 @@ import pytest
 from ident.diagnosis import Diagnosis, diagnose
 from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
-from ident.excitation.bspline import SplineMotion
+from ident.excitation.motions import SplineMotion
 from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis.deciding import Deciding

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise
 from ident.excitation.check import Limits
-from ident.excitation.estimate import ArmEstimate, Noise
-from ident.excitation.mechanism import Mechanism
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import CONFIGS
 

@@ -3,11 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.excitation.certificate import prove, reach, speed_bound, torque_rate
-from ident.excitation.estimate import ArmEstimate
-from ident.excitation.fourier import FourierBasis, FourierSeries
-from ident.excitation.mechanism import Mechanism, tip_path
-from ident.excitation.torque import torque_bounds
+from ident.excitation.arm_model import ArmEstimate, Mechanism, tip_path, torque_bounds
+from ident.excitation.check import prove, speed_bound, swept_radius, torque_rate
+from ident.excitation.motions import FourierBasis, FourierSeries
 
 
 @pytest.fixture
@@ -45,7 +43,7 @@ def test_what_touches_zero_is_not_proven(series: FourierSeries) -> None:
 def test_speed_bound_holds(mechanism: Mechanism, series: FourierSeries) -> None:
     extents = np.zeros(7)
     extents[-1] = 0.078
-    rate = speed_bound(series, reach(mechanism, extents))
+    rate = speed_bound(series, swept_radius(mechanism, extents))
     times = np.linspace(0.1, 7.9, 400)
     for half in (1e-3, 2e-2):
         moved = [tip_path(mechanism, series.sample(times + side * half).q) for side in (-1, 1)]

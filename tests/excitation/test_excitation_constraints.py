@@ -5,17 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.excitation.capsules import space_of
+from ident.excitation.arm_model import ArmEstimate, Mechanism, torque_bounds
 from ident.excitation.check import Limits
-from ident.excitation.constraints import Constraints
-from ident.excitation.estimate import ArmEstimate
-from ident.excitation.evaluation import Evaluator
-from ident.excitation.fourier import FourierBasis
-from ident.excitation.information import Columns
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.motion import Samples
-from ident.excitation.program import Program
-from ident.excitation.torque import torque_bounds
+from ident.excitation.clearance import space_of
+from ident.excitation.information import Columns, Evaluator
+from ident.excitation.motions import FourierBasis, Samples
+from ident.excitation.program import Constraints, Program
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.collision import CollisionChecker
@@ -87,7 +82,7 @@ def test_deviation_of_torque_is_that_of_random_parameters(
         drives = estimate.drives * (1.0 + 0.1 * rng.normal(size=estimate.drives.shape))
         varied = ArmEstimate(estimate.bodies * scale[0], drives, estimate.payload * scale[1])
         loaded = varied.loads[1]
-        from ident.excitation.torque import rigid_torque
+        from ident.excitation.arm_model import rigid_torque
 
         tau = rigid_torque(mechanism, samples, loaded[None])[0]
         draws.append(tau + samples.qd * drives[:, 1] + drives[:, 3] + drives[:, 2])

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.excitation.criteria import d_optimality, log_condition, rsd_mean, rsd_worst, scaled, unscale
-from ident.excitation.objectives import GoalAttainment, MeanTorque, View
+from ident.excitation.criteria import (
+    GoalAttainment,
+    MeanTorque,
+    d_optimality,
+    log_condition,
+    rsd_mean,
+    rsd_worst,
+    scaled,
+    unscale,
+)
+from ident.excitation.information import View
 
 
 @pytest.fixture

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.excitation.estimate import ArmEstimate
-from ident.excitation.evaluation import Evaluator
-from ident.excitation.fourier import FourierBasis
-from ident.excitation.information import Assembly, Columns, Rows
-from ident.excitation.mechanism import Mechanism
+from ident.excitation.arm_model import ArmEstimate, Mechanism
+from ident.excitation.information import Assembly, Columns, Evaluator, Rows
+from ident.excitation.motions import FourierBasis
 from ident.structure import Condition, ModelStructure
 
 NAMES = (

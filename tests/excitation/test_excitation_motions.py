@@ -10,9 +10,9 @@ import pytest
 
 from fri.errors import ConfigurationError, RefusedError
 from ident.excitation import ExcitationPlan, PointToPoint, SplineBasis, Workspace, check_motion, random_points
+from ident.excitation.arm_model import Mechanism
 from ident.excitation.check import Limits
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.motion import ParametricMotion
+from ident.excitation.motions import ParametricMotion
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import pytest
 
 from fri.errors import ConfigurationError, RefusedError
 from ident.excitation import ExcitationPlan, Workspace, arm_limits, check_motion, feasible_fourier
-from ident.excitation.estimate import ArmEstimate
-from ident.excitation.mechanism import Mechanism, tip_path
+from ident.excitation.arm_model import ArmEstimate, Mechanism, tip_path
 from lwr_driver.arm import Arm
 
 

@@ -31,13 +31,10 @@ from ident.excitation import (
     table_row,
     trade_off,
 )
-from ident.excitation.estimate import ArmEstimate
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.motion import Samples
-from ident.excitation.point_to_point import random_points
-from ident.excitation.polish import polish
-from ident.excitation.search import judge
-from ident.excitation.torque import rigid_torque, torque_bounds
+from ident.excitation.arm_model import ArmEstimate, Mechanism, rigid_torque, torque_bounds
+from ident.excitation.comparison import random_points
+from ident.excitation.motions import Samples
+from ident.excitation.search import judge, polish
 from ident.model import DynamicModel
 from ident.model_file import write_model
 from ident.structure import ModelStructure

@@ -4,9 +4,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from ident.excitation.capsules import space_of
-from ident.excitation.mechanism import Mechanism, tip_path
-from ident.excitation.space import Space, distances, row_gradient
+from ident.excitation.arm_model import Mechanism, tip_path
+from ident.excitation.clearance import Space, distances, row_gradient, space_of
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Box, Cell, PayloadShape
 from lwr_driver.collision import CollisionChecker

@@ -55,9 +55,3 @@ def test_known_optimum_with_active_constraints() -> None:
 def test_contradicting_constraints_end_where_least_is_violated() -> None:
     solution = minimise(Contradiction(), np.array([2.5]), iterations=50)
     assert abs(solution.x[0]) <= 1.0 + 1e-6, "anywhere between the two violates least in sum"
-
-
-def test_stop_is_asked_before_each_iteration() -> None:
-    asked = iter([False, False, True])
-    solution = minimise(HockSchittkowski(), np.zeros(4), stop=lambda: next(asked))
-    assert solution.iterations == 2

@@ -1,33 +1,39 @@
-"""Distances in space along a motion, cheap and with derivatives: flange bounds, self-collision, ground and
-boxes.
+"""Distances along a motion with derivatives: flange bounds, self-collision, ground and boxes.
 
-Every body is one or more capsules (segments with a radius) that enclose its collision shape; the distance of
-two capsules is that of two segments less the radii. The derivative follows from the witness points alone (the
-envelope theorem): a unit force pair along the connecting line, turned into joint torques. These distances
-steer the optimisation; the verdict comes from the collision checker's own shapes.
+Every body is one or more capsules (segments with a radius) around its collision shape. The distance of two capsules
+is the distance of their segments less the radii. Its derivative follows from the nearest points alone (envelope
+theorem): a unit force pair along the connecting line, turned into joint torques.
+
+A capsule encloses its shape wholly, so capsules apart mean shapes apart. These distances steer the optimisation; the
+verdict comes from the collision checker with the shapes themselves.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
+import coal
 import numpy as np
+import pinocchio as pin
 from numba import njit
 
-from ident.excitation.mechanism import Mechanism
-from ident.excitation.motion import Array
+from fri.errors import ConfigurationError
+from ident.excitation.arm_model import Mechanism
+from ident.excitation.motions import Array
 
-__all__ = ["Space", "distances", "row_gradient"]
+__all__ = ["Space", "distances", "enclose", "row_gradient", "space_of"]
 
 _FAR = 0.15
+_RIM = 0.4  # distance of the segment's end from the flat end of a cylinder, as a share of the radius
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """What the flange and the links must keep away from, as arrays.
+    """Capsules of the arm and obstacles of the cell, as arrays.
 
-    body (c,): joint frame that carries each capsule, -1 for the base; ends (c, 2, 3) [m] in that frame;
-    thickness (c,) pairs (p, 2): capsules to be kept apart
+    body (c,): joint frame carrying each capsule, -1 for the base
+    ends (c, 2, 3): ends of its segment in this frame [m]; thickness (c,): its radius [m]
+    pairs (p, 2): capsules to be kept apart
     ground : height of the ground in frame 0 [m] (-inf: none); grounded (g,): capsules kept above it
     boxes : half sizes (b, 3), placements (b, 3, 3), (b, 3) in frame 0; boxed (k, 2): (capsule, box) pairs
     """
@@ -48,6 +54,12 @@ class Space:
         """Number of distances at each sample: two of the flange, then pairs, ground, boxes."""
         return 2 + len(self.pairs) + len(self.grounded) + len(self.boxed)
 
+    def floor(self, clearance: float, flange: tuple[float | None, float | None], reserve: float) -> Array:
+        """Least distance of each row [m]: bounds of the flange (None: no bound) plus a reserve, then the clearance."""
+        floor = np.full(self.rows, clearance)
+        floor[:2] = [-np.inf if bound is None else bound + reserve for bound in flange]
+        return floor
+
     def extents(self, joints: int) -> Array:
         """Distance of the farthest point of each body's capsules from the body's frame, (joints,) [m]."""
         farthest = np.zeros(joints)
@@ -59,26 +71,13 @@ class Space:
 
     @property
     def shapes(self) -> tuple:
-        """The fields in the order in which the compiled functions read them."""
-        return (
-            self.body,
-            self.ends,
-            self.thickness,
-            self.pairs,
-            self.ground,
-            self.grounded,
-            self.box_size,
-            self.box_rotation,
-            self.box_centre,
-            self.boxed,
-        )
+        """The fields in the order of the compiled functions."""
+        return tuple(getattr(self, item.name) for item in fields(self))
 
 
 @njit(cache=True, error_model="numpy")
 def _segments(p1, q1, p2, q2, out):  # type: ignore[no-untyped-def]
-    """Nearest points of two segments (Ericson, Real-Time Collision Detection, 5.1.9) into out[0], out[1];
-    distance.
-    """
+    """Distance of two segments, nearest points into out (Ericson, Real-Time Collision Detection, 5.1.9)."""
     d1x, d1y, d1z = q1[0] - p1[0], q1[1] - p1[1], q1[2] - p1[2]
     d2x, d2y, d2z = q2[0] - p2[0], q2[1] - p2[1], q2[2] - p2[2]
     rx, ry, rz = p1[0] - p2[0], p1[1] - p2[1], p1[2] - p2[2]
@@ -254,7 +253,7 @@ def _distances(arm, q, value, shapes):  # type: ignore[no-untyped-def]
             dz = middle[first, 2] - middle[second, 2]
             apart = np.sqrt(dx * dx + dy * dy + dz * dz) - middle[first, 3] - middle[second, 3]
             if apart > _FAR:
-                # far pairs need no exact distance: that of the enclosing spheres is a lower bound
+                # far pairs need no exact distance: the enclosing spheres give a lower bound
                 value[i, row + k] = apart
                 continue
             gap = _segments(world[first, 0], world[first, 1], world[second, 0], world[second, 1], near)
@@ -278,9 +277,7 @@ def _distances(arm, q, value, shapes):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def row_gradient(arm, q, row, weight, qbar, shapes):  # type: ignore[no-untyped-def]
-    """Set qbar (m, n) to the derivative of sum_i weight_i * distance_i of one row; samples of weight 0 are
-    skipped.
-    """
+    """Set qbar (m, n) to the derivative of sum_i weight_i * distance_i of one row; zero weights are skipped."""
     rotation, translation, tip = arm
     body, ends, _, pairs, _, grounded, box_size, box_rotation, box_centre, boxed = shapes
     m, n = q.shape
@@ -342,9 +339,100 @@ def row_gradient(arm, q, row, weight, qbar, shapes):  # type: ignore[no-untyped-
 
 
 def distances(mechanism: Mechanism, space: Space, q: Array) -> Array:
-    """All distances at the postures q (m, n), as (m, rows) [m]; beyond 0.15 m a lower bound may stand for
-    them.
-    """
+    """All distances at the postures q (m, n), as (m, rows) [m]; beyond 0.15 m possibly lower bounds."""
     out = np.empty((q.shape[0], space.rows))
     _distances(mechanism.geometry, np.ascontiguousarray(q), out, space.shapes)
     return out
+
+
+def enclose(shape: coal.CollisionGeometry) -> tuple[Array, float]:
+    """Segment ends (2, 3) [m] in the shape's frame and radius [m] of a capsule around a shape."""
+    if isinstance(shape, coal.Sphere):
+        return np.zeros((2, 3)), float(shape.radius)
+    if isinstance(shape, coal.Capsule):
+        return _centred(np.array([0.0, 0.0, 1.0]), float(shape.halfLength)), float(shape.radius)
+    if isinstance(shape, coal.Cylinder):
+        axis, half, radius = np.array([0.0, 0.0, 1.0]), float(shape.halfLength), float(shape.radius)
+    elif isinstance(shape, coal.Box):
+        sides = np.array(shape.halfSide)
+        longest = int(np.argmax(sides))
+        axis, half = np.eye(3)[longest], float(sides[longest])
+        radius = float(np.linalg.norm(np.delete(sides, longest)))
+    else:
+        raise ConfigurationError(
+            f"collision shape {type(shape).__name__} is not supported; use sphere, capsule, cylinder or box"
+        )
+    inset = min(_RIM * radius, half)
+    return _centred(axis, half - inset), float(np.hypot(radius, inset))
+
+
+def _centred(axis: Array, half: float) -> Array:
+    return np.stack([-half * axis, half * axis])
+
+
+def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[Space, tuple[str, ...]]:
+    """The distances of a collision model's pairs as capsules, and a name for each row of `Space`.
+
+    Frame 0 is the first joint's frame at zero. Without a geometry only the flange rows remain.
+    """
+    names = ["flange distance from axis 1", "flange height"]
+    if geometry is None:
+        return Space(), tuple(names)
+    to_zero = np.linalg.inv(mechanism.base)
+    to_zero[:3, 3] -= mechanism.translation[0]
+    capsules: dict[int, tuple[int, Array, float]] = {}  # joint frame, segment, radius by shape
+    boxes: dict[int, tuple[Array, Array]] = {}  # half sides, pose by shape
+    pairs: list[tuple[int, int]] = []
+    grounded: list[int] = []
+    boxed: list[tuple[int, int]] = []
+    ground = -np.inf
+    pair_names: list[str] = []
+    ground_names: list[str] = []
+    box_names: list[str] = []
+
+    def capsule(index: int) -> int:
+        if index not in capsules:
+            item = geometry.geometryObjects[index]
+            segment, radius = enclose(item.geometry)
+            joint = int(item.parentJoint)
+            frame = to_zero if joint == 0 else mechanism.links[joint - 1]
+            pose = frame @ np.array(item.placement.homogeneous)
+            capsules[index] = (joint - 1, segment @ pose[:3, :3].T + pose[:3, 3], radius)
+        return list(capsules).index(index)
+
+    for pair in geometry.collisionPairs:
+        indices = (int(pair.first), int(pair.second))
+        shapes = [geometry.geometryObjects[index] for index in indices]
+        fixed = [k for k in range(2) if int(shapes[k].parentJoint) == 0]
+        label = f"{shapes[0].name} to {shapes[1].name}"
+        flat = [k for k in fixed if isinstance(shapes[k].geometry, coal.Halfspace)]
+        solid = [k for k in fixed if isinstance(shapes[k].geometry, coal.Box)]
+        if flat:
+            half = shapes[flat[0]].geometry
+            if not np.allclose(half.n, [0.0, 0.0, 1.0]):
+                raise ConfigurationError(f"{shapes[flat[0]].name}: only a level ground is supported")
+            ground = float((to_zero @ np.array([0.0, 0.0, half.d, 1.0]))[2])
+            grounded.append(capsule(indices[1 - flat[0]]))
+            ground_names.append(label)
+        elif solid:
+            box = shapes[solid[0]]
+            pose = to_zero @ np.array(box.placement.homogeneous)
+            boxes[indices[solid[0]]] = (np.array(box.geometry.halfSide), pose)
+            boxed.append((capsule(indices[1 - solid[0]]), list(boxes).index(indices[solid[0]])))
+            box_names.append(label)
+        else:
+            pairs.append((capsule(indices[0]), capsule(indices[1])))
+            pair_names.append(label)
+    space = Space(
+        body=np.array([body for body, _, _ in capsules.values()], dtype=np.int64),
+        ends=np.array([ends for _, ends, _ in capsules.values()]).reshape(-1, 2, 3),
+        thickness=np.array([radius for _, _, radius in capsules.values()], dtype=np.float64),
+        pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
+        ground=ground,
+        grounded=np.array(grounded, dtype=np.int64),
+        box_size=np.array([size for size, _ in boxes.values()]).reshape(-1, 3),
+        box_rotation=np.ascontiguousarray([pose[:3, :3] for _, pose in boxes.values()]).reshape(-1, 3, 3),
+        box_centre=np.array([pose[:3, 3] for _, pose in boxes.values()]).reshape(-1, 3),
+        boxed=np.array(boxed, dtype=np.int64).reshape(-1, 2),
+    )
+    return space, tuple(names + pair_names + ground_names + box_names)
