@@ -70,6 +70,7 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("tests/rows/test_rows.py", {"tests/rows/test_rows.py": 0}),
         ("configs/cell.yaml", {"tests/use/test_face.py": 2, "tests/use/test_patch.py": 2}),
         ("docs/page.md", {"tests/test_documents.py": 1}),
+        ("page.md", {}),
     ],
 )
 def test_distance_is_the_shortest_chain_of_imports(
