@@ -1,4 +1,4 @@
-# Two commands: `make experiment` and `make test`. Each sets up what it needs in .venv.
+# `make experiment` and `make test` are the two to know. Every target sets up .venv as far as it needs it.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,13 +6,15 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.test-ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: help setup experiment test test-long lint browser screenshot clean
+.PHONY: help setup experiment test test-long quick hooks lint browser screenshot clean
 
 help:
 	@echo "make experiment   set up and run the whole experiment against the built-in emulator"
 	@echo "make test         set up and run ruff, mypy and the tests"
-	@echo "make test-long    run the tests that take minutes each"
-	@echo "make screenshot   make the pictures of the README anew"
+	@echo "make quick        run ruff and the tests nearest to the changed files, within 60 s of CPU"
+	@echo "make test-long    run the tests marked long, minutes each"
+	@echo "make hooks        install the checks made at each commit"
+	@echo "make screenshot   take the pictures of the documents again"
 	@echo "make clean        remove the virtual environment and the caches"
 
 $(READY): pyproject.toml
@@ -48,7 +50,13 @@ lint: $(TEST_READY)
 test: lint browser
 	$(BIN)/pytest -n auto --dist loadfile -m "not long"
 
-# What takes longer: benchmarks named in the documents, campaigns.
+quick: $(TEST_READY)
+	@$(BIN)/python .ci/quick
+
+hooks: $(TEST_READY)
+	$(BIN)/pre-commit install
+
+# Benchmarks named in the documents, campaigns.
 test-long: $(TEST_READY) browser
 	$(BIN)/pytest -m long
 

@@ -26,7 +26,7 @@ from real_lwr4 import (
 
 from ident.import_log import LogMapping, import_log
 from lwr_driver.configuration import find
-from runner.commands.identify import command
+from runner.cli import main
 
 pytestmark = needs_recordings
 
@@ -103,7 +103,7 @@ def test_the_command_line_does_the_same(tmp_path):
     import_log(mapping, DATA / "measurements_3.npz", tmp_path / "run_3.mcap")
     options = ["--model", "1", "--estimator", "physical", "--tilt", "--json"]
     options += ["--urdf", str(find("lwr4plus.urdf"))]
-    result = CliRunner().invoke(command, [str(tmp_path / "run_3.mcap"), *options])
+    result = CliRunner().invoke(main, ["identify", str(tmp_path / "run_3.mcap"), *options])
     assert result.exit_code == 0, result.output
     content = json.loads(result.stdout)
     np.testing.assert_allclose(content["mounting"]["tilt_rad"], mounted((3,)).tilt_rad, rtol=1e-6)

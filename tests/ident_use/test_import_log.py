@@ -16,7 +16,7 @@ from ident.import_log import LogMapping, import_log
 from ident.kinematics import Chain
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
-from runner.commands.import_log import command
+from runner.cli import main
 
 JOINTS = ["a", "b"]
 PLAIN: dict[str, Any] = {
@@ -267,7 +267,7 @@ def test_command_imports_and_reports(tmp_path: Path) -> None:
     write_csv(tmp_path, 20)
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(PLAIN))
     arguments = [str(tmp_path / "map.yaml"), str(tmp_path), str(tmp_path / "x.mcap")]
-    result = CliRunner().invoke(command, [*arguments, "--payload", "flange", "--payload-mass", "1.5"])
+    result = CliRunner().invoke(main, ["import", *arguments, "--payload", "flange", "--payload-mass", "1.5"])
     assert result.exit_code == 0, result.output
     assert "/joint_states 20 (recording: 20)" in result.output
     session = read_session(tmp_path / "x.mcap")

@@ -22,6 +22,7 @@ from ident.model_file import read_model, write_model
 from ident.payload import identify_payload, with_payload
 from ident.signals.settings import SignalSettings
 from ident.structure import Condition, ModelStructure
+from runner.cli import main
 from runner.commands import compare as compare_command
 from runner.commands import export as export_command
 from runner.commands import payload as payload_command
@@ -201,7 +202,7 @@ def test_arms_of_another_geometry_are_not_compared(truth_model: Any) -> None:
 
 
 def run(command: Any, *arguments: object) -> str:
-    result = CliRunner().invoke(command, [str(argument) for argument in arguments])
+    result = CliRunner().invoke(main, [command.name, *map(str, arguments)])
     assert result.exit_code == 0, (result.output, result.exception)
     return result.output
 
@@ -227,7 +228,7 @@ def test_commands_work_on_files(
     outputs = [tmp_path / name for name in ("lwr.urdf", "lwr.xml", "lwr.c", "lwr.py")]
     text = run(export_command.command, whole, *outputs, "--payload", "load")
     assert all(output.exists() for output in outputs)
-    refused = CliRunner().invoke(export_command.command, [str(whole), str(outputs[0])])
-    assert isinstance(refused.exception, ConfigurationError)
-    refused = CliRunner().invoke(export_command.command, [str(whole), str(tmp_path / "lwr.sdf")])
-    assert "ending says the format" in str(refused.exception)
+    refused = CliRunner().invoke(main, ["export", str(whole), str(outputs[0])])
+    assert refused.exit_code == ConfigurationError.exit_code
+    refused = CliRunner().invoke(main, ["export", str(whole), str(tmp_path / "lwr.sdf")])
+    assert "ending says the format" in refused.output
