@@ -1,6 +1,6 @@
 """Do the stated 95 % intervals hold the true parameters in 95 % of the cases, on the emulator's data?
 
-Run `python benchmarks/coverage.py [--pairs 20] [--period-s 20] [--estimator wls]`. Each pair is a session of
+Run `python -m benchmarks.coverage [--pairs 20] [--period-s 20] [--estimator wls]`. Each pair is a session of
 the bare emulated arm and one with the payload: another random Fourier motion, fresh noise, the default
 emulator with its elastic joints, quantised sensors and slow motor torques, recorded through controller, link
 and log. Model 2 is identified with the settings as they come and held against the emulator's parameters.
@@ -9,8 +9,6 @@ What identification does not model (the motors move against the links by the joi
 data on purpose. It shows in the drives: their intervals are printed by kind of parameter.
 """
 
-# ruff: noqa: E402  the threads and the path must be set before the imports that depend on them
-
 from __future__ import annotations
 
 import argparse
@@ -18,21 +16,18 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import sys
 import tempfile
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[1] / "tests" / name) for name in ("", "ident_estimation")]
-
 import numpy as np
-from emulated_sessions import record_pair
-from estimation_arm import true_base
 
 from ident.identify import ESTIMATORS, Identification, IdentificationSettings, identify
 from ident.kinematics import Chain
 from ident.parameters import split_name
 from lwr_driver.configuration import find
 from runner.published import TABLE_2
+from tests.ident.estimation.emulated_sessions import record_pair
+from tests.ident.estimation_arm import true_base
 
 
 def inside(found: Identification, kind: str | None) -> np.ndarray:

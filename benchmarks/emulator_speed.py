@@ -1,7 +1,7 @@
 """Speed of the emulator in lock step, socket included, as a multiple of real time on one core.
 
-    python benchmarks/emulator_speed.py
-    python benchmarks/emulator_speed.py --periods 1 --seconds 60 --two-cores
+    python -m benchmarks.emulator_speed
+    python -m benchmarks.emulator_speed --periods 1 --seconds 60 --two-cores
 
 The PC's end is a few lines of its own (receive, add a sine to the setpoint, send), so that the emulator is
 measured and not the driver. Both processes share one core unless told otherwise. On a machine that is busy

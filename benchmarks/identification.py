@@ -1,6 +1,6 @@
 """Regressor, base parameters, weighted least squares and the whole command, against pinocchio and FIGAROH.
 
-Run `python benchmarks/identification.py [--figaroh] [--samples 100000] [--no-command]`. CPU seconds on one
+Run `python -m benchmarks.identification [--figaroh] [--samples 100000] [--no-command]`. CPU seconds on one
 core, LWR4+, random states; the ratio is the other's time over ours. `--figaroh` installs FIGAROH from PyPI
 into a temporary environment (`--figaroh-python PATH` takes one that has it). Then `lwr-run identify` is run
 on two 60 s sessions and on two 600 s sessions, 1 kHz, one of each pair with a payload: CPU and peak memory.
@@ -232,10 +232,10 @@ def command(length_s: float) -> None:
     """`lwr-run identify` on a session without and one with payload: CPU and peak memory of the process."""
     with tempfile.TemporaryDirectory() as folder:
         maker = (
-            f"from {Path(__file__).stem} import session; from pathlib import Path; "
+            f"from benchmarks.{Path(__file__).stem} import session; from pathlib import Path; "
             f"[session(Path({folder!r}), {length_s}, loaded) for loaded in (False, True)]"
         )
-        subprocess.run([sys.executable, "-c", maker], check=True, cwd=Path(__file__).parent)
+        subprocess.run([sys.executable, "-c", maker], check=True, cwd=Path(__file__).parents[1])
         files = [str(Path(folder) / f"{name}_{length_s:g}.mcap") for name in ("bare", "loaded")]
         start = resource.getrusage(resource.RUSAGE_CHILDREN)
         program = (

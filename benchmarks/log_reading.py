@@ -1,6 +1,6 @@
 """CPU time of writing and reading a session log of 600 s at 1 kHz, beside the official reader on a slice.
 
-    python benchmarks/log_reading.py [--seconds 600] [--slice 10]
+    python -m benchmarks.log_reading [--seconds 600] [--slice 10]
 
 Three channels of seven joints (measured, commanded, motor torques) as the recorder writes them. The official
 reader decodes with `mcap-ros2-support` a slice of the same file; its time is scaled to the whole.

@@ -1,6 +1,6 @@
 """Memory and CPU time of a diagnosis of two long sessions of seven joints.
 
-Run `python benchmarks/long_sessions.py [--seconds 600]`. The sessions are made here: a healthy LWR4+, positions and
+Run `python -m benchmarks.long_sessions [--seconds 600]`. The sessions are made here: a healthy LWR4+, positions and
 joint torques every 4 ms, motor torques every 12 ms, a motion that does not repeat.
 """
 

@@ -1,5 +1,5 @@
 """What the diagnosis says of recordings of real arms that others published, and what it gains; printed by
-`python benchmarks/real_data.py`.
+`python -m benchmarks.real_data`.
 
 LWR4+: joint torque sensors, low-passed at 2 Hz by the source (github kjyv/FloBaRoID). TX40: motor torques of six
 joints at 5 kHz (github thanhndv212/figaroh-examples). iiwa 14: constant-velocity sweeps of one joint, torque

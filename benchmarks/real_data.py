@@ -1,6 +1,6 @@
 """Real arms: held-out accuracy, repeatability floor, honesty of the standard deviations, and what the diagnosis finds.
 
-Run `python benchmarks/real_data.py [--data FOLDER]`. The folder holds measurements_1.npz to _3.npz and the
+Run `python -m benchmarks.real_data [--data FOLDER]`. The folder holds measurements_1.npz to _3.npz and the
 URDF files that FloBaRoID published (github kjyv/FloBaRoID, data/KUKA/HW and model, LGPL-3): Model 1, joint
 torque sensors, 25 s a run. Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast.
 
@@ -28,8 +28,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from real_cases import iiwa14, lwr4, tx40
 
+from benchmarks.real_cases import iiwa14, lwr4, tx40
 from ident.cad_prior import cad_prior
 from ident.estimators import Estimate
 from ident.identify import Identification, IdentificationSettings, identify

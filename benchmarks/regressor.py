@@ -1,6 +1,6 @@
 """Regressor, base parameters and accumulation against plain pinocchio (and FIGAROH, where it is installed).
 
-Run `python benchmarks/regressor.py [--samples 100000]`. It prints CPU seconds on one core (best of the runs),
+Run `python -m benchmarks.regressor [--samples 100000]`. It prints CPU seconds on one core (best of the runs),
 ratios to pinocchio's loop, and the peak memory of a long two-payload record. A busy machine changes the
 seconds by half, the ratios little.
 """
@@ -164,5 +164,5 @@ if __name__ == "__main__":
     if "OPENBLAS_NUM_THREADS" not in os.environ:
         # numpy reads this when it is loaded, so the script starts again with it.
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
-        os.execv(sys.executable, [sys.executable, *sys.argv])
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     main()

@@ -1,6 +1,6 @@
 """How fast the loop process answers: its latency in real time, measured by the other side.
 
-    python benchmarks/reply_latency.py --period-ms 1 --seconds 10 [--json FILE]
+    python -m benchmarks.reply_latency --period-ms 1 --seconds 10 [--json FILE]
 
 A sender process stands in for the controller: it sends at the FRI rate in command mode and clocks each answer
 from the moment its packet left. The loop under test is the driver's own process, with recorder, ring and

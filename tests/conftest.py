@@ -13,6 +13,10 @@ from hypothesis import settings
 # Before numpy is imported: the matrices are small, and test processes run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Programs started by tests import this tree, wherever the environment was installed from, and the tests' own modules.
+ROOT = str(Path(__file__).resolve().parents[1])
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (ROOT, os.environ.get("PYTHONPATH"))))
+
 # No test asserts a wall-clock time: a busy computer is not a failure.
 settings.register_profile("project", deadline=None)
 settings.load_profile("project")

@@ -1,9 +1,9 @@
 """How well the diagnosis finds what it was not told: hidden cases from seeds, judged against their truth.
 
-    python benchmarks/discovery --cases 100 --jobs 2 --out campaign
-    python benchmarks/discovery --cases 500 --out campaign        goes on where it was left
-    python benchmarks/discovery --report --out campaign           tables of what is there
-    python benchmarks/discovery --again --out campaign            diagnoses once more, on the same logs
+    python -m benchmarks.discovery --cases 100 --jobs 2 --out campaign
+    python -m benchmarks.discovery --cases 500 --out campaign        goes on where it was left
+    python -m benchmarks.discovery --report --out campaign           tables of what is there
+    python -m benchmarks.discovery --again --out campaign            diagnoses once more, on the same logs
 
 The hidden arms, their sensors and the drawing of cases are in `tests/hidden_physics`. Sessions, the
 references of the healthy arm, one line a case in `results.jsonl` and the figures in `summary.json` are in the
@@ -13,21 +13,14 @@ folder; the truth stands in the results only, and no diagnosis gets to see it.
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-_HERE = Path(__file__).resolve().parent
-_TESTS = str(_HERE.parents[1] / "tests")
-for folder in (str(_HERE), _TESTS):
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-# Worker processes start from nothing.
-os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(_HERE), _TESTS, os.environ.get("PYTHONPATH"))))
 
-import click  # noqa: E402
-from campaign import KINDS, Plan, run  # noqa: E402
-from tally import read_results, summary, tables  # noqa: E402
+import click
+
+from benchmarks.discovery.campaign import KINDS, Plan, run
+from benchmarks.discovery.tally import read_results, summary, tables
 
 
 @click.command()
@@ -79,4 +72,5 @@ def main(
     (out / "summary.json").write_text(summary(results), encoding="utf-8")
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from hidden_physics.cases import KINDS, Case, Store, draw, twin
-from hidden_physics.causes import CAUSES
-from hidden_physics.engine import commissioned, diagnosed
-from hidden_physics.inflation import inflation
-from hidden_physics.outside import OUTSIDE
-from hidden_physics.robots import Encoder
-from hidden_physics.verdict import error_rows, judge
 from joblib import Parallel, delayed
+
+from tests.hidden_physics.cases import KINDS, Case, Store, draw, twin
+from tests.hidden_physics.causes import CAUSES
+from tests.hidden_physics.engine import commissioned, diagnosed
+from tests.hidden_physics.inflation import inflation
+from tests.hidden_physics.outside import OUTSIDE
+from tests.hidden_physics.robots import Encoder
+from tests.hidden_physics.verdict import error_rows, judge
 
 __all__ = ["KINDS", "Plan", "run"]
 

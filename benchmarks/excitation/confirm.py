@@ -1,6 +1,6 @@
 """The planned motion against random points in a whole experiment on the emulator: deviations and true errors.
 
-    python benchmarks/excitation/confirm.py [--out FOLDER]
+    python -m benchmarks.excitation.confirm [--out FOLDER]
 
 Both experiments move for the same time with the same arm, payload, noise, cycle (5 ms) and identification; only the
 motion differs. Finished experiments in FOLDER are not repeated.

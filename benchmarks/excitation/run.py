@@ -1,8 +1,8 @@
 """Excitation: results of planning, their time and their safety. One command:
 
-    python benchmarks/excitation/run.py                  # everything, about an hour on one core
-    python benchmarks/excitation/run.py --section table1 --section gradient
-    python benchmarks/excitation/run.py --seeds 3 --budget 10
+    python -m benchmarks.excitation.run                  # everything, about an hour on one core
+    python -m benchmarks.excitation.run --section table1 --section gradient
+    python -m benchmarks.excitation.run --seeds 3 --budget 10
 
 Budgets are CPU seconds of this process (one BLAS thread, one job). Limits are those of the arm file, with its
 position margin. Every motion is checked at exact extrema, on a 1 ms grid, and proven in between,
@@ -25,9 +25,9 @@ from typing import Any
 
 import click
 import numpy as np
-from front_plot import scatter
 from threadpoolctl import threadpool_limits
 
+from benchmarks.excitation.front_plot import scatter
 from fri.errors import LwrError
 from ident.excitation import (
     Assembled,

@@ -1,10 +1,10 @@
 """The trust campaign: one command, seeded, resumable, with a table as its result.
 
-    python benchmarks/trust                         all sections, with their full numbers
-    python benchmarks/trust wire --runs 10000       faults on the wire, in lock step
-    python benchmarks/trust realtime --seconds 600  ten minutes of each measurement
-    python benchmarks/trust wire --only 857         repeat one run and tell all about it
-    python benchmarks/trust table                   what there is, as a table
+    python -m benchmarks.trust                         all sections, with their full numbers
+    python -m benchmarks.trust wire --runs 10000       faults on the wire, in lock step
+    python -m benchmarks.trust realtime --seconds 600  ten minutes of each measurement
+    python -m benchmarks.trust wire --only 857         repeat one run and tell all about it
+    python -m benchmarks.trust table                   what there is, as a table
 
 Results go to a JSON file after every piece of work; the same command goes on where it was broken off. `table`
 joins several such files into the first and writes Markdown. Exit code 1 if a promise was broken.
@@ -20,12 +20,7 @@ from pathlib import Path
 
 import click
 
-_ROOT = str(Path(__file__).resolve().parents[2])
-if _ROOT not in sys.path:
-    # Run as a folder: the modules are found by their full names only.
-    sys.path[0] = _ROOT
-
-from benchmarks.trust.table import Ledger  # noqa: E402
+from benchmarks.trust.table import Ledger
 
 SECTIONS = {
     "wire": "faults on the wire, alone and mixed, in every phase",

@@ -9,7 +9,11 @@ from benchmarks.trust.table import Ledger
 
 __all__ = ["campaign"]
 
-_ARM, _JOINTS, _SENSORS = "sim/test_sim_arm.py", "sim/test_sim_joints.py", "sim/test_sim_sensors.py"
+_ARM, _JOINTS, _SENSORS = (
+    "sim_backend/test_arm.py",
+    "sim_backend/test_joints.py",
+    "sim_backend/test_sensors.py",
+)
 _LINES = {
     "energy balance": [f"{_ARM}::test_energy_in_is_stored_or_dissipated_and_the_error_shrinks_with_the_step"],
     "static torque is gravity": [

@@ -34,10 +34,10 @@ _FAULTS: dict[str, tuple[str, dict[str, Any], str | None]] = {
 }
 _LINES = {
     "wrong payload, by lwr-run": [
-        "experiment/test_experiment.py::test_a_payload_that_is_not_there_is_noticed_before_anything_moves"
+        "runner/experiment/test_experiment.py::test_a_payload_that_is_not_there_is_noticed_before_anything_moves"
     ],
     "payload lost in motion, by lwr-run": [
-        "experiment/test_payload_and_torque.py::test_payload_that_is_lost_in_motion_fails_the_session"
+        "runner/experiment/test_payload_and_torque.py::test_payload_that_is_lost_in_motion_fails_the_session"
     ],
 }
 

@@ -14,10 +14,10 @@ __all__ = ["campaign"]
 
 _RUNS = 500
 _LINES = {
-    "freshness and holds": ["session/test_motor_torque.py"],
-    "order, scale, payload, said by lwr-run": ["experiment/test_payload_and_torque.py"],
-    "trace of an unknown clock": ["session/test_alignment.py"],
-    "trace file": ["session/test_trace.py"],
+    "freshness and holds": ["lwr_driver/session/test_motor_torque.py"],
+    "order, scale, payload, said by lwr-run": ["runner/experiment/test_payload_and_torque.py"],
+    "trace of an unknown clock": ["lwr_driver/session/test_alignment.py"],
+    "trace file": ["lwr_driver/session/test_trace.py"],
 }
 
 

@@ -39,7 +39,7 @@ FILES = {
     "tests/conftest.py": "",
     "tests/rows/samples.py": "from fri import wire",
     "tests/rows/test_rows.py": "import ident.rows.build",
-    "tests/rows/test_samples.py": "from samples import one",
+    "tests/rows/test_samples.py": "from tests.rows.samples import one",
     "tests/use/conftest.py": "def cell(): return 'configs/cell.yaml'",
     "tests/use/test_face.py": "import ident",
     "tests/use/test_patch.py": "'runner.cli.main'",

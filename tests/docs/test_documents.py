@@ -14,12 +14,12 @@ import click
 import pytest
 import yaml
 from click.testing import CliRunner
-from markdown import DOCUMENTS, ROOT, Command, blocks, commands
 
 from fri.errors import LwrError
 from ident.effects import EFFECTS
 from runner.cli import VERBS, main
 from runner.experiment_file import Experiment
+from tests.docs.markdown import DOCUMENTS, ROOT, Command, blocks, commands
 
 WITH_COMMANDS = [document for document in DOCUMENTS if any(not c.slow for c in commands(document))]
 WITH_PYTHON = [d for d in DOCUMENTS if any(not block.slow for block in blocks(d, "python"))]
@@ -58,8 +58,9 @@ def test_slow_commands_exist_with_these_options(document: Path, command: Command
     if head == "make":
         assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
     elif head == "python":
-        program = ROOT / rest[0]
-        assert program.is_file() or (program / "__main__.py").is_file()
+        assert rest[0] == "-m"
+        program = ROOT / rest[1].replace(".", "/")
+        assert program.with_suffix(".py").is_file() or (program / "__main__.py").is_file()
     else:
         assert head == "lwr-run"
         with click.Context(main, **main.context_settings) as context:
@@ -84,7 +85,7 @@ def test_slow_commands_do_what_they_say(document: Path, workplace: Callable[[], 
         if words[0] == "make":
             words = ["lwr-run", "experiment", "--yes"]
         elif words[0] == "python":
-            words = [sys.executable, str(ROOT / words[1]), *words[2:]]
+            words[0] = sys.executable
         elif words[1] == "experiment":
             words.append("--yes")
         done = subprocess.run(words, cwd=place, env=environment, capture_output=True, text=True)
@@ -118,7 +119,7 @@ def test_links_and_files_that_are_named_exist(document: Path) -> None:
         if "://" not in target:
             assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
     for name in re.findall(
-        r"`((?:configs|benchmarks|fri|ident|runner|lwr_driver|sim_backend|docs)/[\w./]+)`", text
+        r"`((?:configs|benchmarks|tests|fri|ident|runner|lwr_driver|sim_backend|docs)/[\w./]+)`", text
     ):
         assert (ROOT / name).exists(), f"{document}: {name}"
 

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from markdown import ROOT
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+
+from tests.docs.markdown import ROOT
 
 LAYOUT = json.loads((ROOT / "configs/layouts/lwr.json").read_text())
 TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}

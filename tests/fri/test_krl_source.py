@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fri_rig import Rig
 
 from fri.errors import ConfigurationError
 from fri.handshake import IdentificationHandshake
@@ -14,6 +13,7 @@ from fri.packets import JOINT_NAMES, new_cmd, new_msr
 from fri.states import Control, State
 from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from sim_backend.configuration import krl_program
+from tests.fri.fri_rig import Rig
 
 
 def run(body: str, ticks: int = 5, data: str = "", **settings: int) -> tuple[KrlProgram, Rig]:

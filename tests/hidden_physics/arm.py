@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from hidden_physics.bristles import FILM_ROW, HOUSING_ROW, STATES, advance
-from hidden_physics.traits import TRAITS, trait_rows
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Drive, Payload, with_payload
+from tests.hidden_physics.bristles import FILM_ROW, HOUSING_ROW, STATES, advance
+from tests.hidden_physics.traits import TRAITS, trait_rows
 
 __all__ = ["Contact", "HiddenArm", "Load"]
 

@@ -22,7 +22,7 @@ import math
 import numpy as np
 from numba import njit
 
-from hidden_physics.traits import TRAITS
+from tests.hidden_physics.traits import TRAITS
 
 __all__ = ["SHORT", "STATES", "advance"]
 

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hidden_physics.causes import CAUSES
-from hidden_physics.hidden import Cause, Hidden, Scene
-from hidden_physics.inflation import base_error
-from hidden_physics.motions import SCHEDULES, exciting_motion
-from hidden_physics.outside import OUTSIDE
-from hidden_physics.recording import Order, begin_s, record
-from hidden_physics.robots import SESSIONS, Day, Encoder, Setting, session_settings
 from lwr_driver.session import read_session
+from tests.hidden_physics.causes import CAUSES
+from tests.hidden_physics.hidden import Cause, Hidden, Scene
+from tests.hidden_physics.inflation import base_error
+from tests.hidden_physics.motions import SCHEDULES, exciting_motion
+from tests.hidden_physics.outside import OUTSIDE
+from tests.hidden_physics.recording import Order, begin_s, record
+from tests.hidden_physics.robots import SESSIONS, Day, Encoder, Setting, session_settings
 
 __all__ = ["KINDS", "Case", "Sessions", "Store", "draw"]
 

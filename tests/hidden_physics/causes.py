@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from hidden_physics.hidden import (
+from tests.hidden_physics.hidden import (
     COULOMB,
     JOINT_NOISE,
     MOTOR_NOISE,
@@ -21,9 +21,9 @@ from hidden_physics.hidden import (
     log_uniform,
     trait,
 )
-from hidden_physics.motions import PERIOD_S, PERIODS
-from hidden_physics.robots import SESSIONS, Setting
-from hidden_physics.traits import JOINTS, every
+from tests.hidden_physics.motions import PERIOD_S, PERIODS
+from tests.hidden_physics.robots import SESSIONS, Setting
+from tests.hidden_physics.traits import JOINTS, every
 
 __all__ = ["CAUSES"]
 

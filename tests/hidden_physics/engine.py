@@ -12,14 +12,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hidden_physics.cases import Case, Sessions, Store, twin
-from hidden_physics.motions import SCHEDULES
-from hidden_physics.robots import Day, Encoder
 from ident.diagnosis import ArmData, Reference, commission, diagnose
 from ident.kinematics import Chain
 from ident.model_file import read_model, write_model
 from lwr_driver.arm import Arm
 from lwr_driver.session import read_session
+from tests.hidden_physics.cases import Case, Sessions, Store, twin
+from tests.hidden_physics.motions import SCHEDULES
+from tests.hidden_physics.robots import Day, Encoder
 
 __all__ = ["COMMISSIONING_DAYS", "REFERENCE", "commissioned", "diagnosed", "healthy_sets"]
 
@@ -27,7 +27,7 @@ COMMISSIONING_DAYS = 12
 _FIRST_DAY = 5000
 
 REFERENCE = Path(__file__).parent / "reference.yaml"
-"""The healthy arm with the link encoder, commissioned once: `python -m hidden_physics.engine` in `tests`."""
+"""The healthy arm with the link encoder, commissioned once: `python -m tests.hidden_physics.engine`."""
 
 
 @cache

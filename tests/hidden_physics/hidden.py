@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hidden_physics.motions import PERIOD_S, PERIODS, REST_S
-from hidden_physics.robots import SESSIONS, Encoder, Setting
-from hidden_physics.traits import JOINTS
+from tests.hidden_physics.motions import PERIOD_S, PERIODS, REST_S
+from tests.hidden_physics.robots import SESSIONS, Encoder, Setting
+from tests.hidden_physics.traits import JOINTS
 
 __all__ = [
     "COULOMB",

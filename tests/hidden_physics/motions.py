@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hidden_physics.recording import PERIOD_MS
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
 from lwr_driver.motion import Motion, check_motion
+from tests.hidden_physics.recording import PERIOD_MS
 
 __all__ = ["PERIODS", "PERIOD_S", "REST_S", "SCHEDULES", "exciting_motion"]
 

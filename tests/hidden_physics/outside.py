@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from hidden_physics.hidden import (
+from tests.hidden_physics.hidden import (
     COULOMB,
     JOINT_NOISE,
     MOTOR_NOISE,
@@ -18,8 +18,8 @@ from hidden_physics.hidden import (
     fault,
     trait,
 )
-from hidden_physics.robots import Setting
-from hidden_physics.traits import JOINTS
+from tests.hidden_physics.robots import Setting
+from tests.hidden_physics.traits import JOINTS
 
 __all__ = ["OUTSIDE"]
 

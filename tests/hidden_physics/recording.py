@@ -8,16 +8,13 @@ as the experiment does. Both give the same file.
 from __future__ import annotations
 
 import io
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import hidden_physics
 from fri.controller_end import ControllerEnd
 from fri.states import Quality, State
 from lwr_driver.arm import Arm
@@ -238,7 +235,6 @@ def record_by_processes(order: Order, arm: Arm | None = None) -> Path:
     port = free_port("127.0.0.1")
     link = LinkSettings(address="127.0.0.1", port=port, lock_step=True, realtime="allow")
     with (
-        _python_path(str(Path(hidden_physics.__file__).parents[1])),
         EmulatorProcess(fri_port=port, settings=order.cabinet_settings()),
         Driver(arm, link, motor_torque=KrlMotorTorque()) as driver,
     ):
@@ -250,17 +246,3 @@ def record_by_processes(order: Order, arm: Arm | None = None) -> Path:
         driver.end_record(outcome.status, outcome.reason)
         outcome.check()
     return order.path
-
-
-@contextmanager
-def _python_path(folder: str) -> Iterator[None]:
-    """Let processes started meanwhile import from `folder`."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = folder if before is None else os.pathsep.join((folder, before))
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before

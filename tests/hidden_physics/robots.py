@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hidden_physics.traits import JOINTS, every, merged
+from tests.hidden_physics.traits import JOINTS, every, merged
 
 __all__ = ["SESSIONS", "Day", "Encoder", "Setting", "session_settings"]
 
@@ -128,8 +128,8 @@ def session_settings(day: Day, hidden: Setting) -> dict[str, Any]:
         chain["held"] = dict(hidden.held)
     return {
         "sensors.position_sensor": day.encoder,
-        "robot.plant": {"type": "hidden_physics.arm:HiddenArm", "options": plant},
-        "robot.effects": [{"type": "hidden_physics.sensing:SensorChain", "options": chain}],
+        "robot.plant": {"type": "tests.hidden_physics.arm:HiddenArm", "options": plant},
+        "robot.effects": [{"type": "tests.hidden_physics.sensing:SensorChain", "options": chain}],
     }
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from hidden_physics.traits import JOINTS
 from sim_backend.plant import Effect, Plant, Reading
+from tests.hidden_physics.traits import JOINTS
 
 __all__ = ["FAULTS", "SensorChain"]
 

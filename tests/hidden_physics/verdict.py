@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hidden_physics.causes import CAUSES
-from hidden_physics.hidden import Hidden
+from tests.hidden_physics.causes import CAUSES
+from tests.hidden_physics.hidden import Hidden
 
 __all__ = ["SURE", "Verdict", "error_rows", "judge"]
 

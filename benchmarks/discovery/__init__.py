@@ -1,0 +1,1 @@
+"""Hidden causes in simulated sessions, diagnosed and judged against the truth."""

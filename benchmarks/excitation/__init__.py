@@ -1,0 +1,1 @@
+"""Planned motions: criteria, computing time and safety, and an experiment with each."""

@@ -1,0 +1,18 @@
+"""Tests and benchmarks are packages of the project's root, imported by their full names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("package", ["tests", "benchmarks"])
+def test_modules_are_found_without_changes_of_the_search_path(package: str) -> None:
+    for module in (ROOT / package).rglob("*.py"):
+        assert (module.parent / "__init__.py").is_file(), f"{module.parent} is no package"
+        source = module.read_text(encoding="utf-8")
+        for change in ("sys." + "path", "syspath" + "_prepend"):
+            assert change not in source, f"{module}: {change}"

@@ -1,0 +1,173 @@
+"""Columns and rows of Models 1, 2 and 3."""
+
+import numpy as np
+import pytest
+
+from fri.errors import ConfigurationError, DataError
+from ident import regressor
+from ident.parameters import PER_LINK
+from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Samples
+from tests.ident.dynamics.core_arms import bodies, lwr, states, tx40
+
+
+def standard(structure: ModelStructure, seed: int = 0) -> np.ndarray:
+    """Random values of all columns, physically possible bodies."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=structure.n_columns)
+    size = len(PER_LINK)
+    for link, body in enumerate(bodies(structure.n_links, seed)):
+        x[size * link : size * link + 10] = body
+    return x
+
+
+def expected_torques(structure, x, q, qd, qdd, payload):
+    """Equations (1) to (4) written out: (joint, motor) torques (N, n)."""
+    n = structure.chain.n
+    table = x[: 17 * structure.n_links].reshape(-1, 17)
+    inertial = table[:n, :10].copy()
+    if payload is not None:
+        inertial[-1] += table[structure.payload_link(payload), :10]
+    ia, fvl, fcl, offl, fvm, fcm, offm = table[:n, 10:].T
+    joint = regressor.torque(structure.chain, q, qd, qdd, inertial) + fvl * qd + fcl * np.sign(qd) + offl
+    return joint, ia * qdd + joint + fvm * qd + fcm * np.sign(qd) + offm
+
+
+@pytest.mark.parametrize("payload", [None, "load", "box"])
+def test_rows_are_equations_1_to_4_in_the_documented_order(payload):
+    structure = ModelStructure(lwr(), 2, payloads=("load", "box"))
+    assert structure.n_columns == 9 * 17
+    x = standard(structure)
+    q, qd, qdd = states(structure.chain, 11)
+    joint, motor = expected_torques(structure, x, q, qd, qdd, payload)
+    motor_rows, joint_rows = (structure.regressor(q, qd, qdd, payload=payload) @ x).reshape(2, 7, 11)
+    assert pytest.approx(motor, abs=1e-10) == motor_rows.T
+    assert pytest.approx(joint, abs=1e-10) == joint_rows.T
+
+
+def test_models_1_and_3_have_joint_and_difference_rows():
+    q, qd, qdd = states(lwr(), 6)
+    two = ModelStructure(lwr(), 2)
+    x = standard(two)
+    motor, joint = (two.regressor(q, qd, qdd) @ x).reshape(2, -1)
+    assert ModelStructure(lwr(), 1).regressor(q, qd, qdd) @ x == pytest.approx(joint, abs=1e-12)
+    assert ModelStructure(lwr(), 3).regressor(q, qd, qdd) @ x == pytest.approx(motor - joint, abs=1e-10)
+
+
+def test_a_payloads_columns_are_zero_where_it_is_absent():
+    structure = ModelStructure(lwr(), 2, payloads=("load",))
+    q, qd, qdd = states(structure.chain, 5)
+    bare = structure.regressor(q, qd, qdd)
+    loaded = structure.regressor(q, qd, qdd, payload="load")
+    assert not bare[:, 119:].any()
+    assert np.array_equal(loaded[:, 119:129], loaded[:, 102:112])
+    assert loaded[:, 119:129].any(axis=0).all()
+
+
+def test_selected_columns_are_those_of_the_whole_matrix():
+    structure = ModelStructure(lwr(), 2, payloads=("load",))
+    q, qd, qdd = states(structure.chain, 9)
+    columns = [128, 120, 16, 30, 112, 119, 103]
+    for sides in (("motor", "joint"), ("joint",)):
+        whole = structure.regressor(q, qd, qdd, payload="load", sides=sides)
+        part = structure.regressor(q, qd, qdd, payload="load", sides=sides, columns=columns)
+        assert np.array_equal(part, whole[:, columns])
+
+
+def test_row_blocks_name_every_row_once():
+    structure = ModelStructure(lwr(), 2, payloads=("load",))
+    sessions = [(Condition(), 5), (Condition("load", ("joint",)), 3)]
+    assert structure.rows(sessions) == 5 * 14 + 3 * 7
+    blocks = list(structure.row_blocks(sessions))
+    covered = np.concatenate([np.arange(91)[block.rows] for block in blocks])
+    assert covered.tolist() == list(range(91))
+    assert [(b.session, b.side, b.joint) for b in blocks[6:8]] == [(0, "motor", 6), (0, "joint", 0)]
+
+
+def test_stack_takes_the_sides_that_were_measured():
+    structure = ModelStructure(lwr(), 2, payloads=("load",))
+    q, qd, qdd = states(structure.chain, 4)
+    tau = np.arange(28.0).reshape(4, 7)
+    sessions = [Samples(q, qd, qdd, joint=tau), Samples(q, qd, qdd, tau, tau + 100, "load")]
+    stacked = structure.stack(sessions)
+    assert stacked.shape == (7 * 4 + 14 * 4, 136)
+    assert np.array_equal(stacked[:28], structure.regressor(q, qd, qdd, sides=("joint",)))
+    assert np.array_equal(stacked[28:], structure.regressor(q, qd, qdd, payload="load"))
+    assert structure.torques(sessions[1])[[0, 1, 4, 28]].tolist() == [0, 7, 1, 100]
+    three = ModelStructure(lwr(), 3)
+    assert three.torques(Samples(q, qd, qdd, tau, tau + 1)).tolist() == [-1.0] * 28
+
+
+def test_a_missing_channel_is_named():
+    q, qd, qdd = states(lwr(), 4)
+    with pytest.raises(DataError, match=r"Model 3 needs difference torque; the session has joint torque"):
+        ModelStructure(lwr(), 3).measured(Samples(q, qd, qdd, joint=q))
+    with pytest.raises(DataError, match=r"Model 1 needs joint torque; the session has motor torque"):
+        ModelStructure(lwr(), 1).measured(Samples(q, qd, qdd, motor=q))
+    with pytest.raises(DataError, match="no session"):
+        ModelStructure(lwr(), 1).stack([])
+
+
+def test_terms_are_left_out_by_symbol_and_by_name():
+    structure = ModelStructure(lwr(), 2, without=("Fvl", "offm3"))
+    q, qd, qdd = states(structure.chain, 5)
+    matrix = structure.regressor(q, qd, qdd)
+    gone = [k for k, name in enumerate(structure.names) if name.startswith("Fvl") or name == "offm3"]
+    assert np.flatnonzero(~structure.active).tolist() == gone
+    assert not matrix[:, gone].any()
+    with pytest.raises(ConfigurationError, match="'Fvx', which is no parameter"):
+        ModelStructure(lwr(), 2, without=("Fvx",))
+
+
+def test_the_wrist_of_the_tx40_is_coupled():
+    """Terms of FIGAROH's TX40 example: Iam6, fvm6, fcm6."""
+    structure = ModelStructure(tx40(), 2, sides=("motor",), couplings=(Coupling(("q5", "q6")),))
+    assert structure.names[-3:] == ("Iam6", "fvm6", "fcm6")
+    q, qd, qdd = states(structure.chain, 30)
+    rows = structure.regressor(q, qd, qdd)[:, -3:].reshape(6, 30, 3)
+    assert not rows[:4].any()
+    assert np.array_equal(rows[4, :, 0], qdd[:, 5])
+    assert np.array_equal(rows[5, :, 0], qdd[:, 4])
+    for joint in (4, 5):
+        assert np.array_equal(rows[joint, :, 1], qd[:, 4] + qd[:, 5])
+        assert np.array_equal(rows[joint, :, 2], np.sign(qd[:, 4] + qd[:, 5]))
+    with pytest.raises(ConfigurationError, match="'A9' is not one of"):
+        ModelStructure(lwr(), 2, couplings=(Coupling(("A1", "A9")),))
+
+
+@pytest.mark.parametrize(
+    ("coulomb", "expected"),
+    [
+        (Coulomb(), [-1, -1, 0, 1, 1]),
+        (Coulomb("deadband", 0.1), [-1, 0, 0, 0, 1]),
+        (Coulomb("tanh", 0.1), np.tanh([-10, -0.5, 0, 0.5, 10])),
+    ],
+)
+def test_the_sign_of_small_speeds_is_a_choice(coulomb, expected):
+    assert coulomb(np.array([-1.0, -0.05, 0.0, 0.05, 1.0])) == pytest.approx(np.array(expected, dtype=float))
+
+
+def test_unknown_choices_are_refused():
+    with pytest.raises(ConfigurationError, match="model 4"):
+        ModelStructure(lwr(), 4)
+    with pytest.raises(ConfigurationError, match="not a choice of"):
+        ModelStructure(lwr(), 2, sides=("motors",))
+    with pytest.raises(ConfigurationError, match="repeat"):
+        ModelStructure(lwr(), 2, payloads=("a", "a"))
+    with pytest.raises(ConfigurationError, match=r"width 0\.0 must be positive"):
+        Coulomb("tanh")
+    structure = ModelStructure(lwr(), 1, payloads=("load",))
+    q = states(structure.chain, 2)[0]
+    with pytest.raises(ConfigurationError, match=r"payload 'laod' is not in this model \(payloads: load\)"):
+        structure.regressor(q, q, q, payload="laod")
+    with pytest.raises(ConfigurationError, match="not a choice of joint"):
+        structure.regressor(q, q, q, sides=("motor",))
+    with pytest.raises(ConfigurationError, match="did you mean 'ZZ2'"):
+        structure.index("ZZ2R")
+
+
+def test_units_of_all_columns():
+    structure = ModelStructure(tx40(), 2, payloads=("p",), couplings=(Coupling(("q5", "q6")),))
+    units = dict(zip(structure.names, structure.units, strict=True))
+    assert units["Iam6"] == "kg m^2"
+    assert units["fvm6"] == "Nm s/rad"
+    assert units["M7"] == "kg"

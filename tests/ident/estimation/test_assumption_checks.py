@@ -1,0 +1,119 @@
+"""Each assumption is found to hold where it does and violated where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.assumptions import check_assumptions, repeatability
+from ident.estimators import InstrumentalVariables, Problem, RowGroup, WeightedLeastSquares
+from tests.ident.regression_problems import ar1, design, problem
+
+CHI = np.linspace(-2.0, 2.5, 12)
+NAMES = (
+    "zero mean",
+    "serially uncorrelated",
+    "equal variance",
+    "normality",
+    "exogeneity",
+    "condition number",
+)
+
+
+def verdicts(case: Problem, **options) -> dict[str, bool | None]:
+    found = check_assumptions(case, WeightedLeastSquares().fit(case), **options)
+    return {check.name: check.holds for check in found.checks}
+
+
+def test_white_normal_residuals_pass_every_check():
+    matrices = design(samples=300)
+    passed = []
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        passed.append(verdicts(problem(matrices, CHI, [random.normal(size=300) for _ in matrices])))
+    for name in NAMES:
+        if name == "exogeneity":
+            assert all(found[name] is None for found in passed)
+        else:
+            assert np.mean([bool(found[name]) for found in passed]) >= 0.9, name
+
+
+def test_correlated_residuals_are_found():
+    matrices = design(samples=300)
+    random = np.random.default_rng(0)
+    found = verdicts(problem(matrices, CHI, [ar1(random, 300, 0.5) for _ in matrices]))
+    assert found["serially uncorrelated"] is False
+
+
+def test_a_variance_that_grows_with_the_torque_is_found():
+    matrices = design(samples=300)
+    random = np.random.default_rng(0)
+    noise = [0.3 * np.abs(m @ CHI) * random.normal(size=300) for m in matrices]
+    assert verdicts(problem(matrices, CHI, noise))["equal variance"] is False
+
+
+def test_spikes_are_not_normal():
+    matrices = design(samples=300)
+    random = np.random.default_rng(0)
+    noise = [random.normal(size=300) for _ in matrices]
+    noise[1][[50, 120]] = 25.0
+    found = check_assumptions(case := problem(matrices, CHI, noise), WeightedLeastSquares().fit(case))
+    assert found["normality"].holds is False
+    assert "A2" in found["normality"].finding
+
+
+def test_a_missing_offset_is_found():
+    matrices = [np.delete(m, 1, axis=1) for m in design(samples=300)]
+    random = np.random.default_rng(0)
+    noise = [random.normal(size=300) + (5.0 if k % 3 == 1 else 0.0) for k in range(6)]
+    found = verdicts(problem(matrices, np.delete(CHI, 1), noise))
+    assert found["zero mean"] is False
+
+
+@pytest.mark.parametrize(("column_noise", "holds"), [(0.0, True), (0.5, False)])
+def test_noise_in_the_regressor_is_found_by_instruments(column_noise, holds):
+    matrices = design(samples=1000)
+    random = np.random.default_rng(2)
+    measured = [
+        m + column_noise * np.where(np.arange(12) < 3, 0, 1) * random.normal(size=m.shape) for m in matrices
+    ]
+    noise = [0.5 * random.normal(size=1000) for _ in matrices]
+    case = problem(matrices, CHI, noise, measured=measured)
+    # Instruments near the truth, as a commanded motion is, but not equal to it.
+    near = [m + 0.05 * np.roll(m, 1, axis=0) for m in matrices]
+    estimate = WeightedLeastSquares().fit(case)
+    instrumental = InstrumentalVariables(lambda values: near).fit(case)
+    assert check_assumptions(case, estimate, instrumental=instrumental)["exogeneity"].holds is holds
+
+
+def _periodic(repeating: float, seed: int = 0) -> Problem:
+    random = np.random.default_rng(seed)
+    period, periods = 50, 6
+    time = np.arange(period) * 2 * np.pi / period
+    matrix = np.tile(np.column_stack([np.ones(period), np.sin(time), np.cos(time)]), (periods, 1))
+    error = np.tile(repeating * np.sin(3 * time), periods)
+    target = matrix @ np.array([1.0, 2.0, 3.0]) + error + 0.1 * random.normal(size=period * periods)
+    return Problem(
+        ("a", "b", "c"), (RowGroup("A1", "joint", 0, matrix, target, np.arange(period * periods)),), 0.2
+    )
+
+
+def test_model_error_is_told_from_noise_by_the_periods():
+    clean, wrong = _periodic(0.0), _periodic(0.2)
+    assert verdicts(clean, period_rows=50)["lack of fit"] is True
+    assert verdicts(wrong, period_rows=50)["lack of fit"] is False
+    structured, noise, _ = repeatability(wrong, WeightedLeastSquares().fit(wrong), 50)["A1 joint"]
+    assert structured == pytest.approx(0.2 / np.sqrt(2), rel=0.15)
+    assert noise == pytest.approx(0.1, rel=0.1)
+
+
+def test_the_verdict_table_names_every_check_and_what_follows():
+    matrices = design(samples=300)
+    random = np.random.default_rng(0)
+    case = problem(matrices, CHI, [ar1(random, 300, 0.9) for _ in matrices])
+    found = check_assumptions(case, WeightedLeastSquares().fit(case))
+    text = found.summary()
+    assert all(name in text for name in NAMES)
+    assert "VIOLATED" in text
+    assert "the stated robust ones hold" in text
+    assert found.to_dict()["serially uncorrelated"]["verdict"] == "VIOLATED"

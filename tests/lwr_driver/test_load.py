@@ -1,0 +1,42 @@
+"""Load data over the link, to the KRL program of this project."""
+
+from __future__ import annotations
+
+import pytest
+
+from fri.errors import ConfigurationError, RobotError
+from lwr_driver.driver import Driver, LinkSettings
+from runner.experiment_file import Payload
+from runner.laboratory import free_port
+from runner.payload import load_data
+from sim_backend.process import EmulatorProcess
+from tests.lwr_driver.driver_rig import arm
+
+
+def test_load_data_reach_the_controller_and_too_heavy_ones_do_not() -> None:
+    port = free_port("127.0.0.1")
+    settings = {"fri.program": "lwr_identification", "fri.period_ms": 5}
+    link = LinkSettings(address="127.0.0.1", port=port, lock_step=True, handshake="lwr_identification")
+    payload = Payload("block", 3.34, (0.0, -0.066, 0.144), (0.01, 0.0, 0.0, 0.02, 0.0, 0.03))
+    with EmulatorProcess(fri_port=port, settings=settings) as emulator, Driver(arm(), link) as driver:
+        driver.connect()
+        driver.set_load(*load_data(arm(), payload))
+        load = emulator.status()["load"]
+        assert load["mass"] == pytest.approx(3.34)
+        assert load["com"] == pytest.approx([0.0, -0.066, 0.144], abs=1e-6)
+        assert load["inertia"] == pytest.approx([0.01, 0.0, 0.0, 0.02, 0.0, 0.03])
+        with pytest.raises(RobotError, match=r"waited .* for load data of 20 kg in force; .*LWR_LOAD_MAX"):
+            driver.set_load(20.0, timeout_s=1.0)
+        driver.set_load(*load_data(arm(), None))
+        assert emulator.status()["load"]["mass"] == 0.0
+        driver.wait_quality()
+        driver.enter_command()
+        with pytest.raises(RobotError, match="cannot change in mode hold"):
+            driver.set_load(1.0)
+
+
+def test_other_programs_take_none() -> None:
+    driver = Driver(arm(), LinkSettings(address="127.0.0.1", handshake="stanford"))
+    assert not driver.sets_load
+    with pytest.raises(ConfigurationError, match="takes no load data; enter them at the pendant"):
+        driver.set_load(1.0)

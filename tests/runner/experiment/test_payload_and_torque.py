@@ -1,0 +1,39 @@
+"""What a session's own data tell about the payload and about the motor torques."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.runner.experiment.experiment_rig import experiment_file, run
+
+
+def test_payload_that_is_lost_in_motion_fails_the_session(tmp_path: Path) -> None:
+    lost = [{"command": "unmount", "when": "moving", "occurrence": 1, "after_cycles": 100}]
+    payload = {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}
+    file = experiment_file(
+        tmp_path,
+        emulator_settings={"fri.period_ms": 5, "schedule": lost},
+        sessions=[{"name": "loaded", "payload": payload}],
+    )
+    done = run("experiment", str(file), "--yes", "--out", str(tmp_path / "out"))
+    assert done.code == 5, done.text
+    assert "payload changed during the motion" in done.text
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["exit_status"] == "fail"
+
+
+@pytest.mark.slow
+def test_motor_torques_of_swapped_joints_and_wrong_scale_are_said(tmp_path: Path) -> None:
+    krl = {"reals": [1, 4, 3, 2, 5, 6, 7], "scale": [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]}
+    file = experiment_file(
+        tmp_path,
+        motor_torque={"source": "krl_reals", "krl": krl},
+        sessions=[{"name": "unloaded"}],
+    )
+    done = run("experiment", str(file), "--yes", "--out", str(tmp_path / "out"))
+    assert "motor torque of A2 follows the torque sensor of A3" in done.text
+    warnings = json.loads((tmp_path / "out" / "summary.json").read_text())["sessions"][0]["warnings"]
+    assert any("motor_torque.krl" in warning for warning in warnings)
