@@ -20,8 +20,8 @@ from scipy.interpolate import CubicSpline
 
 from fri.errors import ConfigurationError, DataError
 from ident.discrepancy import SimulationError
-from ident.model import DynamicModel
-from ident.signals.filters import low_pass
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import low_pass
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import find, parse
 from lwr_driver.session import Session

@@ -17,13 +17,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident import regressor
-from ident.cad_prior import cad_prior
+from ident.dynamics import regressor
+from ident.dynamics.parameters import INERTIAL, PER_LINK
 from ident.effects import Simulated, find_effect
 from ident.effects.model_torque import parameter_values
+from ident.estimators.physical import cad_prior
 from ident.export import consistent_parameters
-from ident.model import DynamicModel
-from ident.parameters import INERTIAL, PER_LINK
+from ident.model.dynamic_model import DynamicModel
 from sim_backend.plant import Drive, Effect
 from sim_backend.rigid_body import with_inertias
 

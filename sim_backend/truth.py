@@ -19,7 +19,7 @@ from sim_backend.plant import Drive
 from sim_backend.rigid_body import BODY_PARAMETERS, Payload, chain, with_inertias
 
 if TYPE_CHECKING:
-    from ident.model import DynamicModel
+    from ident.model.dynamic_model import DynamicModel
 
 __all__ = ["DRIVE_PARAMETERS", "RobotFile", "robot_file", "robot_model", "true_arm", "truth"]
 
@@ -79,7 +79,7 @@ def robot_model(config: EmulatorConfig) -> DynamicModel | None:
     if "chain" not in content:
         return None
     # An arm by its parameters needs nothing of the estimation, and is there in half the time.
-    from ident.model_file import read_model
+    from ident.model.model_file import read_model
 
     model = read_model(content)
     if model.structure.chain.n != JOINTS:

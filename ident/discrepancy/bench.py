@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fri.errors import DataError
-from ident.base import BaseSet
-from ident.cad_prior import cad_prior
 from ident.discrepancy.candidates import Dictionary, Trial
 from ident.discrepancy.evidence import Evidence, Floats
 from ident.discrepancy.noise import noise_floor, repeatability
@@ -18,8 +16,10 @@ from ident.discrepancy.recording import Recording
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.selection import Selection
 from ident.discrepancy.settings import DiagnosisSettings
-from ident.kinematics import Chain
-from ident.structure import Coupling
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
+from ident.estimators.physical import cad_prior
 
 __all__ = [
     "ArmData",

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from fri.errors import DataError
-from ident.base import BaseSet
 from ident.discrepancy.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.discrepancy.evidence import Floats
 from ident.discrepancy.nominal import Arm
@@ -19,8 +18,9 @@ from ident.discrepancy.recording import Recording, record
 from ident.discrepancy.reference import DELAY_STD_S, Reference
 from ident.discrepancy.selection import gains, select
 from ident.discrepancy.settings import DiagnosisSettings
-from ident.kinematics import Chain
-from ident.model import DynamicModel
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.kinematics import Chain
+from ident.model.dynamic_model import DynamicModel
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

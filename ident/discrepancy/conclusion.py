@@ -30,7 +30,7 @@ from ident.discrepancy.result import (
 from ident.discrepancy.selection import Claim, Selection
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
-from ident.model import DynamicModel
+from ident.model.dynamic_model import DynamicModel
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

@@ -28,9 +28,9 @@ from ident.discrepancy.reference import Reference
 from ident.discrepancy.result import Diagnosis, Finding
 from ident.discrepancy.selection import Claim, Null, Selection, hopeful, select
 from ident.discrepancy.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS
-from ident.kinematics import Chain
-from ident.model import DynamicModel
+from ident.model.dynamic_model import DynamicModel
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

@@ -13,10 +13,10 @@ from fri.errors import DataError
 from ident.discrepancy.bandwidth import passed_band
 from ident.discrepancy.hygiene import Stuck, clipped_at, held_times, stuck_at
 from ident.discrepancy.settings import DiagnosisSettings
-from ident.kinematics import Chain
-from ident.signals.prepare import PreparedSession, prepare
-from ident.signals.settings import SignalSettings
-from ident.structure import Side
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Side
+from ident.rows.filters import SignalSettings
+from ident.rows.prepare import PreparedSession, prepare
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

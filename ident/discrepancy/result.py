@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.discrepancy.evidence import Floats
-from ident.model import DynamicModel
+from ident.model.dynamic_model import DynamicModel
 
 __all__ = [
     "SCHEMA_VERSION",

@@ -23,8 +23,8 @@ from ident.discrepancy.recording import record
 from ident.discrepancy.reference import Reference
 from ident.discrepancy.selection import select
 from ident.discrepancy.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
 from ident.effects import Shape, find_effect
-from ident.kinematics import Chain
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

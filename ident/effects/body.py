@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ident import regressor
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 from ident.effects.effect import Column, Simulated
 from ident.effects.motion import Floats, Motion
-from ident.kinematics import Chain
 
 __all__ = [
     "Body",

@@ -7,7 +7,7 @@ import numpy as np
 from ident.effects.effect import Column
 from ident.effects.motion import Floats, Motion
 from ident.effects.springs import Springs
-from ident.signals.filters import differentiate, low_pass
+from ident.rows.filters import differentiate, low_pass
 
 __all__ = ["changed_springs", "deflected"]
 

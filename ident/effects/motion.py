@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ident import regressor
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 from ident.effects.springs import Springs
-from ident.kinematics import Chain
 
 __all__ = ["Floats", "Motion"]
 

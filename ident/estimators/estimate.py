@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ident.distributions import normal_quantile, student_quantile
+from ident.estimators.distributions import normal_quantile, student_quantile
 from ident.estimators.problem import FloatArray, Problem
 
 __all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]

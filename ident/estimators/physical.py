@@ -4,10 +4,13 @@ dissipate.
 Standard parameters are fitted through their base parameters under linear matrix inequalities (Sousa and
 Cortesao 2014; Wensing, Kim and Slotine 2018) with a distance to a prior model that settles what the data
 cannot say (Lee, Wensing and Park 2020). The convex program goes to clarabel.
+
+The arm's own URDF as the prior model of an estimation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -16,14 +19,15 @@ import numpy as np
 from scipy import sparse
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.parameters import INERTIAL, PER_LINK, from_com, pseudo_inertia, split_name
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate
+from ident.estimators.least_squares import class_variances
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.estimators.problem import FloatArray, Problem
-from ident.estimators.solution import class_variances
-from ident.parameters import pseudo_inertia
 
-__all__ = ["BodyPrior", "PhysicallyConsistent", "nearest_consistent"]
+__all__ = ["BodyPrior", "PhysicallyConsistent", "cad_prior", "nearest_consistent"]
 
 Metric = Literal["pullback", "entropic", "euclidean"]
 
@@ -370,3 +374,52 @@ def _refit(estimate: Estimate, problem: Problem, values: FloatArray) -> tuple:
             )
         )
     return tuple(fits)
+
+
+# A payload of which nothing but perhaps the mass is known: a body of this radius of gyration, anywhere
+# within reach.
+_PAYLOAD_KG = 3.0
+_PAYLOAD_RADIUS_M = 0.1
+_PAYLOAD_STD = 3.0
+_DISSIPATIVE = ("Ia", "Fvl", "Fcl", "Fvm", "Fcm")
+
+
+def cad_prior(
+    base: BaseSet, *, relative_std: float = 0.2, payload_masses: Mapping[str, float] | None = None
+) -> BodyPrior:
+    """Prior of the base set's arm: the inertials of the URDF, within `relative_std` of themselves.
+
+    payload_masses : stated mass [kg] by payload name; a payload is otherwise as good as unknown. Inertials
+        that belong to no rigid body are replaced by the nearest that do. Raises ConfigurationError for a
+        chain without URDF and for a structure without rigid bodies (Model 3).
+    """
+    structure = base.structure
+    if "difference" in structure.sides:
+        raise ConfigurationError("Model 3 has no rigid bodies, so a prior of them says nothing; use `wls`")
+    n = structure.chain.n
+    masses = payload_masses or {}
+    spheres = []
+    for payload in structure.payloads:
+        mass = masses.get(payload, _PAYLOAD_KG)
+        inertia = np.eye(3) * mass * _PAYLOAD_RADIUS_M**2
+        spheres.append(from_com(mass, np.zeros(3), inertia))
+    links = nearest_consistent(structure.chain.urdf_inertials())
+    inertial = np.vstack([links, *[sphere[None, :] for sphere in spheres]])
+    bodies = np.array(
+        [[len(PER_LINK) * k + i for i in range(len(INERTIAL))] for k in range(structure.n_links)],
+        dtype=np.int64,
+    )
+    symbols = [split_name(name)[0] for name in structure.names]
+    acts = np.any(base.matrix != 0.0, axis=0)
+    rigid = np.zeros(structure.n_columns, dtype=bool)
+    rigid[bodies.ravel()] = True
+    return BodyPrior(
+        projection=np.asarray(base.matrix),
+        bodies=bodies,
+        nonnegative=np.array(
+            [k for k, s in enumerate(symbols) if s in _DISSIPATIVE and acts[k]], dtype=np.int64
+        ),
+        inertial=inertial,
+        absent=np.flatnonzero((~rigid & ~acts) | ~structure.active),
+        relative_std=np.array([relative_std] * n + [_PAYLOAD_STD] * len(spheres)),
+    )

@@ -18,9 +18,13 @@ from scipy.optimize import minimize_scalar
 from fri.errors import ConfigurationError, DataError
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Covariance, Estimate
+from ident.estimators.least_squares import (
+    class_variances,
+    consumed_parameters,
+    estimate_from,
+    weighted_solution,
+)
 from ident.estimators.problem import FloatArray, Problem
-from ident.estimators.solution import class_variances, consumed_parameters, estimate_from
-from ident.estimators.weighted import weighted_solution
 
 __all__ = ["MaximumAPosteriori", "Prior"]
 

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.base import BaseSet, closed_form_base
+from ident.dynamics.base_closed_form import closed_form_base
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.structure import Condition, ModelStructure
 from ident.excitation.bspline import SplineBasis
 from ident.excitation.capsules import space_of
 from ident.excitation.check import Check, Limits, PathChecker, check_motion
@@ -28,8 +30,7 @@ from ident.excitation.problem import PlanProblem
 from ident.excitation.search import Setup
 from ident.excitation.views import motion_view
 from ident.excitation.wanted import Criteria, reported_criteria, wanted_target
-from ident.model_file import read_model
-from ident.structure import Condition, ModelStructure
+from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.collision import CollisionChecker

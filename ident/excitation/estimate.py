@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident import parameters
+from ident.dynamics import parameters
+from ident.dynamics.parameters import DRIVE, INERTIAL
 from ident.excitation.mechanism import Mechanism
 from ident.excitation.motion import Array
-from ident.model import DynamicModel
-from ident.parameters import DRIVE, INERTIAL
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import read_mapping
 
 __all__ = ["BODY", "DRIVE", "ArmEstimate", "Noise", "split_name"]

@@ -1,6 +1,6 @@
 """The arm's geometry as plain arrays, the form that the compiled sweeps read.
 
-`ident.kinematics.Chain` is the arm everywhere else, and every number here is taken from it. The search for a motion
+`dynamics.kinematics.Chain` is the arm everywhere else, and every number here is taken from it. The search for a motion
 needs the same numbers as contiguous arrays of rotations and translations, because its forward and reverse sweeps
 (`sweep`, `space`: values and exact gradients in one compiled loop over the samples) cannot read an object, and it
 needs the flange, which the limits of the workspace are about and which no dynamic parameter refers to.
@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 
 from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.urdf import read_urdf
 from ident.excitation.motion import Array
-from ident.kinematics import Chain
-from ident.urdf import read_urdf
 
 __all__ = ["Mechanism", "tip_path"]
 

@@ -20,7 +20,7 @@ from ident.excitation.objectives import View
 from ident.excitation.plan import ExcitationPlan
 from ident.excitation.problem import PlanProblem, Prior
 from ident.excitation.views import motion_view, samples_view
-from ident.signals.prepare import prepare
+from ident.rows.prepare import prepare
 from lwr_driver.configuration import find
 from lwr_driver.session import read_session
 

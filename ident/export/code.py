@@ -12,8 +12,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from fri.errors import ConfigurationError
-from ident.export.expressions import Expression, Graph
-from ident.export.newton_euler import torques
+from ident.export.newton_euler import Expression, Graph, torques
 from ident.export.standard import StandardModel
 
 __all__ = ["Program", "to_c", "to_numpy"]

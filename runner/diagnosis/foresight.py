@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.discrepancy import ArmData, Diagnosis, Reference
 from ident.discrepancy.signatures import overlap, signature_bench, signatures
-from ident.kinematics import Chain
-from ident.model import DynamicModel
+from ident.dynamics.kinematics import Chain
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.session import JointColumns, Phase, Session
 from runner.diagnosis.look_alikes import Foreseen, LookAlikes
 from runner.experiment_file import Payload

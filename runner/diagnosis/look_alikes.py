@@ -24,8 +24,8 @@ from ident.discrepancy.candidates import Candidate
 from ident.discrepancy.evidence import Rows
 from ident.discrepancy.selection import reach
 from ident.discrepancy.signatures import Signature, overlap, signature_bench, signatures
+from ident.dynamics.kinematics import Chain
 from ident.effects import find_effect
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis.words import joints_text, named, variable_of
 

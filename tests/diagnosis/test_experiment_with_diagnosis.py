@@ -15,7 +15,7 @@ import yaml
 from click.testing import CliRunner
 
 from fri.errors import DataError
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.session import read_session

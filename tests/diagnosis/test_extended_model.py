@@ -11,8 +11,8 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
-from ident.model import DynamicModel
-from ident.model_file import read_model, write_model
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import read_model, write_model
 from lwr_driver.configuration import find
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig, load_configuration

@@ -12,7 +12,7 @@ from ident.discrepancy import diagnose
 from ident.discrepancy.evidence import Rows
 from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.signatures import signature_bench
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]

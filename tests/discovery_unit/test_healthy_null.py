@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.base import numeric_base
 from ident.discrepancy.commission import delay_std
 from ident.discrepancy.nominal import Arm
 from ident.discrepancy.presliding import with_far_presliding
 from ident.discrepancy.reference import DELAY_STD_S, Reference
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.structure import ModelStructure
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import ModelStructure
+from ident.model.dynamic_model import DynamicModel
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:

@@ -9,8 +9,8 @@ from ident.discrepancy.bench import Bench
 from ident.discrepancy.candidates import Candidate, Trial
 from ident.discrepancy.intervals import estimated, phases_of
 from ident.discrepancy.signatures import signature_bench
+from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 
 AMPLITUDE, VELOCITY = 0.4, 0.15

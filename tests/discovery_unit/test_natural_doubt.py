@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ident.discrepancy import Diagnosis, diagnose
+from ident.dynamics.kinematics import Chain
 from ident.excitation import ExcitationPlan
 from ident.excitation.bspline import SplineMotion
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis.deciding import Deciding
 from runner.diagnosis.decision import decisions

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
+from ident.dynamics.structure import Condition, ModelStructure
 from ident.excitation.estimate import ArmEstimate
 from ident.excitation.evaluation import Evaluator
 from ident.excitation.fourier import FourierBasis
 from ident.excitation.information import Assembly, Columns, Rows
 from ident.excitation.mechanism import Mechanism
-from ident.structure import Condition, ModelStructure
 
 NAMES = (
     "ZZ1R",

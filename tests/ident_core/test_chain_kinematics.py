@@ -6,8 +6,8 @@ import pytest
 from core_arms import RIGHT, bodies, lwr, shared, states
 
 from fri.errors import ConfigurationError
-from ident import regressor
-from ident.kinematics import Chain
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 
 INERTIAL = (
     '<inertial><mass value="{m}"/><origin xyz="{x} 0.02 0.05" rpy="0.1 0.2 0.3"/>'

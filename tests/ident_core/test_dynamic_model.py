@@ -6,9 +6,10 @@ import yaml
 from core_arms import bodies, lwr, scara, states, tx40
 
 from fri.errors import ConfigurationError
-from ident.base import numeric_base
-from ident.model import Condition, Coupling, DynamicModel, ModelStructure
-from ident.model_file import model_text, read_model, write_model
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.structure import Condition, Coupling, ModelStructure
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import model_text, read_model, write_model
 
 STRUCTURES = {
     "lwr": lambda: ModelStructure(lwr(), 2, payloads=("load",)),

@@ -5,9 +5,9 @@ import pytest
 from core_arms import bodies, lwr, states, tx40
 
 from fri.errors import ConfigurationError, DataError
-from ident import regressor
-from ident.parameters import PER_LINK
-from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Samples
+from ident.dynamics import regressor
+from ident.dynamics.parameters import PER_LINK
+from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Samples
 
 
 def standard(structure: ModelStructure, seed: int = 0) -> np.ndarray:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.kinematics import Chain
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
 from runner.commands.import_log import command

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident.competitors import competitor_scores
-from ident.cross_validation import cross_validate
-from ident.forward_simulation import simulate, simulate_session
-from ident.identify import IdentificationSettings, identify
-from ident.model import DynamicModel
-from ident.signals.settings import SignalSettings
-from ident.validation import Validation, validate
+from ident.estimation.compare import competitor_scores
+from ident.estimation.forward_simulation import simulate, simulate_session
+from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.validate import Validation, cross_validate, validate
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
 

@@ -1,0 +1,252 @@
+"""How the base stands: the direction of gravity in the base's own axes, found from the same sessions.
+
+A base that leans by an angle t lets the first joint feel gravity, about t times the moment of the whole arm:
+one degree is half a newton metre on an LWR4+. The motion of the first joint makes that unlike any parameter
+of a link, so the two angles can be estimated together with the base parameters. Gravity enters the torque
+linearly, tau(q, qd, qdd; g + dg) = tau(q, qd, qdd; g) + G(q; dg), so d tau / d t_k = G(q; dg / dt_k), with
+G the regressor at rest under the gravity dg / dt_k; a few Gauss-Newton steps suffice.
+
+What resembles it: a torque sensor of joint 1 that picks up joint 2 (crosstalk), a cable across joint 1.
+A level on the base decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.distributions import fisher_tail
+from ident.estimators.estimate import Covariance
+from ident.estimators.physical import cad_prior
+from ident.estimators.prior import MaximumAPosteriori, Prior
+from ident.rows.observation import observe
+from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+
+if TYPE_CHECKING:
+    from lwr_driver.session import Session
+
+__all__ = ["Mounting", "find_mounting"]
+
+FloatArray = NDArray[np.float64]
+
+_NAMES = ("tilt_1", "tilt_2")
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Direction of gravity that the torques speak of.
+
+    axes : (2, 3), unit vectors in the base's axes, perpendicular to the gravity that was assumed.
+    tilt_rad : (2,), rotation of the base about them; it leans by the norm.
+    covariance : (2, 2) [rad^2]. assumed, gravity : (3,) before and after, in the base's axes [m/s^2].
+    identification : the arm identified under the gravity found; its chain has it.
+    steps : number of Gauss-Newton steps; converged : the last was below a tenth of a standard deviation.
+    """
+
+    axes: FloatArray
+    tilt_rad: FloatArray
+    covariance: Covariance
+    assumed: FloatArray
+    gravity: FloatArray
+    identification: Identification
+    steps: int
+    converged: bool
+
+    @property
+    def chain(self) -> Chain:
+        """The arm under the gravity found."""
+        return self.identification.structure.chain
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the two angles (2,) [rad]."""
+        return self.covariance.std
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so large a tilt on an upright base (Hotelling's T^2)."""
+        square = float(self.tilt_rad @ np.linalg.solve(self.covariance.matrix, self.tilt_rad))
+        freedom = max(self.covariance.degrees_of_freedom, 2.0)
+        return fisher_tail(square * (freedom - 1.0) / (2.0 * freedom), 2, freedom - 1.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        return {
+            "axes": self.axes.tolist(),
+            "tilt_rad": self.tilt_rad.tolist(),
+            "std_rad": self.std.tolist(),
+            "p_value": self.p_value,
+            "assumed_gravity": self.assumed.tolist(),
+            "gravity": self.gravity.tolist(),
+            "steps": self.steps,
+            "converged": self.converged,
+        }
+
+    def __str__(self) -> str:
+        degrees, std = np.rad2deg(self.tilt_rad), np.rad2deg(self.std)
+        parts = [
+            f"{angle:.2f} ± {s:.2f} deg about [{', '.join(f'{x:.3g}' for x in axis)}]"
+            for angle, s, axis in zip(degrees, std, self.axes, strict=True)
+        ]
+        size = float(np.linalg.norm(degrees))
+        return f"the base leans by {size:.2f} deg: {', '.join(parts)} (p = {self.p_value:.1e})" + (
+            "" if self.converged else "; NOT converged"
+        )
+
+
+def find_mounting(
+    sessions: Sequence[Session],
+    chain: Chain,
+    settings: IdentificationSettings | None = None,
+    *,
+    prior_std_rad: float = float(np.deg2rad(2.0)),
+    steps: int = 6,
+) -> Mounting:
+    """Tilt of the base of `chain` from the sessions, and the arm identified under it.
+
+    settings : as for `identify`; the steps themselves are maximum a posteriori with the inertials of the URDF
+    as prior (`cad_prior`; without one, weighted least squares), so that weakly excited parameters do not take
+    the tilt's part. prior_std_rad : how crooked a base may be; with a tenth of a degree from the data it
+    hardly matters, and it keeps an angle at zero of which the motion says nothing. The standard deviations
+    are the larger of the block jackknife's and the posterior's; those of the arm's parameters do not contain
+    the tilt's.
+
+    Raises ConfigurationError for Model 3, which has no gravity in it, and DataError as `identify` does.
+    """
+    settings = settings or IdentificationSettings()
+    if settings.model == 3:
+        raise ConfigurationError("Model 3 has no gravity in it; find the mounting with Model 1 or 2")
+    if not np.any(chain.gravity):
+        raise ConfigurationError("the chain has no gravity, so its base cannot lean; give `gravity`")
+    axes = _axes(chain.gravity)
+    tilt = np.zeros(2)
+    # The steps need plausible values of all parameters, whatever estimator gives the final ones.
+    inner = replace(settings, essential=None, estimator="wls" if chain.urdf is None else "map")
+    found = identify(sessions, chain, inner)
+    done, converged = 0, False
+    covariance = None
+    while done < steps and not converged:
+        done += 1
+        step, covariance = _step(found, sessions, axes, tilt, prior_std_rad)
+        tilt = tilt + step
+        turned = replace(chain, gravity=_turned(chain.gravity, axes, tilt))
+        found = identify(sessions, turned, inner)
+        converged = bool(np.all(np.abs(step) < 0.1 * covariance.std))
+    assert covariance is not None
+    found = identify(sessions, found.structure.chain, settings)
+    gravity = found.structure.chain.gravity
+    return Mounting(axes, tilt, covariance, chain.gravity, gravity, found, done, converged)
+
+
+def _axes(gravity: FloatArray) -> FloatArray:
+    """Two axes perpendicular to gravity, for gravity along -z those of x and y."""
+    up = -gravity / np.linalg.norm(gravity)
+    first = np.eye(3)[int(np.argmin(np.abs(up)))]
+    first = first - (first @ up) * up
+    first /= np.linalg.norm(first)
+    return np.vstack([first, np.cross(up, first)]) + 0.0
+
+
+def _turned(gravity: FloatArray, axes: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Gravity in the axes of a base that was rotated by `tilt` about `axes` (Rodrigues, inverse rotation)."""
+    vector = -(tilt @ axes)
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return gravity.copy()
+    axis = vector / angle
+    return (
+        gravity * np.cos(angle)
+        + np.cross(axis, gravity) * np.sin(angle)
+        + axis * (axis @ gravity) * (1.0 - np.cos(angle))
+    )
+
+
+def _step(
+    found: Identification,
+    sessions: Sequence[Session],
+    axes: FloatArray,
+    tilt: FloatArray,
+    prior_std_rad: float,
+) -> tuple[FloatArray, Covariance]:
+    """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
+    gravity = found.structure.chain.gravity
+    columns = _columns(found, sessions, [-np.cross(axis, gravity) for axis in axes])
+    groups = tuple(
+        replace(group, matrix=np.column_stack([group.matrix, column]))
+        for group, column in zip(found.problem.groups, columns, strict=True)
+    )
+    problem = replace(
+        found.problem,
+        names=(*found.problem.names, *_NAMES),
+        groups=groups,
+        units=(*found.problem.units, "rad", "rad") if found.problem.units else (),
+    )
+    estimator = MaximumAPosteriori(
+        _prior(found, tilt, prior_std_rad), 1.0, CovarianceSettings(kind="jackknife")
+    )
+    estimate = estimator.fit(problem)
+    posterior, jackknife = (estimate.covariances[kind] for kind in ("posterior", "jackknife"))
+    std = np.maximum(posterior.std, jackknife.std)[-2:]
+    correlation = posterior.matrix[-2:, -2:] / np.outer(posterior.std[-2:], posterior.std[-2:])
+    stated = replace(jackknife, matrix=correlation * np.outer(std, std))
+    return estimate.values[-2:], stated
+
+
+def _columns(
+    found: Identification, sessions: Sequence[Session], directions: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Torque (m, 2) of each row group at rest under each gravity: what a change of gravity by it adds."""
+    structure, settings = found.structure, found.settings
+    structures = [
+        replace(
+            structure,
+            chain=replace(structure.chain, gravity=direction),
+            without=(*structure.without, "offl", "offm"),
+        )
+        for direction in directions
+    ]
+    result = []
+    for session, payload in zip(sessions, found.payloads, strict=True):
+        chosen = session.select(structure.chain.joint_names)
+        moving = prepare(
+            chosen, settings.signals, resonance_hz=settings.resonance_hz, motor=settings.model == 2
+        )
+        still = _at_rest(moving)
+        groups = [observe([still], [payload], s, columns=found.base.columns).groups for s in structures]
+        for pair in zip(*groups, strict=True):
+            result.append(np.column_stack([group.matrix @ found.estimate.values for group in pair]))
+    return result
+
+
+def _at_rest(session: PreparedSession) -> PreparedSession:
+    return replace(session, passages=tuple(_passage_at_rest(passage) for passage in session.passages))
+
+
+def _passage_at_rest(passage: Passage) -> Passage:
+    motor = None if passage.motor is None else _channel_at_rest(passage.motor)
+    return replace(passage, joint=_channel_at_rest(passage.joint), motor=motor)
+
+
+def _channel_at_rest(channel: TorqueChannel) -> TorqueChannel:
+    still = np.zeros_like(channel.qd)
+    return replace(channel, qd=still, qdd=still)
+
+
+def _prior(found: Identification, tilt: FloatArray, prior_std_rad: float) -> Prior:
+    """The arm's prior with the tilt's: the whole tilt, steps made before included, is expected to be zero."""
+    p = len(found.base.names)
+    mean, precision = np.zeros(p + 2), np.zeros((p + 2, p + 2))
+    if found.structure.chain.urdf is not None:
+        arm = cad_prior(found.base).prior("pullback")
+        mean[:p], precision[:p, :p] = arm.mean, arm.precision
+    mean[p:] = -tilt
+    precision[p, p] = precision[p + 1, p + 1] = prior_std_rad**-2
+    return Prior(mean, precision)
