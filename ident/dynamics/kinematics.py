@@ -252,6 +252,12 @@ class Chain:
         placements.setflags(write=False)
         object.__setattr__(self, "link_placements", placements)
 
+    def __repr__(self) -> str:
+        kinds = "".join("P" if prismatic else "R" for prismatic in self.prismatic)
+        gravity = ", ".join(f"{value:.4g}" for value in self.gravity)
+        source = "a table" if self.urdf is None else "a URDF"
+        return f"Chain of {self.n} joints ({kinds}) {' '.join(self.joint_names)} from {source}, gravity [{gravity}]"
+
     @property
     def n(self) -> int:
         """Number of joints."""

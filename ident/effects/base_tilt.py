@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 
 from ident.effects.effect import Column, Effect, Parameter, Setting, Shape, Simulated
-from ident.effects.motion import Motion
+from ident.effects.motion import Floats, Motion
+
+
+def sideways_gravity(gravity: Floats, axes: Floats) -> Floats:
+    """Derivatives (k, 3) of gravity (3,) in the base's axes, for rotations of the base about `axes` (k, 3)."""
+    return np.array([-np.cross(axis, gravity) for axis in axes])
 
 
 class BaseTilt(Effect):
@@ -32,12 +37,8 @@ class BaseTilt(Effect):
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Gravity torques of the sideways parts of gravity, in all rows."""
         down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
-        columns = []
-        for axis in np.eye(3)[:2]:
-            # The base turned by +angle sees gravity turned by -angle.
-            torque = motion.gravity_along(-np.cross(axis, down))
-            columns.append(Column(motor=torque, joint=torque))
-        return tuple(columns)
+        torques = [motion.gravity_along(direction) for direction in sideways_gravity(down, np.eye(3)[:2])]
+        return tuple(Column(motor=torque, joint=torque) for torque in torques)
 
     def simulate(self, joint: int, parameters: Mapping[str, float]) -> Simulated:
         """Gravity of the simulated arm turned."""

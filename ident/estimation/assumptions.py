@@ -28,7 +28,7 @@ _WIDE_CONDITION = 100.0
 
 @dataclass(frozen=True)
 class Check:
-    """One assumption: whether it holds (None: could not be tested), what was found, what follows."""
+    """One assumption: whether it holds (None: not testable), finding and consequence."""
 
     name: str
     holds: bool | None
@@ -51,6 +51,9 @@ class Assumptions:
 
     def __getitem__(self, name: str) -> Check:
         return next(check for check in self.checks if check.name == name)
+
+    def __repr__(self) -> str:
+        return "Assumptions: " + ", ".join(f"{check.name} {check.verdict}" for check in self.checks)
 
     def summary(self) -> str:
         """Verdict table."""

@@ -1,18 +1,15 @@
-"""Two models of an arm, parameter by parameter: what differs by more than chance.
+"""Comparison of two models parameter by parameter, and of a model with other predictors of the joint torque.
 
-Two robots, two dates, two estimators. Where the models have different base sets the parameters of both are
-carried to the combinations that both determine: with K1 and K2 the matrices of the regrouping relations
-(base = K standard), a base parameter of one is comparable when its row of K is a combination of the rows of
-the other.
+The two models may come from two robots, dates or estimators. With different base sets, both are expressed in the
+combinations determined by both: with K1 and K2 the matrices of the regrouping relations (base = K standard), a
+base parameter of one is comparable when its row of K is a combination of the rows of the other.
 
-Other predictors of the joint torque, to hold an identified model against.
+The other predictors of the joint torque:
 
-* the controller's own mass matrix and gravity torque, as the channel `/fri/controller_model` has them:
+* the controller's own mass matrix and gravity torque from the channel `/fri/controller_model`:
   tau = M(q) qdd + g(q), without centrifugal terms and friction, at the times of that channel;
 * the CAD model: the inertials of the URDF, without friction;
 * another identified model.
-
-All of them describe the joint side.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +25,14 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import regressor
 from ident.dynamics.structure import Side
+from ident.dynamics.tables import Tabular
 from ident.estimation.validate import SessionScore, mounted, predictor, prepared_session, score_session
 from ident.estimators.distributions import normal_tail
 from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel
-
-if TYPE_CHECKING:
-    from ident.rows.filters import SignalSettings
-    from lwr_driver.session import Session
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require
+from lwr_driver.session import Session
 
 __all__ = ["Comparison", "Difference", "compare", "competitor_scores", "score_cad", "score_controller_model"]
 
@@ -49,7 +46,7 @@ class Difference:
     """One parameter in both models.
 
     z : difference over its standard deviation; NaN without covariances. p : probability of a larger |z|.
-    percent : second less first, of the first [%].
+    percent : second minus first, of the first [%].
     note : how the parameter is expressed where the base sets differ.
     """
 
@@ -66,20 +63,20 @@ class Difference:
 
     @property
     def difference(self) -> float:
-        """Second less first."""
+        """Second minus first."""
         return self.second - self.first
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Tabular):
     """All comparable parameters; prints itself.
 
     level : significance level of a single statement after Holm's correction for their number.
-    significant : names whose difference is more than chance at that level.
-    p : probability that all differences together are chance, by the Cauchy combination of the single ones
-        (NaN without covariances). It holds under any correlation and needs no inverse of a covariance that
-        was estimated from a few blocks of data.
-    only_first, only_second : parameters that one model determines and the other does not.
+    significant : names with a difference beyond chance at that level.
+    p : probability of all differences together by chance, the Cauchy combination of the single ones
+        (NaN without covariances). It holds under any correlation and needs no inverse of a covariance
+        estimated from a few blocks of data.
+    only_first, only_second : parameters determined by one model alone.
     """
 
     first: str
@@ -112,6 +109,24 @@ class Comparison:
             "only_second": list(self.only_second),
         }
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each comparable parameter."""
+        return [d.__dict__ | {"significant": d.name in self.significant} for d in self.differences]
+
+    def __repr__(self) -> str:
+        lines = [f"Comparison of {self.first} and {self.second}"]
+        count = f"{len(self.differences)} comparable parameters"
+        if not math.isfinite(self.p):
+            return "\n".join([*lines, f"  {count}; no significance: a model without covariance"])
+        lines.append(
+            f"  {count}, {len(self.significant)} differ significantly, p = {self.p:.2g} all together"
+        )
+        ordered = sorted(self.differences, key=lambda d: -abs(d.z) if math.isfinite(d.z) else 0.0)
+        lines += [
+            f"  {d.name:<8}{d.first:>11.5g}{d.second:>11.5g} {d.unit}, z = {d.z:.1f}" for d in ordered[:5]
+        ]
+        return "\n".join(lines)
+
     def __str__(self) -> str:
         lines = [
             f"first   {self.first}",
@@ -133,7 +148,7 @@ class Comparison:
                 f"{100 * self.level:g} % over all of them together)"
             )
             spread = math.sqrt(np.nanmean([d.z**2 for d in self.differences]))
-            lines.append(f"all together: p = {self.p:.2g} that it is chance; rms of z {spread:.2f}")
+            lines.append(f"all together by chance: p = {self.p:.2g}; rms of z {spread:.2f}")
         else:
             lines.append("no significance: a model without covariance")
         for title, names in (("only first", self.only_first), ("only second", self.only_second)):
@@ -145,14 +160,16 @@ class Comparison:
 def compare(
     first: DynamicModel, second: DynamicModel, *, level: float = 0.05, labels: tuple[str, str] | None = None
 ) -> Comparison:
-    """Compare two models of the same kinematics; estimates are taken as independent of each other.
+    """Compare two models of the same kinematics, with independent estimates.
 
     level : probability of calling any parameter different when none is (Holm 1979).
-    labels : names for the two in the table.
+    labels : names of the two models in the table.
 
-    A parameter that one model has eliminated as not essential counts as 0 there, without uncertainty.
-    Raises ConfigurationError for arms of different joints or geometry, or when nothing is comparable.
+    A parameter eliminated from one model as not essential counts as 0 there, without uncertainty.
+    Raises ConfigurationError for arms of different joints or geometry, and when nothing is comparable.
     """
+    for name, model in (("first", first), ("second", second)):
+        require(model, DynamicModel, name, "read a model with `read_model`")
     _require_same_arm(first, second)
     first_k, second_k = _matrices(first, second)
     rows, found, only_first = [], [], []
@@ -179,7 +196,7 @@ def compare(
     mix = np.array([weights for _, weights in rows])
     select[np.arange(len(rows)), [k for k, _ in rows]] = 1.0
     a, b = select @ _values(first), mix @ _values(second)
-    # Rows that neither model gives a value to say nothing.
+    # Parameters without a value in either model are left out.
     alive = (np.abs(a) > 0) | (np.abs(b) > 0)
     cov_a, cov_b = _covariance(first), _covariance(second)
     known = cov_a is not None and cov_b is not None
@@ -279,14 +296,14 @@ def _standard_names(model: DynamicModel) -> list[str]:
 
 
 def _combination(rows: Floats, target: Floats) -> tuple[Floats, float]:
-    """Weights of the combination of rows nearest to `target`, and the largest entry that is left."""
+    """Weights of the combination of rows nearest to `target`, and the largest entry of the remainder."""
     weights = np.asarray(np.linalg.lstsq(rows.T, target, rcond=1e-12)[0], dtype=np.float64)
     weights[np.abs(weights) < 1e-10] = 0.0
     return weights, float(np.abs(rows.T @ weights - target).max())
 
 
 def _note(weights: Floats, model: DynamicModel, name: str) -> str:
-    """How the second model expresses the parameter, unless it is its own of the same name."""
+    """The parameter in terms of the second model; empty for its own parameter of the same name."""
     names = _names(model)
     used = np.flatnonzero(weights)
     if len(used) == 1 and weights[used[0]] == 1.0 and names[used[0]].rstrip("R") == name.rstrip("R"):
@@ -331,14 +348,14 @@ def _std(value: float) -> str:
 
 def competitor_scores(
     model: DynamicModel,
-    sessions: Sequence[Session],
+    sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
     others: Sequence[DynamicModel] = (),
 ) -> tuple[SessionScore, ...]:
-    """Every competitor that exists for each session; the model itself lends its joints and its URDF."""
+    """Scores of every competitor available for each session; joints and URDF are those of the model."""
     found = []
-    for session in sessions:
+    for session in as_sessions(sessions):
         prepared = prepared_session(model, session, settings)
         if not any(passage.joint.torque.shape[1] for passage in prepared.passages):
             continue
@@ -360,15 +377,14 @@ def score_cad(model: DynamicModel, prepared: PreparedSession, session: Session) 
     def predict(channel: TorqueChannel, side: Side) -> Floats:
         return regressor.torque(chain, channel.q, channel.qd, channel.qdd, bodies)
 
-    carried = session.metadata.get("payload", "none").strip() not in ("", "none")
-    notes = ("CAD: the payload is not in the URDF.",) if carried else ()
+    notes = ("CAD: the payload is not in the URDF.",) if payload_name(session) else ()
     return score_session(prepared, predict, ("joint",), session, "CAD (URDF), no friction", notes=notes)
 
 
 def score_controller_model(prepared: PreparedSession, session: Session) -> SessionScore | None:
-    """The controller's mass matrix and gravity; None where the session has no such channel.
+    """The controller's mass matrix and gravity; None for a session without that channel.
 
-    Only the joint samples that a message of the channel belongs to (nearest, within 2 ms) are scored.
+    Only joint samples with a message of the channel (nearest, within 2 ms) are scored.
     """
     channel = session.controller_model
     if channel is None or not len(channel):
@@ -406,7 +422,7 @@ def score_controller_model(prepared: PreparedSession, session: Session) -> Sessi
 
 
 def _matched(samples: Floats, times: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Samples that messages belong to, and these messages."""
+    """Samples with a message, and these messages."""
     nearest = np.clip(np.searchsorted(samples, times), 1, len(samples) - 1)
     nearest -= samples[nearest] - times > times - samples[nearest - 1]
     close = np.abs(samples[nearest] - times) <= 2e-3

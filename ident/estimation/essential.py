@@ -30,11 +30,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EssentialSettings:
-    """When a parameter may go.
+    """Limits of the elimination of parameters.
 
     significance : level of the F test against zero. largest_loss_percent : bound on the growth of the
-        weighted residual rms, all eliminations together. keep : parameters that stay, drop : parameters that
-        go first and untested; names with or without their `R`, or a symbol for all links (`Fvl`).
+        weighted residual rms, all eliminations together. keep : parameters never eliminated. drop : parameters
+        eliminated first and untested. Names with or without their `R`, or a symbol for all links (`Fvl`).
     """
 
     significance: float = 0.01
@@ -56,9 +56,7 @@ class EssentialSettings:
 
 @dataclass(frozen=True)
 class Elimination:
-    """One parameter set to zero: its estimate and RSD just before,
-    the F statistic and what the fit lost by it.
-    """
+    """One parameter set to zero: its estimate and RSD just before, F statistic and loss of fit."""
 
     name: str
     estimate: float
@@ -74,7 +72,6 @@ class Essential:
 
     columns : positions of the essential parameters in the base set. estimate : WLS of the reduced problem.
     loss_percent : growth of the weighted residual rms over the base parameters.
-    joint_p : p-value of the F test that all that were tested away are zero together.
     """
 
     columns: NDArray[np.int64]
@@ -87,6 +84,13 @@ class Essential:
     def names(self) -> tuple[str, ...]:
         """Names of the essential parameters."""
         return self.estimate.names
+
+    def __repr__(self) -> str:
+        names = " ".join(e.name for e in self.eliminated[:12]) + (" ..." if len(self.eliminated) > 12 else "")
+        return (
+            f"{len(self.names)} essential parameters, {len(self.eliminated)} eliminated ({names or 'none'}); "
+            f"the weighted residual grew by {self.loss_percent:.2f} %"
+        )
 
     def summary(self) -> str:
         """Counts and the reason for each elimination."""

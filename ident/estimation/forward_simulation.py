@@ -1,13 +1,12 @@
-"""Forward simulation: the model moves under a position controller along the commanded motion.
+"""Forward simulation of the model under a position controller along the commanded motion.
 
 The arm of the model (rigid links, drive inertia, friction) follows the command under a diagonal position
-controller that knows nothing of the model; the torque that this takes and the motion that results are
-compared with the measured ones. Unlike the computed-torque test it needs no measured acceleration, and errors
-of the model act back on the motion.
+controller independent of the model. Its torque and motion are compared with the measured ones. Unlike the
+computed-torque test this needs no measured acceleration, and errors of the model act back on the motion.
 
-The controller gives joint j the stiffness w^2 m_j with m_j the joint's largest own inertia along the command,
+The controller gives joint j the stiffness w^2 m_j, with m_j the joint's largest own inertia along the command,
 and critical damping. A step takes the equations of motion linearised at its start, 0.6 of the way to its end
-(linearly implicit theta method): stable for any slope of the friction at rest, and little damping of its own.
+(linearly implicit theta method): stable for any slope of the friction at rest, with little numerical damping.
 sign(qd) is smoothed to tanh(qd / width).
 """
 
@@ -15,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +23,12 @@ from fri.errors import DataError
 from ident.dynamics import regressor
 from ident.dynamics.parameters import PER_LINK
 from ident.dynamics.structure import Side
+from ident.dynamics.tables import Tabular
 from ident.estimation.validate import mounted, prepared_session
 from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
-
-if TYPE_CHECKING:
-    from ident.rows.filters import SignalSettings
-    from lwr_driver.session import Session
+from lwr_driver.session import Session
 
 __all__ = ["ForwardSimulation", "simulate", "simulate_session"]
 
@@ -46,7 +44,7 @@ _ADVICE = (
 
 
 @dataclass(frozen=True, eq=False)
-class ForwardSimulation:
+class ForwardSimulation(Tabular):
     """Simulated motion and torque beside the measured ones; prints itself.
 
     times (N,) [s]; q, qd (N, n); torque (N, n) of `side`. measured_q, measured_torque (N, n).
@@ -65,12 +63,12 @@ class ForwardSimulation:
 
     @property
     def torque_rms(self) -> Floats:
-        """RMS (n,) of measured less simulated torque [Nm]."""
+        """RMS (n,) of measured minus simulated torque [Nm]."""
         return np.sqrt(np.mean((self.measured_torque - self.torque) ** 2, axis=0))
 
     @property
     def position_rms(self) -> Floats:
-        """RMS (n,) of measured less simulated position [rad]."""
+        """RMS (n,) of measured minus simulated position [rad]."""
         return np.sqrt(np.mean((self.measured_q - self.q) ** 2, axis=0))
 
     @property
@@ -90,6 +88,18 @@ class ForwardSimulation:
             "torque_rms": dict(zip(self.joint_names, self.torque_rms.tolist(), strict=True)),
             "position_rms": dict(zip(self.joint_names, self.position_rms.tolist(), strict=True)),
         }
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each joint."""
+        columns = (self.joint_names, self.torque_rms.tolist(), self.position_rms.tolist())
+        keys = ("joint", "torque_rms", "position_rms")
+        return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+
+    def __repr__(self) -> str:
+        return (
+            f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
+            f"relative error {100 * self.relative:.2f} %, {len(self.times)} samples"
+        )
 
     def __str__(self) -> str:
         lines = [

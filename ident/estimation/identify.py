@@ -1,4 +1,4 @@
-"""From session logs to a dynamic model with a certificate for each parameter."""
+"""From session logs to a dynamic model with the uncertainty of each parameter."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
+from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
 from ident.estimators.covariance import CovarianceSettings
@@ -29,9 +30,8 @@ from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
+from lwr_driver.session import Session
 
 __all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "identify"]
 
@@ -61,19 +61,18 @@ _WIDE_CONDITION = 100.0
 
 @dataclass(frozen=True)
 class IdentificationSettings:
-    """What to estimate and how.
+    """Model, estimator and signal processing of an identification.
 
     model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
-    estimator : one of `ESTIMATORS`, or a factory that gets the base set, the problem and the covariance
-        settings and returns an estimator. "iv" takes the commanded motion as instruments. "wls" (default)
-        takes nothing but the data; "physical" (consistent bodies near the URDF's, within 20 % of themselves)
-        is the one to predict motions that were not recorded, above all after a short or weakly exciting one:
-        on three runs of a real LWR4+ it errs by 3 to 4 % where least squares errs by 9 to 14 %
-        (`benchmarks/real_data.py`).
+    estimator : one of `ESTIMATORS`, or a factory from base set, problem and covariance settings to an
+        estimator. "iv" takes the commanded motion as instruments. "wls" (default) uses the data alone.
+        "physical" (consistent bodies within 20 % of the URDF's) predicts new motions best, above all after a
+        short or weakly exciting recording: on three runs of a real LWR4+ its error is 3 to 4 %, that of least
+        squares 9 to 14 % (`benchmarks/real_data.py`).
     without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
     resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
-    essential : how essential parameters are found; None leaves that out.
-    robot : name of the arm in the model; the sessions' metadata otherwise.
+    essential : settings of the search for essential parameters; None skips it.
+    robot : name of the arm in the model; default from the sessions' metadata.
     """
 
     model: int = 2
@@ -94,11 +93,11 @@ class IdentificationSettings:
 
 
 @dataclass(frozen=True)
-class Identification:
+class Identification(Tabular):
     """Result of `identify`.
 
-    base : the base parameters and their regrouping; estimate : values, covariance and residuals.
-    prepared : the sessions as filtered, without their samples. problem : the stacked regression.
+    base : the base parameters and their regrouping. estimate : values, covariance and residuals.
+    prepared : the filtered sessions, without their samples. problem : the stacked regression.
     warnings : sentences for the report.
     """
 
@@ -132,7 +131,8 @@ class Identification:
     @cached_property
     def essential_model(self) -> DynamicModel:
         """The identified model with the essential parameters only.
-        Raises ConfigurationError if none were sought.
+
+        Raises ConfigurationError when the settings skip the search for them.
         """
         if self.essential is None:
             raise ConfigurationError("essential parameters were not sought; set `essential` in the settings")
@@ -194,7 +194,7 @@ class Identification:
         return result
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything a file or a report needs, as plain numbers and texts."""
+        """Plain content for files and reports."""
         return {
             "model": self.settings.model,
             "estimator": self.estimate.method,
@@ -222,8 +222,26 @@ class Identification:
             "warnings": list(self.warnings),
         }
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each base parameter: name, unit, estimate, std, rsd_percent."""
+        return self.parameters
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in self.counts.items())
+        violated = [check.name for check in self.assumptions.checks if check.holds is False]
+        return "\n".join(
+            [
+                f"Identification of {self.robot}, Model {self.settings.model}, {len(self.prepared)} sessions",
+                f"  parameters: {counts}"
+                + ("" if self.essential is None else f", {len(self.essential.names)} essential"),
+                f"  condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}",
+                f"  violated assumptions: {', '.join(violated) or 'none'}; {len(self.warnings)} warnings",
+                *(f"  {line.strip()}" for line in repr(self.estimate).splitlines()[:6]),
+            ]
+        )
+
     def summary(self) -> str:
-        """The result as text."""
+        """Counts, sessions, parameters, residuals, assumptions and warnings as text."""
         counts = self.counts
         lines = [
             f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} "
@@ -247,15 +265,20 @@ class Identification:
 
 
 def identify(
-    sessions: Sequence[Session], chain: Chain, settings: IdentificationSettings | None = None
+    sessions: Sessions, chain: Chain, settings: IdentificationSettings | None = None
 ) -> Identification:
     """Identify the arm `chain` from one or more sessions, stacked.
 
-    The payload of each session is the one its metadata names (`none`: the bare arm). A session without motor
-    torques adds its joint rows only, one without joint torques its motor rows. Raises DataError
-    with advice for input that cannot be used.
+    sessions : a session, the path of a log, or several of either. The payload of each comes from its metadata
+        (`none`: the bare arm). A session without motor torques adds its joint rows only, one without joint
+        torques its motor rows.
+
+    Raises ConfigurationError for arguments of a wrong type, DataError for unusable sessions.
     """
     settings = settings or IdentificationSettings()
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
+    sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file")
     chosen = [session.select(chain.joint_names) for session in sessions]
@@ -275,9 +298,9 @@ def identify(
     if not sensed and settings.model != 2:
         raise DataError(
             f"Model {settings.model} needs joint torques, and no session has them; choose Model 2 "
-            "(`--model 2`), which then has motor rows only"
+            "(`--model 2`), then of motor rows only"
         )
-    payloads = [_payload(session) for session in chosen]
+    payloads = [payload_name(session) for session in chosen]
     carried = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
     structure = ModelStructure(
         chain,
@@ -292,7 +315,7 @@ def identify(
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     prepared, problems, instruments = [], [], []
     for session, payload in zip(chosen, mounted, strict=True):
-        # One session after the other: the full-rate signals of only one are in memory at a time.
+        # One session after the other, so that memory holds the full-rate signals of one only.
         whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
         problems.append(
             observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
@@ -312,8 +335,8 @@ def identify(
     if settings.estimator == "iv":
         if instrumental is None:
             raise DataError(
-                "estimator `iv` takes its instruments from the commanded motion, and not every session has "
-                "it: record /joint_command and do not average periods, or choose `wls`"
+                "estimator `iv` takes its instruments from the commanded motion, missing in a session: record "
+                "/joint_command and do not average periods, or choose `wls`"
             )
         estimate = instrumental
     assumptions = check_assumptions(
@@ -345,7 +368,7 @@ def identify(
 
 
 def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
-    """The estimator; for instrumental variables, which need more than this, the WLS to compare them with."""
+    """The estimator; for instrumental variables the WLS they are compared with."""
     name = settings.estimator
     factory = _ESTIMATORS["wls" if name == "iv" else name] if isinstance(name, str) else name
     return factory(base, problem, settings.covariance)
@@ -357,7 +380,7 @@ def _instrumental(
     instruments: Sequence[Problem],
     settings: IdentificationSettings,
 ) -> Estimate | None:
-    """Instrumental-variable estimate on the commanded motion, None where a session does not have it."""
+    """Instrumental-variable estimate on the commanded motion; None when a session lacks it."""
     if len(instruments) < len(problems):
         return None
     matrices = [group.matrix for one in instruments for group in one.groups]
@@ -365,16 +388,11 @@ def _instrumental(
 
 
 def _common_period(prepared: Sequence[PreparedSession]) -> int | None:
-    """Rows of a period, if all sessions have the same and at least one has two of them."""
+    """Rows of a period, if all sessions share it and at least one has two periods."""
     lengths = {session.period_rows for session in prepared}
     length = lengths.pop() if len(lengths) == 1 else None
     averaged = any(session.settings.average_periods for session in prepared)
     return None if averaged or not any(session.periods > 1 for session in prepared) else length
-
-
-def _payload(session: Session) -> str | None:
-    name = session.metadata.get("payload", "none").strip()
-    return None if name in ("", "none") else name
 
 
 def _same_robot(sessions: Sequence[Session]) -> None:
@@ -393,7 +411,7 @@ def _every_joint_moves(prepared: Sequence[PreparedSession], chain: Chain) -> Non
     if still:
         raise DataError(
             f"joint{'s' if len(still) > 1 else ''} {', '.join(still)} never "
-            f"move{'s' if len(still) == 1 else ''}; plan an excitation that moves every joint, or identify "
+            f"move{'s' if len(still) == 1 else ''}; plan an excitation of every joint, or identify "
             "with a chain in which these joints are fixed"
         )
 
@@ -419,7 +437,7 @@ def _payload_warnings(
     estimate: Estimate,
     structure: ModelStructure,
 ) -> list[str]:
-    """What the estimated mass of each payload says. DataError where it contradicts the announcement."""
+    """Estimated against stated mass of each payload. DataError for a payload not mounted as stated."""
     found = []
     if structure.payloads and None not in payloads:
         found.append(
@@ -435,7 +453,7 @@ def _payload_warnings(
         place = base.names.index(name)
         mass, std = float(estimate.values[place]), float(estimate.std[place])
         carriers = [s for s, p in zip(sessions, payloads, strict=True) if p == payload]
-        stated = next((m for m in map(_stated_mass, carriers) if m is not None), None)
+        stated = next((m for m in map(stated_mass, carriers) if m is not None), None)
         estimated = f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg"
         absent = mass < 3.0 * std if stated is None else mass + 3.0 * std < 0.5 * stated
         if absent:
@@ -447,29 +465,17 @@ def _payload_warnings(
                 else f"it was not mounted in {names}, or it was mounted in {bare or 'all sessions'} as well"
             )
             raise DataError(
-                f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; say "
-                "what was mounted (`--payload FILE=NAME`, `none`: the bare arm) or record the session again"
+                f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; name "
+                "the mounted payload (`--payload FILE=NAME`, `none`: the bare arm) or record the session again"
             )
         if stated is not None and abs(mass - stated) > max(0.1 * stated, 3.0 * std):
             found.append(
-                f"{estimated} against {stated:.3f} kg stated; check what was mounted, and the torque "
+                f"{estimated} against {stated:.3f} kg stated; check the mounted payload and the torque "
                 "sensors' gain"
             )
         elif mass < 3.0 * std:
-            found.append(
-                f"{estimated} is not above zero; the motion says too little about so light a payload"
-            )
+            found.append(f"{estimated} is not above zero; the motion excites so light a payload too little")
     return found
-
-
-def _stated_mass(session: Session) -> float | None:
-    stated = session.metadata.get("payload_mass", "")
-    try:
-        return float(stated) if stated else None
-    except ValueError as error:
-        raise DataError(
-            f"{session.path.name}: `payload_mass` {stated!r} in the metadata is no number"
-        ) from error
 
 
 def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:

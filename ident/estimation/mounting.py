@@ -1,26 +1,27 @@
-"""How the base stands: the direction of gravity in the base's own axes, found from the same sessions.
+"""Tilt of the base: the direction of gravity in the base's own axes, from the sessions of the identification.
 
-A base that leans by an angle t lets the first joint feel gravity, about t times the moment of the whole arm:
-one degree is half a newton metre on an LWR4+. The motion of the first joint makes that unlike any parameter
-of a link, so the two angles can be estimated together with the base parameters. Gravity enters the torque
+Under a tilt t gravity acts on the first joint with about t times the moment of the whole arm: half a newton
+metre per degree on an LWR4+. It varies with the position of the first joint, unlike the torque of any link
+parameter, so the two angles can be estimated together with the base parameters. Gravity enters the torque
 linearly, tau(q, qd, qdd; g + dg) = tau(q, qd, qdd; g) + G(q; dg), so d tau / d t_k = G(q; dg / dt_k), with
-G the regressor at rest under the gravity dg / dt_k; a few Gauss-Newton steps suffice.
+G the regressor at rest under the gravity dg / dt_k. A few Gauss-Newton steps suffice.
 
-What resembles it: a torque sensor of joint 1 that picks up joint 2 (crosstalk), a cable across joint 1.
-A level on the base decides.
+Similar causes are crosstalk from joint 2 to the torque sensor of joint 1 and a cable across joint 1. A spirit
+level on the base decides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
+from ident.effects.base_tilt import sideways_gravity
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.distributions import fisher_tail
@@ -29,9 +30,8 @@ from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.rows.observation import observe
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
+from ident.rows.sessions import Sessions, as_sessions, require
+from lwr_driver.session import Session
 
 __all__ = ["Mounting", "find_mounting"]
 
@@ -42,13 +42,13 @@ _NAMES = ("tilt_1", "tilt_2")
 
 @dataclass(frozen=True)
 class Mounting:
-    """Direction of gravity that the torques speak of.
+    """Estimated direction of gravity in the base's axes.
 
-    axes : (2, 3), unit vectors in the base's axes, perpendicular to the gravity that was assumed.
-    tilt_rad : (2,), rotation of the base about them; it leans by the norm.
+    axes : (2, 3), unit vectors in the base's axes, perpendicular to the assumed gravity.
+    tilt_rad : (2,), rotation of the base about them; its norm is the tilt.
     covariance : (2, 2) [rad^2]. assumed, gravity : (3,) before and after, in the base's axes [m/s^2].
-    identification : the arm identified under the gravity found; its chain has it.
-    steps : number of Gauss-Newton steps; converged : the last was below a tenth of a standard deviation.
+    identification : the arm identified under the estimated gravity, with it in the chain.
+    steps : number of Gauss-Newton steps. converged : the last was below a tenth of a standard deviation.
     """
 
     axes: FloatArray
@@ -62,7 +62,7 @@ class Mounting:
 
     @property
     def chain(self) -> Chain:
-        """The arm under the gravity found."""
+        """The arm under the estimated gravity."""
         return self.identification.structure.chain
 
     @property
@@ -90,6 +90,9 @@ class Mounting:
             "converged": self.converged,
         }
 
+    def __repr__(self) -> str:
+        return f"Mounting: {self}"
+
     def __str__(self) -> str:
         degrees, std = np.rad2deg(self.tilt_rad), np.rad2deg(self.std)
         parts = [
@@ -103,7 +106,7 @@ class Mounting:
 
 
 def find_mounting(
-    sessions: Sequence[Session],
+    sessions: Sessions,
     chain: Chain,
     settings: IdentificationSettings | None = None,
     *,
@@ -112,23 +115,27 @@ def find_mounting(
 ) -> Mounting:
     """Tilt of the base of `chain` from the sessions, and the arm identified under it.
 
-    settings : as for `identify`; the steps themselves are maximum a posteriori with the inertials of the URDF
-    as prior (`cad_prior`; without one, weighted least squares), so that weakly excited parameters do not take
-    the tilt's part. prior_std_rad : how crooked a base may be; with a tenth of a degree from the data it
-    hardly matters, and it keeps an angle at zero of which the motion says nothing. The standard deviations
-    are the larger of the block jackknife's and the posterior's; those of the arm's parameters do not contain
-    the tilt's.
+    sessions, settings : as for `identify`. The steps are maximum a posteriori with the inertials of the URDF as
+        prior (`cad_prior`; weighted least squares without a URDF), so that weakly excited parameters do not
+        absorb the tilt.
+    prior_std_rad : standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree
+        from the data, and keeps an unexcited angle at zero.
 
-    Raises ConfigurationError for Model 3, which has no gravity in it, and DataError as `identify` does.
+    The standard deviations are the larger of the block jackknife's and the posterior's; those of the arm's
+    parameters do not include the tilt's.
+
+    Raises ConfigurationError for Model 3 (no gravity), and the errors of `identify`.
     """
     settings = settings or IdentificationSettings()
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    sessions = as_sessions(sessions)
     if settings.model == 3:
         raise ConfigurationError("Model 3 has no gravity in it; find the mounting with Model 1 or 2")
     if not np.any(chain.gravity):
         raise ConfigurationError("the chain has no gravity, so its base cannot lean; give `gravity`")
     axes = _axes(chain.gravity)
     tilt = np.zeros(2)
-    # The steps need plausible values of all parameters, whatever estimator gives the final ones.
+    # The steps need plausible values of all parameters, with any final estimator.
     inner = replace(settings, essential=None, estimator="wls" if chain.urdf is None else "map")
     found = identify(sessions, chain, inner)
     done, converged = 0, False
@@ -156,7 +163,7 @@ def _axes(gravity: FloatArray) -> FloatArray:
 
 
 def _turned(gravity: FloatArray, axes: FloatArray, tilt: FloatArray) -> FloatArray:
-    """Gravity in the axes of a base that was rotated by `tilt` about `axes` (Rodrigues, inverse rotation)."""
+    """Gravity in the axes of a base rotated by `tilt` about `axes` (Rodrigues, inverse rotation)."""
     vector = -(tilt @ axes)
     angle = float(np.linalg.norm(vector))
     if angle == 0.0:
@@ -178,7 +185,7 @@ def _step(
 ) -> tuple[FloatArray, Covariance]:
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
-    columns = _columns(found, sessions, [-np.cross(axis, gravity) for axis in axes])
+    columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
     groups = tuple(
         replace(group, matrix=np.column_stack([group.matrix, column]))
         for group, column in zip(found.problem.groups, columns, strict=True)
@@ -203,7 +210,7 @@ def _step(
 def _columns(
     found: Identification, sessions: Sequence[Session], directions: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    """Torque (m, 2) of each row group at rest under each gravity: what a change of gravity by it adds."""
+    """Torque (m, 2) of each row group at rest under each gravity, the change of torque for one of gravity."""
     structure, settings = found.structure, found.settings
     structures = [
         replace(
@@ -241,7 +248,7 @@ def _channel_at_rest(channel: TorqueChannel) -> TorqueChannel:
 
 
 def _prior(found: Identification, tilt: FloatArray, prior_std_rad: float) -> Prior:
-    """The arm's prior with the tilt's: the whole tilt, steps made before included, is expected to be zero."""
+    """The arm's prior with the tilt's: zero for the whole tilt, earlier steps included."""
     p = len(found.base.names)
     mean, precision = np.zeros(p + 2), np.zeros((p + 2, p + 2))
     if found.structure.chain.urdf is not None:

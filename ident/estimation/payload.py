@@ -1,6 +1,6 @@
 """The ten parameters of a payload from a known arm model and a loaded session.
 
-With the arm's parameters chi known to a covariance S, the rows of the loaded session are::
+With the arm's parameters chi known with covariance S, the rows of the loaded session are::
 
     y - A chi = P x + e         x = XX XY XZ YY YZ ZZ MX MY MZ M of the payload in the frame of the last link
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,16 +24,16 @@ from ident.dynamics.base_set import numeric_base
 from ident.dynamics.parameters import INERTIAL, PER_LINK, to_com
 from ident.dynamics.physical import project, reference_bodies
 from ident.dynamics.structure import Condition, ModelStructure
+from ident.dynamics.tables import Tabular
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem, RowGroup
 from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
 from ident.rows.observation import observe
 from ident.rows.prepare import prepare
-
-if TYPE_CHECKING:
-    from ident.rows.filters import SignalSettings
-    from lwr_driver.session import Session
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
+from lwr_driver.session import Session
 
 __all__ = ["PayloadEstimate", "identify_payload", "with_payload"]
 
@@ -44,16 +44,16 @@ _LINK = len(PER_LINK)
 
 
 @dataclass(frozen=True, eq=False)
-class PayloadEstimate:
+class PayloadEstimate(Tabular):
     """A payload's parameters; prints itself.
 
     values, covariance : (10,), (10, 10) in the frame of the last link, from residual and arm model together.
     arm_covariance : (10, 10), the arm model's part of it (zero when the model has no covariance).
     cross : (10, p), covariance with the arm model's parameters.
-    consistent : (10,) the nearest body that can exist.
-    announced_kg : mass that the session announces, None without.
+    consistent : (10,) the nearest physically consistent body. exact : whether it is the estimate itself.
+    announced_kg : mass in the session's metadata, None without.
     residual : rms of the rows by joint and side [Nm].
-    offsets : estimated shifts of the torque offsets by joint [Nm], empty when they were held.
+    offsets : estimated shifts of the torque offsets by joint [Nm], empty for fixed offsets.
     """
 
     payload: str
@@ -102,7 +102,7 @@ class PayloadEstimate:
 
     @property
     def mass_deviation(self) -> float:
-        """Estimated less announced mass in standard deviations; NaN without an announced mass."""
+        """Estimated minus announced mass in standard deviations; NaN without an announced mass."""
         if self.announced_kg is None:
             return math.nan
         return (self.mass - self.announced_kg) / self.mass_std
@@ -121,8 +121,8 @@ class PayloadEstimate:
         if abs(self.mass_deviation) <= 3.0:
             return f"{text}; they agree"
         if abs(percent) <= 3.0:
-            return f"{text}; more than chance: the torque sensors' gain or parts that were not weighed"
-        return f"{text}; they contradict: check what was mounted and what was announced"
+            return f"{text}; more than chance: the torque sensors' gain or parts not weighed"
+        return f"{text}; they contradict: check the mounted payload and the announced mass"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -131,17 +131,7 @@ class PayloadEstimate:
             "robot": self.robot,
             "session": self.session,
             "payload": self.payload,
-            "parameters": [
-                {"name": name, "unit": unit, "value": value, "std": std, "consistent": body}
-                for name, unit, value, std, body in zip(
-                    self.names,
-                    self.units,
-                    self.values.tolist(),
-                    self.std.tolist(),
-                    self.consistent.tolist(),
-                    strict=True,
-                )
-            ],
+            "parameters": self.records(),
             "mass_kg": self.mass,
             "mass_std_kg": self.mass_std,
             "com_m": self.com.tolist(),
@@ -153,6 +143,32 @@ class PayloadEstimate:
             "offset_shifts_nm": self.offsets,
             "notes": list(self.notes),
         }
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each of the ten parameters."""
+        return [
+            {"name": name, "unit": unit, "value": value, "std": std, "consistent": body}
+            for name, unit, value, std, body in zip(
+                self.names,
+                self.units,
+                self.values.tolist(),
+                self.std.tolist(),
+                self.consistent.tolist(),
+                strict=True,
+            )
+        ]
+
+    def __repr__(self) -> str:
+        com = ", ".join(f"{1e3 * c:.1f} ± {1e3 * s:.1f}" for c, s in zip(self.com, self.com_std, strict=True))
+        return "\n".join(
+            [
+                f"Payload {self.payload!r} of {self.robot} from {self.session}",
+                f"  mass {self.mass:.4f} ± {self.mass_std:.4f} kg; {self.verdict}",
+                f"  centre of mass x, y, z: {com} mm",
+                f"  physically consistent: {'yes' if self.exact else 'no, see `consistent`'}; residual rms up to "
+                f"{max(self.residual.values()):.3f} Nm",
+            ]
+        )
 
     def __str__(self) -> str:
         arm = np.sqrt(np.diag(self.arm_covariance))
@@ -183,26 +199,28 @@ class PayloadEstimate:
 
 def identify_payload(
     model: DynamicModel,
-    sessions: Sequence[Session],
+    sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
     covariance: CovarianceSettings | None = None,
     free_offsets: bool = False,
 ) -> PayloadEstimate:
-    """Estimate the payload of one or more loaded sessions (all with the same one) with a known arm model.
+    """Estimate the payload of one or more sessions with the same payload, given a model of the arm.
 
-    free_offsets : estimate new torque offsets too: sensor zeros move between mountings.
+    sessions : a session, the path of a log, or several of either.
+    free_offsets : estimate new torque offsets too, because sensor zeros move between mountings.
 
-    Raises DataError for a session without payload, sessions of different payloads or of other joints, a
-    motion that does not determine the ten parameters (they are named), and ConfigurationError for a model
-    without a rigid part or one whose arm contains a payload.
+    Raises DataError for a session without payload, for different payloads or other joints, and for a motion
+    too poor for the ten parameters (they are named); ConfigurationError for arguments of a wrong type, a model
+    without a rigid part, and one with a payload inside its arm.
     """
+    require(model, DynamicModel, "model", "read the arm's model with `read_model`")
+    sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name a session with the payload mounted")
     if model.structure.sides == ("difference",):
         raise ConfigurationError(
-            f"the model of {model.robot} describes torque differences, which a payload does not change; use "
-            "Model 1 or 2"
+            f"the model of {model.robot} describes torque differences, unchanged by a payload; use Model 1 or 2"
         )
     payload = _payload_name(sessions)
     structure, arm_columns, body, offset_columns = _structure(model, payload, free_offsets)
@@ -248,7 +266,7 @@ def identify_payload(
         cross=cross[:_BODY],
         consistent=found.bodies[0],
         exact=found.exact,
-        announced_kg=_announced(sessions),
+        announced_kg=next((m for m in map(stated_mass, sessions) if m is not None), None),
         residual={fit.label: fit.rms for fit in fitted.classes},
         offsets={
             structure.names[c]: float(v) for c, v in zip(offset_columns, fitted.values[_BODY:], strict=True)
@@ -258,9 +276,9 @@ def identify_payload(
 
 
 def with_payload(model: DynamicModel, estimate: PayloadEstimate) -> DynamicModel:
-    """The arm model with the payload in it, covariances between the two included.
+    """The arm model with the payload, covariances between the two included.
 
-    Raises ConfigurationError for a payload that the model has already, or whose parameters regroup with the
+    Raises ConfigurationError for a payload already in the model, and for payload parameters regrouped with the
     arm's under the model's conditions.
     """
     if estimate.payload in model.structure.payloads:
@@ -294,7 +312,7 @@ def with_payload(model: DynamicModel, estimate: PayloadEstimate) -> DynamicModel
 
 
 def _payload_name(sessions: Sequence[Session]) -> str:
-    found = {session.metadata.get("payload", "none").strip() or "none" for session in sessions}
+    found = {payload_name(session) or "none" for session in sessions}
     if len(found) > 1:
         raise DataError(
             f"the sessions carry different payloads ({', '.join(sorted(found))}); identify each by itself"
@@ -308,20 +326,10 @@ def _payload_name(sessions: Sequence[Session]) -> str:
     return name
 
 
-def _announced(sessions: Sequence[Session]) -> float | None:
-    masses = {session.metadata.get("payload_mass", "") for session in sessions} - {""}
-    if not masses:
-        return None
-    try:
-        return float(masses.pop())
-    except ValueError as error:
-        raise DataError(f"{sessions[0].path.name}: `payload_mass` in the metadata is no number") from error
-
-
 def _structure(
     model: DynamicModel, payload: str, free_offsets: bool
 ) -> tuple[ModelStructure, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Structure of the arm with this payload alone; columns of the arm, the payload and freed offsets."""
+    """Structure of the arm with this payload alone; columns of the arm, the payload and free offsets."""
     own = model.structure
     if model.base is not None and all(c.payload is not None for c in model.base.conditions):
         raise ConfigurationError(
@@ -340,13 +348,13 @@ def _structure(
 
 
 def _arm_parameters(model: DynamicModel) -> NDArray[np.int64]:
-    """Which of the model's parameters are the arm's: not those of payloads that it knows."""
+    """The model's parameters of the arm, without those of its payloads."""
     first, count = _LINK * model.structure.chain.n, _LINK * len(model.structure.payloads)
     return np.flatnonzero((model.columns < first) | (model.columns >= first + count))
 
 
 def _reduced(rows: Problem, chi: Floats, units: Sequence[str]) -> Problem:
-    """The rows less what the arm's parameters `chi` explain, for the remaining columns."""
+    """The rows minus the torque of the arm's parameters `chi`, with the remaining columns."""
     arm = len(chi)
     groups = [
         RowGroup(
@@ -363,7 +371,7 @@ def _reduced(rows: Problem, chi: Floats, units: Sequence[str]) -> Problem:
 
 
 def _influence(rows: Problem, weights: Floats, arm: int) -> Floats:
-    """G A (k, p): how much the estimate falls when the arm's parameters rise."""
+    """G A (k, p): fall of the estimate per unit of the arm's parameters."""
     count = len(rows.names) - arm
     normal, mixed = np.zeros((count, count)), np.zeros((count, arm))
     for group, number in zip(rows.groups, rows.class_of_group, strict=True):

@@ -1,14 +1,14 @@
-"""How well a model predicts torque on motions that its estimate has not seen.
+"""Test of a model on sessions it was not fitted to.
 
-The computed-torque test: the torque of each side is computed from the filtered measured motion and compared,
-sample by sample, with the measured one. No torque is filtered for it; beside the plain figures stand those in
-the band of the estimation, where both went through the same parallel low-pass. Samples at which a joint
-stands still are left out for that joint: its Coulomb torque is unknown there.
+The computed-torque test compares, sample by sample, the measured torque of each side with the torque computed
+from the filtered measured motion. The measured torque is not filtered. A second set of figures is limited to the
+band of the estimation: both torques pass the same parallel low-pass. Samples of a joint at standstill are left
+out for that joint, because its Coulomb torque is unknown there.
 
-Where the excitation repeats, the scatter between its periods is what no model of the motion alone can
-explain: the floor that a residual may reach.
+With a periodic excitation the scatter between periods is the floor of the residual: no model of the motion
+alone can explain it.
 
-Cross-validation over sessions: each is predicted by a model that was identified from all the others.
+Cross-validation predicts each session with a model identified from all the others.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Side
+from ident.dynamics.tables import Tabular
 from ident.estimation.identify import IdentificationSettings, identify
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require
+from lwr_driver.session import Session
 
 __all__ = [
     "CrossValidation",
@@ -50,13 +50,13 @@ Predictor = Callable[[TorqueChannel, Side], Floats]
 
 @dataclass(frozen=True)
 class Score:
-    """Residual (measured less computed) of one joint and side in one session [Nm].
+    """Residual (measured minus computed) of one joint and side in one session [Nm].
 
     rms, bias : root mean square and mean. relative : rms of the residual over rms of the torque.
-    worst, worst_time_s : largest residual and when it happened, from the first sample of the log.
-    band_rms : rms in the band of the estimation. floor_rms : scatter between periods in that band, NaN
-        without them.
-    samples : number of samples, those at standstill left out.
+    worst, worst_time_s : largest residual and its time from the first sample of the log.
+    band_rms : rms in the band of the estimation. floor_rms : scatter between periods in that band, NaN for
+        an excitation without periods.
+    samples : number of samples, without those at standstill.
     """
 
     joint: str
@@ -71,15 +71,15 @@ class Score:
     floor_rms: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain content; what does not exist is null."""
+        """Plain content; missing figures are null."""
         return {key: _finite(value) for key, value in self.__dict__.items()}
 
 
 @dataclass(frozen=True)
-class SessionScore:
-    """One session against one model.
+class SessionScore(Tabular):
+    """Residuals of one model in one session.
 
-    seen : whether the estimate was made from this session. relative : by side, residual over torque of all
+    seen : whether the model was fitted to this session. relative : by side, residual over torque of all
         joints, both as Euclidean norms. standstill : share of samples left out.
     """
 
@@ -107,6 +107,20 @@ class SessionScore:
             "notes": list(self.notes),
         }
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each joint and side."""
+        head = {"session": self.session, "predictor": self.predictor, "seen": self.seen}
+        return [head | score.__dict__ for score in self.scores]
+
+    def __repr__(self) -> str:
+        relative = ", ".join(f"{side} {100 * value:.2f} %" for side, value in self.relative.items())
+        worst = max(self.scores, key=lambda s: -1.0 if math.isnan(s.relative) else s.relative)
+        return (
+            f"{self.session}, payload {self.payload or 'none'}, {self.predictor}"
+            f"{' (fitted to it)' if self.seen else ''}: relative error {relative}; largest {worst.joint} "
+            f"{worst.side} {100 * worst.relative:.1f} %"
+        )
+
     def __str__(self) -> str:
         label = "  SEEN BY THE ESTIMATE: no validation" if self.seen else ""
         lines = [f"{self.session}, payload {self.payload or 'none'}: {self.predictor}{label}"]
@@ -130,8 +144,8 @@ class SessionScore:
 
 
 @dataclass(frozen=True)
-class Validation:
-    """All sessions against the model and its competitors; prints itself."""
+class Validation(Tabular):
+    """Scores of the model and of its competitors in all sessions; prints itself."""
 
     robot: str
     scores: tuple[SessionScore, ...]
@@ -140,7 +154,7 @@ class Validation:
 
     @property
     def unseen(self) -> tuple[SessionScore, ...]:
-        """The scores that say something: sessions that the estimate has not seen."""
+        """The scores in sessions the model was not fitted to."""
         return tuple(score for score in self.scores if not score.seen)
 
     def to_dict(self) -> dict[str, Any]:
@@ -152,6 +166,19 @@ class Validation:
             "competitors": [score.to_dict() for score in self.competitors],
             "notes": list(self.notes),
         }
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each session, predictor, joint and side."""
+        return [row for score in (*self.scores, *self.competitors) for row in score.records()]
+
+    def __repr__(self) -> str:
+        rivals = f", {len(self.competitors)} scores of competitors" if self.competitors else ""
+        return "\n".join(
+            [
+                f"Validation of the model of {self.robot}: {len(self.scores)} sessions{rivals}",
+                *_few([f"  {score!r}" for score in self.scores], 8),
+            ]
+        )
 
     def __str__(self) -> str:
         parts = [f"Computed torque, {self.robot}", *map(str, self.scores)]
@@ -182,26 +209,28 @@ class Validation:
 
 def validate(
     model: DynamicModel,
-    sessions: Sequence[Session],
+    sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
     allow_seen: bool = False,
 ) -> Validation:
     """Computed-torque test of a model on sessions.
 
-    allow_seen : score sessions that the estimate was made from too, and label them; otherwise they are
-        refused.
+    sessions : a session, the path of a log, or several of either.
+    allow_seen : score sessions the model was fitted to as well, and label them; otherwise they are refused.
 
-    Raises DataError for a session of another robot, with a payload that the model does not know, without any
-    channel that the model describes, or that the estimate has seen.
+    Raises ConfigurationError for arguments of a wrong type, DataError for a session of another robot, with a
+    payload missing in the model, without any channel of the model, or seen by the estimate.
     """
+    require(model, DynamicModel, "model", "read one with `read_model`, or take `identify(...).model`")
+    sessions = as_sessions(sessions)
     if not sessions:
-        raise DataError("no session given; name at least one session file that the estimate has not seen")
+        raise DataError("no session given; name at least one session file the model was not fitted to")
     seen = seen_sessions(model, sessions)
     if any(seen) and not allow_seen:
         named = ", ".join(s.path.name for s, flag in zip(sessions, seen, strict=True) if flag)
         raise DataError(
-            f"{named}: the estimate was made from this session, so predicting it proves nothing; give a "
+            f"{named}: the model was fitted to this session, so predicting it proves nothing; give a "
             "session of another motion, or --allow-seen to see the fit anyway"
         )
     scores = []
@@ -237,7 +266,7 @@ def predictor(model: DynamicModel, payload: str | None) -> Predictor:
 
 
 def seen_sessions(model: DynamicModel, sessions: Sequence[Session]) -> list[bool]:
-    """Which of the sessions the model was estimated from, by the uids (or file names) in its provenance."""
+    """Whether the model was fitted to each session, by the uids (or file names) in its provenance."""
     entries = model.provenance.get("sessions", ())
     uids, files = set(), set()
     for entry in entries if isinstance(entries, (list, tuple)) else ():
@@ -256,11 +285,9 @@ def seen_sessions(model: DynamicModel, sessions: Sequence[Session]) -> list[bool
 
 
 def mounted(model: DynamicModel, session: Session) -> str | None:
-    """The payload of a session as the model knows it. Raises DataError for one that it does not."""
-    name = session.metadata.get("payload", "none").strip()
-    if name in ("", "none"):
-        return None
-    if model.structure.sides == ("difference",):
+    """The payload of a session by its name in the model. Raises DataError for one missing there."""
+    name = payload_name(session)
+    if name is None or model.structure.sides == ("difference",):
         return None
     if name not in model.structure.payloads:
         known = ", ".join(model.structure.payloads) or "none"
@@ -274,7 +301,7 @@ def mounted(model: DynamicModel, session: Session) -> str | None:
 def prepared_session(
     model: DynamicModel, session: Session, settings: SignalSettings | None
 ) -> PreparedSession:
-    """The session filtered as for the estimation, with the joints of the model."""
+    """The session with the joints of the model, filtered as for the estimation."""
     chosen = session.select(model.structure.chain.joint_names)
     wants_motor = "motor" in model.structure.sides or "difference" in model.structure.sides
     return prepare(chosen, settings, motor=wants_motor)
@@ -326,13 +353,13 @@ def score_session(
             scores.append(_score(joint, side, k, rows, (times, error, torque, used), prepared))
     if not scores:
         raise DataError(
-            f"{prepared.name}: no usable {' or '.join(sides)} torque; the model describes nothing that this "
-            "session has, choose another session or a model of the other side"
+            f"{prepared.name}: no usable {' or '.join(sides)} torque; this session has no channel of the "
+            "model, choose another session or a model of the other side"
         )
     return SessionScore(
         session=prepared.name,
         uid=session.metadata.get("uid", ""),
-        payload=_payload_name(session),
+        payload=payload_name(session),
         predictor=name,
         seen=seen,
         scores=tuple(scores),
@@ -340,11 +367,6 @@ def score_session(
         standstill=float(np.mean(still)),
         notes=notes,
     )
-
-
-def _payload_name(session: Session) -> str | None:
-    name = session.metadata.get("payload", "none").strip()
-    return None if name in ("", "none") else name
 
 
 def _residuals(passage: Passage, predict: Predictor, side: Side, settings: SignalSettings) -> _Rows | None:
@@ -374,7 +396,7 @@ def _interpolated(times: Floats, values: Floats, wanted: Floats) -> Floats:
 
 
 def _inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
-    """Samples in the part of the passage that rows come from."""
+    """Samples in the part of the passage with rows."""
     step = float(np.median(np.diff(passage.rows))) if len(passage.rows) > 1 else 1.0
     nearest = np.clip(np.searchsorted(passage.rows, channel.times), 0, len(passage.rows) - 1)
     before = np.maximum(nearest - 1, 0)
@@ -442,9 +464,15 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _few(lines: Sequence[str], count: int) -> list[str]:
+    """The first lines, and a line with the number of the others."""
+    left = len(lines) - count
+    return [*lines[:count], *([f"  and {left} more"] if left > 0 else [])]
+
+
 @dataclass(frozen=True)
-class CrossValidation:
-    """One score a session, and the sessions that could not be left out with the reason."""
+class CrossValidation(Tabular):
+    """One score for each session left out, and the sessions never left out with the reason."""
 
     scores: tuple[SessionScore, ...]
     skipped: tuple[str, ...]
@@ -466,6 +494,18 @@ class CrossValidation:
             "rms": self.rms,
         }
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each session left out, joint and side."""
+        return [row for score in self.scores for row in score.records()]
+
+    def __repr__(self) -> str:
+        return "\n".join(
+            [
+                f"Cross-validation: {len(self.scores)} sessions left out in turn, {len(self.skipped)} skipped",
+                *_few([f"  {score!r}" for score in self.scores], 8),
+            ]
+        )
+
     def __str__(self) -> str:
         lines = ["Cross-validation: each session by the model of the others"]
         lines += ["", *("\n".join([str(score), ""]) for score in self.scores)]
@@ -475,21 +515,22 @@ class CrossValidation:
 
 
 def cross_validate(
-    sessions: Sequence[Session], chain: Chain, settings: IdentificationSettings | None = None
+    sessions: Sessions, chain: Chain, settings: IdentificationSettings | None = None
 ) -> CrossValidation:
     """Leave out one session at a time.
 
-    A session whose payload no other session carries cannot be predicted by the others; it is skipped and
-    named. Raises DataError when no fold is left.
+    sessions : two at least, as for `identify`. A session with a payload of its own is skipped and named: the
+    others cannot predict it. Raises DataError when no fold is left.
     """
     settings = settings or IdentificationSettings()
+    sessions = as_sessions(sessions)
     if len(sessions) < 2:
         raise DataError(f"{len(sessions)} session cannot be cross-validated; give two at least")
     scores, skipped = [], []
     for number, session in enumerate(sessions):
         others = [other for k, other in enumerate(sessions) if k != number]
-        payload = session.metadata.get("payload", "none")
-        if payload not in ("", "none") and all(o.metadata.get("payload", "none") != payload for o in others):
+        payload = payload_name(session)
+        if payload is not None and all(payload_name(other) != payload for other in others):
             skipped.append(f"{session.path.name}: payload {payload!r} is in no other session; not left out")
             continue
         try:

@@ -1,13 +1,14 @@
-"""What an estimator returns, and the one interface of all estimators."""
+"""The result of an estimator, and the interface of all estimators."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from ident.dynamics.tables import Tabular
 from ident.estimators.distributions import normal_quantile, student_quantile
 from ident.estimators.problem import FloatArray, Problem
 
@@ -16,11 +17,10 @@ __all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance (p, p) of the estimate, what it assumes (`kind`), and the degrees of freedom of its
-    intervals.
+    """Covariance (p, p) of the estimate, its assumption (`kind`) and the degrees of freedom of its intervals.
 
-    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed those of
-    the normal law because a serial-correlation-robust variance is itself uncertain.
+    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed the normal
+    ones because a variance robust to serial correlation is itself uncertain.
     """
 
     matrix: FloatArray
@@ -38,10 +38,9 @@ class Covariance:
 class ClassFit:
     """Residual of one joint and side.
 
-    sigma : std of the rows with the correct degrees of freedom [Nm]; rms : plain root mean square [Nm];
-    parameters : share of the p parameters that these rows consumed (the trace of their part of the hat
-        matrix);
-    n_eff : number of independent rows that the serial correlation leaves.
+    sigma : std of the rows with the correct degrees of freedom [Nm]. rms : plain root mean square [Nm].
+    parameters : share of the p parameters consumed by these rows (the trace of their part of the hat matrix).
+    n_eff : effective number of independent rows under serial correlation.
     """
 
     joint: str
@@ -59,13 +58,13 @@ class ClassFit:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Tabular):
     """Result of an estimator.
 
-    values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed,
-        by name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y
-        - A chi [Nm] of each row group. standard : standard parameters, where the estimator finds them;
-        prior_scale : factor s on the prior's covariance, where there is a prior.
+    values : (p,) estimates. covariance : the stated one. covariances : all computed ones by name
+        ("textbook", "hac", "bootstrap"). weights : (classes,) inverse variances. residuals : y - A chi [Nm] of
+        each row group. standard : standard parameters, if the estimator finds them. prior_scale : factor s on
+        the prior's covariance, with a prior.
     """
 
     method: str
@@ -108,9 +107,41 @@ class Estimate:
         half = chosen.inflation * factor * chosen.std
         return np.column_stack([self.values - half, self.values + half])
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each parameter: name, unit, estimate, std, rsd_percent."""
+        columns = (
+            self.names,
+            self._units,
+            self.values.tolist(),
+            self.std.tolist(),
+            self.rsd_percent.tolist(),
+        )
+        keys = ("name", "unit", "estimate", "std", "rsd_percent")
+        return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+
+    @property
+    def _units(self) -> tuple[str, ...]:
+        return self.units or ("",) * len(self.names)
+
+    def __repr__(self) -> str:
+        rms = [fit.rms for fit in self.classes]
+        residual = f"; residual rms {min(rms):.3g} to {max(rms):.3g} Nm" if rms else ""
+        lines = [
+            f"Estimate ({self.method}): {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows"
+            f"{residual}{'' if self.converged else ', NOT converged'}",
+            f"  standard deviations: {self.covariance.kind}; least certain parameters:",
+        ]
+        rsd = self.rsd_percent
+        for k in np.argsort(-rsd, kind="stable")[:6]:
+            lines.append(
+                f"  {self.names[k]:<10}{self.values[k]:>11.4g} ± {self.std[k]:<9.2g} {self._units[k]:<9} "
+                f"RSD {rsd[k]:.1f} %"
+            )
+        return "\n".join(lines)
+
     def summary(self) -> str:
         """Table of the parameters and of the residual per joint and side."""
-        units = self.units or ("",) * len(self.names)
+        units = self._units
         lines = [
             f"{self.method}: {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows, "
             f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
@@ -135,7 +166,7 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """Settings in the constructor, work in `fit`."""
+    """Interface of the estimators: settings in the constructor, work in `fit`."""
 
     def fit(self, problem: Problem) -> Estimate:
         """Estimate the parameters of the problem."""

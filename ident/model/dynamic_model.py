@@ -15,6 +15,7 @@ from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import INERTIAL, PER_LINK
 from ident.dynamics.structure import Condition, ModelStructure, Side
+from ident.dynamics.tables import Tabular
 from ident.effects.model_torque import check_entry, effects_torque
 from ident.effects.motion import Motion
 
@@ -29,21 +30,19 @@ _BODY = len(INERTIAL)
 
 
 @dataclass(frozen=True, eq=False)
-class DynamicModel:
-    """Parameter values of a model structure: what `model.yaml` holds.
+class DynamicModel(Tabular):
+    """Parameter values of a model structure, the content of `model.yaml`.
 
     robot : name of the arm.
     structure : chain, model number, columns.
-    names : (p,) names of the parameters that have a value, base names (`ZZ2R`) or standard ones; the others
-        are 0.
+    names : (p,) names of the parameters with a value, base names (`ZZ2R`) or standard ones; the others are 0.
     values : (p,). covariance : (p, p) or None.
-    base : the base set when the parameters are base parameters, None for standard parameters.
-    provenance : where the values come from (sessions, estimator, date, software), plain content for YAML.
-    effects : entries of further effects (`ident.effects`): cause, side, joints, parameters.
-    `torque` has them,
-        the regressor does not.
+    base : the base set of base parameters, None for standard parameters.
+    provenance : origin of the values (sessions, estimator, date, software), plain content for YAML.
+    effects : entries of further effects (`ident.effects`): cause, side, joints, parameters. They are part of
+        `torque`, not of the regressor.
 
-    Raises ConfigurationError when names are unknown or repeat and when shapes do not fit.
+    Raises ConfigurationError for unknown or repeated names and for wrong shapes.
     """
 
     robot: str
@@ -82,9 +81,35 @@ class DynamicModel:
         for entry in self.effects:
             check_entry(entry, self.structure.chain.n)
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each parameter: name, unit, value, and std with a covariance."""
+        std = self.std
+        return [
+            {"name": name, "unit": unit, "value": float(self.values[k])}
+            | ({} if std is None else {"std": float(std[k])})
+            for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True))
+        ]
+
+    def __repr__(self) -> str:
+        known = "with" if self.covariance is not None else "without"
+        lines = [
+            f"Dynamic model of {self.robot}: Model {self.structure.model}, {len(self.names)} {self.kind} "
+            f"parameters {known} covariance",
+            f"  {self.structure.chain.n} joints {' '.join(self.structure.chain.joint_names)}; torque of "
+            f"{' and '.join(self.structure.sides)} side",
+        ]
+        if self.structure.payloads:
+            lines.append(f"  payloads: {', '.join(self.structure.payloads)}")
+        if self.effects:
+            lines.append(f"  effects: {', '.join(str(entry['cause']) for entry in self.effects)}")
+        sessions = self.provenance.get("sessions", ())
+        if isinstance(sessions, (list, tuple)) and sessions:
+            lines.append(f"  identified from {len(sessions)} sessions by {self.provenance.get('estimator')}")
+        return "\n".join(lines)
+
     @cached_property
     def positions(self) -> NDArray[np.int64]:
-        """(p,) where the parameters stand: rows of the base set, or standard columns."""
+        """(p,) positions of the parameters: rows of the base set, or standard columns."""
         find = self.structure.index if self.base is None else self.base.index
         found = np.array([find(name) for name in self.names], dtype=np.int64)
         if len(set(found.tolist())) != len(found):
@@ -95,7 +120,7 @@ class DynamicModel:
 
     @property
     def kind(self) -> Literal["base", "standard"]:
-        """Which kind of parameters the values are."""
+        """Kind of the parameters."""
         return "standard" if self.base is None else "base"
 
     @property
@@ -111,20 +136,20 @@ class DynamicModel:
 
     @property
     def columns(self) -> NDArray[np.int64]:
-        """(p,) columns of the structure's regressor that multiply the values."""
+        """(p,) columns of the structure's regressor multiplied by the values."""
         return self.positions if self.base is None else self.base.columns[self.positions]
 
     def value(self, name: str) -> float:
-        """Value of a parameter, 0 where the model gives none. Raises ConfigurationError for unknown names."""
+        """Value of a parameter, 0 without one in the model. Raises ConfigurationError for unknown names."""
         find = self.structure.index if self.base is None else self.base.index
         hits = np.flatnonzero(self.positions == find(name))
         return float(self.values[hits[0]]) if len(hits) else 0.0
 
     @cached_property
     def standard(self) -> Floats:
-        """(n_columns,) standard parameters with this model's torque: of smallest norm for base parameters.
+        """(n_columns,) standard parameters with this model's torque, for base parameters of smallest norm.
 
-        Enough for simulation: torque, mass matrix and gravity depend on the base parameters only. See
+        Torque, mass matrix and gravity depend on the base parameters only, so these suffice for simulation. See
         `standard_parameters` for others.
         """
         return self.standard_parameters()
@@ -134,12 +159,10 @@ class DynamicModel:
     ) -> Floats:
         """Standard parameters (n_columns,) with this model's torque.
 
-        prior : (n_columns,) the ones wanted (CAD); the nearest with the right torque are returned. Without it
-            those of
-            smallest norm.
-        project : turns them into physically consistent ones, e.g. a convex program over the unobservable
-            directions
-            (`base.matrix` has them as its null space).
+        prior : (n_columns,) desired parameters (CAD); the nearest with the right torque are returned. Without
+            it those of smallest norm.
+        project : turns them into physically consistent ones, e.g. by a convex program over the unobservable
+            directions (the null space of `base.matrix`).
         """
         if self.base is None:
             vector = np.zeros(self.structure.n_columns)
@@ -181,11 +204,10 @@ class DynamicModel:
         measured: bool = False,
     ) -> Floats:
         """Inverse dynamics (N, n) [Nm, N] of one side (default the structure's first), equations (1) to (4),
-        with the physics of the model's effects.
+        with the model's effects.
 
         q, qd, qdd : (N, n). payload : the payload mounted, one of the structure's. time : (N,) [s], evenly
-        spaced, for effects with a memory; default 1 ms steps. measured : add what the sensors do
-        to the torque.
+        spaced, for effects with a memory; default 1 ms steps. measured : add the errors of the sensors.
         """
         position, speed, acceleration = regressor.check_states(self.structure.chain, q, qd, qdd)
         chosen = self.structure.sides[0] if side is None else side
@@ -254,9 +276,7 @@ class DynamicModel:
         payload: str | None = None,
         side: Side | None = None,
     ) -> Floats:
-        """Inverse dynamics (N, n) of the linear model alone, without its effects; arguments as in
-        `torque`.
-        """
+        """Inverse dynamics (N, n) of the linear model, without its effects; arguments as in `torque`."""
         chosen = self.structure.sides[0] if side is None else side
         chosen = self.structure.condition_sides(Condition(payload, (chosen,)))[0]
         position, speed, acceleration = regressor.check_states(self.structure.chain, q, qd, qdd)
@@ -308,7 +328,7 @@ class DynamicModel:
         payload: str | None = None,
         sides: Sequence[Side] | None = None,
     ) -> Floats:
-        """Observation matrix (sides x n x N, p) of the parameters that have values."""
+        """Observation matrix (sides x n x N, p) of the parameters with a value."""
         return self.structure.regressor(q, qd, qdd, payload=payload, sides=sides, columns=self.columns)
 
     def torque_std(

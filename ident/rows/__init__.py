@@ -12,7 +12,9 @@ from ident.rows.filters import (
     low_pass,
     optimal_cutoff,
 )
+from ident.rows.observation import observe
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+from ident.rows.sessions import Sessions, as_sessions, payload_name
 
 __all__ = [
     "Delay",
@@ -20,13 +22,17 @@ __all__ = [
     "ParallelFilter",
     "Passage",
     "PreparedSession",
+    "Sessions",
     "SignalSettings",
     "TorqueChannel",
     "advice",
+    "as_sessions",
     "differentiate",
     "estimate_delay",
     "excitation_frequency",
     "low_pass",
+    "observe",
     "optimal_cutoff",
+    "payload_name",
     "prepare",
 ]
