@@ -1,11 +1,10 @@
 """Base parameters from the modified-DH constants alone, by the rules of Khalil, Bennis and Gautier.
 
-The rigid part works on the links' energies. Going from the last link to the first, what a joint's motion
-cannot tell apart is moved to the link before it:
+The rigid part works on the links' energies. From the last link to the first, parameters indistinguishable by the
+motion of a joint are moved to the link before it:
 
-* revolute joint j: a body that is symmetric about z_j and has no inertia about it (YY_j = XX_j, MZ_j, M_j)
-  moves no differently when it is fixed to link j-1, so YY_j, MZ_j and M_j are regrouped into link j-1 (and
-  XX_j - YY_j stays);
+* revolute joint j: a body symmetric about z_j without inertia about it (YY_j = XX_j, MZ_j, M_j) moves in the
+  same way when fixed to link j-1, so YY_j, MZ_j and M_j are regrouped into link j-1 (and XX_j - YY_j stays);
 * prismatic joint j: link j turns with link j-1, so its six inertia entries are regrouped there.
 
 Near the base, with r1 the first revolute joint and r2 the first revolute joint not parallel to it:
@@ -16,12 +15,12 @@ Near the base, with r1 the first revolute joint and r2 the first revolute joint 
 * prismatic, r1 < j < r2: the first moment along z_r1 has no effect (one of MX_j, MY_j, MZ_j is regrouped into
   the others); when z_j is parallel to z_r1, MX_j and MY_j are regrouped into link j-1.
 
-What is left are functions of the motion, one for each rigid base parameter. Some of them are quadratic forms
-of the joint speeds with constant coefficients plus a constant force (ZZ_r1 is qd_r1^2 / 2), as are the
-functions of the drive inertias and offsets; written out as such, they show which of those are regrouped
-(Ia_r1 into ZZ_r1, Ia_r2 into ZZ_r2 when z_r2 is perpendicular to z_r1, the prismatic ones). The stack of
-sessions, sides and payloads is then a small matrix of constants whose independent columns are the base
-parameters. A payload is body n + 1, welded to link n while mounted.
+One function of the motion remains for each rigid base parameter. Some are quadratic forms of the joint speeds
+with constant coefficients plus a constant force (ZZ_r1 is qd_r1^2 / 2), like the functions of the drive
+inertias and offsets. Written in this form they show the regrouped drive parameters (Ia_r1 into ZZ_r1, Ia_r2
+into ZZ_r2 when z_r2 is perpendicular to z_r1, the prismatic ones). The stack of sessions, sides and payloads is
+then a small matrix of constants; its independent columns are the base parameters. A payload is body n + 1,
+welded to link n while mounted.
 
 Reference: Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE
 Trans. Robotics and Automation 6(3), 1990; Khalil, Bennis and Gautier, The use of the generalized links to
@@ -55,7 +54,7 @@ _YY, _ZZ, _MX, _MY, _MZ, _M = 3, 5, 6, 7, 8, 9
 def closed_form_base(structure: ModelStructure, conditions: Sequence[Condition] | None = None) -> BaseSet:
     """Base parameters of the stack of `conditions` (default: the bare arm and every payload, all sides).
 
-    Raises ConfigurationError for a chain without gravity, which the rules do not cover.
+    Raises ConfigurationError for a chain without gravity, not covered by the rules.
     """
     stack = tuple(conditions) if conditions is not None else structure.conditions()
     if not stack:
@@ -73,7 +72,7 @@ def closed_form_base(structure: ModelStructure, conditions: Sequence[Condition] 
 
 @dataclass(frozen=True, eq=False)
 class _Axes:
-    """Directions of the axes up to r2, whatever q: what the special rules ask for.
+    """Directions of the axes up to r2, independent of q, for the special rules near the base.
 
     r1 : first revolute joint (n if none). r2 : first revolute joint not parallel to it (n if none).
     r3 : first revolute joint after r2 not parallel to r2 (n if none).
@@ -134,7 +133,7 @@ class _Rigid:
         self.regrouping = np.array(rows).reshape(-1, 10 * n)
 
     def _regroup(self, effective: Floats, j: int) -> list[int]:
-        """Move what joint j cannot tell apart to link j-1; return the parameters of link j that act."""
+        """Regroup the parameters of link j into link j-1; return the remaining parameters of link j."""
         chain, axes = self.chain, self.axes
         own, moved = effective[j], np.zeros((10, effective.shape[2]))
         stays = list(range(10))
@@ -159,7 +158,7 @@ class _Rigid:
         return stays
 
     def _first_moments(self, own: Floats, moved: Floats, j: int) -> list[int]:
-        """Prismatic link between r1 and r2: which first moments act, after regrouping (and the mass)."""
+        """Prismatic link between r1 and r2: the remaining first moments after regrouping (and the mass)."""
         a = np.where(np.abs(self.axes.axis[j]) < _SAME, 0.0, self.axes.axis[j])
         if abs(self.axes.along[j]) > 1 - _SAME:
             moved[_MX], moved[_MY] = own[_MX].copy(), own[_MY].copy()
@@ -245,12 +244,12 @@ class _Rigid:
         return self.regrouping[:, 10 * j + position]
 
     def _beyond(self, j: int, position: int) -> Floats:
-        """The function of a parameter of link j less that of the same, fixed to link j-1 at q_j = 0."""
+        """The function of a parameter of link j minus that of the same, fixed to link j-1 at q_j = 0."""
         carried = frame_change(self.chain.placement(j))[:, position]
         return self._function(j, position) - self.regrouping[:, 10 * (j - 1) : 10 * j] @ carried
 
     def _axial(self, j: int) -> Floats:
-        """Energy of a unit mass from its speed along z_r1 at link j less that at link j-1, and its weight."""
+        """Energy of a unit mass from its speed along z_r1 at link j minus that at link j-1, and its weight."""
         chain, axes, n = self.chain, self.axes, self.chain.n
         speed = np.array([axes.along[k] if chain.prismatic[k] and k <= j else 0.0 for k in range(n)])
         before = np.where(np.arange(n) < j, speed, 0.0)
@@ -267,7 +266,7 @@ class _Rigid:
 
 
 def _coordinates(structure: ModelStructure, rigid: _Rigid, payload: str | None, side: Side) -> Floats:
-    """(g, n_columns): every column of the rows of one condition and side on functions that are independent.
+    """(g, n_columns): every column of the rows of one condition and side on independent functions.
 
     Functions: the rigid base functions, constant quadratic forms (n, n), constant forces (n), and for each
     joint qd and sign(qd); then two for each coupling.
@@ -310,10 +309,10 @@ def _signal_row(base: int, n: int, joint: int, signal: int) -> int:
 
 
 def _rewrite(functions: Floats, constants: Floats, forms: list[tuple[int, Floats, Floats]]) -> None:
-    """Express the functions that have a constant form by it (in place).
+    """Replace functions with a constant form by it (in place).
 
-    A relation says coefficients . functions = form; the function of its highest link is replaced by the form
-    and the functions of lower links, so the relations are taken from the last link to the first.
+    A relation is coefficients . functions = form. The function of its highest link is replaced by the form and
+    the functions of lower links, so the relations are taken from the last link to the first.
     """
     for pivot, coefficients, form in reversed(forms):
         amount = functions[pivot] / coefficients[pivot]

@@ -1,11 +1,9 @@
-"""The result of a base-parameter analysis, and the choice of columns that both routes share.
+"""Base parameters: their set, the preferred columns, and the numeric route.
 
-Base parameters from the rank of observation matrices at random states (Gautier 1991).
-
-Random states excite every combination that any motion can excite, so dependence among the columns of the
-sampled matrix is dependence of the model. Rounding leaves dependent columns at 1e-15 of the independent ones,
-and real dependence on the geometry (link lengths of a centimetre) leaves singular values above 1e-6: the gap
-between the two is nine orders of magnitude wide, and the rank is read off at its widest place.
+The numeric route takes the rank of observation matrices at random states (Gautier 1991). Random states excite
+every excitable combination, so dependent columns of the sampled matrix are dependent in the model. Rounding
+leaves singular values of 1e-15, the geometry (link lengths of a centimetre) values above 1e-6. The rank is read
+off at the widest gap between the two.
 """
 
 from __future__ import annotations
@@ -43,11 +41,11 @@ class BaseSet:
     With x the standard parameters (n_columns,), the torques depend only on
     `x[columns] + regrouping @ x[dependent]`.
 
-    structure, conditions : what was analysed.
-    columns : (b,) standard columns that carry the base parameters, ascending.
+    structure, conditions : the analysed rows.
+    columns : (b,) standard columns of the base parameters, ascending.
     dependent : (k,) columns regrouped into those. regrouping : (b, k).
     not_identifiable : columns without any effect on the rows.
-    excluded : columns that the structure leaves out.
+    excluded : columns left out by the structure.
     method : "numeric" or "closed form".
     gap : ratio of the smallest accepted to the largest rejected singular value (inf for the closed form).
     threshold : the relative singular value between the two (0 for the closed form).
@@ -103,7 +101,7 @@ class BaseSet:
         raise ConfigurationError(f"{name!r} is no base parameter of this model{advice}")
 
     def status(self, name: str) -> str:
-        """What became of the standard parameter `name`, in words."""
+        """Role of the standard parameter `name` in the base set, in words."""
         column = self.structure.index(name)
         if column in self.columns:
             return "a base parameter"
@@ -124,11 +122,9 @@ class BaseSet:
         return x[self.columns] + self.regrouping @ x[self.dependent]
 
     def expand(self, base: ArrayLike, prior: ArrayLike | None = None) -> Floats:
-        """Standard parameters (n_columns,) with these base parameters (b,): those nearest to `prior` (default
-        0).
+        """Standard parameters (n_columns,) with these base parameters (b,), nearest to `prior` (default 0).
 
-        All of them give the same torque; the difference is which representative of the set one likes to see.
-        Parameters without effect keep the prior's value.
+        Any prior gives the same torque. Parameters without effect keep the prior's value.
         """
         values = np.asarray(base, dtype=np.float64)
         if values.shape != (len(self.columns),):
@@ -151,11 +147,11 @@ class BaseSet:
         return f"{self.names[row]} = {' '.join(terms)}"
 
     def relations(self) -> tuple[str, ...]:
-        """The relations of all base parameters that others are regrouped into."""
+        """The relations of all base parameters with other parameters regrouped into them."""
         return tuple(self.relation(name) for name in self.names if name.endswith("R"))
 
     def summary(self) -> str:
-        """Counts, how the rank was decided, relations and the parameters without effect, as text."""
+        """Counts, gap at the rank, relations and parameters without effect, as text."""
         names = self.structure.names
         total = self.structure.n_columns - len(self.excluded)
         lines = [
@@ -178,7 +174,7 @@ class BaseSet:
 
 
 def columns_by_preference(structure: ModelStructure) -> NDArray[np.int64]:
-    """All columns, those that the literature keeps as base parameters first.
+    """All columns, those kept as base parameters in the literature first.
 
     Khalil's choice: of a revolute joint's link YY, MZ and M are regrouped into the link before it; of a
     prismatic joint's link the six entries of the inertia tensor (and MZ where a rule needs it); lower links
@@ -197,7 +193,7 @@ def columns_by_preference(structure: ModelStructure) -> NDArray[np.int64]:
 
 
 def independent_columns(matrix: Floats, order: Sequence[int], tolerance: float) -> list[int]:
-    """Columns of `matrix`, in `order`, that are independent of those taken before them.
+    """Columns of `matrix`, in `order`, independent of those taken before them.
 
     Columns must have norm 1 or 0. A column is taken when its distance from the span of the taken ones exceeds
     `tolerance` (Gram-Schmidt, orthogonalised twice: Giraud, Langou and Rozloznik 2005).
@@ -229,10 +225,10 @@ def base_set(
     gap: float = float("inf"),
     threshold: float = 0.0,
 ) -> BaseSet:
-    """Base set of a matrix (any rows, n_columns) whose row space is that of the observation matrix.
+    """Base set of a matrix (any rows, n_columns) with the row space of the observation matrix.
 
-    tolerance : distance (columns scaled to norm 1) below which a column depends on others.
-    zero : norm, relative to the largest, below which a column has no effect.
+    tolerance : largest distance (columns scaled to norm 1) of a dependent column from the others.
+    zero : largest norm, relative to the largest column, of a column without effect.
     """
     norms = np.sqrt(np.einsum("ij,ij->j", matrix, matrix))
     used = norms > zero * norms.max(initial=0.0)
@@ -285,9 +281,9 @@ def numeric_base(
 
     samples : random states for each condition; the default gives three rows for each column.
 
-    Columns are scaled to norm 1; the rank is where consecutive singular values, the smaller below 1e-8 of the
-    largest, fall the most. Raises DataError when there is no clear gap (a factor of 1e3): the geometry is
-    then nearly degenerate, and the message says by how much.
+    Columns are scaled to norm 1. The rank is at the largest ratio of consecutive singular values, the smaller
+    below 1e-8 of the largest. Raises DataError without a clear gap (a factor of 1e3), for a nearly degenerate
+    geometry.
     """
     stack = tuple(conditions) if conditions is not None else structure.conditions()
     if not stack:
@@ -326,7 +322,7 @@ def numeric_base(
     if len(found) != rank:
         raise DataError(
             f"the singular values say rank {rank}, the columns {len(found)}; the geometry is nearly "
-            "degenerate (an angle or a length that should be exact is not): check the modified-DH constants"
+            "degenerate (an inexact angle or length): check the modified-DH constants"
         )
     return found
 

@@ -1,17 +1,14 @@
-"""Modified Denavit-Hartenberg frames (Khalil and Kleinfinger, 1986): the transform, and frames for axes.
+"""Serial chains of revolute and prismatic joints in modified Denavit-Hartenberg frames.
 
-Serial chains of revolute and prismatic joints in modified Denavit-Hartenberg frames.
-
-Frame j stands on the axis of joint j (z_j along it) and is reached from frame j-1 by (Khalil and Kleinfinger,
-1986)::
+The pose of frame j, with z_j along the axis of joint j, in frame j-1 is (Khalil and Kleinfinger, 1986)::
 
     T(j-1, j) = Rx(alpha_j) Tx(d_j) Rz(theta_j) Tz(r_j)
 
 with theta_j = theta0_j + q_j for a revolute joint and r_j = r0_j + q_j for a prismatic one. The names of the
-dynamic parameters refer to these frames. A chain comes from a table of those numbers or from a URDF. When the
-link frames of the URDF already obey the convention they are used as they are; otherwise such frames are built
-on the joint axes, and `link_placements` keeps where each URDF link frame stands in its modified-DH frame, so
-that inertial parameters can be carried both ways.
+dynamic parameters refer to these frames. A chain comes from a table of those numbers or from a URDF. Link
+frames of the URDF that obey the convention are used as they are. Otherwise such frames are built on the joint
+axes, and `link_placements` keeps the pose of each URDF link frame in its modified-DH frame, so that inertial
+parameters can be converted both ways.
 """
 
 from __future__ import annotations
@@ -58,7 +55,7 @@ def mdh_transform(alpha: float, d: float, theta: float, r: float) -> NDArray[np.
 
 
 def _read_transform(pose: NDArray[np.float64], snap_rad: float) -> NDArray[np.float64] | None:
-    """alpha, d, theta, r of a pose that has the modified-DH form, else None."""
+    """alpha, d, theta, r of a pose of the modified-DH form, else None."""
     rotation, shift = pose[:3, :3], pose[:3, 3]
     alpha = np.arctan2(-rotation[1, 2], rotation[2, 2])
     theta = np.arctan2(-rotation[0, 1], rotation[0, 0])
@@ -100,8 +97,8 @@ def build_frames(
 
     x_j lies along the common normal of axes j and j+1 (towards j+1; for crossing axes, the direction nearest
     to the link frame's x). Frame 0 is frame 1 at q = 0. The last frame keeps the origin and, as far as the
-    axis allows, the x axis of the URDF's link frame, so that a payload's frame is the one users know. Returns
-    base placement, (n, 4) table, (n, 4, 4) link placements.
+    axis allows, the x axis of the URDF's link frame, and so the usual frame of a payload. Returns base
+    placement, (n, 4) table, (n, 4, 4) link placements.
     """
     links, pose = [], np.eye(4)
     for step in local:
@@ -137,9 +134,9 @@ def build_frames(
 def _foot(
     frame: NDArray[np.float64], point: NDArray[np.float64], axis: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Where axis j meets the x axis of the frame before it (the foot of the incoming common normal)."""
+    """Intersection of axis j with the x axis of the frame before it (the foot of the common normal)."""
     x, z, start = frame[:3, 0], frame[:3, 2], frame[:3, 3]
-    # start + s x + t z = point + u axis, where for parallel axes t = 0 is taken by least squares.
+    # start + s x + t z = point + u axis; least squares takes t = 0 for parallel axes.
     solution = np.linalg.lstsq(np.column_stack([x, z, -axis]), point - start, rcond=1e-9)[0]
     if np.linalg.norm(np.cross(z, axis)) < _PARALLEL:
         return point + axis * float(axis @ (start - point))
@@ -157,7 +154,7 @@ def _common_normal(
     cross = np.cross(axis, next_axis)
     between = next_point - entry
     if np.linalg.norm(cross) < _PARALLEL:
-        # Parallel axes: every common normal serves; take the one that makes r_j zero.
+        # Parallel axes: of all common normals take the one with r_j = 0.
         normal = between - axis * float(axis @ between)
         if np.linalg.norm(normal) < _LENGTH_SNAP_M:
             return _perpendicular(link, axis), entry
@@ -197,7 +194,7 @@ class Chain:
     alpha, d, theta, r : (n,) float64, the constants of the table [rad, m, rad, m] (at q = 0).
     gravity : (3,) acceleration of gravity in frame 0 [m/s^2].
     base_placement : (4, 4) pose of frame 0 in the root link of the URDF (identity for a table).
-    link_names : n names of the links that the joints move.
+    link_names : n names of the links moved by the joints.
     link_placements : (n, 4, 4) pose of each URDF link frame in the modified-DH frame of its joint.
     urdf : text of the URDF the chain was read from, or None.
     """
@@ -271,8 +268,7 @@ class Chain:
         gravity: ArrayLike = STANDARD_GRAVITY,
         base_placement: ArrayLike | None = None,
     ) -> Chain:
-        """Chain from a modified-DH table: one mapping a joint with `alpha`, `d`, `theta`, `r` (0 where left
-        out).
+        """Chain from a modified-DH table: a mapping for each joint with `alpha`, `d`, `theta`, `r` (default 0).
 
         `name` (default `q1`, `q2`, ...) and `kind` ("revolute" or "prismatic") are optional. Raises
         ConfigurationError on unknown keys or kinds.
@@ -321,8 +317,7 @@ class Chain:
         root, tip : link names; by default the root of the tree and the end of its only chain of movable
             joints.
         gravity : (3,) in the axes of the root link [m/s^2].
-        snap_rad : angles alpha and theta this near to a multiple of pi/2 are taken as that multiple, because
-            files
+        snap_rad : angles alpha and theta this near to a multiple of pi/2 are rounded to it, because files
             write 1.5708; 0 takes every digit as it stands.
 
         Fixed joints are merged. Raises ConfigurationError for an unreadable file, a tree without a unique
@@ -399,10 +394,10 @@ class Chain:
         return np.array([parameters.transform(row, pose) for row, pose in zip(rows, inverse, strict=True)])
 
     def urdf_inertials(self) -> NDArray[np.float64]:
-        """(n, 10) inertial parameters that the URDF gives, in modified-DH frames.
+        """(n, 10) inertial parameters of the URDF, in modified-DH frames.
 
-        Bodies fixed to a moving link, side branches included, are added to it (their own movable joints are
-        taken at 0). Raises ConfigurationError when the chain was not read from a URDF.
+        Bodies fixed to a moving link, side branches included, are added to it (with their own movable joints
+        at 0). Raises ConfigurationError for a chain from a table.
         """
         if self.urdf is None:
             raise ConfigurationError(
@@ -413,7 +408,7 @@ class Chain:
         return self.inertial_from_links([urdf.lumped_inertial(link, stop) for link in self.link_names])
 
     def to_pinocchio(self, inertial: ArrayLike | None = None) -> Any:
-        """pinocchio `Model` whose joint frames are the modified-DH frames; `inertial` (n, 10), default zero.
+        """pinocchio `Model` in the modified-DH frames; `inertial` (n, 10), default zero.
 
         Positions are those of the chain (theta0 and r0 are inside the joint placements).
         """
@@ -437,7 +432,7 @@ class Chain:
         return model
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain content for YAML or JSON from which `from_dict` restores the chain (not the URDF text)."""
+        """Plain content of the chain (without the URDF text) for YAML or JSON, read by `from_dict`."""
         assert self.link_placements is not None
         rows = [
             {
@@ -460,7 +455,7 @@ class Chain:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], *, urdf: str | None = None) -> Chain:
-        """The chain that `to_dict` described. Raises ConfigurationError on missing or unknown keys."""
+        """The chain from the content of `to_dict`. Raises ConfigurationError on missing or unknown keys."""
         unknown = set(content) - {"joints", "gravity", "base_placement", "link_placements"}
         if unknown or "joints" not in content or "gravity" not in content:
             named = f"unknown key `{sorted(unknown)[0]}`" if unknown else "`joints` and `gravity` are needed"

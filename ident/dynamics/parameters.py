@@ -90,7 +90,7 @@ def split_name(name: str) -> tuple[str, int, bool]:
 
 
 def unit(name: str, *, prismatic: bool = False) -> str:
-    """SI unit of the parameter `name` (`prismatic` tells the kind of its joint, for the drive parameters)."""
+    """SI unit of the parameter `name`; `prismatic` is the kind of its joint, for the drive parameters."""
     symbol = split_name(name)[0]
     if symbol in _UNITS:
         return _UNITS[symbol]
@@ -133,8 +133,8 @@ def to_com(
     """Mass [kg] (...,), centre of mass [m] (..., 3) and inertia about it [kg m^2] (..., 3, 3), axes of the
     link.
 
-    A body of zero mass must have zero first moments; its centre of mass is put at the origin. Raises
-    ConfigurationError when first moments stand beside a zero mass.
+    The centre of mass of a body without mass and first moments is the origin. Raises ConfigurationError for
+    first moments with zero mass.
     """
     inertial = _inertial(parameters)
     mass, moment = inertial[..., 9], inertial[..., 6:9]

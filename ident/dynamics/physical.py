@@ -1,15 +1,14 @@
-"""Standard parameters of bodies that can exist, as near as possible to identified base parameters.
+"""Physically consistent bodies nearest to identified base parameters.
 
-A set of base parameters fixes only combinations of the standard ones; what it leaves free is chosen here.
-With P(x) the pseudo-inertia of a body (`parameters.pseudo_inertia`) the program is, over the inertial
-parameters x::
+Base parameters fix only combinations of the standard ones; the free combinations are chosen here. With P(x)
+the pseudo-inertia of a body (`parameters.pseudo_inertia`) the program over the inertial parameters x is::
 
     minimise    (K x - chi)' W (K x - chi) / 2  +  w sum_bodies tr[(P0^-1 (P(x) - P0))^2] / 2
     subject to  P(x) >= margin P0   for every body
 
-First with K x = chi exactly: then the torques are those that were identified, and only the free combinations
-follow the reference bodies P0. Where no real bodies have these base parameters, the base parameters give way,
-each by its own standard deviation (W is the inverse covariance), and the result says by how much.
+The first attempt has K x = chi exactly: the torques are the identified ones, and only the free combinations
+follow the reference bodies P0. If no consistent bodies have these base parameters, the base parameters move in
+units of their standard deviations (W is the inverse covariance), and the result reports the shift.
 
 Reference: Sousa and Cortesao, Physical feasibility of robot base inertial parameter identification, 2014 (the
 linear matrix inequality); Wensing, Kim and Slotine 2018 (pseudo-inertia); Lee, Wensing and Park 2020 (the
@@ -43,9 +42,9 @@ _TRIANGLE = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2,
 class Projection:
     """Consistent bodies for base parameters.
 
-    bodies : (k, 10) inertial parameters. base : (b,) the base parameters that they have.
+    bodies : (k, 10) inertial parameters. base : (b,) their base parameters.
     exact : whether these are the identified ones.
-    shift : (b,) how far each had to move, in its standard deviations; zero when exact.
+    shift : (b,) shift of each base parameter in its standard deviations; zero when exact.
     """
 
     bodies: Floats
@@ -71,15 +70,15 @@ def project(
     """Consistent bodies for base parameters, see the head of the module.
 
     matrix : (b, 10 k), K: base parameters of the bodies' inertial parameters. base : (b,), chi.
-    reference : (k, 10) bodies P0, each of which can exist.
-    covariance : (b, b) of `base`; without it a parameter's scale is what the reference bodies contribute to
-        it.
+    reference : (k, 10) consistent bodies P0.
+    covariance : (b, b) of `base`; without it the scale of a parameter is the contribution of the reference
+        bodies.
     margin : smallest pseudo-inertia allowed, as a share of that of the reference body.
-    firmness : weight w of the reference bodies where the base parameters must give way; 0.1 lets a body
-        differ by three times its own size for one standard deviation.
+    firmness : weight w of the reference bodies when the base parameters must move; with 0.1 a body differs by
+        three times its own size for one standard deviation.
 
-    Raises ConfigurationError for shapes that do not fit or a reference body that cannot exist, DataError when
-    the solver finds no bodies.
+    Raises ConfigurationError for wrong shapes or an inconsistent reference body, DataError when the solver
+    finds no bodies.
     """
     bodies = np.atleast_2d(np.asarray(reference, dtype=np.float64))
     k_matrix, chi = np.asarray(matrix, dtype=np.float64), np.asarray(base, dtype=np.float64)
@@ -107,7 +106,7 @@ def project(
         found = _solve_nearest(weight @ slope, weight @ missing, len(bodies), margin, firmness)
     x = bodies.ravel() + step @ found
     if exact:
-        # The solver stops at 1e-9; the last digits come from least squares, far inside the margin.
+        # The solver stops at 1e-9; least squares gives the last digits, far inside the margin.
         x = x + step @ np.linalg.lstsq(slope, chi - k_matrix @ x, rcond=1e-12)[0]
     reached = k_matrix @ x
     sigma = scale if covariance is None else np.sqrt(np.maximum(np.diag(np.asarray(covariance)), 0.0))
@@ -118,7 +117,7 @@ def project(
 def reference_bodies(
     bodies: ArrayLike, *, smallest_mass_kg: float = 0.05, gyration_m: float = 0.01
 ) -> Floats:
-    """Bodies (k, 10) that can exist, near the given ones: CAD models and published parameters often cannot.
+    """Consistent bodies (k, 10) near the given ones, for inconsistent CAD models and published parameters.
 
     Masses are raised to `smallest_mass_kg` and the principal second moments of mass about the centre of mass
     to mass x `gyration_m`^2.
@@ -164,7 +163,7 @@ def _steps(roots: Floats) -> Floats:
 
 
 def _scale(slope: Floats, covariance: ArrayLike | None) -> Floats:
-    """How much each base parameter changes when a body changes by its own size."""
+    """Change of each base parameter when a body changes by its own size."""
     scale = np.linalg.norm(slope, axis=1)
     if covariance is not None and np.shape(covariance) != (len(slope), len(slope)):
         raise ConfigurationError(f"covariance has shape {np.shape(covariance)}; expected {(len(slope),) * 2}")
@@ -172,7 +171,7 @@ def _scale(slope: Floats, covariance: ArrayLike | None) -> Floats:
 
 
 def _root_weight(scale: Floats, covariance: ArrayLike | None) -> Floats:
-    """Matrix whose square is the weight W; directions without variance are held to 1e-6 of the scale."""
+    """Square root of the weight W; directions without variance are held to 1e-6 of the scale."""
     if covariance is None:
         return np.diag(1.0 / np.where(scale > 0.0, scale, 1.0))
     matrix = np.asarray(covariance, dtype=np.float64)
@@ -196,7 +195,7 @@ def _solve_exact(slope: Floats, missing: Floats, bodies: int, margin: float) -> 
     import clarabel
 
     size = 10 * bodies
-    # Rows of the base set are independent, but a badly scaled one would hurt: orthonormal rows instead.
+    # The rows of the base set are independent but badly scaled: take orthonormal ones.
     left, values, right = np.linalg.svd(slope, full_matrices=False)
     keep = values > 1e-10 * values.max(initial=0.0)
     rows, target = right[keep], (left.T @ missing)[keep] / values[keep]
@@ -217,7 +216,7 @@ def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, f
     right = triangle[:, size]
     unit = max(float(np.linalg.norm(rows, axis=1).max()), 1e-300)
     rows, right = rows / unit, right / unit
-    # Residuals r = rows z - right are variables: their squares keep the numbers tame.
+    # Residuals r = rows z - right are variables, for better scaling.
     columns = size + len(rows)
     p = sparse.diags(
         np.concatenate([np.full(size, firmness / unit**2 + 1e-12), np.ones(len(rows))]), format="csc"

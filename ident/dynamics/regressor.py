@@ -7,12 +7,11 @@ origins, in the link frames; Khalil and Dombre 2002, section 9.3; Atkeson, An an
                          + v_jk . (m_k a_k + alpha_k x h_k + omega_k x (omega_k x h_k)) ]
 
 with omega_k, alpha_k, a_k the angular velocity, angular acceleration and linear acceleration minus gravity of
-frame k, and (v_jk, w_jk) the velocity that a unit speed of joint j alone gives to frame k. Instead of
-carrying 60 wrench columns down the chain, the kernel carries the six numbers (v_jk, w_jk) up, which costs a
-tenth.
+frame k, and (v_jk, w_jk) the velocity of frame k for a unit speed of joint j alone. The kernel carries these
+six numbers up the chain, at a tenth of the cost of carrying 60 wrench columns down.
 
-Samples run in the inner loop, in blocks that fit the first-level cache, and every column of the result is
-contiguous over samples: the loops vectorise, and a column that nobody wants costs nothing.
+Samples run in the inner loop, in blocks of the size of the first-level cache, and every column of the result is
+contiguous over samples: the loops vectorise, and columns not asked for cost nothing.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ Floats = NDArray[np.float64]
 
 
 def check_states(chain: Chain, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """The three (N, n) float64 arrays, or DataError naming the array, joint and row that is no use."""
+    """The three (N, n) float64 arrays. Raises DataError with array, joint and row of a bad value."""
     checked = []
     for name, values in (("q", q), ("qd", qd), ("qdd", qdd)):
         array = np.ascontiguousarray(values, dtype=np.float64)
@@ -80,13 +79,13 @@ def rigid_regressor(
     """Rigid-body regressor of every joint: (n, N, C), `tau[:, j] = result[j] @ parameters`.
 
     q, qd, qdd : (N, n) [rad, rad/s, rad/s^2; m for prismatic joints].
-    columns : (n, 10) int, where the parameter i of link k goes, -1 where it is not wanted; by default all
-        10 n in their order. C = largest entry + 1.
-    out : (C, n, N) float64 C-contiguous to write into (the structural zeros are not rewritten: pass
-        an array that held a result of the same `columns`, or zeros).
+    columns : (n, 10) int, column of parameter i of link k, -1 to leave it out; by default all 10 n in their
+        order. C = largest entry + 1.
+    out : (C, n, N) float64 C-contiguous to write into. Structural zeros (links before the joint) are not
+        rewritten: pass zeros, or an earlier result for the same `columns`.
 
     The result is a view of memory ordered (column, joint, sample): `result.reshape(n * N, C)` makes no copy
-    and is Fortran-ordered, which LAPACK takes as it is. Zero by structure: links before the joint.
+    and is Fortran-ordered, as LAPACK expects.
     """
     states = check_states(chain, q, qd, qdd)
     wanted = all_columns(chain) if columns is None else np.ascontiguousarray(columns, dtype=np.int64)
@@ -108,14 +107,14 @@ def fill_rigid(
 ) -> None:
     """`rigid_regressor` without checks and without an array of its own.
 
-    out : (>= C, >= 1, n, >= N) float64 C-contiguous; [column, 0, joint, sample] is written, only for those
-        that the chain's structure allows to differ from zero.
+    out : (>= C, >= 1, n, >= N) float64 C-contiguous; [column, 0, joint, sample] is written, except structural
+        zeros.
     """
     _fill(_fixed(q), _fixed(qd), _fixed(qdd), *_constants(chain), chain.gravity, _fixed(columns), out)
 
 
 def _fixed(array: Any) -> Any:
-    """The array as contiguous and read-only, so that numba compiles for one kind of argument only."""
+    """The array as contiguous and read-only: numba then compiles for one kind of argument."""
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
     return view
@@ -192,7 +191,7 @@ def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  #
 
 @njit(cache=True, inline="always")
 def _advance(body, joint, ca, sa, d, prismatic, size):  # type: ignore[no-untyped-def]
-    c, sn, r, speed, thrust = joint[0], joint[1], joint[2], joint[3], joint[4]
+    c, sn, r, speed, acceleration = joint[0], joint[1], joint[2], joint[3], joint[4]
     wx, wy, wz = body[0], body[1], body[2]
     ex, ey, ez = body[3], body[4], body[5]
     ax, ay, az = body[6], body[7], body[8]
@@ -206,7 +205,7 @@ def _advance(body, joint, ca, sa, d, prismatic, size):  # type: ignore[no-untype
         a0 = ax[s] + e1 * pz - e2 * py + w1 * u2 - w2 * u1
         a1 = ay[s] + e2 * px - e0 * pz + w2 * u0 - w0 * u2
         a2 = az[s] + e0 * py - e1 * px + w0 * u1 - w1 * u0
-        cs, ss, qd, qdd = c[s], sn[s], speed[s], thrust[s]
+        cs, ss, qd, qdd = c[s], sn[s], speed[s], acceleration[s]
         # into frame k: Rx(-alpha) then Rz(-theta)
         t1, t2 = ca * w1 + sa * w2, ca * w2 - sa * w1
         b0, b1, b2 = cs * w0 + ss * t1, cs * t1 - ss * w0, t2
@@ -316,11 +315,11 @@ def torque(chain: Chain, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, inertial: 
 
     Batches cost 0.4 us a sample on one core; a call for a single sample costs 15 us, most of it checks.
     """
-    position, speed, thrust = check_states(chain, q, qd, qdd)
+    position, speed, acceleration = check_states(chain, q, qd, qdd)
     bodies = np.ascontiguousarray(inertial, dtype=np.float64)
     if bodies.shape != (chain.n, 10):
         raise ConfigurationError(f"inertial parameters have shape {bodies.shape}; expected ({chain.n}, 10)")
-    return _rnea(position, speed, thrust, bodies, chain, chain.gravity)
+    return _rnea(position, speed, acceleration, bodies, chain, chain.gravity)
 
 
 def gravity_torque(chain: Chain, q: ArrayLike, inertial: ArrayLike) -> Floats:

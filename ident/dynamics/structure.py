@@ -1,5 +1,4 @@
-"""The linear structure of the torque models 1, 2 and 3: which columns, which rows, and the stacked
-observation matrix.
+"""The linear structure of the torque models 1, 2 and 3: columns, rows and the stacked observation matrix.
 
 **Models.** With tau_l the joint torque and tau the motor torque (both after the gear)::
 
@@ -7,21 +6,21 @@ observation matrix.
     tau   = Ia qdd + tau_l + Fvm qd + Fcm sign(qd) + offm               motor rows
     tau - tau_l = Ia qdd + Fvm qd + Fcm sign(qd) + offm                 difference rows
 
-Model 1 has joint rows, Model 2 motor and joint rows, Model 3 difference rows. A structure may be told to have
-other sides, for an arm without one of the channels.
+Model 1 has joint rows, Model 2 motor and joint rows, Model 3 difference rows. Other sides can be chosen for an
+arm without one of the channels.
 
 **Columns.** The 17 standard parameters of each link in the order of `parameters.PER_LINK`, link after link;
-then 17 for each payload, which is a body of its own (link n + 1, n + 2, ...) in the frame of the last link,
-so its columns equal those of link n where it is mounted and are zero where it is not; then three for each
+then 17 for each payload, a body of its own (link n + 1, n + 2, ...) in the frame of the last link. Its columns
+equal those of link n in sessions with the payload and are zero in the others. Last come three columns for each
 coupling of joints.
 
 **Rows.** Session after session in the order given; in a session side after side (motor before joint); in a
 side joint after joint; in a joint sample after sample. So `W.reshape` never mixes, and the rows of one joint
-and side, which share one error variance, are one contiguous slice (`row_blocks`).
+and side, with their common error variance, are one contiguous slice (`row_blocks`).
 
-Reference: equations (1) to (8) of Kolyubin, Paramonov and Shiriaev, Refining dynamics identification for
-co-bots, 2017; Jubien, Gautier and Janot, Dynamic identification of the Kuka LWR robot using motor torques and
-joint torque sensors data, 2014.
+Reference: equations (1) to (8) of Kolyubin, Shiriaev and Jubien, Refining Dynamics Identification for Co-Bots:
+Case Study on KUKA LWR4+, 2017; Jubien, Gautier and Janot, Dynamic identification of the Kuka LWR robot using
+motor torques and joint torque sensors data, 2014.
 """
 
 from __future__ import annotations
@@ -47,14 +46,14 @@ MODEL_SIDES: dict[int, tuple[Side, ...]] = {1: ("joint",), 2: ("motor", "joint")
 
 _JOINT_TERMS = frozenset({"Fvl", "Fcl", "offl"})
 _MOTOR_TERMS = frozenset({"Ia", "Fvm", "Fcm", "offm"})
-# The signal that each drive parameter multiplies, in the order of the atoms after the rigid ones.
+# The signal multiplied by each drive parameter, in the order of the atoms after the rigid ones.
 _SIGNALS = ("qdd", "qd", "sign", "one")
 _SIGNAL_OF = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
 
 
 @dataclass(frozen=True)
 class Coulomb:
-    """The function that stands for sign(qd).
+    """The model's function for sign(qd).
 
     kind : "sign" (0 at exactly 0), "deadband" (0 up to `width`), "tanh" (tanh(qd / width)).
     width : [rad/s or m/s], positive for the last two.
@@ -91,10 +90,7 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Condition:
-    """What a session's rows stand for: the payload mounted (None: the bare arm) and the sides measured.
-
-    `sides` None means all sides of the structure.
-    """
+    """Payload mounted in a session (None: the bare arm) and its measured sides (None: all of the structure)."""
 
     payload: str | None = None
     sides: tuple[Side, ...] | None = None
@@ -102,7 +98,7 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """One session for the regression: q, qd, qdd (N, n), torques (N, n) where measured, the payload."""
+    """One session for the regression: q, qd, qdd (N, n), measured torques (N, n) or None, payload."""
 
     q: Floats
     qd: Floats
@@ -127,10 +123,9 @@ class ModelStructure:
     """Columns and rows of a linear torque model for a chain.
 
     chain : the arm. model : 1, 2 or 3.
-    payloads : names of the payloads that are identified (link n + 1 is the first). A session is recorded with
-        one of them or with none.
+    payloads : names of the identified payloads (link n + 1 is the first). A session has one of them or none.
     without : parameters left out of the model: a symbol for all links ("Fvl") or a name for one ("offm3").
-    couplings : coupled joints. coulomb : the function that stands for sign(qd).
+    couplings : coupled joints. coulomb : the function for sign(qd).
     sides : other sides than the model's, for an arm without a channel, e.g. ("motor",).
 
     Raises ConfigurationError for unknown models, names, joints.
@@ -193,7 +188,7 @@ class ModelStructure:
 
     @cached_property
     def active(self) -> NDArray[np.bool_]:
-        """(n_columns,) which parameters the model has; the others were left out by `without`."""
+        """(n_columns,) whether each parameter is in the model, not left out by `without`."""
         mask = np.ones(self.n_columns, dtype=bool)
         symbols = [split_name(name)[0] for name in self.names]
         for item in self.without:
@@ -202,15 +197,13 @@ class ModelStructure:
                 known = sorted({*self.names, *symbols})
                 near = difflib.get_close_matches(item, known, n=1)
                 advice = f"did you mean {near[0]!r}?" if near else f"symbols: {', '.join(PER_LINK)}"
-                raise ConfigurationError(
-                    f"`without` names {item!r}, which is no parameter of this model; {advice}"
-                )
+                raise ConfigurationError(f"`without` names {item!r}, not a parameter of this model; {advice}")
             mask[hits] = False
         mask.setflags(write=False)
         return mask
 
     def index(self, name: str) -> int:
-        """Column of the parameter `name`. Raises ConfigurationError for a name the model does not have."""
+        """Column of the parameter `name`. Raises ConfigurationError for an unknown name."""
         if name not in self.names:
             near = difflib.get_close_matches(name, self.names, n=1)
             advice = f"; did you mean {near[0]!r}?" if near else ""
@@ -231,7 +224,7 @@ class ModelStructure:
         return (Condition(), *(Condition(payload) for payload in self.payloads))
 
     def condition_sides(self, condition: Condition) -> tuple[Side, ...]:
-        """Sides of a condition in row order. Raises ConfigurationError for one the structure lacks."""
+        """Sides of a condition in row order. Raises ConfigurationError for a side missing in the structure."""
         if condition.sides is None:
             return self.sides
         foreign = [side for side in condition.sides if side not in self.sides]
@@ -239,15 +232,15 @@ class ModelStructure:
             raise ConfigurationError(f"sides {condition.sides!r} are not a choice of {', '.join(self.sides)}")
         return tuple(side for side in self.sides if side in condition.sides)
 
-    # ---- atoms: the distinct signals that all columns are made of ----
+    # ---- atoms: the distinct signals of all columns ----
 
     @cached_property
     def n_signals(self) -> int:
-        """Number of atoms that are not rigid: qdd, qd, sign(qd), 1 and three for each coupling."""
+        """Number of non-rigid atoms: qdd, qd, sign(qd), 1 and three for each coupling."""
         return len(_SIGNALS) + 3 * len(self.couplings)
 
     def signals(self, qd: Floats, qdd: Floats, out: NDArray[np.float64]) -> None:
-        """Write the atoms that are not rigid, from qd and qdd (N, n), to `out` (n_signals, n, N)."""
+        """Write the non-rigid atoms, from qd and qdd (N, n), to `out` (n_signals, n, N)."""
         out[0], out[1], out[2], out[3] = qdd.T, qd.T, self.coulomb(qd).T, 1.0
         out[4:] = 0.0
         for number, coupling in enumerate(self.couplings):
@@ -259,7 +252,7 @@ class ModelStructure:
             out[first + 2, a] = out[first + 2, b] = self.coulomb(both)
 
     def signal_of(self, column: int, side: Side, joint: int) -> int | None:
-        """The non-rigid atom that stands in `column` in the rows of `side` and `joint`; None where zero."""
+        """The non-rigid atom of `column` in the rows of `side` and `joint`; None for zero."""
         if not self.active[column]:
             return None
         link, position = divmod(column, len(PER_LINK))
@@ -278,7 +271,7 @@ class ModelStructure:
         return _SIGNAL_OF[symbol] if present[side] else None
 
     def rigid_of(self, column: int, payload: str | None) -> tuple[int, int] | None:
-        """(link, inertial position) of the arm's rigid column that stands in `column`; None where zero."""
+        """(link, inertial position) of the arm's rigid column in `column`; None for zero."""
         link, position = divmod(column, len(PER_LINK))
         if not self.active[column] or link >= self.n_links or position >= len(INERTIAL):
             return None
@@ -313,18 +306,18 @@ class ModelStructure:
     ) -> Floats:
         """Observation matrix of one session: (sides x n x N, C) float64, Fortran-ordered.
 
-        q, qd, qdd : (N, n). payload : the payload that is mounted. sides : default all of the structure.
-        columns : (C,) indices of the columns wanted (default all n_columns), e.g. those of a base set.
+        q, qd, qdd : (N, n). payload : the mounted payload. sides : default all of the structure.
+        columns : (C,) indices of columns (default all n_columns), e.g. those of a base set.
         Row order: side, joint, sample (see the module).
         """
-        position, speed, thrust = check_states(self.chain, q, qd, qdd)
+        position, speed, acceleration = check_states(self.chain, q, qd, qdd)
         chosen = self.condition_sides(Condition(payload, tuple(sides) if sides is not None else None))
         wanted = self._columns(columns)
         n, samples = self.chain.n, len(position)
         out = np.zeros((len(wanted), len(chosen), n, samples))
-        self._write_rigid(position, speed, thrust, payload, chosen, wanted, out)
+        self._write_rigid(position, speed, acceleration, payload, chosen, wanted, out)
         signals = np.empty((self.n_signals, n, samples))
-        self.signals(speed, thrust, signals)
+        self.signals(speed, acceleration, signals)
         for c, column in enumerate(wanted):
             if not self._may_be_signal(column):
                 continue
@@ -336,7 +329,7 @@ class ModelStructure:
         return out.reshape(len(wanted), -1).T
 
     def stack(self, sessions: Sequence[Samples], *, columns: ArrayLike | None = None) -> Floats:
-        """Stacked observation matrix of sessions, each with the sides whose torque it has."""
+        """Stacked observation matrix of sessions, each with its measured sides."""
         parts = [
             self.regressor(s.q, s.qd, s.qdd, payload=s.payload, sides=self.measured(s), columns=columns)
             for s in sessions
@@ -348,7 +341,7 @@ class ModelStructure:
         )
 
     def measured(self, samples: Samples) -> tuple[Side, ...]:
-        """Sides of the structure that the session has the torque for. Raises DataError for none."""
+        """Measured sides of the structure. Raises DataError for none."""
         have: dict[str, bool] = {"motor": samples.motor is not None, "joint": samples.joint is not None}
         have["difference"] = have["motor"] and have["joint"]
         sides = tuple(side for side in self.sides if have[side])
@@ -400,7 +393,7 @@ class ModelStructure:
                 first[source] = c
             else:
                 copies.append((c, first[source]))
-        # Difference rows, which have no rigid part, never stand beside others in front of them (side order).
+        # Difference rows have no rigid part and are never preceded by other sides (side order).
         fill_rigid(self.chain, q, qd, qdd, first, out)
         for target, origin in copies:
             out[target, 0] = out[origin, 0]
@@ -411,7 +404,7 @@ class ModelStructure:
 
 
 def side_torque(motor: Floats | None, joint: Floats | None, side: Side) -> Floats:
-    """The measured torque (N, n) of a side. Raises DataError when it was not measured."""
+    """The measured torque (N, n) of a side. Raises DataError without it."""
     if side == "difference":
         if motor is None or joint is None:
             raise DataError("the difference of motor and joint torque needs both channels")

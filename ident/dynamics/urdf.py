@@ -1,4 +1,4 @@
-"""The part of a URDF that dynamics needs: links' inertials and the tree of joints, read with plain XML.
+"""Inertials of the links and the tree of joints from a URDF, read with plain XML.
 
 Positions, axes and inertia are taken as written (roll-pitch-yaw as in the URDF specification); meshes,
 visuals and extensions are ignored, so a file reads without its packages.
@@ -50,7 +50,7 @@ class Urdf:
 
     @property
     def root(self) -> str:
-        """The only link that is no joint's child."""
+        """The only link without a parent joint."""
         children = {joint.child for joint in self.joints}
         roots = [link for link in self.inertials if link not in children]
         if len(roots) != 1:
@@ -93,7 +93,7 @@ class Urdf:
         return link
 
     def _below(self, link: str) -> list[Joint]:
-        """Movable joints that leave `link` or a body fixed to it, and the fixed joints between."""
+        """Movable joints from `link` or a body fixed to it, and the fixed joints between."""
         found, pending = [], [link]
         while pending:
             here = pending.pop()
@@ -116,7 +116,7 @@ class Urdf:
 def read_urdf(source: str | Path) -> Urdf:
     """Read a URDF from a path, or from its text when `source` begins with `<`.
 
-    Raises ConfigurationError with the file, the element and the remedy when it cannot be understood.
+    Raises ConfigurationError with file, element and remedy for an invalid URDF.
     """
     text, place = _text(source)
     try:
@@ -133,7 +133,7 @@ def read_urdf(source: str | Path) -> Urdf:
         for name in (joint.parent, joint.child):
             if name not in inertials:
                 raise ConfigurationError(
-                    f"{place}: joint {joint.name!r} refers to link {name!r}, which does not exist"
+                    f"{place}: joint {joint.name!r} refers to link {name!r}, missing in the file"
                 )
     return Urdf(tree.get("name", "robot"), text, joints, inertials)
 
@@ -156,7 +156,7 @@ def _numbers(
     try:
         values = np.array([float(part) for part in text.split()])
     except ValueError as error:
-        raise ConfigurationError(f'{place}: `{key}="{text}"` holds something that is no number') from error
+        raise ConfigurationError(f'{place}: `{key}="{text}"` is not a list of numbers') from error
     if values.shape != (len(default),) or not np.all(np.isfinite(values)):
         raise ConfigurationError(f'{place}: `{key}="{text}"` must hold {len(default)} finite numbers')
     return values

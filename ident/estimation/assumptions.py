@@ -1,8 +1,8 @@
-"""Are the assumptions under which the standard deviations hold true for these residuals?
+"""Tests of the assumptions behind the standard deviations.
 
-Equation (13) takes the residuals for zero-mean, serially uncorrelated, of equal variance within a joint and
-side, and independent of the regressor. Each is tested in every run; the verdicts say which stated standard
-deviation to believe and what to look into.
+Equation (13) assumes residuals of zero mean, without serial correlation, of equal variance within a joint and
+side, and independent of the regressor. Every run tests each assumption; the verdicts name the valid standard
+deviation and the cause to look for.
 """
 
 from __future__ import annotations
@@ -238,15 +238,14 @@ def _normality(series: _Series) -> Check:
 
 
 def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
-    """Durbin, Wu and Hausman: do instruments that carry no measurement noise give another estimate?
+    """Durbin, Wu and Hausman: difference between the estimates with noise-free instruments and without.
 
     Parameter by parameter, because the joint statistic needs more independent rows than parameters squared.
-    The variance of a difference is at most that of both estimates together; instruments as strong as here
-    make it far smaller, so the efficient difference V_IV - V_LS is taken with that sum's hundredth as a
-    floor.
+    The variance of a difference is at most the sum of both. Instruments as strong as here make it far smaller,
+    so it is taken as V_IV - V_LS, and at least a hundredth of the sum.
     """
     consequence = (
-        "noise in the positions, or physics that the model lacks, goes with the regressor: lower "
+        "noise in the positions or unmodelled physics correlates with the regressor: lower "
         "`cutoff_hz`, use instrumental variables, or extend the model"
     )
     if instrumental is None:
@@ -286,11 +285,10 @@ def _condition(problem: Problem) -> Check:
 def repeatability(
     problem: Problem, estimate: Estimate, period_rows: int
 ) -> dict[str, tuple[float, float, float]]:
-    """By class: residual that repeats from period to period and the one that does not [Nm], and the F test's
-    p.
+    """By class: residual repeating every period, the remaining residual [Nm], and p of the F test.
 
-    The scatter of the residual between periods at equal phase is pure error; what is the same in all periods
-    is error of the model, however small its standard deviation is stated.
+    The scatter of the residual between periods at equal phase is pure error; the part common to all periods is
+    an error of the model, however small the stated standard deviations are.
     """
     result = {}
     for row_class, fit in zip(problem.classes, estimate.classes, strict=True):
@@ -336,6 +334,6 @@ def _lack_of_fit(problem: Problem, estimate: Estimate, period_rows: int) -> Chec
         p_value > _LEVEL,
         f"F test p {p_value:.2g} ({label}: {structured:.3g} Nm repeats every period, {noise:.3g} Nm does "
         "not)",
-        "physics that the model lacks; more data will not reduce it, an extended model will",
+        "unmodelled physics; more data will not reduce it, an extended model will",
         p_value=p_value,
     )

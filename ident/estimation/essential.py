@@ -1,10 +1,9 @@
-"""From base to essential parameters: what the data do not support is set to zero, one parameter after the
-other.
+"""Essential parameters: base parameters not supported by the data are set to zero, one after the other.
 
-Backward elimination: the parameter with the largest relative standard deviation goes first if an F test with
-the serial-correlation-robust variance cannot tell it from zero and the fit does not suffer by more than a
-stated bound. After each step the others take over what they can (restricted least squares), so that the order
-matters and is recorded. `keep` and `drop` lists serve the supervised way of the paper.
+Backward elimination begins with the parameter of the largest relative standard deviation. It is set to zero if
+an F test with the variance robust to serial correlation cannot distinguish it from zero and the loss of fit
+stays within a bound. After each step the others adapt (restricted least squares), so the order matters and is
+recorded. `keep` and `drop` lists serve the supervised way of the paper.
 """
 
 from __future__ import annotations
@@ -134,7 +133,7 @@ def find_essential(
     settings: EssentialSettings | None = None,
     covariance: CovarianceSettings | None = None,
 ) -> Essential:
-    """Eliminate backwards from an estimate of the base parameters, then estimate what is left by WLS.
+    """Eliminate backwards from an estimate of the base parameters, then estimate the remaining ones by WLS.
 
     The restricted solutions follow in closed form: with C the textbook covariance and V the robust one,
     setting chi_i = 0 takes chi to P chi, C to P C P^T and V to P V P^T with P = I - C e_i e_i^T / C_ii.
@@ -215,8 +214,7 @@ def _positions(names: Sequence[str], wanted: Sequence[str], which: str) -> list[
         ]
         if not hits:
             raise ConfigurationError(
-                f"`{which}` names {item!r}, which is no base parameter; the base parameters are "
-                f"{', '.join(names)}"
+                f"`{which}` names {item!r}, not a base parameter; the base parameters are {', '.join(names)}"
             )
         found += [k for k in hits if k not in found]
     return found

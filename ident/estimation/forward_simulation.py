@@ -122,9 +122,9 @@ def simulate_session(
 ) -> ForwardSimulation:
     """Simulate the longest uninterrupted stretch of a session.
 
-    The reference is the commanded motion where the session has one that the arm followed to 0.1 rad, else the
-    measured one. Motor torque is simulated where the model has it, else joint torque. Raises DataError when
-    the mass matrix of the model is not positive definite.
+    The reference is the commanded motion if the arm followed it to 0.1 rad, else the measured one. Motor torque is
+    simulated if the model has it, else joint torque. Raises DataError when the mass matrix of the model is not
+    positive definite.
     """
     prepared = prepared_session(model, session, settings)
     side: Side = "motor" if "motor" in model.structure.sides and prepared.has_motor else "joint"
@@ -139,7 +139,7 @@ def simulate_session(
     joint = passage.joint
     measured = _resampled(joint.times, joint.q, times)
     command = _command(session, prepared, times)
-    # A log may hold a command that is not that of its cycle: another clock, a plan that came later.
+    # The command in a log may belong to another cycle: another clock, a plan made later.
     if command is None or np.abs(command - measured).max() > _NEAR_RAD:
         reference, target = "measured", measured
     else:
@@ -173,8 +173,7 @@ def simulate(
     start: Floats | None = None,
     bandwidth_hz: float = 20.0,
 ) -> tuple[Floats, Floats, Floats]:
-    """Position, velocity and torque (N, n) of the model under position control along `target` (N, n) at
-    `times`.
+    """Position, velocity and torque (N, n) of the model under position control along `target` (N, n) at `times`.
 
     The torque drives the links alone for the joint side, links and drives for the motor side.
     Raises DataError, naming the time, when the mass matrix is not positive definite.
@@ -196,7 +195,7 @@ def simulate(
     frequency = 2.0 * math.pi * bandwidth_hz
     stiffness, damping = frequency**2 * own, 2.0 * frequency * own
     rate = np.gradient(target, times, axis=0)
-    thrust = np.gradient(rate, times, axis=0)
+    acceleration = np.gradient(rate, times, axis=0)
     q = np.array(target[0] if start is None else start, dtype=np.float64)
     qd = rate[0].copy()
     positions, speeds, torques = np.empty((3, len(times), n))
@@ -209,7 +208,7 @@ def simulate(
         load = regressor.torque(chain, q[None], qd[None], still, bodies)[0] + resisting
         ahead = _IMPLICIT * dt
         system = mass + ahead * slope + np.diag(ahead * damping + ahead**2 * stiffness)
-        change = stiffness * (rate[k] - qd) + damping * thrust[k]
+        change = stiffness * (rate[k] - qd) + damping * acceleration[k]
         push = dt * (torque - load + ahead * change)
         step = np.linalg.solve(system, push)
         q = q + dt * (qd + _IMPLICIT * step)

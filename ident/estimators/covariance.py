@@ -1,19 +1,18 @@
-"""Covariances that hold for what the residuals really are.
+"""Covariances valid for serially correlated residuals.
 
-The textbook covariance of equation (14) takes the rows for serially uncorrelated. Residuals of a real arm are
-not: unmodelled physics repeats with the motion, so neighbouring rows err alike and the textbook standard
-deviation can be several times too small. Here the scores of all rows of one instant are summed first, so
-correlation between joints and sides is covered too, and then
+The textbook covariance of equation (14) assumes serially uncorrelated rows. Residuals of a real arm are
+correlated: unmodelled physics repeats with the motion, so neighbouring rows have similar errors, and the
+textbook standard deviation can be several times too small. Here the scores of all rows of one instant are
+summed first, so correlation between joints and sides is covered too, and then
 
 * `hac`: Bartlett-weighted autocovariances of the scores (Newey and West 1987), bandwidth after Andrews (1991)
   or stated, critical values after Kiefer and Vogelsang (2005). With a hundred parameters on a minute of
-  motion it is still 10 to 20 % too small, since the residuals at the very frequencies that matter were fitted
-  away;
+  motion it is still 10 to 20 % too small, because the fit removes residuals at the frequencies of the motion;
 * `jackknife` (the default): blocks of time, twice the bandwidth long, are left out one after the other. It
-  undoes that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard
-  deviations are the jackknife's, correlations the HAC's, which have full rank. Where the motion is periodic a
-  block is a part of the period, left out of all periods together: what the model lacks repeats with the
-  motion, so the periods are no independent witnesses of it;
+  corrects that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard
+  deviations are the jackknife's; correlations are the HAC's, of full rank. For a periodic motion a block is a
+  part of the period, left out of all periods together: unmodelled physics repeats with the motion, so the
+  periods are not independent;
 * `bootstrap`: blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
 """
 
@@ -46,7 +45,7 @@ _CHUNK = 8192
 
 @dataclass(frozen=True)
 class CovarianceSettings:
-    """Which covariance an estimate states.
+    """The stated covariance of an estimate.
 
     kind : "jackknife" (blocks of time left out, default), "hac" (Newey-West) and "bootstrap" (blocks drawn)
         are robust to serial correlation; "textbook" is equation (14).
@@ -74,9 +73,7 @@ class Scores:
         coefficients: Sequence[FloatArray],
         matrices: Sequence[FloatArray] | None = None,
     ) -> Scores:
-        """Scores with a coefficient for each row (weight times
-        residual); `matrices` replace the regressors.
-        """
+        """Scores with a coefficient for each row (weight times residual); `matrices` replace the regressors."""
         spans: dict[int, tuple[int, int]] = {}
         for group in problem.groups:
             if len(group.time_index):
@@ -108,9 +105,7 @@ class Scores:
         return sum(len(record) for record in self.records)
 
     def bartlett(self, length: int) -> FloatArray:
-        """Sum over lags |l| < length of (1 - |l| / length) S_l: the sum of squares of all windows of
-        `length`.
-        """
+        """Sum over lags |l| < length of (1 - |l| / length) S_l, the sum of squares of all windows of `length`."""
         p = self.records[0].shape[1]
         total = np.zeros((p, p))
         for record in self.records:
@@ -125,9 +120,7 @@ class Scores:
         return Scores(tuple(_block_sums(record, factor) for record in self.records))
 
     def bandwidth(self, bread: FloatArray) -> float:
-        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in
-        samples, over the parameters' own scores.
-        """
+        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own scores."""
         numerator = denominator = 0.0
         directions = bread.T / np.maximum(np.sqrt(np.abs(np.diag(bread))), 1e-300)
         for record in self.records:
@@ -186,9 +179,9 @@ def jackknife(
 ) -> Covariance:
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
-    coefficients : weight times residual of each row; row_weights : what multiplies a row's a a^T in the
-        inverse of `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p,
-        p) covariance whose correlations are taken over.
+    coefficients : weight times residual of each row. row_weights : factor of a row's a a^T in the inverse of
+        `bread`. matrices : instruments in place of one of the regressors. correlation : (p, p) covariance for
+        the correlations.
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
@@ -205,7 +198,7 @@ def jackknife(
     shifts = []
     for key, normal in normals.items():
         rest = information - normal
-        # Instruments that hardly follow the regressors can make a diagonal entry negative.
+        # Weak instruments can make a diagonal entry negative.
         scale = np.sqrt(np.maximum(np.abs(np.diag(rest)), 1e-12 * np.abs(np.diag(information))))
         scaled = rest / np.outer(scale, scale)
         shifts.append(np.linalg.lstsq(scaled, sums[key] / scale, rcond=1e-10)[0] / scale)
@@ -227,8 +220,8 @@ def jackknife(
 class _Blocks:
     """Blocks of time of all records.
 
-    length : of a block in samples. spans : (first sample, number of samples that do not repeat, number of
-        blocks) by record.
+    length : of a block in samples. spans : (first sample, number of samples up to the first repetition, number
+        of blocks) by record.
     """
 
     length: int
@@ -308,9 +301,7 @@ def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int,
 
 
 def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatArray:
-    """Number of independent rows of each class: n / (1 + 2 sum of
-    autocorrelations) by Geyer's initial sequence.
-    """
+    """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's sequence."""
     result = []
     for row_class in problem.classes:
         total: FloatArray = np.zeros(1)

@@ -1,7 +1,4 @@
-"""Tails and quantiles of the distributions that tests and intervals need, from `scipy.special`.
-
-They are what `scipy.stats` evaluates too; importing that takes longer than most commands take to do their work.
-"""
+"""Tails and quantiles of distributions from `scipy.special`, without the slow import of `scipy.stats`."""
 
 from __future__ import annotations
 
@@ -26,35 +23,35 @@ Value = TypeVar("Value", float, NDArray[np.float64])
 
 
 def normal_tail(z: Value) -> Value:
-    """Probability that a standard normal variable exceeds z; of an array, of each."""
+    """Probability of a standard normal variable above z, for a number or elementwise."""
     return special.ndtr(-z)  # type: ignore[no-any-return]
 
 
 def normal_quantile(p: float) -> float:
-    """Value that a standard normal variable stays below with probability p."""
+    """Quantile p of the standard normal distribution."""
     return float(special.ndtri(p))
 
 
 def student_tail(t: float, freedom: float) -> float:
-    """Probability that Student's t of so many degrees of freedom exceeds t."""
+    """Probability of Student's t with `freedom` degrees of freedom above t."""
     return float(special.stdtr(freedom, -t))
 
 
 def student_quantile(p: float, freedom: float) -> float:
-    """Value that Student's t of so many degrees of freedom stays below with probability p."""
+    """Quantile p of Student's t with `freedom` degrees of freedom."""
     return float(special.stdtrit(freedom, p))
 
 
 def chi_square_tail(x: float, freedom: float) -> float:
-    """Probability that chi-square of so many degrees of freedom exceeds x."""
+    """Probability of chi-square with `freedom` degrees of freedom above x."""
     return float(special.chdtrc(freedom, x))
 
 
 def fisher_tail(f: float, freedom: float, rest: float) -> float:
-    """Probability that Fisher's F(freedom, rest) exceeds f."""
+    """Probability of Fisher's F(freedom, rest) above f."""
     return float(special.fdtrc(freedom, rest, f))
 
 
 def fisher_limit(p: float, freedom: float, rest: float) -> float:
-    """Value that Fisher's F(freedom, rest) exceeds with probability p."""
+    """Quantile 1 - p of Fisher's F(freedom, rest)."""
     return float(special.fdtri(freedom, rest, 1.0 - p))

@@ -1,14 +1,12 @@
-"""Instrumental variables (IDIM-IV, Janot, Vandanjon and Gautier 2014): consistent when the regressor is
-noisy.
+"""Estimators for a noisy regressor: instrumental variables and total least squares.
 
-The instruments are the regressor evaluated on motions that the measurement noise has not touched: the states
-of a simulation with the present estimate under the same controller and reference, or the commanded motion
-itself.
+Instrumental variables (IDIM-IV, Janot, Vandanjon and Gautier 2014) stay consistent under noise. The instruments
+are the regressor on motions free of measurement noise: the states of a simulation with the present estimate
+under the same controller and reference, or the commanded motion itself.
 
-Total least squares: errors in the regressor's columns as well as in the torque.
-
-Mixed and scaled (Golub and Van Loan 1980; Van Huffel and Vandewalle 1991): columns named exact (offsets) have
-no error, the others an error of known size relative to their own root mean square.
+Total least squares, mixed and scaled (Golub and Van Loan 1980; Van Huffel and Vandewalle 1991), has errors in the
+columns as well as in the torque. Exact columns (offsets) have no error, the others an error of known size
+relative to their own root mean square.
 """
 
 from __future__ import annotations
@@ -66,7 +64,7 @@ class InstrumentalVariables:
             if not condition < 1e12:
                 raise DataError(
                     f"the instruments do not span the parameters (condition {condition:.1e}); simulate the "
-                    "same motion that was recorded, all joints moving"
+                    "recorded motion, all joints moving"
                 )
             bread = np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale), dtype=np.float64)
             new = bread @ moment
@@ -129,12 +127,12 @@ def _moments(
 class TotalLeastSquares:
     """Minimises ||Y - Omega chi||^2 / (1 + chi^T D chi) over rows weighted as in WLS.
 
-    D holds the variances of the columns' errors over that of the torque's, which is what the residual leaves
-    when the columns' share is taken off; the two are solved for in turn.
+    D holds the variances of the columns' errors over that of the torque. The torque's variance is the residual's
+    minus the columns' share; the two are solved for in turn.
 
     relative_noise : standard deviation of a column's error as a share of the column's root mean square, one
-        for all or by parameter name. With a 10 Hz position filter and a 2 Hz parallel filter encoder noise
-        leaves 1e-4 to 1e-3, which is why TLS and WLS agree on such data.
+        for all or by parameter name. Encoder noise behind a 10 Hz position filter and a 2 Hz parallel filter
+        is 1e-4 to 1e-3, so TLS and WLS agree on such data.
     exact : pattern of the names of columns without error (default: the offsets, columns of ones).
     """
 
@@ -144,9 +142,7 @@ class TotalLeastSquares:
     iterations: int = 50
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,) from the smallest singular vector; the
-        covariance from the scores of the criterion.
-        """
+        """Estimate (p,) from the smallest singular vector, covariance from the scores of the criterion."""
         values, weights, factor, _, _ = weighted_solution(problem)
         p = factor.parameters
         column = self._noise(problem, factor.r[:, :p], factor.rows)
@@ -208,7 +204,7 @@ class TotalLeastSquares:
         if isinstance(self.relative_noise, Mapping):
             unknown = set(self.relative_noise) - set(problem.names)
             if unknown:
-                raise DataError(f"relative noise is given for {sorted(unknown)[0]!r}, which is no parameter")
+                raise DataError(f"relative noise is given for {sorted(unknown)[0]!r}, not a parameter")
             share = np.array([self.relative_noise.get(name, 0.0) for name in problem.names])
         else:
             share = np.full(len(problem.names), float(self.relative_noise))

@@ -129,10 +129,11 @@ class Estimate(Tabular):
         lines = [
             f"Estimate ({self.method}): {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows"
             f"{residual}{'' if self.converged else ', NOT converged'}",
-            f"  standard deviations: {self.covariance.kind}; least certain parameters:",
+            f"  standard deviations: {self.covariance.kind}",
+            "  least certain parameters:",
         ]
         rsd = self.rsd_percent
-        for k in np.argsort(-rsd, kind="stable")[:6]:
+        for k in np.argsort(-rsd, kind="stable")[:5]:
             lines.append(
                 f"  {self.names[k]:<10}{self.values[k]:>11.4g} ± {self.std[k]:<9.2g} {self._units[k]:<9} "
                 f"RSD {rsd[k]:.1f} %"
@@ -174,6 +175,6 @@ class Estimator(Protocol):
 
 
 def rsd_percent(values: FloatArray, std: FloatArray) -> FloatArray:
-    """100 std / |value|, equation (15); infinite where the value is zero."""
+    """100 std / |value|, equation (15); infinite for a value of zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values != 0.0, 100.0 * std / np.abs(values), np.inf)

@@ -1,12 +1,11 @@
-"""From a solution to a results object: residuals, variances with the right degrees of freedom,
+"""Ordinary, weighted and iteratively reweighted least squares.
+
+Ordinary least squares, equation (11), has one variance for all rows; weighted least squares, equations (13) and
+(14), one for each joint and side. Iteratively reweighted least squares gives less weight to rows with large
+residuals (Huber 1964; Beaton and Tukey 1974).
+
+`estimate_from` makes the results object of any estimator: residuals, variances with the right degrees of freedom,
 covariances.
-
-Ordinary least squares, equation (11): every row counts alike.
-
-Weighted least squares, equations (13) and (14): one variance for each joint and side.
-
-Iteratively reweighted least squares: rows that fit badly count less (Huber 1964; Beaton and
-Tukey 1974).
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ __all__ = [
 
 
 def factor_of(problem: Problem, weights: FloatArray) -> TriangularFactor:
-    """Weighted factor of the whole stack, after the checks that every estimator needs."""
+    """Weighted factor of the whole stack, after the checks common to all estimators."""
     factor = problem.weighted(weights)
     diagonal = np.abs(np.diag(factor.r)[:-1])
     norms = np.linalg.norm(factor.r[:, :-1], axis=0)
@@ -53,7 +52,7 @@ def factor_of(problem: Problem, weights: FloatArray) -> TriangularFactor:
 
 
 def consumed_parameters(problem: Problem, weights: FloatArray, root: FloatArray) -> FloatArray:
-    """Share of the p parameters that each class consumed, tr(N^-1 w_c A_c^T A_c); the shares sum to p.
+    """Share of the p parameters consumed by each class, tr(N^-1 w_c A_c^T A_c); the shares sum to p.
 
     `root` (p, p) with root root^T = N^-1, the inverse weighted normal matrix.
     """
@@ -104,13 +103,12 @@ def estimate_from(
     converged: bool = True,
     notes: tuple[str, ...] = (),
 ) -> Estimate:
-    """Results object with the covariances that `settings` asks for.
+    """Results object with the covariances of `settings`.
 
     bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each
-        row (default: class weight times residual). matrices : what multiplies them (default: the regressors;
-        the instruments of an instrumental-variable estimate). row_weights : what multiplies a a^T of each
-        row in the inverse of `bread` (default: class weight). plain : the estimator's own textbook
-        covariance.
+        row (default: class weight times residual). matrices : their matrices (default: the regressors;
+        instruments for an instrumental-variable estimate). row_weights : factor of a a^T of each row in the
+        inverse of `bread` (default: class weight). plain : the estimator's own textbook covariance.
     scores : in place of coefficients and matrices. offset : (p, p), added to the robust covariances.
     """
     residuals = problem.residuals(values)
@@ -178,7 +176,7 @@ def _robust(
     matrices: Sequence[FloatArray] | None,
     scores: Scores | None,
 ) -> dict[str, Covariance]:
-    """The serial-correlation-robust covariances; without rows of its own (`scores` given) HAC only."""
+    """The covariances robust to serial correlation; with given `scores` HAC only."""
     rows = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
     inflation = np.sqrt(rows / np.maximum(rows - consumed, 1.0))
     if scores is None:
@@ -257,7 +255,7 @@ class OrdinaryLeastSquares:
 class WeightedLeastSquares:
     """Minimises sum over classes of ||e_c||^2 / sigma_c^2 with sigma_c^2 iterated from the residuals.
 
-    tolerance : largest relative change of a variance at which the iteration stops.
+    tolerance : the iteration stops at this largest relative change of a variance.
     """
 
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
@@ -299,7 +297,7 @@ def weighted_solution(
     return factor.solve(), weights, factor, iterations, False
 
 
-# Constants for 95 % efficiency at the normal law.
+# Constants for 95 % efficiency with normal residuals.
 _TUNING = {"huber": 1.345, "tukey": 4.685}
 
 
@@ -317,9 +315,7 @@ class RobustLeastSquares:
     tolerance: float = 1e-6
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,); the covariance is the M-estimator's
-        sandwich with the scores psi(e / sigma) / sigma.
-        """
+        """Estimate (p,), with the M-estimator's sandwich covariance from the scores psi(e / sigma) / sigma."""
         values, weights, factor, _, _ = weighted_solution(problem)
         consumed = consumed_parameters(problem, weights, factor.inverse_root())
         stages = ("huber",) if self.loss == "huber" else ("huber", "tukey")

@@ -1,11 +1,9 @@
-"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives that only
-dissipate.
+"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives dissipative.
 
 Standard parameters are fitted through their base parameters under linear matrix inequalities (Sousa and
-Cortesao 2014; Wensing, Kim and Slotine 2018) with a distance to a prior model that settles what the data
-cannot say (Lee, Wensing and Park 2020). The convex program goes to clarabel.
-
-The arm's own URDF as the prior model of an estimation.
+Cortesao 2014; Wensing, Kim and Slotine 2018). A distance to a prior model determines the combinations unseen in
+the data (Lee, Wensing and Park 2020). The convex program is solved by clarabel. `cad_prior` makes the prior from
+the arm's own URDF.
 """
 
 from __future__ import annotations
@@ -40,16 +38,16 @@ _FINEST = 1e10
 
 @dataclass(frozen=True)
 class BodyPrior:
-    """The standard parameters and what is known of them beforehand.
+    """Prior knowledge of the standard parameters.
 
     projection : K (p, n), base parameters = K standard parameters.
     bodies : (k, 10) int, positions of the ten inertial parameters of each rigid body, in the order of
         `parameters.INERTIAL`.
-    nonnegative : positions of parameters that cannot be negative (drive inertia, friction).
-    inertial : (k, 10) prior of the bodies; each must be consistent (`nearest_consistent` makes it so).
-    absent : positions of parameters that the model leaves out; they stay zero.
-    relative_std : how far a body may be from its prior, as a share of itself, one for all or (k,). The
-        default is the robot-to-robot variation that the paper reports, up to 20 %.
+    nonnegative : positions of parameters without negative values (drive inertia, friction).
+    inertial : (k, 10) consistent prior of the bodies, if need be from `nearest_consistent`.
+    absent : positions of parameters left out of the model; they stay zero.
+    relative_std : standard deviation of a body from its prior, as a share of itself, one for all or (k,). The
+        default is the robot-to-robot variation in the paper, up to 20 %.
     """
 
     projection: FloatArray
@@ -98,9 +96,7 @@ class BodyPrior:
         return total
 
     def prior(self, metric: Metric) -> Prior:
-        """The same as a normal prior of the base parameters; those
-        with a drive parameter in them stay free.
-        """
+        """The same as a normal prior of the base parameters; those with a drive parameter stay free."""
         n = self.projection.shape[1]
         inertial = np.zeros(n, dtype=bool)
         inertial[self.bodies.ravel()] = True
@@ -122,7 +118,7 @@ class PhysicallyConsistent:
     metric : distance of a body from its prior: "pullback" (quadratic, invariant), "entropic"
         (log-determinant divergence, keeps away from the boundary), "euclidean".
     strength : s; 1 takes the prior as stated, "evidence" and "cross_validation" let the data choose, see
-        `MaximumAPosteriori`. Data with model errors choose too loose a prior, which costs accuracy on other
+        `MaximumAPosteriori`. Data with model errors choose too loose a prior, at the cost of accuracy on other
         motions.
     margin : smallest eigenvalue of a pseudo-inertia relative to the prior's smallest. The result's
         `standard` holds the standard parameters (n,).
@@ -135,7 +131,7 @@ class PhysicallyConsistent:
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,) and `standard` (n,). Standard deviations are those without the inequalities."""
+        """Estimate (p,) and `standard` (n,), with the standard deviations of the unconstrained problem."""
         linear = MaximumAPosteriori(self.prior.prior(self.metric), self.strength, self.covariance).fit(
             problem
         )
@@ -146,7 +142,7 @@ class PhysicallyConsistent:
         p, projection = len(problem.names), self.prior.projection
         weights = np.minimum(linear.weights, _FINEST / _mean_squares(problem))
         for _ in range(_REWEIGHTINGS):
-            # Where the constraints bind, the residual grows and its weight must fall with it.
+            # With active constraints the residual grows, so its weight must fall.
             factor = problem.weighted(weights * np.minimum(shares, 1.0))
             standard = program.solve(factor.r[:p, :p] @ projection, factor.r[:p, p])
             values = projection @ standard
@@ -235,8 +231,7 @@ class _Program:
             if entropic:
                 first = n + number * (_BODY + 4)
                 rows, offset, kinds = _entropic_rows(places, n + extra, first)
-                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4, whose second-order form is
-                # the pullback metric.
+                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4; to second order the pullback metric.
                 slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
                 strength = self.strength * prior.firmness[number]
                 linear[places] += strength * slope
@@ -290,9 +285,7 @@ def _run(
 
 
 def _svec(matrix: FloatArray) -> FloatArray:
-    """Upper triangle (..., k (k + 1) / 2) column by column,
-    off-diagonals times sqrt(2): clarabel's PSD cone.
-    """
+    """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD cone."""
     size = matrix.shape[-1]
     entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]
     return np.stack(entries, axis=-1)
@@ -306,9 +299,7 @@ def _psd_rows(places: np.ndarray, width: int, floor: FloatArray) -> tuple[FloatA
 
 
 def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArray, FloatArray, list]:
-    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at
-    column `first`.
-    """
+    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at column `first`."""
     lower = [(i, j) for j in range(4) for i in range(j, 4)]
     psd = np.zeros((36, width))
     big = np.zeros((_BODY, 8, 8))
@@ -331,7 +322,7 @@ def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArr
 
 
 def _compact(mass: float) -> FloatArray:
-    """Pseudo-inertia of a ball of that mass and the density of aluminium: the scale of a real body."""
+    """Pseudo-inertia of an aluminium ball of that mass, the scale of a real body."""
     radius = (3.0 * mass / (4.0 * np.pi * 2700.0)) ** (1.0 / 3.0)
     return np.diag([mass * radius**2 / 5.0] * 3 + [mass])
 
@@ -345,7 +336,7 @@ def _smallest(matrix: FloatArray) -> FloatArray:
 
 
 def _sizes(body: FloatArray) -> FloatArray:
-    """Natural size (10,) of each parameter of a body: its radius of gyration makes lengths."""
+    """Natural size (10,) of each parameter of a body, with its radius of gyration as length."""
     mass = max(abs(float(body[9])), 1e-3)
     inertia = max(float(np.mean(np.abs(body[[0, 3, 5]]))), float(_compact(mass)[0, 0]) * 2.0)
     length = np.sqrt(inertia / mass)
@@ -376,8 +367,7 @@ def _refit(estimate: Estimate, problem: Problem, values: FloatArray) -> tuple:
     return tuple(fits)
 
 
-# A payload of which nothing but perhaps the mass is known: a body of this radius of gyration, anywhere
-# within reach.
+# A payload of unknown inertia: a body of this radius of gyration, with its centre of mass within this distance.
 _PAYLOAD_KG = 3.0
 _PAYLOAD_RADIUS_M = 0.1
 _PAYLOAD_STD = 3.0
@@ -389,13 +379,14 @@ def cad_prior(
 ) -> BodyPrior:
     """Prior of the base set's arm: the inertials of the URDF, within `relative_std` of themselves.
 
-    payload_masses : stated mass [kg] by payload name; a payload is otherwise as good as unknown. Inertials
-        that belong to no rigid body are replaced by the nearest that do. Raises ConfigurationError for a
-        chain without URDF and for a structure without rigid bodies (Model 3).
+    payload_masses : stated mass [kg] by payload name; without it a payload is as good as unknown. Inconsistent
+        inertials are replaced by the nearest consistent ones.
+
+    Raises ConfigurationError for a chain without URDF and for a structure without rigid bodies (Model 3).
     """
     structure = base.structure
     if "difference" in structure.sides:
-        raise ConfigurationError("Model 3 has no rigid bodies, so a prior of them says nothing; use `wls`")
+        raise ConfigurationError("Model 3 has no rigid bodies and so no prior of them; use `wls`")
     n = structure.chain.n
     masses = payload_masses or {}
     spheres = []

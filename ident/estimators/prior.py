@@ -1,8 +1,7 @@
 """Maximum a posteriori: least squares with a prior model (CAD, or another arm of the series).
 
-The prior says where the parameters are expected and how far from there they may lie; the data decide how much
-to trust it. Rows count with their effective number, so that thousands of correlated rows do not drown the
-prior.
+The prior has a mean and a covariance; the data decide its weight. Rows count with their effective number, so
+that thousands of correlated rows do not overrule the prior.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ __all__ = ["MaximumAPosteriori", "Prior"]
 
 @dataclass(frozen=True)
 class Prior:
-    """Normal prior: mean (p,) and precision (p, p), the inverse covariance; zero precision knows nothing."""
+    """Normal prior: mean (p,) and precision (p, p), the inverse covariance, zero for free parameters."""
 
     mean: FloatArray
     precision: FloatArray
@@ -51,7 +50,7 @@ class Prior:
 
     @classmethod
     def independent(cls, mean: FloatArray, std: FloatArray) -> Prior:
-        """Independent parameters with standard deviations (p,); infinite where nothing is known."""
+        """Independent parameters with standard deviations (p,), infinite for free ones."""
         return cls(
             np.where(np.isfinite(std), mean, 0.0), np.diag(1.0 / np.asarray(std, dtype=np.float64) ** 2)
         )
@@ -63,14 +62,14 @@ class Prior:
         """Prior of base parameters chi_B = P chi from one of standard parameters.
 
         mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool,
-            base parameters that the prior speaks of, the others stay free.
+            base parameters under the prior, the others stay free.
         """
         chosen = np.flatnonzero(known)
         part = projection[chosen]
         inner = part @ covariance @ part.T
         scale = np.sqrt(np.diag(inner))
         if np.any(scale <= 0):
-            raise ConfigurationError("a base parameter that the prior speaks of has no prior variance")
+            raise ConfigurationError("a base parameter under the prior has no prior variance")
         precision = np.zeros((len(projection),) * 2)
         block = np.linalg.inv(inner / np.outer(scale, scale) + 1e-9 * np.eye(len(chosen))) / np.outer(
             scale, scale
@@ -85,9 +84,9 @@ class Prior:
 class MaximumAPosteriori:
     """Minimises sum of (n_eff / n) ||e_c||^2 / sigma_c^2 + (chi - chi_0)^T Lambda (chi - chi_0) / s.
 
-    strength : how the prior's scale s is chosen: "evidence" maximises the marginal likelihood of the data
-        (MacKay 1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the
-        prior's own standard deviations, smaller is firmer).
+    strength : choice of the prior's scale s: "evidence" maximises the marginal likelihood of the data (MacKay
+        1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the prior's own
+        standard deviations, a smaller one trusts it more).
     blocks : number of blocks of the cross-validation.
     """
 
@@ -98,7 +97,7 @@ class MaximumAPosteriori:
     iterations: int = 20
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,); the stated covariance is the posterior's, which counts the effective rows."""
+        """Estimate (p,), with the posterior covariance of the effective rows."""
         if len(self.prior.mean) != len(problem.names):
             raise DataError(
                 f"the prior has {len(self.prior.mean)} parameters, the problem {len(problem.names)}"

@@ -1,23 +1,19 @@
-"""The rows of a problem in the order in which they were measured, for estimators that run along.
+"""Estimators that take the rows in the order of measurement, while the arm moves.
 
-Recursive least squares in square-root form: the estimate while the arm moves.
+Recursive least squares keeps the information as a triangular factor, updated by orthogonal transformations
+(Bierman 1977), so it stays positive definite. Forgetting acts on the information from the data, never on the
+initial one; this prevents wind-up without excitation.
 
-The information is kept as a triangular factor, updated by orthogonal transformations (Bierman 1977), so it
-stays positive definite. Forgetting acts on what was learned, never on the initial information, which prevents
-wind-up when the motion excites nothing.
-
-Dynamic regressor extension and mixing (Aranovskiy, Bobtsov, Ortega and Pyrkin 2017) for weak excitation.
-
+Dynamic regressor extension and mixing (Aranovskiy, Bobtsov, Ortega and Pyrkin 2017) is for weak excitation.
 Extension: the regression y = a^T chi is accumulated with a fading memory (Kreisselmeier's filter),
 
     Phi <- lambda Phi + sum w a a^T,    Y <- lambda Y + sum w a y,    so that Y = Phi chi at any time.
 
-Mixing: multiplied by a row of the adjugate it falls apart into p scalar regressions, z_i = d_i chi_i. Any
-scale of a row may be chosen; here d_i^2 = 1 / (Phi^-1)_ii, the information on parameter i that the others
-leave, which is zero as long as the motion cannot tell i from them and does not suffer when other directions
-are not excited (the determinant would). Each parameter is then a scalar weighted mean over the whole motion:
-it moves only when it is excited and keeps its initial value otherwise, and its error never grows because of
-another parameter's.
+Mixing: multiplied by a row of the adjugate it separates into p scalar regressions, z_i = d_i chi_i. The scale
+of a row is free; here d_i^2 = 1 / (Phi^-1)_ii, the information on parameter i left by the others. It is zero as
+long as the motion cannot distinguish i from them, and unlike the determinant does not suffer from other
+unexcited directions. Each parameter is then a scalar weighted mean over the whole motion: it moves only when
+excited, keeps its initial value otherwise, and its error never grows with another parameter's.
 """
 
 from __future__ import annotations
@@ -47,9 +43,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Instant:
-    """All rows of one instant: matrix (k, p), target (k,), class of
-    each row (k,), number of the record and time.
-    """
+    """All rows of one instant: matrix (k, p), target (k,), class of each row (k,), record and time."""
 
     record: int
     time_index: int
@@ -97,7 +91,7 @@ class RecursiveFilter:
 
     @classmethod
     def start(cls, mean: FloatArray, std: FloatArray, forgetting: float = 1.0) -> RecursiveFilter:
-        """Filter that begins at `mean` (p,) with standard deviations `std` (p,)."""
+        """Filter beginning at `mean` (p,) with standard deviations `std` (p,)."""
         information = 1.0 / np.asarray(std, dtype=np.float64)
         p = len(information)
         r = np.zeros((p + 1, p + 1))
@@ -121,16 +115,14 @@ class RecursiveFilter:
 
     @property
     def root(self) -> FloatArray:
-        """(p, p) with root root^T the covariance that uncorrelated rows would have."""
+        """(p, p) with root root^T the covariance for uncorrelated rows."""
         p = self._r.shape[1] - 1
         return solve_triangular(self._r[:p, :p], np.eye(p))
 
 
 @dataclass(frozen=True)
 class Track:
-    """Course of a recursive estimate: records and time indices (K,), values and standard
-    deviations (K, p).
-    """
+    """Course of a recursive estimate: records and time indices (K,), values and standard deviations (K, p)."""
 
     record: np.ndarray
     time_index: np.ndarray
@@ -142,8 +134,8 @@ class Track:
 class RecursiveLeastSquares:
     """Weighted recursive least squares with forgetting.
 
-    memory_s : time constant of the forgetting [s], None keeps all; then the result is that of WLS.
-    prior : where to begin; None begins without information (a standard deviation of `initial_std`).
+    memory_s : time constant of the forgetting [s], None keeps all, with the result of WLS.
+    prior : initial information; None begins without any (a standard deviation of `initial_std`).
     sigma : standard deviation of the rows by class label ("A1 motor"); None takes those of a WLS over the
         problem.
     """
@@ -162,9 +154,9 @@ class RecursiveLeastSquares:
         p = len(problem.names)
         if self.prior is None:
             return RecursiveFilter.start(np.zeros(p), np.full(p, self.initial_std), forgetting)
-        faint = np.eye(p) / self.initial_std**2
+        weak = np.eye(p) / self.initial_std**2
         r = np.zeros((p + 1, p + 1))
-        r[:p, :p] = np.linalg.cholesky(self.prior.precision + faint).T
+        r[:p, :p] = np.linalg.cholesky(self.prior.precision + weak).T
         r[:p, p] = solve_triangular(r[:p, :p].T, self.prior.precision @ self.prior.mean, lower=True)
         return RecursiveFilter(r, forgetting)
 
@@ -181,7 +173,7 @@ class RecursiveLeastSquares:
         return Track(np.array(record), np.array(time_index), np.array(values), np.array(deviations))
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate after the last row; older rows count less where there is forgetting."""
+        """Estimate after the last row; with forgetting, older rows count less."""
         sigma, recursion = self._sigma(problem), self.start(problem)
         ages: dict[int, dict[int, int]] = {}
         count = 0
@@ -228,14 +220,14 @@ class RecursiveLeastSquares:
 
 @dataclass(frozen=True)
 class RegressorExtensionMixing:
-    """Element-wise estimates that need no persistent excitation.
+    """Element-wise estimates without persistent excitation.
 
     memory_s : time constant of the extension [s]; it runs on from one session to the next. every : instants
         between two mixings.
-    initial, initial_std : values (p,) to begin with and their standard deviation (a number or (p,)); what is
-        never excited stays there. sigma : standard deviation of the rows by class, None takes the root mean
-        square of the torque by class as a scale, which needs no solution of the whole problem.
-    null : share of a parameter in the unexcited directions above which it counts as not excited.
+    initial, initial_std : initial values (p,) and their standard deviation (a number or (p,)), kept by
+        parameters never excited. sigma : standard deviation of the rows by class; None takes the root mean
+        square of the torque by class as a scale, without a solution of the whole problem.
+    null : largest share of an excited parameter in the unexcited directions.
     """
 
     memory_s: float = 30.0
@@ -247,7 +239,7 @@ class RegressorExtensionMixing:
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,); its covariance follows from the estimate being linear in the torques."""
+        """Estimate (p,), with the covariance of an estimate linear in the torques."""
         p = len(problem.names)
         weights = self._weights(problem)
         start = np.zeros(p) if self.initial is None else np.asarray(self.initial, dtype=np.float64)
@@ -319,9 +311,7 @@ def _influence(
     forgetting: float,
     values: FloatArray,
 ) -> tuple[Scores, FloatArray]:
-    """Influence of every instant on the estimate, as scores, and
-    the covariance for uncorrelated residuals.
-    """
+    """Influence of every instant on the estimate, as scores, and the covariance for uncorrelated residuals."""
     p = len(values)
     records: dict[int, list[tuple[int, FloatArray]]] = {}
     white = np.zeros((p, p))

@@ -1,15 +1,11 @@
-"""What the XML formats share: numbers with all digits, friction of both sides, the comment at the head.
+"""Export to the XML descriptions URDF and MJCF, with all digits of the numbers.
 
-URDF with the identified inertials and friction: reading it back gives the torques of the model.
+A URDF holds rigid bodies and, for each joint, `damping` and `friction`; read back, it gives the torques of the
+model. Drive inertias and torque offsets have no place in the format and go to a comment.
 
-A URDF holds rigid bodies and, for each joint, `damping` and `friction`. Drive inertias and torque offsets
-have no place in it; they stand in a comment. Numbers are written with all digits.
-
-MJCF, the model format of MuJoCo: bodies, drive inertia as `armature`, `frictionloss` and `damping` of each
-joint.
-
-Body frames are the modified Denavit-Hartenberg frames of the chain; every joint has a motor. Torque offsets
-have no place in the format; they stand in a comment.
+MJCF, the model format of MuJoCo, holds bodies, drive inertia as `armature`, `frictionloss` and `damping` of each
+joint. Body frames are the modified Denavit-Hartenberg frames of the chain; every joint has a motor. Torque offsets
+go to a comment.
 """
 
 from __future__ import annotations
@@ -28,10 +24,9 @@ __all__ = ["comment", "digits", "document", "friction", "require_consistent", "t
 
 
 def friction(model: StandardModel) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]:
-    """Damping [Nm s/rad] and dry friction [Nm] of each joint, both sides together, and notes on what was cut
-    to zero.
+    """Damping [Nm s/rad] and dry friction [Nm] of each joint, both sides together, and notes.
 
-    Simulators refuse negative friction.
+    Negative friction, refused by simulators, becomes zero and is noted.
     """
     damping = model.drive[:, 1] + model.drive[:, 4]
     dry = model.drive[:, 2] + model.drive[:, 5]
@@ -45,7 +40,7 @@ def friction(model: StandardModel) -> tuple[NDArray[np.float64], NDArray[np.floa
 
 
 def require_consistent(model: StandardModel) -> None:
-    """Raise ConfigurationError that names the link which cannot exist."""
+    """Raise ConfigurationError with the name of a physically inconsistent link."""
     bad = [
         v.reason for v in parameters.consistency(model.inertial, model.chain.link_names) if not v.consistent
     ]
@@ -56,12 +51,12 @@ def require_consistent(model: StandardModel) -> None:
 
 
 def digits(value: float) -> str:
-    """Shortest text that reads back as the same number."""
+    """Shortest text with all digits of the number."""
     return repr(float(value) + 0.0)
 
 
 def comment(model: StandardModel, notes: tuple[str, ...]) -> str:
-    """Text of the comment at the head: what the format has no place for."""
+    """Text of the comment at the head: parameters without a place in the format."""
     names = model.chain.joint_names
     rows = [
         f" Inertials and friction identified: {model.title or 'a serial arm'}.",
@@ -88,11 +83,10 @@ def to_urdf(model: StandardModel, *, name: str | None = None) -> str:
     """URDF text of a consistent model: the arm's own URDF with new inertials, or a new one for a chain from a
     table.
 
-    What is fixed to a moving link belongs to that link's parameters, so its own inertial is taken away.
-    Angles of joint origins within 1e-5 of a multiple of pi/2 are written as that multiple, as the chain takes
-    them.
+    Bodies fixed to a moving link are part of that link's parameters and lose their own inertial. Angles of joint
+    origins within 1e-5 of a multiple of pi/2 are written as that multiple, as in the chain.
 
-    Raises ConfigurationError for a model whose links cannot exist: project it first.
+    Raises ConfigurationError for a physically inconsistent model: project it first.
     """
     require_consistent(model)
     return _changed(model, name) if model.chain.urdf is not None else _new(model, name or "arm")
@@ -130,7 +124,7 @@ def _changed(model: StandardModel, name: str | None) -> str:
 
 
 def _carried(urdf: str, moving: tuple[str, ...], joints: tuple[str, ...]) -> list[str]:
-    """Links that hang on a moving link without being one: their bodies are part of its parameters."""
+    """Links fixed to a moving link; their bodies are part of its parameters."""
     tree = read_urdf(urdf)
     found, pending = [], list(moving)
     while pending:
@@ -213,8 +207,8 @@ def _snapped(angle: float) -> float:
 def to_mjcf(model: StandardModel, *, name: str = "arm") -> str:
     """MJCF text of a consistent model.
 
-    Armature and friction of both sides of the gear act at the joint; what is negative is written as 0 and
-    noted. Raises ConfigurationError for a model whose links cannot exist: project it first.
+    Armature and friction of both sides of the gear act at the joint; negative ones are written as 0 and noted.
+    Raises ConfigurationError for a physically inconsistent model: project it first.
     """
     require_consistent(model)
     chain = model.chain
@@ -267,7 +261,7 @@ def to_mjcf(model: StandardModel, *, name: str = "arm") -> str:
 
 
 def _limits(urdf: str | None) -> dict[str, str]:
-    """Ranges of the joints that the URDF limits."""
+    """Ranges of the joints with limits in the URDF."""
     if urdf is None:
         return {}
     found = {}

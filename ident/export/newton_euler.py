@@ -1,14 +1,12 @@
-"""A small graph of expressions that simplifies itself as it is built.
-
-Equal expressions are one node (hash consing), so common subexpressions are found by construction. Constants
-are folded; terms with a zero, factors of one and double signs vanish; signs move outwards, so that `a - b`
-and `b - a` share a node.
-
-Recursive Newton-Euler of a chain with given parameters, written as expressions of q, qd and qdd.
+"""Recursive Newton-Euler of a chain with given parameters as expressions of q, qd and qdd.
 
 The customised algorithm of Khalil and Kleinfinger (1987): modified Denavit-Hartenberg frames, inertia about
 the frame origins, and U = [alpha]x + [omega]x[omega]x formed once a link. With base parameters most of the
-ten numbers of a link are zero; their terms never come into being.
+ten numbers of a link are zero and create no terms.
+
+The graph of expressions simplifies itself. Equal expressions are one node (hash consing), so common
+subexpressions are found by construction. Constants are folded; terms with a zero, factors of one and double signs
+vanish; signs move outwards, so that `a - b` and `b - a` share a node.
 """
 
 from __future__ import annotations
@@ -159,7 +157,7 @@ class Graph:
         return Expression(self, self._known[node])
 
     def operands(self, index: int) -> tuple[int, ...]:
-        """Nodes that node `index` is made of."""
+        """Operands of node `index`."""
         kind, *rest = self.nodes[index]
         if kind in ("const", "input"):
             return ()
@@ -168,7 +166,7 @@ class Graph:
         return (int(rest[0]),)
 
     def needed(self, outputs: Sequence[Expression]) -> list[int]:
-        """Nodes that the outputs depend on, operands first."""
+        """Nodes needed for the outputs, operands first."""
         found: set[int] = set()
         pending = [output.index for output in outputs]
         while pending:
@@ -352,7 +350,7 @@ def _wrench(
     products: Vector,
     u: _Matrix,
 ) -> tuple[Vector, Vector]:
-    """Force and moment about the origin of frame k that the motion of link k needs."""
+    """Force and moment about the origin of frame k for the motion of link k."""
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = (float(value) for value in model.inertial[k])
     c = graph.const
     first: Vector = (c(mx), c(my), c(mz))

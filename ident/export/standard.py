@@ -1,6 +1,7 @@
-"""An arm with numbers for all its parameters and one condition of load: what all exports start from.
+"""The input of all exports: an arm with one payload and numbers for every standard parameter.
 
-From an identified model to numbers for every standard parameter: as they are, or as possible bodies.
+`standard_model` makes it from an identified model, with the base parameters as they are or with physically
+consistent bodies.
 """
 
 from __future__ import annotations
@@ -38,14 +39,13 @@ class CoupledDrives:
 
 @dataclass(frozen=True, eq=False)
 class StandardModel:
-    """Numbers for every standard parameter of a chain, with the payload (if any) already part of the last
-    link.
+    """Numbers for every standard parameter of a chain, with the payload (if any) as part of the last link.
 
     inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia Fvl Fcl offl Fvm Fcm
         offm.
-    sides : what the model describes: joint torque, motor torque, or only their difference.
-    coulomb_kind, coulomb_width : the function that stands for sign(qd).
-    consistent : whether every link is a body that can exist (needed for URDF and MJCF, not for code).
+    sides : torques of the model: joint torque, motor torque, or only their difference.
+    coulomb_kind, coulomb_width : the function for sign(qd).
+    consistent : whether every link is physically consistent (needed for URDF and MJCF, not for code).
     title : one line for the head of a file.
     """
 
@@ -79,7 +79,7 @@ _STATES = 200
 
 @dataclass(frozen=True, eq=False)
 class ConsistentParameters:
-    """Standard parameters (n_columns,) whose bodies can exist, and what that cost.
+    """Physically consistent standard parameters (n_columns,), and the change of torque.
 
     projection : the cone program's result, its base parameters in the order of `names`.
     torque_change_nm : (n,) root mean square change of the joint torque at random states [Nm]; zero when
@@ -93,7 +93,7 @@ class ConsistentParameters:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader of the exported file must know."""
+        """Notes for the exported file."""
         if self.projection.exact:
             return ("Physically consistent bodies with exactly the identified torque.",)
         order = np.argsort(-np.abs(self.projection.shift))
@@ -119,9 +119,8 @@ def standard_model(
 ) -> StandardModel:
     """The model with one payload (or none) mounted, ready for export.
 
-    consistent : bodies that can exist, see `consistent_parameters`; else the base parameters as they stand
-        and
-        zero for the rest, which has the same torque in the fewest operations.
+    consistent : physically consistent bodies, see `consistent_parameters`; else the base parameters as they are
+        and zero for the rest, with the same torque in the fewest operations.
     reference : (bodies, 10) of `consistent_parameters`.
 
     Raises ConfigurationError for an unknown payload, and for `consistent` with a model of torque differences.
@@ -143,9 +142,9 @@ def standard_model(
         named = ", ".join(str(effect["cause"]) for effect in model.effects)
         notes = (
             *notes,
-            f"Effects of the model that are not in this file: {named}.",
-            "The parameters are those beside these effects; without them a model identified without effects "
-            "predicts better.",
+            f"Effects of the model missing in this file: {named}.",
+            "The parameters were estimated together with these effects; without them, a model identified "
+            "without effects predicts better.",
         )
     title = f"{model.robot}, {'bare arm' if payload is None else f'payload {payload}'}"
     return StandardModel(
@@ -163,13 +162,13 @@ def standard_model(
 
 
 def consistent_parameters(model: DynamicModel, reference: Floats | None = None) -> ConsistentParameters:
-    """Standard parameters of the model as bodies that can exist, see `ident.dynamics.physical`.
+    """Standard parameters of the model as physically consistent bodies, see `ident.dynamics.physical`.
 
-    reference : (links + payloads, 10) bodies that fill in what was not identified; default those of the URDF,
-        repaired where they cannot exist.
+    reference : (links + payloads, 10) bodies for the combinations not identified; default those of the URDF,
+        made consistent.
 
-    Base parameters that were found not essential (value 0) may move by the median standard deviation of the
-    others of their unit. Raises ConfigurationError for a model of torque differences, which has no bodies.
+    Base parameters eliminated as not essential (value 0) may move by the median standard deviation of the others
+    of their unit. Raises ConfigurationError for a model of torque differences, without bodies.
     """
     structure, n = model.structure, model.structure.chain.n
     if structure.sides == ("difference",):
@@ -234,7 +233,7 @@ def _reference(model: DynamicModel, reference: Floats | None) -> Floats:
 
 
 def _rods(chain: Chain) -> Floats:
-    """Bodies of 3 kg halfway to the next joint: for links of which nothing is known."""
+    """Bodies of 3 kg halfway to the next joint, for links of unknown inertia."""
     bodies = []
     for k in range(chain.n):
         com = 0.5 * chain.placement(k + 1)[:3, 3] if k + 1 < chain.n else np.zeros(3)

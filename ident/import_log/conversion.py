@@ -1,6 +1,6 @@
-"""Recordings as named columns: CSV (any delimiter, with or without header) and NPZ; refused if not whole.
+"""From a recording and its mapping to a session log: reading, conversion to SI at the joint, checks, writing.
 
-From a recording and its mapping to a session log: conversion to SI at the joint, checks, and writing.
+Recordings are CSV (any delimiter, with or without header) or NPZ files; incomplete ones are refused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 class Recording:
     """The files of a recording, each read once.
 
-    source : a file, or the folder of the files that the mapping names.
+    source : a file, or the folder of the files named in the mapping.
     """
 
     source: Path
@@ -41,7 +41,7 @@ class Recording:
     _digests: dict[Path, str] = field(default_factory=dict, repr=False)
 
     def path(self, file: str | None) -> Path:
-        """The file that a signal names, or the source itself."""
+        """The file named by a signal, or the source itself."""
         if file is None:
             if self.source.is_dir():
                 raise DataError(
@@ -178,7 +178,7 @@ def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[st
 
 
 def _fast(path: Path, rows: list[tuple[int, str]], mark: str | None, width: int) -> FloatArray | None:
-    """The table by numpy's own reader; None where a row is not a plain row of numbers."""
+    """The table by numpy's own reader; None unless every row is a plain row of numbers."""
     try:
         values = np.loadtxt(
             [line.strip().rstrip(mark or " ") for _, line in rows], delimiter=mark, ndmin=2, comments=None
@@ -221,11 +221,11 @@ _ONCE = ("position", "velocity", "joint_torque")
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import did; prints itself.
+    """Result of an import; prints itself.
 
-    rows : samples written of each topic. rows_in_source : samples that the recording holds.
+    rows : samples written of each topic. rows_in_source : samples of the recording.
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
-    holes : intervals longer than 1.75 periods, where the recording seems to have lost samples.
+    holes : intervals longer than 1.75 periods, probably with lost samples.
     """
 
     path: Path
@@ -286,14 +286,13 @@ def import_log(
     payload, payload_mass [kg], serial : instead of the mapping's.
     beside : folder of the mapping file, for its URDF.
 
-    The session's uid follows from the content of the files and the rows taken, so the same recording is
-    recognised when it is imported again. Raises DataError naming file, column and row for non-finite values,
-    times that do not increase, files of unequal length or missing columns; ConfigurationError for an output
-    that exists.
+    The session's uid follows from the content of the files and the rows taken, so a second import of the same
+    recording is recognised. Raises DataError with file, column and row for non-finite values, times that do not
+    increase, files of unequal length or missing columns; ConfigurationError for an existing output.
     """
     source = Path(source)
     if not source.exists():
-        raise DataError(f"{source}: no such file or folder; give the recording that the mapping describes")
+        raise DataError(f"{source}: no such file or folder; give the recording of the mapping")
     recording = Recording(source, mapping.delimiter, mapping.header)
     total, channels = _read(mapping, recording, rows)
     joint = channels["position"]
@@ -398,7 +397,7 @@ def _clock(
 def _log_times(
     mapping: LogMapping, base: TimeBase, clock: FloatArray, place: str, first: int
 ) -> NDArray[np.int64]:
-    """UTC [ns] of each sample; strictly increasing, or an error that names the rows."""
+    """UTC [ns] of each sample, strictly increasing. DataError with the rows otherwise."""
     if not np.isfinite(clock).all():
         row = int(np.flatnonzero(~np.isfinite(clock))[0])
         raise DataError(
@@ -424,7 +423,7 @@ def _log_times(
 
 
 def _published(mapping: LogMapping, base: TimeBase, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The source's own clock [ns]; counted from the first sample where it begins below zero."""
+    """The source's own clock [ns], counted from the first sample if it begins below zero."""
     published = times - _origin_ns(mapping, base)
     return published - min(0, int(published[0]))
 

@@ -5,7 +5,7 @@ Layout (schema_version 1)::
     schema_version: 1
     robot: KUKA LWR4+
     model: {number: 2, sides: [motor, joint], payloads: [load], without: [], couplings: [], coulomb: {...}}
-    conditions: [{payload: null, sides: [motor, joint]}, ...]     # of a base set: what its sessions had
+    conditions: [{payload: null, sides: [motor, joint]}, ...]     # of a base set: its sessions
     chain: {joints: [{name, link, kind, alpha, d, theta, r}, ...], gravity: [0, 0, -9.81]}
     parameters: [{name: ZZ2R, unit: kg m^2, value: 1.4, std: 0.014, kind: base}, ...]
     covariance: rows of the lower triangle, each a text of numbers, in the order of `parameters`
@@ -106,7 +106,7 @@ class _File:
 
 
 def write_model(model: DynamicModel, path: str | Path) -> None:
-    """Write a model to `path` (YAML, UTF-8), replacing what is there in one step."""
+    """Write a model to `path` (YAML, UTF-8), replacing an existing file in one step."""
     target = Path(path)
     beside = target.with_name(target.name + ".part")
     beside.write_text(model_text(model), encoding="utf-8")
@@ -150,7 +150,7 @@ def _parameter_entries(model: DynamicModel) -> list[dict[str, Any]]:
     for k, (name, unit, value) in enumerate(zip(model.names, model.units, model.values, strict=True)):
         entry: dict[str, Any] = {"name": name, "unit": unit, "value": float(value)}
         if model.covariance is not None:
-            # The root of the variance as written, so that a file read and written again stays the same.
+            # The root of the written variance, so that a file read and written again stays the same.
             entry["std"] = float(f"{np.sqrt(float(f'{model.covariance[k, k]:.10g}')):.10g}")
         entry["kind"] = model.kind
         entries.append(entry)
@@ -160,9 +160,8 @@ def _parameter_entries(model: DynamicModel) -> list[dict[str, Any]]:
 def read_model(source: str | Path | Mapping[str, Any]) -> DynamicModel:
     """Read a model from a file, or from its content as a mapping.
 
-    Strict: unknown or missing keys, unknown names, units that differ, a covariance that does not fit its
-    standard deviations or is not positive semi-definite raise ConfigurationError with the file, the key and
-    the remedy.
+    Strict: unknown or missing keys, unknown names, wrong units, a covariance inconsistent with its standard
+    deviations or not positive semi-definite raise ConfigurationError with the file, the key and the remedy.
     """
     if isinstance(source, Mapping):
         content, where = dict(source), "model"
@@ -172,7 +171,7 @@ def read_model(source: str | Path | Mapping[str, Any]) -> DynamicModel:
     if version != SCHEMA_VERSION:
         raise ConfigurationError(
             f"{where}: schema_version is {version!r}; this software reads {SCHEMA_VERSION}. "
-            "Write the model again with the software that made it, or update this one"
+            "Write the model again with its own software, or update this one"
         )
     file = parse(_File, content, where)
     try:
@@ -233,7 +232,7 @@ def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...]) -> 
         try:
             numbers = np.array([float(part) for part in row.split()])
         except ValueError as error:
-            raise ConfigurationError(f"`covariance[{k}]` holds something that is no number") from error
+            raise ConfigurationError(f"`covariance[{k}]` holds an entry that is no number") from error
         if numbers.shape != (k + 1,) or not np.all(np.isfinite(numbers)):
             raise ConfigurationError(
                 f"`covariance[{k}]` must hold {k + 1} finite numbers, found {len(numbers)}"
@@ -254,7 +253,7 @@ def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...]) -> 
 
 
 def _plain(value: Any) -> Any:
-    """Content that YAML can hold: numpy numbers, arrays and paths become plain ones."""
+    """Plain content for YAML: numpy numbers, arrays and paths are converted."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

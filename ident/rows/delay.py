@@ -1,13 +1,12 @@
-"""How late the motor channel is against the joint channel, from the data, with its uncertainty.
+"""Delay of the motor channel behind the joint channel, estimated from the data with its uncertainty.
 
-Of each joint the difference of the two torques obeys Model 3,
+The difference of the two torques of a joint obeys Model 3,
 
     tau_m(t + d) - tau_l(t) = Ia qdd + Fvm qd + Fcm sign(qd) + offm,
 
 with one delay d for the channel. All terms pass the same low-pass; d enters through the filtered motor torque
-and its time derivative, so it is the solution of a small nonlinear least-squares problem, started from a
-grid. Its standard deviation is robust to serial correlation. A delay acts like a change of Ia by -Fvm d, so
-it must be known before Ia can be believed.
+and its time derivative. It solves a small nonlinear least-squares problem, started from a grid. Its standard
+deviation is robust to serial correlation. An unknown delay would bias Ia by -Fvm d.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _STEPS = 12
-# Scatter of the joints, in their standard deviations, beyond which reversals are not trusted.
+# Largest scatter of the joints, in their standard deviations, with rows at reversals used.
 _TOLERATED = 2.0
 _GRID = 41
 _ATTENUATION_DB = 40.0
@@ -42,12 +41,12 @@ _ATTENUATION_DB = 40.0
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of the motor channel [s] (positive: late), its standard deviation [s], and how it was found.
+    """Delay of the motor channel [s] (positive: late), its standard deviation [s] and origin (`how`).
 
-    by_joint : delay that each moving joint would have by itself, and its standard deviation [s].
-    disagreement : how many times more the joints scatter than their standard deviations allow; the stated
-        standard deviation is already larger by that. Elastic joints and other physics of the drives shift
-        the reversals of a joint and so look like a delay of its own.
+    by_joint : delay of each moving joint by itself, and its standard deviation [s].
+    disagreement : scatter of the joints over their standard deviations; the stated standard deviation already
+        includes this factor. Elastic joints and other physics of the drives shift the reversals of a joint
+        like a delay of its own.
     """
 
     seconds: float
@@ -65,7 +64,7 @@ class Delay:
 class DelayData:
     """One uninterrupted stretch: joint channel on (n,) times, motor channel on (m,) times [s].
 
-    qd, qdd, joint_torque : (n, J); motor_torque : (m, J). span : first and last time that may be used [s].
+    qd, qdd, joint_torque : (n, J); motor_torque : (m, J). span : first and last usable time [s].
     """
 
     times: FloatArray
@@ -85,7 +84,7 @@ def estimate_delay(
     search_s: float = 0.1,
     standstill_rad_s: float = 2e-3,
 ) -> Delay:
-    """Delay d of the motor channel with tau_m(t + d) belonging to the joint state at t.
+    """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t.
 
     Raises DataError when the best delay lies at the edge of +- `search_s`, or no joint moves.
     """
@@ -94,7 +93,7 @@ def estimate_delay(
         need = 4.0 / cutoff_hz + 2.0 * (half_width(cutoff_hz, _ATTENUATION_DB) + search_s)
         raise DataError(
             "the delay of the motor channel cannot be estimated: no stretch without lost samples is longer "
-            f"than the {need:.1f} s that it takes beside the filters' ends; record a longer motion"
+            f"than the {need:.1f} s needed beside the filters' ends; record a longer motion"
         )
     parts = [part for part in found if part is not None and part.moving.any()]
     if not parts:
@@ -123,7 +122,7 @@ def estimate_delay(
 def _refined(
     parts: Sequence[_Filtered], joint_names: Sequence[str], start: float, search_s: float, which: str
 ) -> Delay:
-    """Gauss-Newton from `start`, then each joint by itself to see whether they agree."""
+    """Gauss-Newton from `start`, then each joint by itself for their disagreement."""
     delay = start
     sampling = _sampling_error(parts) if which == "all rows" else 0.0
     for stage in ("coarse", "fine"):
@@ -147,9 +146,7 @@ def _refined(
 
 @dataclass(frozen=True)
 class _Filtered:
-    """Filtered columns of one stretch at its output times, and the filtered motor torque as a
-    smooth curve.
-    """
+    """Filtered columns of one stretch at its output times, and the filtered motor torque as a curve."""
 
     data: DelayData
     cutoff_hz: float
@@ -183,13 +180,13 @@ class _Filtered:
         return cls(data, cutoff_hz, outputs, torque, columns, moving, one_way, curve, curve.derivative())
 
     def between_reversals(self) -> _Filtered:
-        """Only rows in whose filter the joint moves one way."""
+        """The rows without a reversal of the joint within the filter."""
         return replace(self, moving=self.moving & self.one_way)
 
     def columns_at(self, delay: float) -> FloatArray:
-        """The columns filtered at the motor channel's own sample times less the delay.
+        """The columns filtered at the motor channel's own sample times minus the delay.
 
-        A slow channel sees the reversal of Coulomb friction only at its samples; so must the columns.
+        A slow channel samples the reversal of Coulomb friction coarsely; the columns must be sampled alike.
         """
         data = self.data
         dt = float(data.times[1] - data.times[0])
@@ -228,9 +225,7 @@ def _cost(parts: Sequence[_Filtered], delay: float) -> float:
 
 
 def _sampling_error(parts: Sequence[_Filtered]) -> float:
-    """Standard error [s] that a slow channel leaves: each
-    reversal is seen to one sample, evenly distributed.
-    """
+    """Standard error [s] from the sampling of a slow channel: a reversal is known to one sample, uniformly."""
     reversals, period = 0, 0.0
     for part in parts:
         period = float(np.median(np.diff(part.data.motor_times)))

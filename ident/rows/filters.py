@@ -1,9 +1,7 @@
-"""Settings of the way from raw channels to the rows of the regression.
+"""Signal settings, zero-phase filters and cut-off frequencies, from raw channels to rows of the regression.
 
-Zero-phase filters: Butterworth forward and back, derivatives, and the parallel low-pass that
-makes rows.
-
-What the spectra of the motion say about the cut-off frequencies.
+The filters are Butterworth forward and back, central differences, and the parallel low-pass to the row rate.
+The spectra of the motion decide the cut-off frequencies.
 """
 
 from __future__ import annotations
@@ -36,13 +34,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """How raw channels become rows. The defaults are those of the paper, section 5.
+    """Settings from raw channels to rows. The defaults are those of the paper, section 5.
 
     cutoff_hz, order : Butterworth low-pass on the positions, run forward and back. Phase is zero, the gain
         is the square of the filter's: -6 dB at `cutoff_hz`, and the roll-off of order 2 x `order`.
-    decimate_hz : -6 dB frequency of the parallel low-pass, the one filter that torque and every regressor
-        column pass alike, Coulomb columns included, so that it cannot bias the estimate.
-    rate_hz : rate of the rows, None takes 2.5 x `decimate_hz` (decimation that keeps 80 % of the band).
+    decimate_hz : -6 dB frequency of the parallel low-pass. Torque and every regressor column, Coulomb columns
+        included, pass this same filter, so that it cannot bias the estimate.
+    rate_hz : rate of the rows, None takes 2.5 x `decimate_hz` (80 % of the band is kept).
     attenuation_db : stop band of the parallel low-pass.
     choose_cutoff : take `cutoff_hz` from the spectrum of the positions instead.
     average_periods : average the rows of all periods; their scatter gives the noise variance.
@@ -50,13 +48,12 @@ class SignalSettings:
         None takes 2 / `cutoff_hz`.
     longest_bridge_s : lost samples up to this long are bridged by interpolation, a longer gap splits the
         record.
-    bridged_share : a row in which bridged samples have more than this share of the filter's weight is
-        dropped.
-    standstill_rad_s, standstill_share : below that speed the Coulomb torque of a joint is unknown; its row
-        is dropped where such samples have more than that share of the filter's weight. Share 1 keeps all.
-    outlier_scale : distance from the running median, in robust standard deviations, that makes an outlier.
-    motor_delay_s : how late the motor channel's times are [s], or "estimate" to find it in the data.
-    delay_search_s : largest delay, either way, that is looked for.
+    bridged_share : largest share of the filter's weight on bridged samples; rows beyond it are dropped.
+    standstill_rad_s, standstill_share : below this speed the Coulomb torque of a joint is unknown; its rows
+        with more than this share of the filter's weight on such samples are dropped. Share 1 keeps all.
+    outlier_scale : distance of an outlier from the running median, in robust standard deviations.
+    motor_delay_s : delay of the motor channel's times [s], or "estimate" to estimate it from the data.
+    delay_search_s : largest delay searched, in both directions.
     """
 
     cutoff_hz: float = 10.0
@@ -119,7 +116,7 @@ def low_pass(values: FloatArray, dt: float, cutoff_hz: float, order: int = 4) ->
         raise ConfigurationError(
             f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate, {nyquist:g} Hz; lower `cutoff_hz`"
         )
-    # Takes a second to import, and most filtering here is by kernels.
+    # Imported on first use: the import takes a second.
     from scipy.signal import butter, sosfiltfilt
 
     sos = butter(order, cutoff_hz / nyquist, output="sos")
@@ -135,9 +132,7 @@ def differentiate(values: FloatArray, dt: float) -> tuple[FloatArray, FloatArray
 
 
 def interpolate_uniform(values: FloatArray, start: float, dt: float, times: FloatArray) -> FloatArray:
-    """Values (n, k) sampled at start + i dt, at other times (m,):
-    six-point Lagrange, for band-limited signals.
-    """
+    """Values (n, k), sampled at start + i dt, at other times (m,): six-point Lagrange for band-limited signals."""
     position = (times - start) / dt
     nearest = np.rint(position)
     if len(times) and float(np.max(np.abs(position - nearest))) < 1e-6:
@@ -171,7 +166,7 @@ def _lagrange(values, position):  # type: ignore[no-untyped-def]
 
 
 def thinning(times: FloatArray, cutoff_hz: float) -> int:
-    """Neighbouring samples that may be averaged before a low-pass at `cutoff_hz`: 40 means a period stay."""
+    """Number of neighbouring samples to average before a low-pass at `cutoff_hz`: 40 means a period stay."""
     if len(times) < 2:
         return 1
     return max(1, int(1.0 / (40.0 * cutoff_hz * float(np.median(np.diff(times))))))
@@ -191,7 +186,7 @@ class ParallelFilter:
     columns.
 
     times : (m,) sample times [s], need not be equidistant; outputs : (K,) times of the rows [s]. A row is
-        sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time that sample i stands for. Any
+        sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time represented by sample i. Any
         such mean of Y = Omega chi holds for the same chi, so irregular or slow sampling does not bias the
         estimate.
     """
@@ -208,7 +203,7 @@ class ParallelFilter:
 
     @cached_property
     def sample_weights(self) -> FloatArray:
-        """Time that each sample stands for (m,) [s]; capped, so that the ends of a gap do not dominate."""
+        """Time represented by each sample (m,) [s], capped so that the ends of a gap do not dominate."""
         step = np.diff(self.times)
         typical = float(np.median(step)) if len(step) else 1.0
         step = np.minimum(step, 2.0 * typical)
@@ -223,9 +218,7 @@ class ParallelFilter:
         return result.reshape(len(self.outputs), *values.shape[1:])
 
     def share(self, flagged: NDArray[np.generic]) -> FloatArray:
-        """Share (K, ...) of the kernel's absolute weight that falls on flagged samples (m, ...),
-        bool or 0 to 1.
-        """
+        """Share (K, ...) of the kernel's absolute weight on flagged samples (m, ...), bool or 0 to 1."""
         flat = flagged.reshape(len(flagged), -1)
         result = np.zeros((len(self.outputs), flat.shape[1]))
         if flat.any():
@@ -235,7 +228,7 @@ class ParallelFilter:
         return result.reshape(len(self.outputs), *flagged.shape[1:])
 
     def coverage(self) -> FloatArray:
-        """Share (K,) of the kernel's absolute area that the samples cover: a gap or an end leaves less."""
+        """Share (K,) of the kernel's absolute area covered by samples, less than 1 at a gap or an end."""
         whole = np.linspace(-self.half_width, self.half_width, 2001)
         area = float(np.mean(np.abs(self._kernel(np.abs(whole))))) * 2.0 * self.half_width
         result = np.empty(len(self.outputs))
@@ -289,7 +282,7 @@ def _regular(times: FloatArray) -> bool:
 
 
 def half_width(cutoff_hz: float, attenuation_db: float) -> float:
-    """Half length [s] of the Kaiser-windowed sinc whose transition band is half the cut-off wide."""
+    """Half length [s] of the Kaiser-windowed sinc with a transition band of half the cut-off."""
     return (attenuation_db - 7.95) / (2.285 * 2.0 * np.pi * 0.5 * cutoff_hz) / 2.0
 
 
@@ -301,7 +294,7 @@ def _kaiser(position: FloatArray, attenuation_db: float) -> FloatArray:
 
 
 def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) -> float:
-    """Frequency [Hz] below which lies `share` of the power of the fastest-changing joint velocity.
+    """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
 
     velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest
         harmonic.
@@ -317,10 +310,10 @@ def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) 
 
 
 def optimal_cutoff(position: FloatArray, dt: float, order: int = 4) -> float:
-    """Cut-off [Hz] that minimises the expected square error of the accelerations, from the data.
+    """Cut-off [Hz] of the smallest expected square error of the accelerations, from the data.
 
-    position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; what stands
-        above it is signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward
+    position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; the excess
+        over it is the signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward
         pass, the error is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by
         their signal's power. The answer is bounded to 0.02 to 0.4 of the sampling rate.
     """
@@ -346,14 +339,12 @@ def advice(
     motor_rate_hz: float | None = None,
     resonance_hz: float | None = None,
 ) -> tuple[str, ...]:
-    """Warnings about the cut-offs against the excitation n_f w0,
-    the sampling rates and the lowest resonance.
-    """
+    """Warnings about the cut-offs against the excitation n_f w0, the sampling rates and the resonance."""
     found: list[str] = []
     if settings.decimate_hz < 2.0 * excitation_hz:
         found.append(
             f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest "
-            f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms reach there, raise "
+            f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms go up to it, raise "
             "`decimate_hz`"
         )
     if settings.cutoff_hz < 5.0 * excitation_hz:
@@ -376,7 +367,7 @@ def advice(
     if resonance_hz is not None:
         if excitation_hz > 0.5 * resonance_hz:
             found.append(
-                f"the motion reaches {excitation_hz:.2f} Hz, over half the lowest resonance "
+                f"the motion has {excitation_hz:.2f} Hz, over half the lowest resonance "
                 f"{resonance_hz:g} Hz; the joints' elasticity is excited and the rigid model is biased, "
                 "plan a slower motion"
             )
@@ -397,5 +388,5 @@ def _spectrum(signal: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 def moving(position: FloatArray, names: Sequence[str], threshold: float = 1e-2) -> tuple[str, ...]:
-    """Names of joints whose position (n, J) ranges over more than `threshold` rad."""
+    """Names of the joints with a position (n, J) range above `threshold` [rad]."""
     return tuple(name for name, span in zip(names, np.ptp(position, axis=0), strict=True) if span > threshold)

@@ -1,14 +1,11 @@
 """From prepared sessions to the stacked regression: one filter for the torque and for every regressor column.
 
-The regressor is evaluated at the sample times of the torque it explains, and both pass the same parallel
-low-pass down to the row rate, Coulomb columns included (parallel decimation). The full-rate matrix exists
-only for a stretch of rows at a time, so the memory does not grow with the sampling rate.
+The regressor is evaluated at the sample times of its torque, and both pass the same parallel low-pass down to
+the row rate, Coulomb columns included (parallel decimation). The full-rate matrix exists only for a stretch of
+rows at a time, so the memory does not grow with the sampling rate.
 
-Instruments for the estimation: the same rows on motions that carry no measurement noise.
-
-The commanded motion is known exactly, correlates with the true one, and owes nothing to the sensors, which is
-all that an instrument must be; the regressor evaluated on it serves `InstrumentalVariables` and the test of
-exogeneity.
+The same rows on the commanded motion are instruments for the estimation: it is known exactly, correlates with
+the true motion and is independent of the sensors. `InstrumentalVariables` and the test of exogeneity use them.
 """
 
 from __future__ import annotations
@@ -42,7 +39,7 @@ __all__ = ["commanded", "observe", "stack"]
 
 FloatArray = NDArray[np.float64]
 
-# Blocks of rows whose full-rate regressor is held at a time.
+# Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
 
 
@@ -57,9 +54,10 @@ def observe(
 ) -> Problem:
     """Stacked problem of the sessions, each with the payload mounted in it.
 
-    columns : indices of the structure's columns (default all active ones); names : their names in the
-        result. Sessions without a motor channel contribute their joint rows only. Rows of a joint that stood
-        still or whose samples are missing are left out. Raises DataError when no row is left.
+    columns : indices of the structure's columns (default all active ones). names : their names in the result.
+
+    Sessions without a motor channel contribute joint rows only. Rows of a joint at standstill or with missing
+    samples are left out. Raises DataError when no row is left.
     """
     chosen = np.flatnonzero(structure.active) if columns is None else np.asarray(columns, dtype=np.int64)
     titles = [structure.names[c] for c in chosen] if names is None else list(names)
@@ -170,7 +168,7 @@ def _side(
 
 
 def _slope(channel: TorqueChannel, rows: FloatArray, session: PreparedSession) -> FloatArray:
-    """Time derivative (K, n) of the filtered torque: what a delay that is wrong by one second would add."""
+    """Time derivative (K, n) of the filtered torque, the error per second of a wrong delay."""
     settings = session.settings
     step = 0.04 / settings.decimate_hz
     factor = thinning(channel.times, settings.decimate_hz)
@@ -196,7 +194,7 @@ def _filtered(
     joints = structure.chain.n
     matrix = np.empty((joints, len(rows), len(columns)))
     target = np.empty((len(rows), joints))
-    # Neighbouring samples are averaged first, which is a tenth of the work and again the same for both sides.
+    # Averaging neighbouring samples first saves nine tenths of the work and is the same for both sides.
     factor = thinning(channel.times, settings.decimate_hz)
     times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
     mean = np.full(factor, 1.0 / factor)
@@ -225,7 +223,7 @@ def _filtered(
 def _groups(
     session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]
 ) -> list[tuple[RowGroup, FloatArray]]:
-    """Row group and slope of each joint that has rows."""
+    """Row group and slope of each joint with rows."""
     result = []
     average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
     for joint, name in enumerate(session.joint_names):
@@ -251,7 +249,7 @@ def _averaged(
     period_rows: int,
     periods: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]:
-    """Mean of the rows of equal phase over all periods; a phase that one period lacks is left out."""
+    """Mean of the rows of equal phase over all periods; phases missing in a period are left out."""
     phase = index % period_rows
     order = np.argsort(phase, kind="stable")
     values, starts, counts = np.unique(phase[order], return_index=True, return_counts=True)
@@ -264,9 +262,7 @@ def _averaged(
 
 
 def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | None:
-    """`prepared` with the motion commanded in place of the one
-    measured; None without the whole command channel.
-    """
+    """`prepared` with the commanded instead of the measured motion; None without a complete command channel."""
     if session.command is None or not session.command.position.shape[1]:
         return None
     joint, command = session.joint, session.command.select(prepared.joint_names)

@@ -1,8 +1,8 @@
 """From the raw channels of a session to filtered motion and torque at their own sample times.
 
-The positions pass the zero-phase Butterworth and are differentiated; the torques are left as measured, since
-the parallel filter that makes the rows acts on torque and regressor alike. The motion is evaluated at the
-sample times of the motor channel, less its delay, so a slow or irregular torque is never resampled.
+The positions pass the zero-phase Butterworth and are differentiated. The torques stay as measured, because the
+parallel filter of the rows acts on torque and regressor alike. The motion is evaluated at the sample times of
+the motor channel minus its delay, so a slow or irregular torque is never resampled.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Passage:
     """An uninterrupted stretch with the times of its rows.
 
     rows : (K,) times of the rows [s]; index : (K,) int64, their numbers within the session.
-    joint_valid, motor_valid : (K, J), rows that may be used.
+    joint_valid, motor_valid : (K, J), usable rows.
     """
 
     rows: FloatArray
@@ -87,7 +87,7 @@ class PreparedSession:
         periods.
     delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
         rows.
-    moving : joints that move. warnings : sentences for the report. uid : of the session, from its metadata.
+    moving : moving joints. warnings : sentences for the report. uid : of the session, from its metadata.
     mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
     """
 
@@ -113,7 +113,7 @@ class PreparedSession:
         return any(bool(passage.joint_valid.any()) for passage in self.passages)
 
     def without_samples(self) -> PreparedSession:
-        """The same without its passages: what the report needs, in no memory to speak of."""
+        """The same without its passages, to save memory; enough for the report."""
         return replace(self, passages=())
 
     @property
@@ -131,8 +131,7 @@ def prepare(
 ) -> PreparedSession:
     """Filter and align one session. `motor` False leaves the motor channel aside.
 
-    Raises DataError when nothing usable is left: too few samples, times that do not increase, non-finite
-    values, no torque, no motion.
+    Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
     settings = settings or SignalSettings()
     name = session.path.name
@@ -145,7 +144,7 @@ def prepare(
         if not motor or session.motor is None:
             raise DataError(
                 f"{name}: /joint_states has no effort, so no joint torque; record it, or choose Model 2 "
-                "with a session that has motor torques"
+                "with a session with motor torques"
             )
         effort = np.zeros_like(position)
     sequence = session.joint.sequence if session.joint.numbered else None
@@ -169,8 +168,8 @@ def prepare(
     names = moving(position, session.joint_names)
     if not names:
         raise DataError(
-            f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone says "
-            "nothing about inertia and friction"
+            f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone does "
+            "not show inertia and friction"
         )
     windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
@@ -306,10 +305,9 @@ class _Motion:
     def motor_channel(
         self, times: FloatArray, torque: FloatArray, flags: BoolArray, delay: float, settings: SignalSettings
     ) -> TorqueChannel | None:
-        """The motor torque with the motion at its own times less the delay.
+        """The motor torque with the motion at its own times minus the delay.
 
-        Where positions were lost the motion is the bridge's, which at this bandwidth is as good as a
-        measurement.
+        Lost positions are bridged, at this bandwidth as good as measured ones.
         """
         first, last = self.usable(settings)
         actual = times - delay
@@ -349,7 +347,7 @@ def _passage(
 
 
 def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -> BoolArray:
-    """Rows (K, J) whose filter rests on enough true samples of a joint that moves."""
+    """Rows (K, J) with enough measured samples of a moving joint in their filter."""
     factor = thinning(channel.times, settings.decimate_hz)
     times = block_means(channel.times, factor)
     parallel = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db)
@@ -363,9 +361,7 @@ def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -
 def _motor(
     session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Times (m,) [s] on the joint channel's clock, torques (m, J)
-    and outlier flags (m, J) of the motor channel.
-    """
+    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
     assert session.motor is not None
     _check_finite(session.motor, name)
     if not session.motor.effort.shape[1]:
@@ -406,7 +402,7 @@ def _delay(
     if settings.motor_delay_s != "estimate":
         return Delay(float(settings.motor_delay_s), 0.0, "stated")
     if not sensed:
-        return Delay(0.0, 0.0, "no joint torque to hold the motor channel against")
+        return Delay(0.0, 0.0, "no joint torque to compare the motor channel with")
     times, torque, _ = motor_data
     data = [DelayData(m.times, m.qd, m.qdd, m.torque, times, torque, m.usable(settings)) for m in motions]
     rate = 1.0 / float(np.median(np.diff(times)))
@@ -420,7 +416,7 @@ def _delay(
 
 
 def _clock(columns: JointColumns) -> NDArray[np.int64]:
-    """The source's times [ns], or the host's where the source gives none."""
+    """The source's times [ns], or the host's without them."""
     return columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
 
 
@@ -435,7 +431,7 @@ def _check_finite(columns: JointColumns, name: str) -> None:
 
 
 def _windows(session: Session, times: FloatArray) -> tuple[list[tuple[float, float]], bool]:
-    """Spans [s] that rows may come from: the periods, else the excitation, else everything."""
+    """Spans [s] of the rows: the periods, else the excitation, else everything."""
     for name in ("period", "excitation"):
         spans = session.spans(name)
         if spans:
@@ -451,7 +447,7 @@ def _windows(session: Session, times: FloatArray) -> tuple[list[tuple[float, flo
 def _row_grid(
     windows: list[tuple[float, float]], periods: bool, settings: SignalSettings
 ) -> tuple[FloatArray, int | None]:
-    """Times of the rows [s], and the rows in a period if the periods are alike and follow one another."""
+    """Times of the rows [s], and the rows in a period if the periods are equal and consecutive."""
     step = 1.0 / settings.row_rate_hz
     first, last = windows[0][0], windows[-1][1]
     if periods and len(windows) > 1:

@@ -19,7 +19,7 @@ BoolArray = NDArray[np.bool_]
 _JITTER = 0.02
 _TOO_MANY = 0.01
 _GRAINS = 5.0
-# Samples over which the size of a channel's noise is taken to be one.
+# Samples with one common noise level of a channel.
 _BLOCK = 50
 
 
@@ -29,7 +29,7 @@ class Stretch:
 
     start : time of the first sample [s]; dt : sample time [s]; values : (n, k), bridged where `bridged`
         (n,);
-    resampled : whether the source's times were irregular, so that all values are interpolated.
+    resampled : whether all values are interpolated because of irregular times.
     """
 
     start: float
@@ -117,11 +117,11 @@ def _fitted_step(times: FloatArray, steps: NDArray[np.int64], dt: float) -> floa
 def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int]]:
     """Flags (n, k) of samples far from the median of five, and the columns with too many for outliers.
 
-    Far is more than `scale` robust standard deviations and more than 1 % of the range, the deviation taken
-    from the cubic through the four neighbours, which follows any slope. It is the larger of that of the whole
-    column and that of the samples around: the torque of a drive is noisier while it works than at rest. The
-    median keeps steps, so the reversal of Coulomb friction is no outlier. Where over 1 % of a column is far,
-    nothing of it is flagged: that is not an outlier but a property of the signal.
+    Far is more than `scale` robust standard deviations and more than 1 % of the range. The standard deviation is
+    that of the distance from the cubic through the four neighbours, which follows any slope: the larger of the
+    values for the whole column and for the samples around, because a working drive is noisier than one at rest.
+    The median keeps steps, so the reversal of Coulomb friction is no outlier. Nothing is flagged in a column with
+    over 1 % of far samples: they are a property of the signal.
     """
     flags = np.zeros(values.shape, dtype=bool)
     crowded = []
@@ -132,7 +132,7 @@ def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int
         cubic = np.abs(series - (4.0 * (left + right) - far_left - far_right) / 6.0)
         low, high = np.percentile(series, [0.5, 99.5])
         steps = np.abs(np.diff(series))
-        # A joint that stands still jumps by a few steps of its encoder.
+        # A joint at standstill jumps by a few encoder steps.
         grain = _GRAINS * float(np.min(steps, where=steps > 0.0, initial=np.inf)) if np.any(steps) else 0.0
         grain = min(grain, 0.5 * float(np.ptp(series)))
         usual = np.maximum(_median_around(cubic), float(np.median(cubic)))
@@ -145,7 +145,7 @@ def flag_outliers(values: FloatArray, scale: float) -> tuple[BoolArray, list[int
 
 
 def _median_around(values: FloatArray) -> FloatArray:
-    """The largest of the medians of a sample's block (n,) and of the blocks beside it."""
+    """The largest of the medians of a sample's block (n,) and of the neighbouring blocks."""
     whole = len(values) // _BLOCK * _BLOCK
     medians = np.append(np.median(values[:whole].reshape(-1, _BLOCK), axis=1), np.median(values[-_BLOCK:]))
     return np.repeat(maximum_filter1d(medians, 3, mode="nearest"), _BLOCK)[: len(values)]

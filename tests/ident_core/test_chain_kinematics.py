@@ -177,7 +177,7 @@ def test_part_of_a_tree_is_chosen_by_its_tip():
         (urdf([{"type": "floating"}]), "'floating' is not supported"),
         (urdf([{"axis": "0 0 0"}]), "axis has no length"),
         (urdf([{"xyz": "0 0"}]), "must hold 3 finite numbers"),
-        (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', which does not exist"),
+        (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', missing in the file"),
     ],
 )
 def test_unusable_urdfs_are_refused_with_the_reason(text, message):

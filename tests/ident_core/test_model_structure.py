@@ -114,7 +114,7 @@ def test_terms_are_left_out_by_symbol_and_by_name():
     gone = [k for k, name in enumerate(structure.names) if name.startswith("Fvl") or name == "offm3"]
     assert np.flatnonzero(~structure.active).tolist() == gone
     assert not matrix[:, gone].any()
-    with pytest.raises(ConfigurationError, match="'Fvx', which is no parameter"):
+    with pytest.raises(ConfigurationError, match="'Fvx', not a parameter"):
         ModelStructure(lwr(), 2, without=("Fvx",))
 
 

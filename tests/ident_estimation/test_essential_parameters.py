@@ -93,5 +93,5 @@ def test_impossible_settings_are_refused(settings):
 
 def test_an_unknown_name_is_refused():
     data = case()
-    with pytest.raises(ConfigurationError, match="no base parameter"):
+    with pytest.raises(ConfigurationError, match="not a base parameter"):
         find_essential(data, WeightedLeastSquares().fit(data), EssentialSettings(keep=("Fvl9",)))
