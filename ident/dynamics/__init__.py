@@ -5,7 +5,7 @@ from __future__ import annotations
 from ident.dynamics.base_closed_form import closed_form_base
 from ident.dynamics.base_set import BaseSet, columns_by_preference, numeric_base
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Samples, Side
+from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 
 __all__ = [
     "BaseSet",
@@ -14,7 +14,6 @@ __all__ = [
     "Coulomb",
     "Coupling",
     "ModelStructure",
-    "Samples",
     "Side",
     "closed_form_base",
     "columns_by_preference",

@@ -34,17 +34,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.base_set import BaseSet, base_set
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import INERTIAL, PER_LINK, frame_change
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, frame_change
 from ident.dynamics.structure import Condition, ModelStructure, Side
 
 __all__ = ["closed_form_base"]
 
-Floats = NDArray[np.float64]
 
 _SAME = 1e-9
 _TENSOR = range(6)

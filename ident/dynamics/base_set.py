@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident.dynamics.parameters import INERTIAL, PER_LINK
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
 from ident.dynamics.structure import Condition, ModelStructure
 
 __all__ = [
@@ -29,7 +29,6 @@ __all__ = [
     "rank_at_gap",
 ]
 
-Floats = NDArray[np.float64]
 
 _NEGLIGIBLE = 1e-10
 
@@ -290,7 +289,7 @@ def numeric_base(
         raise DataError("no condition was given; at least one session's payload and sides are needed")
     rng = np.random.default_rng(seed)
     if samples is None:
-        rows = structure.rows([(condition, 1) for condition in stack])
+        rows = structure.chain.n * sum(len(structure.condition_sides(condition)) for condition in stack)
         samples = max(16, -(-3 * structure.n_columns // rows))
     parts = [
         structure.regressor(

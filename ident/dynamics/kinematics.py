@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
+from ident.dynamics.parameters import Floats
 from ident.dynamics.urdf import Joint, read_urdf
 
 __all__ = ["STANDARD_GRAVITY", "Chain", "build_frames", "exact_cos_sin", "mdh_transform", "table_as_is"]
@@ -33,7 +34,7 @@ _LENGTH_SNAP_M = 1e-9
 _PARALLEL = 1e-7
 
 
-def exact_cos_sin(angle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def exact_cos_sin(angle: Floats) -> tuple[Floats, Floats]:
     """cos and sin of angles, exactly 0 at right angles."""
     cosine, sine = np.cos(angle), np.sin(angle)
     for values in (cosine, sine):
@@ -41,7 +42,7 @@ def exact_cos_sin(angle: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     return cosine, sine
 
 
-def mdh_transform(alpha: float, d: float, theta: float, r: float) -> NDArray[np.float64]:
+def mdh_transform(alpha: float, d: float, theta: float, r: float) -> Floats:
     """(4, 4) pose Rx(alpha) Tx(d) Rz(theta) Tz(r) of a frame in the one before it."""
     (ca, ct), (sa, st) = exact_cos_sin(np.array([alpha, theta]))
     return np.array(
@@ -54,7 +55,7 @@ def mdh_transform(alpha: float, d: float, theta: float, r: float) -> NDArray[np.
     )
 
 
-def _read_transform(pose: NDArray[np.float64], snap_rad: float) -> NDArray[np.float64] | None:
+def _read_transform(pose: Floats, snap_rad: float) -> Floats | None:
     """alpha, d, theta, r of a pose of the modified-DH form, else None."""
     rotation, shift = pose[:3, :3], pose[:3, 3]
     alpha = np.arctan2(-rotation[1, 2], rotation[2, 2])
@@ -77,9 +78,7 @@ def _zero(length: float) -> float:
     return 0.0 if abs(length) < _LENGTH_SNAP_M else float(length)
 
 
-def table_as_is(
-    local: Sequence[NDArray[np.float64]], joints: Sequence[Joint], snap_rad: float
-) -> NDArray[np.float64] | None:
+def table_as_is(local: Sequence[Floats], joints: Sequence[Joint], snap_rad: float) -> Floats | None:
     """The (n, 4) table when the URDF's own frames obey the convention, else None."""
     rows = []
     for pose, joint in zip(local, joints, strict=True):
@@ -91,8 +90,8 @@ def table_as_is(
 
 
 def build_frames(
-    local: Sequence[NDArray[np.float64]], joints: Sequence[Joint], snap_rad: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    local: Sequence[Floats], joints: Sequence[Joint], snap_rad: float
+) -> tuple[Floats, Floats, Floats]:
     """Modified-DH frames on the joint axes at q = 0.
 
     x_j lies along the common normal of axes j and j+1 (towards j+1; for crossing axes, the direction nearest
@@ -106,7 +105,7 @@ def build_frames(
         links.append(pose)
     origins = [pose[:3, 3] for pose in links]
     axes = [pose[:3, :3] @ joint.axis for pose, joint in zip(links, joints, strict=True)]
-    frames: list[NDArray[np.float64]] = []
+    frames: list[Floats] = []
     for j in range(len(links)):
         entry = origins[j] if j == 0 else _foot(frames[-1], origins[j], axes[j])
         if j + 1 == len(links):
@@ -131,9 +130,7 @@ def build_frames(
     return frames[0], np.array(table), placements
 
 
-def _foot(
-    frame: NDArray[np.float64], point: NDArray[np.float64], axis: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _foot(frame: Floats, point: Floats, axis: Floats) -> Floats:
     """Intersection of axis j with the x axis of the frame before it (the foot of the common normal)."""
     x, z, start = frame[:3, 0], frame[:3, 2], frame[:3, 3]
     # start + s x + t z = point + u axis; least squares takes t = 0 for parallel axes.
@@ -144,12 +141,12 @@ def _foot(
 
 
 def _common_normal(
-    link: NDArray[np.float64],
-    entry: NDArray[np.float64],
-    axis: NDArray[np.float64],
-    next_point: NDArray[np.float64],
-    next_axis: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    link: Floats,
+    entry: Floats,
+    axis: Floats,
+    next_point: Floats,
+    next_axis: Floats,
+) -> tuple[Floats, Floats]:
     """Direction of x_j and origin of frame j."""
     cross = np.cross(axis, next_axis)
     between = next_point - entry
@@ -171,7 +168,7 @@ def _common_normal(
     return x, entry + along * axis
 
 
-def _perpendicular(link: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _perpendicular(link: Floats, axis: Floats) -> Floats:
     """The link frame's x axis (or y, z) made perpendicular to the joint axis."""
     for k in range(3):
         x = link[:3, k] - axis * float(axis @ link[:3, k])
@@ -201,14 +198,14 @@ class Chain:
 
     joint_names: tuple[str, ...]
     prismatic: NDArray[np.bool_]
-    alpha: NDArray[np.float64]
-    d: NDArray[np.float64]
-    theta: NDArray[np.float64]
-    r: NDArray[np.float64]
-    gravity: NDArray[np.float64] = field(default_factory=lambda: np.array(STANDARD_GRAVITY))
-    base_placement: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    alpha: Floats
+    d: Floats
+    theta: Floats
+    r: Floats
+    gravity: Floats = field(default_factory=lambda: np.array(STANDARD_GRAVITY))
+    base_placement: Floats = field(default_factory=lambda: np.eye(4))
     link_names: tuple[str, ...] = ()
-    link_placements: NDArray[np.float64] | None = None
+    link_placements: Floats | None = None
     urdf: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -357,17 +354,17 @@ class Chain:
         )
 
     @cached_property
-    def cos_sin_alpha(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def cos_sin_alpha(self) -> tuple[Floats, Floats]:
         """cos and sin of alpha, exactly 0 and 1 at right angles."""
         return exact_cos_sin(self.alpha)
 
-    def placement(self, joint: int, position: float = 0.0) -> NDArray[np.float64]:
+    def placement(self, joint: int, position: float = 0.0) -> Floats:
         """(4, 4) pose of frame `joint` (counted from 0) in the frame before it at a joint position."""
         theta = self.theta[joint] + (0.0 if self.prismatic[joint] else position)
         r = self.r[joint] + (position if self.prismatic[joint] else 0.0)
         return mdh_transform(self.alpha[joint], self.d[joint], theta, r)
 
-    def forward(self, q: ArrayLike) -> NDArray[np.float64]:
+    def forward(self, q: ArrayLike) -> Floats:
         """Poses (n, 4, 4) of frames 1..n in the root link of the URDF (frame 0 of a table) for one q (n,)."""
         position = np.asarray(q, dtype=np.float64)
         if position.shape != (self.n,):
@@ -378,7 +375,7 @@ class Chain:
             poses.append(pose)
         return np.array(poses)
 
-    def inertial_from_links(self, inertial: ArrayLike) -> NDArray[np.float64]:
+    def inertial_from_links(self, inertial: ArrayLike) -> Floats:
         """(n, 10) parameters in modified-DH frames from the same about the URDF's link frames."""
         assert self.link_placements is not None
         rows = np.asarray(inertial, dtype=np.float64)
@@ -386,14 +383,14 @@ class Chain:
             [parameters.transform(row, pose) for row, pose in zip(rows, self.link_placements, strict=True)]
         )
 
-    def inertial_to_links(self, inertial: ArrayLike) -> NDArray[np.float64]:
+    def inertial_to_links(self, inertial: ArrayLike) -> Floats:
         """(n, 10) parameters about the URDF's link frames from those in modified-DH frames."""
         assert self.link_placements is not None
         inverse = np.linalg.inv(self.link_placements)
         rows = np.asarray(inertial, dtype=np.float64)
         return np.array([parameters.transform(row, pose) for row, pose in zip(rows, inverse, strict=True)])
 
-    def urdf_inertials(self) -> NDArray[np.float64]:
+    def urdf_inertials(self) -> Floats:
         """(n, 10) inertial parameters of the URDF, in modified-DH frames.
 
         Bodies fixed to a moving link, side branches included, are added to it (with their own movable joints

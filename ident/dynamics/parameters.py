@@ -32,6 +32,7 @@ __all__ = [
     "INERTIAL",
     "PER_LINK",
     "Consistency",
+    "Floats",
     "consistency",
     "frame_change",
     "from_com",
@@ -46,6 +47,8 @@ __all__ = [
     "unit",
 ]
 
+Floats = NDArray[np.float64]
+
 INERTIAL = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
 DRIVE = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")
 PER_LINK = INERTIAL + DRIVE
@@ -53,18 +56,7 @@ PER_LINK = INERTIAL + DRIVE
 # Positions of our ten parameters in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
 _IN_PINOCCHIO = np.array([4, 5, 7, 6, 8, 9, 1, 2, 3, 0])
 
-_UNITS = {
-    "XX": "kg m^2",
-    "XY": "kg m^2",
-    "XZ": "kg m^2",
-    "YY": "kg m^2",
-    "YZ": "kg m^2",
-    "ZZ": "kg m^2",
-    "MX": "kg m",
-    "MY": "kg m",
-    "MZ": "kg m",
-    "M": "kg",
-}
+_UNITS = dict.fromkeys(INERTIAL[:6], "kg m^2") | dict.fromkeys(INERTIAL[6:9], "kg m") | {"M": "kg"}
 _DRIVE_UNITS_REVOLUTE = {"I": "kg m^2", "v": "Nm s/rad", "c": "Nm", "o": "Nm"}
 _DRIVE_UNITS_PRISMATIC = {"I": "kg", "v": "N s/m", "c": "N", "o": "N"}
 
@@ -99,7 +91,7 @@ def unit(name: str, *, prismatic: bool = False) -> str:
     return units["o" if kind == "O" else kind]
 
 
-def _inertial(parameters: ArrayLike) -> NDArray[np.float64]:
+def _inertial(parameters: ArrayLike) -> Floats:
     array = np.asarray(parameters, dtype=np.float64)
     if array.shape[-1:] != (10,):
         raise ConfigurationError(
@@ -108,19 +100,17 @@ def _inertial(parameters: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def _tensor(inertial: NDArray[np.float64]) -> NDArray[np.float64]:
+def _tensor(inertial: Floats) -> Floats:
     """Symmetric (..., 3, 3) matrix of the six tensor entries."""
     return inertial[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*inertial.shape[:-1], 3, 3)
 
 
-def _pack(
-    tensor: NDArray[np.float64], moment: NDArray[np.float64], mass: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _pack(tensor: Floats, moment: Floats, mass: Floats) -> Floats:
     entries = tensor.reshape(*tensor.shape[:-2], 9)[..., [0, 1, 2, 4, 5, 8]]
     return np.concatenate([entries, moment, mass[..., None]], axis=-1)
 
 
-def _steiner(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _steiner(u: Floats, v: Floats) -> Floats:
     """(u . v) 1 - (u v' + v u') / 2, the symmetric product of Steiner's theorem."""
     outer = u[..., :, None] * v[..., None, :]
     dot = np.sum(u * v, axis=-1)[..., None, None]
@@ -129,7 +119,7 @@ def _steiner(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float
 
 def to_com(
     parameters: ArrayLike,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats]:
     """Mass [kg] (...,), centre of mass [m] (..., 3) and inertia about it [kg m^2] (..., 3, 3), axes of the
     link.
 
@@ -145,7 +135,7 @@ def to_com(
     return mass.copy(), com, _tensor(inertial) - mass[..., None, None] * _steiner(com, com)
 
 
-def from_com(mass: ArrayLike, com: ArrayLike, inertia: ArrayLike) -> NDArray[np.float64]:
+def from_com(mass: ArrayLike, com: ArrayLike, inertia: ArrayLike) -> Floats:
     """Ten inertial parameters (..., 10) from mass, centre of mass and inertia about it: undoes `to_com`."""
     m = np.asarray(mass, dtype=np.float64)
     c = np.asarray(com, dtype=np.float64)
@@ -153,7 +143,7 @@ def from_com(mass: ArrayLike, com: ArrayLike, inertia: ArrayLike) -> NDArray[np.
     return _pack(tensor, m[..., None] * c, m)
 
 
-def transform(parameters: ArrayLike, placement: ArrayLike) -> NDArray[np.float64]:
+def transform(parameters: ArrayLike, placement: ArrayLike) -> Floats:
     """The same body's parameters in another frame.
 
     placement : (4, 4) homogeneous pose of the frame of `parameters` in the wanted frame.
@@ -169,12 +159,12 @@ def transform(parameters: ArrayLike, placement: ArrayLike) -> NDArray[np.float64
     return _pack(tensor, moment + mass[..., None] * shift, mass)
 
 
-def frame_change(placement: ArrayLike) -> NDArray[np.float64]:
+def frame_change(placement: ArrayLike) -> Floats:
     """(10, 10) matrix of `transform`: parameters in the wanted frame = matrix @ parameters."""
     return transform(np.eye(10), placement).T
 
 
-def pseudo_inertia(parameters: ArrayLike) -> NDArray[np.float64]:
+def pseudo_inertia(parameters: ArrayLike) -> Floats:
     """Pseudo-inertia matrix (..., 4, 4): [[tr(J)/2 1 - J, h], [h', m]] with J about the origin, h first
     moments.
 
@@ -191,7 +181,7 @@ def pseudo_inertia(parameters: ArrayLike) -> NDArray[np.float64]:
     return matrix
 
 
-def from_pseudo_inertia(matrix: ArrayLike) -> NDArray[np.float64]:
+def from_pseudo_inertia(matrix: ArrayLike) -> Floats:
     """Ten inertial parameters (..., 10) from the pseudo-inertia matrix (..., 4, 4)."""
     full = np.asarray(matrix, dtype=np.float64)
     second = full[..., :3, :3]
@@ -199,7 +189,7 @@ def from_pseudo_inertia(matrix: ArrayLike) -> NDArray[np.float64]:
     return _pack(trace * np.eye(3) - second, full[..., :3, 3], full[..., 3, 3])
 
 
-def to_pinocchio(parameters: ArrayLike) -> NDArray[np.float64]:
+def to_pinocchio(parameters: ArrayLike) -> Floats:
     """The ten in pinocchio's order m mc Ixx Ixy Iyy Ixz Iyz Izz (for `Inertia.FromDynamicParameters`)."""
     inertial = _inertial(parameters)
     reordered = np.empty_like(inertial)
@@ -207,7 +197,7 @@ def to_pinocchio(parameters: ArrayLike) -> NDArray[np.float64]:
     return reordered
 
 
-def from_pinocchio(parameters: ArrayLike) -> NDArray[np.float64]:
+def from_pinocchio(parameters: ArrayLike) -> Floats:
     """Our order from pinocchio's (`Inertia.toDynamicParameters`)."""
     return _inertial(parameters)[..., _IN_PINOCCHIO]
 

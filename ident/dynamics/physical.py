@@ -21,17 +21,17 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import parameters
+from ident.dynamics.parameters import Floats
 
 __all__ = ["Projection", "project", "reference_bodies"]
 
 logger = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 
 _SQRT2 = float(np.sqrt(2.0))
 # Rows and columns of the upper triangle, column after column: the order of the solver's cone.

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import Floats
 
 __all__ = [
     "all_columns",
@@ -36,8 +37,6 @@ __all__ = [
 ]
 
 _BLOCK = 128
-
-Floats = NDArray[np.float64]
 
 
 def check_states(chain: Chain, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Floats, Floats, Floats]:
@@ -103,7 +102,7 @@ def rigid_regressor(
 
 
 def fill_rigid(
-    chain: Chain, q: Floats, qd: Floats, qdd: Floats, columns: NDArray[np.int64], out: NDArray[np.float64]
+    chain: Chain, q: Floats, qd: Floats, qdd: Floats, columns: NDArray[np.int64], out: Floats
 ) -> None:
     """`rigid_regressor` without checks and without an array of its own.
 

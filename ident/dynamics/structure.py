@@ -26,7 +26,7 @@ motor torques and joint torque sensors data, 2014.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -34,12 +34,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fri.errors import ConfigurationError, DataError
+from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import DRIVE, INERTIAL, PER_LINK, parameter_names, split_name, unit
-from ident.dynamics.regressor import Floats, check_states, fill_rigid
+from ident.dynamics.parameters import DRIVE, INERTIAL, PER_LINK, Floats, parameter_names, split_name, unit
+from ident.dynamics.regressor import check_states, fill_rigid
 
-__all__ = ["MODEL_SIDES", "Condition", "Coulomb", "Coupling", "ModelStructure", "RowBlock", "Samples", "Side"]
+__all__ = ["MODEL_SIDES", "Condition", "Coulomb", "Coupling", "ModelStructure", "Side"]
 
 Side = Literal["motor", "joint", "difference"]
 MODEL_SIDES: dict[int, tuple[Side, ...]] = {1: ("joint",), 2: ("motor", "joint"), 3: ("difference",)}
@@ -94,28 +94,6 @@ class Condition:
 
     payload: str | None = None
     sides: tuple[Side, ...] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """One session for the regression: q, qd, qdd (N, n), measured torques (N, n) or None, payload."""
-
-    q: Floats
-    qd: Floats
-    qdd: Floats
-    motor: Floats | None = None
-    joint: Floats | None = None
-    payload: str | None = None
-
-
-@dataclass(frozen=True)
-class RowBlock:
-    """The rows of one session, side and joint in a stacked matrix."""
-
-    session: int
-    side: Side
-    joint: int
-    rows: slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +217,7 @@ class ModelStructure:
         """Number of non-rigid atoms: qdd, qd, sign(qd), 1 and three for each coupling."""
         return len(_SIGNALS) + 3 * len(self.couplings)
 
-    def signals(self, qd: Floats, qdd: Floats, out: NDArray[np.float64]) -> None:
+    def signals(self, qd: Floats, qdd: Floats, out: Floats) -> None:
         """Write the non-rigid atoms, from qd and qdd (N, n), to `out` (n_signals, n, N)."""
         out[0], out[1], out[2], out[3] = qdd.T, qd.T, self.coulomb(qd).T, 1.0
         out[4:] = 0.0
@@ -281,19 +259,6 @@ class ModelStructure:
 
     # ---- the stacked matrix ----
 
-    def rows(self, sessions: Sequence[tuple[Condition, int]]) -> int:
-        """Number of rows of the stacked matrix of sessions, each given as (condition, samples)."""
-        return sum(len(self.condition_sides(c)) * self.chain.n * samples for c, samples in sessions)
-
-    def row_blocks(self, sessions: Sequence[tuple[Condition, int]]) -> Iterator[RowBlock]:
-        """The contiguous slices of the stacked rows, one for each session, side and joint, in row order."""
-        start = 0
-        for number, (condition, samples) in enumerate(sessions):
-            for side in self.condition_sides(condition):
-                for joint in range(self.chain.n):
-                    yield RowBlock(number, side, joint, slice(start, start + samples))
-                    start += samples
-
     def regressor(
         self,
         q: ArrayLike,
@@ -328,38 +293,6 @@ class ModelStructure:
                         out[c, s, joint] = signals[atom, joint]
         return out.reshape(len(wanted), -1).T
 
-    def stack(self, sessions: Sequence[Samples], *, columns: ArrayLike | None = None) -> Floats:
-        """Stacked observation matrix of sessions, each with its measured sides."""
-        parts = [
-            self.regressor(s.q, s.qd, s.qdd, payload=s.payload, sides=self.measured(s), columns=columns)
-            for s in sessions
-        ]
-        if not parts:
-            raise DataError("no session was given; at least one is needed")
-        return (
-            parts[0] if len(parts) == 1 else np.asfortranarray(np.concatenate([p.T for p in parts], axis=1).T)
-        )
-
-    def measured(self, samples: Samples) -> tuple[Side, ...]:
-        """Measured sides of the structure. Raises DataError for none."""
-        have: dict[str, bool] = {"motor": samples.motor is not None, "joint": samples.joint is not None}
-        have["difference"] = have["motor"] and have["joint"]
-        sides = tuple(side for side in self.sides if have[side])
-        if not sides:
-            given = " and ".join(name for name in ("motor", "joint") if have[name]) or "no"
-            raise DataError(
-                f"Model {self.model} needs {' or '.join(self.sides)} torque; the session has {given} torque. "
-                "Record the missing channel, or choose another model"
-            )
-        return sides
-
-    def torques(self, samples: Samples) -> Floats:
-        """Measured torques of one session in row order: (sides x n x N,)."""
-        parts = []
-        for side in self.measured(samples):
-            parts.append(side_torque(samples.motor, samples.joint, side).T.ravel())
-        return np.concatenate(parts)
-
     def _columns(self, columns: ArrayLike | None) -> NDArray[np.int64]:
         wanted = np.arange(self.n_columns) if columns is None else np.asarray(columns, dtype=np.int64)
         if wanted.ndim != 1 or np.any((wanted < 0) | (wanted >= self.n_columns)):
@@ -378,7 +311,7 @@ class ModelStructure:
         payload: str | None,
         sides: Sequence[Side],
         wanted: NDArray[np.int64],
-        out: NDArray[np.float64],
+        out: Floats,
     ) -> None:
         rigid_sides = [s for s, side in enumerate(sides) if side != "difference"]
         if not rigid_sides:
@@ -401,15 +334,3 @@ class ModelStructure:
             for c, column in enumerate(wanted):
                 if self.rigid_of(int(column), payload) is not None:
                     out[c, side] = out[c, 0]
-
-
-def side_torque(motor: Floats | None, joint: Floats | None, side: Side) -> Floats:
-    """The measured torque (N, n) of a side. Raises DataError without it."""
-    if side == "difference":
-        if motor is None or joint is None:
-            raise DataError("the difference of motor and joint torque needs both channels")
-        return motor - joint
-    torque = motor if side == "motor" else joint
-    if torque is None:
-        raise DataError(f"the session has no {side} torque")
-    return torque

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
+from ident.dynamics.parameters import Floats
 
 __all__ = ["Joint", "Urdf", "read_urdf"]
 
@@ -30,8 +30,8 @@ class Joint:
     kind: str
     parent: str
     child: str
-    origin: NDArray[np.float64]
-    axis: NDArray[np.float64]
+    origin: Floats
+    axis: Floats
 
     @property
     def movable(self) -> bool:
@@ -46,7 +46,7 @@ class Urdf:
     name: str
     text: str
     joints: tuple[Joint, ...]
-    inertials: dict[str, NDArray[np.float64]]
+    inertials: dict[str, Floats]
 
     @property
     def root(self) -> str:
@@ -104,7 +104,7 @@ class Urdf:
                         pending.append(joint.child)
         return found
 
-    def lumped_inertial(self, link: str, stop: Collection[str]) -> NDArray[np.float64]:
+    def lumped_inertial(self, link: str, stop: Collection[str]) -> Floats:
         """(10,) inertial parameters about the frame of `link`, all on it up to joints `stop` included."""
         total = self.inertials[link].copy()
         for joint in self.joints:
@@ -125,7 +125,7 @@ def read_urdf(source: str | Path) -> Urdf:
         raise ConfigurationError(f"{place}: not well-formed XML: {error}") from error
     if tree.tag != "robot":
         raise ConfigurationError(f"{place}: the top element is <{tree.tag}>; a URDF begins with <robot>")
-    inertials: dict[str, NDArray[np.float64]] = {}
+    inertials: dict[str, Floats] = {}
     for link in tree.findall("link"):
         inertials[link.get("name", "")] = _inertial(link, place)
     joints = tuple(_joint(element, place) for element in tree.findall("joint"))
@@ -147,9 +147,7 @@ def _text(source: str | Path) -> tuple[str, str]:
         raise ConfigurationError(f"{str(source)[:200]}: cannot be read: {error}") from error
 
 
-def _numbers(
-    element: ElementTree.Element | None, key: str, default: tuple[float, ...], place: str
-) -> NDArray[np.float64]:
+def _numbers(element: ElementTree.Element | None, key: str, default: tuple[float, ...], place: str) -> Floats:
     text = element.get(key) if element is not None else None
     if text is None:
         return np.array(default)
@@ -162,7 +160,7 @@ def _numbers(
     return values
 
 
-def _pose(element: ElementTree.Element | None, place: str) -> NDArray[np.float64]:
+def _pose(element: ElementTree.Element | None, place: str) -> Floats:
     shift = _numbers(element, "xyz", (0.0, 0.0, 0.0), place)
     roll, pitch, yaw = _numbers(element, "rpy", (0.0, 0.0, 0.0), place)
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
@@ -176,7 +174,7 @@ def _pose(element: ElementTree.Element | None, place: str) -> NDArray[np.float64
     return pose
 
 
-def _inertial(link: ElementTree.Element, place: str) -> NDArray[np.float64]:
+def _inertial(link: ElementTree.Element, place: str) -> Floats:
     element = link.find("inertial")
     where = f"{place}: link {link.get('name', '')!r}"
     if element is None:

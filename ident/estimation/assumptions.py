@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.dynamics.parameters import Floats
 from ident.estimators.distributions import chi_square_tail, fisher_tail, normal_tail, student_tail
 from ident.estimators.estimate import Estimate
 from ident.estimators.problem import Problem
 
 __all__ = ["Assumptions", "Check", "check_assumptions", "repeatability"]
 
-FloatArray = NDArray[np.float64]
 
 _LEVEL = 0.01
 _WIDE_CONDITION = 100.0
@@ -108,11 +108,11 @@ class _Series:
     """Residuals of the classes, joined over records: label, residual, fitted torque, time, record, n_eff."""
 
     labels: tuple[str, ...]
-    residuals: tuple[FloatArray, ...]
-    fitted: tuple[FloatArray, ...]
+    residuals: tuple[Floats, ...]
+    fitted: tuple[Floats, ...]
     times: tuple[NDArray[np.int64], ...]
     records: tuple[NDArray[np.int64], ...]
-    n_eff: FloatArray
+    n_eff: Floats
 
     @classmethod
     def of(cls, problem: Problem, estimate: Estimate) -> _Series:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import regressor
+from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.validate import SessionScore, mounted, predictor, prepared_session, score_session
@@ -36,7 +37,6 @@ from lwr_driver.session import Session
 
 __all__ = ["Comparison", "Difference", "compare", "competitor_scores", "score_cad", "score_controller_model"]
 
-Floats = NDArray[np.float64]
 
 _SAME_ROW = 1e-8
 

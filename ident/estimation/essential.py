@@ -24,8 +24,6 @@ from ident.estimators.problem import Problem
 
 __all__ = ["Elimination", "Essential", "EssentialSettings", "find_essential"]
 
-FloatArray = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class EssentialSettings:

@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.dynamics import regressor
-from ident.dynamics.parameters import PER_LINK
+from ident.dynamics.parameters import PER_LINK, Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.validate import mounted, prepared_session
@@ -32,7 +31,6 @@ from lwr_driver.session import Session
 
 __all__ = ["ForwardSimulation", "simulate", "simulate_session"]
 
-Floats = NDArray[np.float64]
 
 _WIDTH_RAD_S = 5e-3
 _IMPLICIT = 0.6

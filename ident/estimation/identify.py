@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import BaseSet, numeric_base
@@ -35,7 +34,6 @@ from lwr_driver.session import Session
 
 __all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "identify"]
 
-FloatArray = NDArray[np.float64]
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
@@ -172,18 +170,8 @@ class Identification(Tabular):
 
     @property
     def parameters(self) -> list[dict[str, Any]]:
-        """One entry a base parameter: name, unit, estimate, std, rsd_percent."""
-        rsd = self.estimate.rsd_percent
-        return [
-            {
-                "name": name,
-                "unit": unit,
-                "estimate": float(self.estimate.values[k]),
-                "std": float(self.estimate.std[k]),
-                "rsd_percent": float(rsd[k]),
-            }
-            for k, (name, unit) in enumerate(zip(self.base.names, self.base.units, strict=True))
-        ]
+        """One row for each base parameter: name, unit, estimate, std, rsd_percent."""
+        return self.estimate.records()
 
     @property
     def torque_rms(self) -> dict[str, dict[str, float]]:
@@ -223,7 +211,7 @@ class Identification(Tabular):
         }
 
     def records(self) -> list[dict[str, Any]]:
-        """One row for each base parameter: name, unit, estimate, std, rsd_percent."""
+        """`parameters`."""
         return self.parameters
 
     def __repr__(self) -> str:

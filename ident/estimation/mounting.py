@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import Floats
 from ident.effects.base_tilt import sideways_gravity
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimators.covariance import CovarianceSettings
@@ -35,7 +35,6 @@ from lwr_driver.session import Session
 
 __all__ = ["Mounting", "find_mounting"]
 
-FloatArray = NDArray[np.float64]
 
 _NAMES = ("tilt_1", "tilt_2")
 
@@ -51,11 +50,11 @@ class Mounting:
     steps : number of Gauss-Newton steps. converged : the last was below a tenth of a standard deviation.
     """
 
-    axes: FloatArray
-    tilt_rad: FloatArray
+    axes: Floats
+    tilt_rad: Floats
     covariance: Covariance
-    assumed: FloatArray
-    gravity: FloatArray
+    assumed: Floats
+    gravity: Floats
     identification: Identification
     steps: int
     converged: bool
@@ -66,7 +65,7 @@ class Mounting:
         return self.identification.structure.chain
 
     @property
-    def std(self) -> FloatArray:
+    def std(self) -> Floats:
         """Standard deviations of the two angles (2,) [rad]."""
         return self.covariance.std
 
@@ -153,7 +152,7 @@ def find_mounting(
     return Mounting(axes, tilt, covariance, chain.gravity, gravity, found, done, converged)
 
 
-def _axes(gravity: FloatArray) -> FloatArray:
+def _axes(gravity: Floats) -> Floats:
     """Two axes perpendicular to gravity, for gravity along -z those of x and y."""
     up = -gravity / np.linalg.norm(gravity)
     first = np.eye(3)[int(np.argmin(np.abs(up)))]
@@ -162,7 +161,7 @@ def _axes(gravity: FloatArray) -> FloatArray:
     return np.vstack([first, np.cross(up, first)]) + 0.0
 
 
-def _turned(gravity: FloatArray, axes: FloatArray, tilt: FloatArray) -> FloatArray:
+def _turned(gravity: Floats, axes: Floats, tilt: Floats) -> Floats:
     """Gravity in the axes of a base rotated by `tilt` about `axes` (Rodrigues, inverse rotation)."""
     vector = -(tilt @ axes)
     angle = float(np.linalg.norm(vector))
@@ -179,10 +178,10 @@ def _turned(gravity: FloatArray, axes: FloatArray, tilt: FloatArray) -> FloatArr
 def _step(
     found: Identification,
     sessions: Sequence[Session],
-    axes: FloatArray,
-    tilt: FloatArray,
+    axes: Floats,
+    tilt: Floats,
     prior_std_rad: float,
-) -> tuple[FloatArray, Covariance]:
+) -> tuple[Floats, Covariance]:
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
     columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
@@ -208,8 +207,8 @@ def _step(
 
 
 def _columns(
-    found: Identification, sessions: Sequence[Session], directions: Sequence[FloatArray]
-) -> list[FloatArray]:
+    found: Identification, sessions: Sequence[Session], directions: Sequence[Floats]
+) -> list[Floats]:
     """Torque (m, 2) of each row group at rest under each gravity, the change of torque for one of gravity."""
     structure, settings = found.structure, found.settings
     structures = [
@@ -247,7 +246,7 @@ def _channel_at_rest(channel: TorqueChannel) -> TorqueChannel:
     return replace(channel, qd=still, qdd=still)
 
 
-def _prior(found: Identification, tilt: FloatArray, prior_std_rad: float) -> Prior:
+def _prior(found: Identification, tilt: Floats, prior_std_rad: float) -> Prior:
     """The arm's prior with the tilt's: zero for the whole tilt, earlier steps included."""
     p = len(found.base.names)
     mean, precision = np.zeros(p + 2), np.zeros((p + 2, p + 2))

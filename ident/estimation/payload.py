@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import numeric_base
-from ident.dynamics.parameters import INERTIAL, PER_LINK, to_com
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, to_com
 from ident.dynamics.physical import project, reference_bodies
 from ident.dynamics.structure import Condition, ModelStructure
 from ident.dynamics.tables import Tabular
@@ -37,7 +37,6 @@ from lwr_driver.session import Session
 
 __all__ = ["PayloadEstimate", "identify_payload", "with_payload"]
 
-Floats = NDArray[np.float64]
 
 _BODY = len(INERTIAL)
 _LINK = len(PER_LINK)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.identify import IdentificationSettings, identify
@@ -43,7 +44,6 @@ __all__ = [
     "validate",
 ]
 
-Floats = NDArray[np.float64]
 Predictor = Callable[[TorqueChannel, Side], Floats]
 """The torque (N, n) [Nm] of a side at the samples of a channel, from its times and motion."""
 

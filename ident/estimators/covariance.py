@@ -26,8 +26,9 @@ from typing import Literal
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
+from ident.dynamics.parameters import Floats
 from ident.estimators.estimate import Covariance
-from ident.estimators.problem import FloatArray, Problem, RowGroup
+from ident.estimators.problem import Problem, RowGroup
 
 __all__ = [
     "CovarianceSettings",
@@ -64,14 +65,14 @@ class CovarianceSettings:
 class Scores:
     """Sum over all rows of one instant of row times weighted residual: one (T, p) array a record."""
 
-    records: tuple[FloatArray, ...]
+    records: tuple[Floats, ...]
 
     @classmethod
     def of(
         cls,
         problem: Problem,
-        coefficients: Sequence[FloatArray],
-        matrices: Sequence[FloatArray] | None = None,
+        coefficients: Sequence[Floats],
+        matrices: Sequence[Floats] | None = None,
     ) -> Scores:
         """Scores with a coefficient for each row (weight times residual); `matrices` replace the regressors."""
         spans: dict[int, tuple[int, int]] = {}
@@ -104,7 +105,7 @@ class Scores:
         """Number of instants."""
         return sum(len(record) for record in self.records)
 
-    def bartlett(self, length: int) -> FloatArray:
+    def bartlett(self, length: int) -> Floats:
         """Sum over lags |l| < length of (1 - |l| / length) S_l, the sum of squares of all windows of `length`."""
         p = self.records[0].shape[1]
         total = np.zeros((p, p))
@@ -119,7 +120,7 @@ class Scores:
         """Sums over `factor` neighbouring instants: the same long-run variance from fewer rows."""
         return Scores(tuple(_block_sums(record, factor) for record in self.records))
 
-    def bandwidth(self, bread: FloatArray) -> float:
+    def bandwidth(self, bread: Floats) -> float:
         """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own scores."""
         numerator = denominator = 0.0
         directions = bread.T / np.maximum(np.sqrt(np.abs(np.diag(bread))), 1e-300)
@@ -140,13 +141,13 @@ class Scores:
         return 1.1447 * (alpha * self.samples) ** (1.0 / 3.0)
 
 
-def textbook(bread: FloatArray) -> Covariance:
+def textbook(bread: Floats) -> Covariance:
     """(A^T R^-1 A)^-1 of equation (14): right only for serially uncorrelated residuals."""
     return Covariance(bread, "textbook, equation (14): assumes serially uncorrelated residuals")
 
 
 def hac(
-    scores: Scores, bread: FloatArray, sample_time_s: float, bandwidth_s: float | None = None
+    scores: Scores, bread: Floats, sample_time_s: float, bandwidth_s: float | None = None
 ) -> tuple[Covariance, float]:
     """bread x long-run variance of the scores x bread^T, and the bandwidth used [s]."""
     factor = max(1, -(-max(len(record) for record in scores.records) // _LONGEST))
@@ -169,13 +170,13 @@ def hac(
 
 def jackknife(
     problem: Problem,
-    bread: FloatArray,
-    coefficients: Sequence[FloatArray],
-    row_weights: Sequence[FloatArray],
+    bread: Floats,
+    coefficients: Sequence[Floats],
+    row_weights: Sequence[Floats],
     block_s: float,
     *,
-    matrices: Sequence[FloatArray] | None = None,
-    correlation: FloatArray | None = None,
+    matrices: Sequence[Floats] | None = None,
+    correlation: Floats | None = None,
 ) -> Covariance:
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
@@ -185,8 +186,8 @@ def jackknife(
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
-    normals: dict[tuple[int, int], FloatArray] = {}
-    sums: dict[tuple[int, int], FloatArray] = {}
+    normals: dict[tuple[int, int], Floats] = {}
+    sums: dict[tuple[int, int], Floats] = {}
     cut = _Blocks.of(problem, block_s)
     for number, group in enumerate(problem.groups):
         left = group.matrix if matrices is None else matrices[number]
@@ -267,11 +268,11 @@ class _Blocks:
         return [(int(block[a]), slice(int(a), int(b))) for a, b in itertools.pairwise(edges)]
 
 
-def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int) -> Covariance:
+def bootstrap(problem: Problem, weights: Floats, block_s: float, draws: int, seed: int) -> Covariance:
     """Covariance of `draws` weighted least-squares solutions over blocks of time drawn with replacement."""
     cut = _Blocks.of(problem, block_s)
     p = len(problem.names)
-    grams: dict[tuple[int, int], FloatArray] = {}
+    grams: dict[tuple[int, int], Floats] = {}
     for group, number in zip(problem.groups, problem.class_of_group, strict=True):
         for block, rows in cut.runs(group):
             augmented = np.column_stack([group.matrix[rows], group.target[rows]])
@@ -300,11 +301,11 @@ def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int,
     )
 
 
-def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatArray:
+def effective_rows(problem: Problem, residuals: Sequence[Floats]) -> Floats:
     """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's sequence."""
     result = []
     for row_class in problem.classes:
-        total: FloatArray = np.zeros(1)
+        total: Floats = np.zeros(1)
         count = 0
         for index in row_class.groups:
             group = problem.groups[index]
@@ -323,7 +324,7 @@ def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatAr
     return np.array(result)
 
 
-def correlation_time(autocovariance: FloatArray) -> float:
+def correlation_time(autocovariance: Floats) -> float:
     """1 + 2 sum rho_l, summed over pairs of lags while the pair is positive; at least 1."""
     if autocovariance[0] <= 0:
         return 1.0
@@ -334,7 +335,7 @@ def correlation_time(autocovariance: FloatArray) -> float:
     return max(1.0, 2.0 * float(pairs[:end].sum()) - 1.0)
 
 
-def _block_sums(values: FloatArray, factor: int) -> FloatArray:
+def _block_sums(values: Floats, factor: int) -> Floats:
     whole = -(-len(values) // factor) * factor
     padded = np.pad(values, ((0, whole - len(values)), (0, 0)))
     return padded.reshape(-1, factor, values.shape[1]).sum(axis=1)

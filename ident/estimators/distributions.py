@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy import special
+
+from ident.dynamics.parameters import Floats
 
 __all__ = [
     "chi_square_tail",
@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 
-Value = TypeVar("Value", float, NDArray[np.float64])
+Value = TypeVar("Value", float, Floats)
 
 
 def normal_tail(z: Value) -> Value:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from fri.errors import DataError
+from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings, textbook
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import (
@@ -29,11 +30,11 @@ from ident.estimators.least_squares import (
     factor_of,
     weighted_solution,
 )
-from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.problem import Problem
 
 __all__ = ["InstrumentalVariables", "Instruments", "TotalLeastSquares"]
 
-Instruments = Callable[[FloatArray], Sequence[FloatArray]]
+Instruments = Callable[[Floats], Sequence[Floats]]
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class InstrumentalVariables:
             converged=converged,
         )
 
-    def _checked(self, problem: Problem, values: FloatArray) -> list[FloatArray]:
+    def _checked(self, problem: Problem, values: Floats) -> list[Floats]:
         matrices = [np.asarray(matrix, dtype=np.float64) for matrix in self.instruments(values)]
         if len(matrices) != len(problem.groups):
             raise DataError(
@@ -112,9 +113,7 @@ class InstrumentalVariables:
         return matrices
 
 
-def _moments(
-    problem: Problem, matrices: Sequence[FloatArray], weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _moments(problem: Problem, matrices: Sequence[Floats], weights: Floats) -> tuple[Floats, Floats]:
     p = len(problem.names)
     cross, moment = np.zeros((p, p)), np.zeros(p)
     for group, matrix, number in zip(problem.groups, matrices, problem.class_of_group, strict=True):
@@ -198,7 +197,7 @@ class TotalLeastSquares:
             notes=(f"{len(noisy)} columns with errors, {len(clean)} exact",),
         )
 
-    def _noise(self, problem: Problem, r: FloatArray, rows: int) -> FloatArray:
+    def _noise(self, problem: Problem, r: Floats, rows: int) -> Floats:
         """Standard deviation (p,) of each column's error in units of the weighted torque noise."""
         rms = np.linalg.norm(r, axis=0) / np.sqrt(rows)
         if isinstance(self.relative_noise, Mapping):
@@ -213,7 +212,7 @@ class TotalLeastSquares:
         return share * rms
 
 
-def _solve(r: FloatArray, clean: NDArray[np.intp], noisy: NDArray[np.intp], level: FloatArray) -> FloatArray:
+def _solve(r: Floats, clean: NDArray[np.intp], noisy: NDArray[np.intp], level: Floats) -> Floats:
     """Mixed LS-TLS from the weighted triangular factor (p + 1, p + 1)."""
     p = r.shape[1] - 1
     order = np.concatenate([clean, noisy, [p]]).astype(np.int64)

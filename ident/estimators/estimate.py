@@ -8,9 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.estimators.distributions import normal_quantile, student_quantile
-from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.problem import Problem
 
 __all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
 
@@ -23,13 +24,13 @@ class Covariance:
     ones because a variance robust to serial correlation is itself uncertain.
     """
 
-    matrix: FloatArray
+    matrix: Floats
     kind: str
     degrees_of_freedom: float = float("inf")
     inflation: float = 1.0
 
     @property
-    def std(self) -> FloatArray:
+    def std(self) -> Floats:
         """Standard deviations (p,)."""
         return np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
 
@@ -69,36 +70,36 @@ class Estimate(Tabular):
 
     method: str
     names: tuple[str, ...]
-    values: FloatArray
+    values: Floats
     covariance: Covariance
     covariances: Mapping[str, Covariance]
     classes: tuple[ClassFit, ...]
-    weights: FloatArray
-    residuals: tuple[FloatArray, ...]
+    weights: Floats
+    residuals: tuple[Floats, ...]
     iterations: int = 1
     converged: bool = True
     notes: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    standard: FloatArray | None = None
+    standard: Floats | None = None
     prior_scale: float | None = None
 
     @property
-    def std(self) -> FloatArray:
+    def std(self) -> Floats:
         """Stated standard deviations (p,)."""
         return self.covariance.std
 
     @property
-    def rsd_percent(self) -> FloatArray:
+    def rsd_percent(self) -> Floats:
         """Relative standard deviations (p,) of equation (15) [%], from the stated covariance."""
         return rsd_percent(self.values, self.std)
 
     @property
-    def correlation(self) -> FloatArray:
+    def correlation(self) -> Floats:
         """Correlation matrix (p, p) of the stated covariance."""
         std = np.where(self.std > 0, self.std, 1.0)
         return self.covariance.matrix / np.outer(std, std)
 
-    def interval(self, level: float = 0.95, *, covariance: str | None = None) -> FloatArray:
+    def interval(self, level: float = 0.95, *, covariance: str | None = None) -> Floats:
         """Confidence limits (p, 2) at `level`, from the stated covariance or the one named."""
         chosen = self.covariance if covariance is None else self.covariances[covariance]
         tail = 0.5 + level / 2.0
@@ -174,7 +175,7 @@ class Estimator(Protocol):
         ...
 
 
-def rsd_percent(values: FloatArray, std: FloatArray) -> FloatArray:
+def rsd_percent(values: Floats, std: Floats) -> Floats:
     """100 std / |value|, equation (15); infinite for a value of zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values != 0.0, 100.0 * std / np.abs(values), np.inf)

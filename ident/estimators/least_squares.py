@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from fri.errors import DataError
+from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import (
     CovarianceSettings,
     Scores,
@@ -27,7 +28,7 @@ from ident.estimators.covariance import (
     textbook,
 )
 from ident.estimators.estimate import ClassFit, Covariance, Estimate
-from ident.estimators.problem import FloatArray, Problem, TriangularFactor
+from ident.estimators.problem import Problem, TriangularFactor
 
 __all__ = [
     "OrdinaryLeastSquares",
@@ -41,7 +42,7 @@ __all__ = [
 ]
 
 
-def factor_of(problem: Problem, weights: FloatArray) -> TriangularFactor:
+def factor_of(problem: Problem, weights: Floats) -> TriangularFactor:
     """Weighted factor of the whole stack, after the checks common to all estimators."""
     factor = problem.weighted(weights)
     diagonal = np.abs(np.diag(factor.r)[:-1])
@@ -51,7 +52,7 @@ def factor_of(problem: Problem, weights: FloatArray) -> TriangularFactor:
     return factor
 
 
-def consumed_parameters(problem: Problem, weights: FloatArray, root: FloatArray) -> FloatArray:
+def consumed_parameters(problem: Problem, weights: Floats, root: Floats) -> Floats:
     """Share of the p parameters consumed by each class, tr(N^-1 w_c A_c^T A_c); the shares sum to p.
 
     `root` (p, p) with root root^T = N^-1, the inverse weighted normal matrix.
@@ -64,7 +65,7 @@ def consumed_parameters(problem: Problem, weights: FloatArray, root: FloatArray)
     )
 
 
-def class_variances(problem: Problem, values: FloatArray, consumed: FloatArray) -> FloatArray:
+def class_variances(problem: Problem, values: Floats, consumed: Floats) -> Floats:
     """sigma_c^2 = ||e_c||^2 / (m_c - p_c) of each class [Nm^2], equation (13)."""
     result = []
     for row_class, share in zip(problem.classes, consumed, strict=True):
@@ -88,17 +89,17 @@ def estimate_from(
     problem: Problem,
     *,
     method: str,
-    values: FloatArray,
-    weights: FloatArray,
-    bread: FloatArray,
-    consumed: FloatArray,
+    values: Floats,
+    weights: Floats,
+    bread: Floats,
+    consumed: Floats,
     settings: CovarianceSettings,
-    coefficients: Sequence[FloatArray] | None = None,
-    matrices: Sequence[FloatArray] | None = None,
-    row_weights: Sequence[FloatArray] | None = None,
+    coefficients: Sequence[Floats] | None = None,
+    matrices: Sequence[Floats] | None = None,
+    row_weights: Sequence[Floats] | None = None,
     plain: Covariance | None = None,
     scores: Scores | None = None,
-    offset: FloatArray | None = None,
+    offset: Floats | None = None,
     iterations: int = 1,
     converged: bool = True,
     notes: tuple[str, ...] = (),
@@ -167,13 +168,13 @@ def estimate_from(
 
 def _robust(
     problem: Problem,
-    bread: FloatArray,
-    consumed: FloatArray,
+    bread: Floats,
+    consumed: Floats,
     settings: CovarianceSettings,
-    weights: FloatArray,
-    coefficients: Sequence[FloatArray],
-    row_weights: Sequence[FloatArray],
-    matrices: Sequence[FloatArray] | None,
+    weights: Floats,
+    coefficients: Sequence[Floats],
+    row_weights: Sequence[Floats],
+    matrices: Sequence[Floats] | None,
     scores: Scores | None,
 ) -> dict[str, Covariance]:
     """The covariances robust to serial correlation; with given `scores` HAC only."""
@@ -203,8 +204,8 @@ def _robust(
 
 
 def _nuisance_covariance(
-    problem: Problem, bread: FloatArray, weights: FloatArray, matrices: Sequence[FloatArray] | None
-) -> FloatArray | None:
+    problem: Problem, bread: Floats, weights: Floats, matrices: Sequence[Floats] | None
+) -> Floats | None:
     """sum of (d chi / d quantity) std^2 (d chi / d quantity)^T over the nuisances, or None without any."""
     active = [nuisance for nuisance in problem.nuisances if nuisance.std > 0]
     if not active:
@@ -218,11 +219,6 @@ def _nuisance_covariance(
         shifts.append(nuisance.std * (bread @ moment))
     stacked = np.array(shifts)
     return stacked.T @ stacked
-
-
-def with_notes(estimate: Estimate, *notes: str) -> Estimate:
-    """The same estimate with further notes."""
-    return replace(estimate, notes=estimate.notes + notes)
 
 
 @dataclass(frozen=True)
@@ -281,7 +277,7 @@ class WeightedLeastSquares:
 
 def weighted_solution(
     problem: Problem, iterations: int = 50, tolerance: float = 1e-6
-) -> tuple[FloatArray, FloatArray, TriangularFactor, int, bool]:
+) -> tuple[Floats, Floats, TriangularFactor, int, bool]:
     """Values (p,), inverse variances (classes,), weighted factor, iterations and whether they converged."""
     weights = np.ones(len(problem.classes))
     factor = factor_of(problem, weights)
@@ -352,8 +348,8 @@ class RobustLeastSquares:
         )
 
     def _iterate(
-        self, problem: Problem, values: FloatArray, consumed: FloatArray, loss: str, tuning: float
-    ) -> tuple[FloatArray, FloatArray, int, bool]:
+        self, problem: Problem, values: Floats, consumed: Floats, loss: str, tuning: float
+    ) -> tuple[Floats, Floats, int, bool]:
         scales = _scales(problem, values, consumed)
         for iteration in range(1, self.iterations + 1):
             residuals = problem.residuals(values)
@@ -373,7 +369,7 @@ class RobustLeastSquares:
         return values, scales, self.iterations, False
 
 
-def _loss(u: FloatArray, loss: str, tuning: float) -> tuple[FloatArray, FloatArray]:
+def _loss(u: Floats, loss: str, tuning: float) -> tuple[Floats, Floats]:
     """Weight psi(u) / u and slope psi'(u)."""
     size = np.abs(u)
     if loss == "huber":
@@ -382,7 +378,7 @@ def _loss(u: FloatArray, loss: str, tuning: float) -> tuple[FloatArray, FloatArr
     return (1.0 - ratio) ** 2, (1.0 - ratio) * (1.0 - 5.0 * ratio)
 
 
-def _scales(problem: Problem, values: FloatArray, consumed: FloatArray) -> FloatArray:
+def _scales(problem: Problem, values: Floats, consumed: Floats) -> Floats:
     """Robust standard deviation (classes,): 1.4826 median |e|, corrected for the parameters consumed."""
     residuals = problem.residuals(values)
     result = []
@@ -394,7 +390,7 @@ def _scales(problem: Problem, values: FloatArray, consumed: FloatArray) -> Float
     return np.array(result)
 
 
-def _row_weighted(problem: Problem, row_weights: list[FloatArray]) -> TriangularFactor:
+def _row_weighted(problem: Problem, row_weights: list[Floats]) -> TriangularFactor:
     parts = []
     for group, weight in zip(problem.groups, row_weights, strict=True):
         root = np.sqrt(weight)

@@ -18,12 +18,12 @@ from scipy import sparse
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import BaseSet
-from ident.dynamics.parameters import INERTIAL, PER_LINK, from_com, pseudo_inertia, split_name
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com, pseudo_inertia, split_name
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import class_variances
 from ident.estimators.prior import MaximumAPosteriori, Prior
-from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.problem import Problem
 
 __all__ = ["BodyPrior", "PhysicallyConsistent", "cad_prior", "nearest_consistent"]
 
@@ -50,15 +50,15 @@ class BodyPrior:
         default is the robot-to-robot variation in the paper, up to 20 %.
     """
 
-    projection: FloatArray
+    projection: Floats
     bodies: np.ndarray
     nonnegative: np.ndarray
-    inertial: FloatArray
+    inertial: Floats
     absent: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    relative_std: float | FloatArray = 0.2
+    relative_std: float | Floats = 0.2
 
     @property
-    def firmness(self) -> FloatArray:
+    def firmness(self) -> Floats:
         """1 / relative_std^2 of each body (k,)."""
         return (
             1.0 / np.broadcast_to(np.asarray(self.relative_std, dtype=np.float64), (len(self.bodies),)) ** 2
@@ -76,7 +76,7 @@ class BodyPrior:
                     "`nearest_consistent`"
                 )
 
-    def hessian(self, metric: Metric) -> FloatArray:
+    def hessian(self, metric: Metric) -> Floats:
         """(n, n) quadratic form of the distance to the prior at the prior; zero for the drive parameters.
 
         "pullback" (and "entropic", which agrees with it to second order): tr(J0^-1 dJ J0^-1 dJ) / 2,
@@ -168,13 +168,13 @@ class PhysicallyConsistent:
         )
 
 
-def _mean_squares(problem: Problem) -> FloatArray:
+def _mean_squares(problem: Problem) -> Floats:
     """Mean square torque of each class [Nm^2]."""
     power = [float(c.factor.r[:, -1] @ c.factor.r[:, -1]) / max(c.factor.rows, 1) for c in problem.classes]
     return np.maximum(np.array(power), np.finfo(float).tiny)
 
 
-def nearest_consistent(inertial: FloatArray, *, margin: float = 1e-2) -> FloatArray:
+def nearest_consistent(inertial: Floats, *, margin: float = 1e-2) -> Floats:
     """Consistent (k, 10) nearest to `inertial` in size-relative Euclidean distance.
 
     margin : smallest eigenvalue of each pseudo-inertia relative to a compact body of that mass.
@@ -199,7 +199,7 @@ class _Program:
     strength: float
     margin: float
 
-    def solve(self, quadratic: FloatArray, target: FloatArray) -> FloatArray:
+    def solve(self, quadratic: Floats, target: Floats) -> Floats:
         """Standard parameters (n,) for ||quadratic x - target||^2 plus the regularisation."""
         prior, n = self.prior, quadratic.shape[1]
         start = np.zeros(n)
@@ -253,9 +253,7 @@ class _Program:
         return solution[:n]
 
 
-def _run(
-    quadratic: sparse.csc_matrix, linear: FloatArray, rows: FloatArray, offset: FloatArray, cones: list
-) -> FloatArray:
+def _run(quadratic: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Floats, cones: list) -> Floats:
     # Columns scaled to the size of the curvature: masses and inertias differ by orders of magnitude.
     diagonal = np.sqrt(np.maximum(np.asarray(quadratic.diagonal()).ravel(), 0.0))
     typical = float(np.median(diagonal[diagonal > 0])) if np.any(diagonal > 0) else 1.0
@@ -284,21 +282,21 @@ def _run(
     return scale * np.array(result.x)
 
 
-def _svec(matrix: FloatArray) -> FloatArray:
+def _svec(matrix: Floats) -> Floats:
     """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD cone."""
     size = matrix.shape[-1]
     entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]
     return np.stack(entries, axis=-1)
 
 
-def _psd_rows(places: np.ndarray, width: int, floor: FloatArray) -> tuple[FloatArray, FloatArray, list]:
+def _psd_rows(places: np.ndarray, width: int, floor: Floats) -> tuple[Floats, Floats, list]:
     """Rows of A x + s = b for J(x) - floor in the PSD cone."""
     rows = np.zeros((_BODY, width))
     rows[:, places] = -_svec(pseudo_inertia(np.eye(_BODY))).T
     return rows, -_svec(floor), [clarabel.PSDTriangleConeT(4)]
 
 
-def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArray, FloatArray, list]:
+def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[Floats, Floats, list]:
     """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at column `first`."""
     lower = [(i, j) for j in range(4) for i in range(j, 4)]
     psd = np.zeros((36, width))
@@ -321,13 +319,13 @@ def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArr
     return np.vstack([psd, exponential]), np.concatenate([np.zeros(36), offset]), cones
 
 
-def _compact(mass: float) -> FloatArray:
+def _compact(mass: float) -> Floats:
     """Pseudo-inertia of an aluminium ball of that mass, the scale of a real body."""
     radius = (3.0 * mass / (4.0 * np.pi * 2700.0)) ** (1.0 / 3.0)
     return np.diag([mass * radius**2 / 5.0] * 3 + [mass])
 
 
-def _smallest(matrix: FloatArray) -> FloatArray:
+def _smallest(matrix: Floats) -> Floats:
     """Diagonal floor from a prior's own size, length and mass apart."""
     second = float(
         np.linalg.eigvalsh(matrix[:3, :3] - np.outer(matrix[:3, 3], matrix[:3, 3]) / matrix[3, 3])[0]
@@ -335,7 +333,7 @@ def _smallest(matrix: FloatArray) -> FloatArray:
     return np.diag([second] * 3 + [matrix[3, 3]])
 
 
-def _sizes(body: FloatArray) -> FloatArray:
+def _sizes(body: Floats) -> Floats:
     """Natural size (10,) of each parameter of a body, with its radius of gyration as length."""
     mass = max(abs(float(body[9])), 1e-3)
     inertia = max(float(np.mean(np.abs(body[[0, 3, 5]]))), float(_compact(mass)[0, 0]) * 2.0)
@@ -343,7 +341,7 @@ def _sizes(body: FloatArray) -> FloatArray:
     return np.array([inertia] * 6 + [mass * length] * 3 + [mass])
 
 
-def _touching(prior: BodyPrior, standard: FloatArray, margin: float) -> int:
+def _touching(prior: BodyPrior, standard: Floats, margin: float) -> int:
     count = 0
     for places, body in zip(prior.bodies, prior.inertial, strict=True):
         floor = margin * _smallest(pseudo_inertia(body))
@@ -352,7 +350,7 @@ def _touching(prior: BodyPrior, standard: FloatArray, margin: float) -> int:
     return count
 
 
-def _refit(estimate: Estimate, problem: Problem, values: FloatArray) -> tuple:
+def _refit(estimate: Estimate, problem: Problem, values: Floats) -> tuple:
     """Class table with the residuals of the constrained values."""
     fits = []
     for fit, row_class in zip(estimate.classes, problem.classes, strict=True):

@@ -15,6 +15,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Covariance, Estimate
 from ident.estimators.least_squares import (
@@ -23,7 +24,7 @@ from ident.estimators.least_squares import (
     estimate_from,
     weighted_solution,
 )
-from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.problem import Problem
 
 __all__ = ["MaximumAPosteriori", "Prior"]
 
@@ -32,8 +33,8 @@ __all__ = ["MaximumAPosteriori", "Prior"]
 class Prior:
     """Normal prior: mean (p,) and precision (p, p), the inverse covariance, zero for free parameters."""
 
-    mean: FloatArray
-    precision: FloatArray
+    mean: Floats
+    precision: Floats
 
     def __post_init__(self) -> None:
         p = len(self.mean)
@@ -49,16 +50,14 @@ class Prior:
             )
 
     @classmethod
-    def independent(cls, mean: FloatArray, std: FloatArray) -> Prior:
+    def independent(cls, mean: Floats, std: Floats) -> Prior:
         """Independent parameters with standard deviations (p,), infinite for free ones."""
         return cls(
             np.where(np.isfinite(std), mean, 0.0), np.diag(1.0 / np.asarray(std, dtype=np.float64) ** 2)
         )
 
     @classmethod
-    def projected(
-        cls, mean: FloatArray, covariance: FloatArray, projection: FloatArray, known: FloatArray
-    ) -> Prior:
+    def projected(cls, mean: Floats, covariance: Floats, projection: Floats, known: Floats) -> Prior:
         """Prior of base parameters chi_B = P chi from one of standard parameters.
 
         mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool,
@@ -153,7 +152,7 @@ class MaximumAPosteriori:
     def _how(self) -> str:
         return "stated" if isinstance(self.strength, (int, float)) else self.strength.replace("_", "-")
 
-    def _scale(self, problem: Problem, tempered: FloatArray) -> float:
+    def _scale(self, problem: Problem, tempered: Floats) -> float:
         if isinstance(self.strength, (int, float)):
             return float(self.strength)
         if self.strength == "evidence":
@@ -168,7 +167,7 @@ class MaximumAPosteriori:
         return float(np.exp(found.x))
 
 
-def _start(problem: Problem, prior: Prior) -> tuple[FloatArray, FloatArray]:
+def _start(problem: Problem, prior: Prior) -> tuple[Floats, Floats]:
     """First values and weights; the data alone need not determine the parameters."""
     if not np.any(prior.precision):
         values, weights, *_ = weighted_solution(problem)
@@ -182,21 +181,19 @@ def _start(problem: Problem, prior: Prior) -> tuple[FloatArray, FloatArray]:
     return values, 1.0 / class_variances(problem, values, consumed)
 
 
-def _shares(problem: Problem, values: FloatArray) -> FloatArray:
+def _shares(problem: Problem, values: Floats) -> Floats:
     """n_eff / n of each class."""
     rows = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
     return np.minimum(effective_rows(problem, problem.residuals(values)) / rows, 1.0)
 
 
-def _root_of(precision: FloatArray) -> FloatArray:
+def _root_of(precision: Floats) -> Floats:
     values, vectors = np.linalg.eigh(precision)
     keep = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
     return np.sqrt(values[keep])[:, None] * vectors[:, keep].T
 
 
-def _posterior(
-    problem: Problem, prior: Prior, weights: FloatArray, scale: float
-) -> tuple[FloatArray, FloatArray]:
+def _posterior(problem: Problem, prior: Prior, weights: Floats, scale: float) -> tuple[Floats, Floats]:
     """Values (p,) and root (p, p) with root root^T the posterior covariance."""
     r = problem.weighted(weights).r
     penalty = _root_of(prior.precision) / np.sqrt(scale)
@@ -210,7 +207,7 @@ def _posterior(
     return root @ factor[:p, p], root
 
 
-def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray) -> Callable[[float], float]:
+def _evidence_cost(problem: Problem, prior: Prior, weights: Floats) -> Callable[[float], float]:
     """Minus the log marginal likelihood as a function of log s."""
     r = problem.weighted(weights).r
     p = len(prior.mean)
@@ -229,7 +226,7 @@ def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray) -> Calla
 
 
 def _cross_validation_cost(
-    problem: Problem, prior: Prior, weights: FloatArray, blocks: int
+    problem: Problem, prior: Prior, weights: Floats, blocks: int
 ) -> Callable[[float], float]:
     """Weighted squared error on blocks of time left out, as a function of log s."""
     p = len(prior.mean)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
 from fri.errors import DataError
+from ident.dynamics.parameters import Floats
 
-__all__ = ["FloatArray", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
+__all__ = ["Floats", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
 
-FloatArray = NDArray[np.float64]
 
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
@@ -40,8 +40,8 @@ class RowGroup:
     joint: str
     side: str
     record: int
-    matrix: FloatArray
-    target: FloatArray
+    matrix: Floats
+    target: Floats
     time_index: NDArray[np.int64]
 
     def __post_init__(self) -> None:
@@ -70,11 +70,11 @@ class RowGroup:
 class TriangularFactor:
     """Upper triangular R (p + 1, p + 1) with R^T R = [A y]^T [A y], and its number of rows."""
 
-    r: FloatArray
+    r: Floats
     rows: int
 
     @classmethod
-    def of(cls, matrix: FloatArray, target: FloatArray) -> TriangularFactor:
+    def of(cls, matrix: Floats, target: Floats) -> TriangularFactor:
         """Factor of (m, p) rows and (m,) targets: Gram and Cholesky if safe, else blocked QR."""
         if not len(target):
             return cls(np.zeros((matrix.shape[1] + 1,) * 2), 0)
@@ -104,21 +104,21 @@ class TriangularFactor:
         return self.r.shape[1] - 1
 
     @property
-    def normal(self) -> FloatArray:
+    def normal(self) -> Floats:
         """A^T A, (p, p)."""
         r = self.r[:, :-1]
         return r.T @ r
 
-    def sum_of_squares(self, values: FloatArray) -> float:
+    def sum_of_squares(self, values: Floats) -> float:
         """||y - A chi||^2 for values (p,)."""
         return float(np.sum((self.r @ np.append(-values, 1.0)) ** 2))
 
-    def solve(self) -> FloatArray:
+    def solve(self) -> Floats:
         """Least-squares solution (p,). The matrix must have full rank: see `Problem.require_rank`."""
         p = self.parameters
         return solve_triangular(self.r[:p, :p], self.r[:p, p])
 
-    def inverse_root(self) -> FloatArray:
+    def inverse_root(self) -> Floats:
         """R^-1 (p, p) of the matrix part, so that (A^T A)^-1 = R^-1 R^-T."""
         p = self.parameters
         return solve_triangular(self.r[:p, :p], np.eye(p))
@@ -139,7 +139,7 @@ class Nuisance:
 
     name: str
     std: float
-    columns: Mapping[int, FloatArray]
+    columns: Mapping[int, Floats]
 
 
 @dataclass(frozen=True)
@@ -222,11 +222,11 @@ class Problem:
         found = {index: number for number, row_class in enumerate(self.classes) for index in row_class.groups}
         return tuple(found[index] for index in range(len(self.groups)))
 
-    def weighted(self, weights: Sequence[float] | FloatArray) -> TriangularFactor:
+    def weighted(self, weights: Sequence[float] | Floats) -> TriangularFactor:
         """Factor of the whole stack with a weight (inverse variance) for each class."""
         return TriangularFactor.combine([c.factor for c in self.classes], [float(w) for w in weights])
 
-    def residuals(self, values: FloatArray) -> tuple[FloatArray, ...]:
+    def residuals(self, values: Floats) -> tuple[Floats, ...]:
         """y - A chi [Nm] of each group, each (m,)."""
         return tuple(group.target - group.matrix @ values for group in self.groups)
 
@@ -278,7 +278,7 @@ def _listed(names: Sequence[str], limit: int = 12) -> str:
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
 
 
-def _acting(matrix: FloatArray) -> NDArray[np.int64]:
+def _acting(matrix: Floats) -> NDArray[np.int64]:
     """Columns with a nonzero entry; a joint's rows have none for the links before it."""
     idle = np.flatnonzero(~matrix[:: max(1, len(matrix) // 16)].any(axis=0))
     acting = np.ones(matrix.shape[1], dtype=bool)
@@ -287,7 +287,7 @@ def _acting(matrix: FloatArray) -> NDArray[np.int64]:
     return np.flatnonzero(acting)
 
 
-def _columns(matrix: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
+def _columns(matrix: Floats, chosen: NDArray[np.int64]) -> Floats:
     """Some columns in rising order, without a copy if they are neighbours."""
     if not len(chosen) or chosen[-1] - chosen[0] + 1 == len(chosen):
         return matrix[:, chosen[0] : chosen[-1] + 1] if len(chosen) else matrix[:, :0]
@@ -295,7 +295,7 @@ def _columns(matrix: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
     return matrix.T[chosen].T if by_column else matrix[:, chosen]
 
 
-def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
+def _gram_factor(matrix: Floats, target: Floats) -> Floats | None:
     """Cholesky factor of the equilibrated Gram matrix, or None if it would lose digits."""
     p = matrix.shape[1]
     gram = np.empty((p + 1, p + 1))
@@ -319,7 +319,7 @@ def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
     return r * scale
 
 
-def _blocked_qr(matrix: FloatArray, target: FloatArray) -> FloatArray:
+def _blocked_qr(matrix: Floats, target: Floats) -> Floats:
     p = matrix.shape[1]
     r = np.zeros((0, p + 1))
     for start in range(0, len(target), _QR_ROWS):
@@ -331,7 +331,7 @@ def _blocked_qr(matrix: FloatArray, target: FloatArray) -> FloatArray:
     return r
 
 
-def _triangle(stack: FloatArray) -> FloatArray:
+def _triangle(stack: Floats) -> Floats:
     """R (k, k) of the QR decomposition of (m, k), with rows of zeros for m < k."""
     r = np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
     missing = r.shape[1] - r.shape[0]

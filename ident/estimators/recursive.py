@@ -25,11 +25,12 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from fri.errors import ConfigurationError
+from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings, Scores, textbook
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import consumed_parameters, estimate_from, weighted_solution
 from ident.estimators.prior import Prior
-from ident.estimators.problem import FloatArray, Problem
+from ident.estimators.problem import Problem
 
 __all__ = [
     "Instant",
@@ -47,8 +48,8 @@ class Instant:
 
     record: int
     time_index: int
-    matrix: FloatArray
-    target: FloatArray
+    matrix: Floats
+    target: Floats
     classes: np.ndarray
 
 
@@ -80,7 +81,7 @@ class RecursiveFilter:
         update on the information gathered so far, 1 keeps all.
     """
 
-    def __init__(self, initial: FloatArray, forgetting: float = 1.0) -> None:
+    def __init__(self, initial: Floats, forgetting: float = 1.0) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise ConfigurationError(
                 f"forgetting {forgetting} must lie in (0, 1]; 0.99 forgets over 100 updates"
@@ -90,7 +91,7 @@ class RecursiveFilter:
         self._r = initial.copy()
 
     @classmethod
-    def start(cls, mean: FloatArray, std: FloatArray, forgetting: float = 1.0) -> RecursiveFilter:
+    def start(cls, mean: Floats, std: Floats, forgetting: float = 1.0) -> RecursiveFilter:
         """Filter beginning at `mean` (p,) with standard deviations `std` (p,)."""
         information = 1.0 / np.asarray(std, dtype=np.float64)
         p = len(information)
@@ -99,7 +100,7 @@ class RecursiveFilter:
         r[:p, p] = information * mean
         return cls(r, forgetting)
 
-    def update(self, matrix: FloatArray, target: FloatArray, sigma: FloatArray | float) -> None:
+    def update(self, matrix: Floats, target: Floats, sigma: Floats | float) -> None:
         """Take in rows (k, p) with targets (k,) and standard deviations [Nm]."""
         rows = np.column_stack([matrix, target]) / np.broadcast_to(sigma, target.shape)[:, None]
         parts = [np.sqrt(self._forgetting) * self._r, rows]
@@ -108,13 +109,13 @@ class RecursiveFilter:
         self._r = np.asarray(np.linalg.qr(np.vstack(parts), mode="r"), dtype=np.float64)
 
     @property
-    def values(self) -> FloatArray:
+    def values(self) -> Floats:
         """Present estimate (p,)."""
         p = self._r.shape[1] - 1
         return solve_triangular(self._r[:p, :p], self._r[:p, p])
 
     @property
-    def root(self) -> FloatArray:
+    def root(self) -> Floats:
         """(p, p) with root root^T the covariance for uncorrelated rows."""
         p = self._r.shape[1] - 1
         return solve_triangular(self._r[:p, :p], np.eye(p))
@@ -126,8 +127,8 @@ class Track:
 
     record: np.ndarray
     time_index: np.ndarray
-    values: FloatArray
-    std: FloatArray
+    values: Floats
+    std: Floats
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ class RecursiveLeastSquares:
     def track(self, problem: Problem, *, every: int = 1) -> Track:
         """The estimate after every `every`-th instant."""
         sigma, recursion = self._sigma(problem), self.start(problem)
-        found: list[tuple[int, int, FloatArray, FloatArray]] = []
+        found: list[tuple[int, int, Floats, Floats]] = []
         for count, instant in enumerate(instants(problem), start=1):
             recursion.update(instant.matrix, instant.target, sigma[instant.classes])
             if count % every == 0:
@@ -206,7 +207,7 @@ class RecursiveLeastSquares:
             notes=() if self.memory_s is None else (f"forgets with a time constant of {self.memory_s:g} s",),
         )
 
-    def _sigma(self, problem: Problem) -> FloatArray:
+    def _sigma(self, problem: Problem) -> Floats:
         if self.sigma is None:
             _, weights, *_ = weighted_solution(problem)
             return 1.0 / np.sqrt(weights)
@@ -232,8 +233,8 @@ class RegressorExtensionMixing:
 
     memory_s: float = 30.0
     every: int = 5
-    initial: FloatArray | None = None
-    initial_std: float | FloatArray = 1e4
+    initial: Floats | None = None
+    initial_std: float | Floats = 1e4
     sigma: dict[str, float] | None = None
     null: float = 1e-6
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
@@ -248,7 +249,7 @@ class RegressorExtensionMixing:
         extended, moment = np.zeros((p, p)), np.zeros(p)
         information = 1.0 / np.broadcast_to(np.asarray(self.initial_std, dtype=np.float64), (p,)) ** 2
         total, moving = information.copy(), information * start
-        mixings: dict[int, tuple[FloatArray, FloatArray]] = {}
+        mixings: dict[int, tuple[Floats, Floats]] = {}
         for number, step in enumerate(steps):
             w = weights[step.classes]
             extended = forgetting * extended + (step.matrix.T * w) @ step.matrix
@@ -278,7 +279,7 @@ class RegressorExtensionMixing:
             notes=notes,
         )
 
-    def _weights(self, problem: Problem) -> FloatArray:
+    def _weights(self, problem: Problem) -> Floats:
         if self.sigma is not None:
             return np.array([1.0 / self.sigma[c.label] ** 2 for c in problem.classes])
         power = [
@@ -287,7 +288,7 @@ class RegressorExtensionMixing:
         return 1.0 / np.maximum(np.array(power), 1e-12 * max(power))
 
 
-def _mix(extended: FloatArray, null: float) -> tuple[FloatArray, FloatArray]:
+def _mix(extended: Floats, null: float) -> tuple[Floats, Floats]:
     """Pseudo-inverse (p, p) of the extended regressor and the gain d_i^2 (p,) of each scalar regression."""
     scale = np.sqrt(np.diag(extended))
     used = scale > 0
@@ -305,15 +306,15 @@ def _mix(extended: FloatArray, null: float) -> tuple[FloatArray, FloatArray]:
 def _influence(
     problem: Problem,
     steps: list[Instant],
-    mixings: dict[int, tuple[FloatArray, FloatArray]],
-    total: FloatArray,
-    weights: FloatArray,
+    mixings: dict[int, tuple[Floats, Floats]],
+    total: Floats,
+    weights: Floats,
     forgetting: float,
-    values: FloatArray,
-) -> tuple[Scores, FloatArray]:
+    values: Floats,
+) -> tuple[Scores, Floats]:
     """Influence of every instant on the estimate, as scores, and the covariance for uncorrelated residuals."""
     p = len(values)
-    records: dict[int, list[tuple[int, FloatArray]]] = {}
+    records: dict[int, list[tuple[int, Floats]]] = {}
     white = np.zeros((p, p))
     variance = _class_variance(problem, values)
     back = np.zeros((p, p))
@@ -338,5 +339,5 @@ def _influence(
     return Scores(tuple(arrays)), white
 
 
-def _class_variance(problem: Problem, values: FloatArray) -> FloatArray:
+def _class_variance(problem: Problem, values: Floats) -> Floats:
     return np.array([c.factor.sum_of_squares(values) / max(c.factor.rows, 1) for c in problem.classes])

@@ -13,17 +13,17 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
+from ident.dynamics.parameters import Floats
 from ident.dynamics.urdf import read_urdf
 from ident.export.standard import StandardModel
 
 __all__ = ["comment", "digits", "document", "friction", "require_consistent", "to_mjcf", "to_urdf"]
 
 
-def friction(model: StandardModel) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]:
+def friction(model: StandardModel) -> tuple[Floats, Floats, tuple[str, ...]]:
     """Damping [Nm s/rad] and dry friction [Nm] of each joint, both sides together, and notes.
 
     Negative friction, refused by simulators, becomes zero and is noted.
@@ -162,7 +162,7 @@ def _new(model: StandardModel, name: str) -> str:
     return document(root)
 
 
-def _inertial(body: NDArray[np.float64]) -> ElementTree.Element:
+def _inertial(body: Floats) -> ElementTree.Element:
     mass, com, tensor = parameters.to_com(body)
     element = ElementTree.Element("inertial")
     ElementTree.SubElement(element, "origin", {"xyz": " ".join(map(digits, com)), "rpy": "0 0 0"})
@@ -179,7 +179,7 @@ def _inertial(body: NDArray[np.float64]) -> ElementTree.Element:
     return element
 
 
-def _origin(pose: NDArray[np.float64]) -> dict[str, str]:
+def _origin(pose: Floats) -> dict[str, str]:
     r = pose[:3, :3]
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     if np.hypot(r[0, 0], r[1, 0]) > 1e-9:
@@ -275,7 +275,7 @@ def _limits(urdf: str | None) -> dict[str, str]:
     return found
 
 
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quaternion(rotation: Floats) -> Floats:
     """Unit quaternion w x y z, the eigenvector of Bar-Itzhack (2000): no branch, no loss at half turns."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     matrix = np.array(

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import INERTIAL, PER_LINK, from_com
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com
 from ident.dynamics.physical import Projection, project, reference_bodies
 from ident.dynamics.structure import Side
 from ident.model.dynamic_model import DynamicModel
@@ -50,8 +49,8 @@ class StandardModel:
     """
 
     chain: Chain
-    inertial: NDArray[np.float64]
-    drive: NDArray[np.float64]
+    inertial: Floats
+    drive: Floats
     couplings: tuple[CoupledDrives, ...] = ()
     sides: tuple[str, ...] = ("motor", "joint")
     coulomb_kind: str = "sign"
@@ -70,8 +69,6 @@ class StandardModel:
             values.setflags(write=False)
             object.__setattr__(self, name, values)
 
-
-Floats = NDArray[np.float64]
 
 _LINK, _BODY = len(PER_LINK), len(INERTIAL)
 _STATES = 200

@@ -17,13 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident.import_log.mapping import LogMapping, Signal, TimeBase
+from ident.import_log.mapping import Floats, LogMapping, Signal, TimeBase
 from lwr_driver.configuration import find
 from lwr_driver.session import SessionWriter, session_metadata
 
 __all__ = ["ImportReport", "Recording", "import_log"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass
@@ -36,8 +34,8 @@ class Recording:
     source: Path
     delimiter: str | None = None
     header: bool = True
-    _tables: dict[Path, tuple[tuple[str, ...], FloatArray]] = field(default_factory=dict, repr=False)
-    _archives: dict[Path, dict[str, FloatArray]] = field(default_factory=dict, repr=False)
+    _tables: dict[Path, tuple[tuple[str, ...], Floats]] = field(default_factory=dict, repr=False)
+    _archives: dict[Path, dict[str, Floats]] = field(default_factory=dict, repr=False)
     _digests: dict[Path, str] = field(default_factory=dict, repr=False)
 
     def path(self, file: str | None) -> Path:
@@ -59,7 +57,7 @@ class Recording:
         """SHA-256 of every file read, by name."""
         return {path.name: digest for path, digest in self._digests.items()}
 
-    def column(self, file: str | None, column: str | int) -> FloatArray:
+    def column(self, file: str | None, column: str | int) -> Floats:
         """One column (n,), or one-dimensional NPZ array."""
         path = self.path(file)
         if path.suffix == ".npz":
@@ -73,7 +71,7 @@ class Recording:
         names, values = self._table(path)
         return values[:, _number(path, names, column)]
 
-    def columns(self, signal: Signal, joints: int, what: str) -> FloatArray:
+    def columns(self, signal: Signal, joints: int, what: str) -> Floats:
         """The columns (n, joints) of a signal, as they stand in the file."""
         path = self.path(signal.file)
         if path.suffix == ".npz":
@@ -102,7 +100,7 @@ class Recording:
             )
         return values
 
-    def _array(self, path: Path, name: str) -> FloatArray:
+    def _array(self, path: Path, name: str) -> Floats:
         if path not in self._archives:
             self._digest(path)
             try:
@@ -118,7 +116,7 @@ class Recording:
             raise DataError(f"{path}: array {name!r} has type {values.dtype}; numbers are needed")
         return values.astype(np.float64)
 
-    def _table(self, path: Path) -> tuple[tuple[str, ...], FloatArray]:
+    def _table(self, path: Path) -> tuple[tuple[str, ...], Floats]:
         if path not in self._tables:
             self._digest(path)
             self._tables[path] = _read_csv(path, self.delimiter, self.header)
@@ -143,7 +141,7 @@ def _number(path: Path, names: tuple[str, ...], column: str | int) -> int:
     return names.index(column)
 
 
-def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[str, ...], FloatArray]:
+def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[str, ...], Floats]:
     """Column names (numbers from 1 without a header) and the values (n, m) of a text table."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -177,7 +175,7 @@ def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[st
     return names or tuple(str(k + 1) for k in range(width)), values
 
 
-def _fast(path: Path, rows: list[tuple[int, str]], mark: str | None, width: int) -> FloatArray | None:
+def _fast(path: Path, rows: list[tuple[int, str]], mark: str | None, width: int) -> Floats | None:
     """The table by numpy's own reader; None unless every row is a plain row of numbers."""
     try:
         values = np.loadtxt(
@@ -266,7 +264,7 @@ class ImportReport:
 class _Channel:
     times: NDArray[np.int64]
     published: NDArray[np.int64]
-    values: FloatArray
+    values: Floats
 
 
 def import_log(
@@ -382,7 +380,7 @@ def _read(
 
 def _clock(
     mapping: LogMapping, base: TimeBase, signal: Signal, recording: Recording, count: int, place: str
-) -> FloatArray:
+) -> Floats:
     """Times of the samples (n,) [s] by the source's clock."""
     if base.column is None:
         assert base.rate_hz is not None
@@ -395,7 +393,7 @@ def _clock(
 
 
 def _log_times(
-    mapping: LogMapping, base: TimeBase, clock: FloatArray, place: str, first: int
+    mapping: LogMapping, base: TimeBase, clock: Floats, place: str, first: int
 ) -> NDArray[np.int64]:
     """UTC [ns] of each sample, strictly increasing. DataError with the rows otherwise."""
     if not np.isfinite(clock).all():
@@ -446,7 +444,7 @@ def _utc_ns(text: str) -> int:
     return (elapsed.days * 86400 + elapsed.seconds) * 10**9 + elapsed.microseconds * 1000
 
 
-def _cut(values: FloatArray, rows: tuple[int, int] | None, place: str) -> FloatArray:
+def _cut(values: Floats, rows: tuple[int, int] | None, place: str) -> Floats:
     if rows is None:
         return values
     first, last = rows
@@ -455,7 +453,7 @@ def _cut(values: FloatArray, rows: tuple[int, int] | None, place: str) -> FloatA
     return values[first:last]
 
 
-def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, first: int) -> None:
+def _refuse_non_finite(values: Floats, joints: tuple[str, ...], place: str, first: int) -> None:
     bad = ~np.isfinite(values)
     if bad.any():
         row, column = np.argwhere(bad)[0]
@@ -466,7 +464,7 @@ def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, 
         )
 
 
-def _convert(mapping: LogMapping, name: str, signal: Signal, raw: FloatArray) -> FloatArray:
+def _convert(mapping: LogMapping, name: str, signal: Signal, raw: Floats) -> Floats:
     """Values (n, joints) at the joint: the formulas at the head of `ident.import_log.mapping`."""
     values = raw * signal.factors(len(mapping.joints), name)
     if signal.side == "motor":
@@ -476,7 +474,7 @@ def _convert(mapping: LogMapping, name: str, signal: Signal, raw: FloatArray) ->
 
 
 def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
-    def values(name: str) -> FloatArray | None:
+    def values(name: str) -> Floats | None:
         return channels[name].values if name in channels else None
 
     joint = channels["position"]

@@ -28,6 +28,8 @@ from lwr_driver.configuration import find, parse, read_mapping
 
 __all__ = ["Coupling", "LogMapping", "Signal", "TimeBase", "Transmission"]
 
+Floats = NDArray[np.float64]
+
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _UNITS = {
     "rad": ("angle", 1.0),
@@ -114,7 +116,7 @@ class Signal:
         """Quantity of the unit: angle, rate or torque."""
         return _UNITS[self.unit][0]
 
-    def factors(self, joints: int, where: str) -> NDArray[np.float64]:
+    def factors(self, joints: int, where: str) -> Floats:
         """sign x scale x unit for each joint (n,)."""
         size = _UNITS[self.unit][1]
         factors = np.full(joints, 1.0 if size is None else size)
@@ -144,7 +146,7 @@ class Transmission:
     reduction: tuple[float, ...]
     coupling: tuple[Coupling, ...] = ()
 
-    def matrix(self, joints: tuple[str, ...]) -> NDArray[np.float64]:
+    def matrix(self, joints: tuple[str, ...]) -> Floats:
         """R (n, n). ConfigurationError if it does not fit the joints or has no inverse."""
         if len(self.reduction) != len(joints):
             raise ConfigurationError(
@@ -250,14 +252,14 @@ class LogMapping:
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """R (n, n) of q_motor = R q; the identity without a transmission."""
         if self.transmission is None:
             return np.eye(len(self.joints))
         return self.transmission.matrix(self.joints)
 
     @property
-    def offset(self) -> NDArray[np.float64]:
+    def offset(self) -> Floats:
         """Offsets of the positions (n,) [rad]."""
         return np.zeros(len(self.joints)) if self.offset_rad is None else np.array(self.offset_rad)
 

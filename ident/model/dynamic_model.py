@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError
 from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet
-from ident.dynamics.parameters import INERTIAL, PER_LINK
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
 from ident.dynamics.structure import Condition, ModelStructure, Side
 from ident.dynamics.tables import Tabular
 from ident.effects.model_torque import check_entry, effects_torque
@@ -21,7 +21,6 @@ from ident.effects.motion import Motion
 
 __all__ = ["DynamicModel", "Projection"]
 
-Floats = NDArray[np.float64]
 Projection = Callable[["DynamicModel", Floats], Floats]
 """From a model and its nearest standard parameters (n_columns,) to consistent ones with the same torque."""
 

@@ -25,11 +25,11 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import parse, read_mapping
@@ -223,7 +223,7 @@ def _model(file: _File, content: Mapping[str, Any]) -> DynamicModel:
     return model
 
 
-def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...]) -> NDArray[np.float64]:
+def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...]) -> Floats:
     count = len(entries)
     if len(rows) != count:
         raise ConfigurationError(f"`covariance` has {len(rows)} rows for {count} parameters")

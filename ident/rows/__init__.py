@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ident.rows.delay import Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     ParallelFilter,
     SignalSettings,
@@ -15,6 +14,7 @@ from ident.rows.filters import (
 from ident.rows.observation import observe
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import Sessions, as_sessions, payload_name
+from ident.rows.timebase import Delay, DelayData, estimate_delay
 
 __all__ = [
     "Delay",

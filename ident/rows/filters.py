@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from fri.errors import ConfigurationError
+from ident.dynamics.parameters import Floats
 
 __all__ = [
     "ParallelFilter",
@@ -96,8 +97,6 @@ class SignalSettings:
         return self.edge_s if self.edge_s is not None else 2.0 / self.cutoff_hz
 
 
-FloatArray = NDArray[np.float64]
-
 # Central differences of sixth order: error (w dt)^6 / 140 of the velocity, (w dt)^6 / 560 of the
 # acceleration.
 _FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
@@ -105,7 +104,7 @@ _SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
 _OUTPUTS = 8
 
 
-def low_pass(values: FloatArray, dt: float, cutoff_hz: float, order: int = 4) -> FloatArray:
+def low_pass(values: Floats, dt: float, cutoff_hz: float, order: int = 4) -> Floats:
     """Butterworth low-pass of `order` run forward and back over (n, k) values sampled every `dt` seconds.
 
     Zero phase. The gain is the square of the single pass: -6 dB at the cut-off, roll-off of order 2 x
@@ -124,14 +123,14 @@ def low_pass(values: FloatArray, dt: float, cutoff_hz: float, order: int = 4) ->
     return sosfiltfilt(sos, values, axis=0, padlen=pad)
 
 
-def differentiate(values: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+def differentiate(values: Floats, dt: float) -> tuple[Floats, Floats]:
     """First and second derivative (n, k) by central differences of sixth order; no phase shift."""
     first = correlate1d(values, _FIRST / dt, axis=0, mode="nearest")
     second = correlate1d(values, _SECOND / dt**2, axis=0, mode="nearest")
     return first, second
 
 
-def interpolate_uniform(values: FloatArray, start: float, dt: float, times: FloatArray) -> FloatArray:
+def interpolate_uniform(values: Floats, start: float, dt: float, times: Floats) -> Floats:
     """Values (n, k), sampled at start + i dt, at other times (m,): six-point Lagrange for band-limited signals."""
     position = (times - start) / dt
     nearest = np.rint(position)
@@ -165,14 +164,14 @@ def _lagrange(values, position):  # type: ignore[no-untyped-def]
     return result
 
 
-def thinning(times: FloatArray, cutoff_hz: float) -> int:
+def thinning(times: Floats, cutoff_hz: float) -> int:
     """Number of neighbouring samples to average before a low-pass at `cutoff_hz`: 40 means a period stay."""
     if len(times) < 2:
         return 1
     return max(1, int(1.0 / (40.0 * cutoff_hz * float(np.median(np.diff(times))))))
 
 
-def block_means(values: NDArray[np.generic], factor: int) -> FloatArray:
+def block_means(values: NDArray[np.generic], factor: int) -> Floats:
     """Means (m // factor, ...) of `factor` neighbours in (m, ...); a remainder at the end is left out."""
     count = len(values) // factor
     grouped = np.asarray(values[: count * factor], dtype=np.float64).reshape(count, factor, -1)
@@ -191,8 +190,8 @@ class ParallelFilter:
         estimate.
     """
 
-    times: FloatArray
-    outputs: FloatArray
+    times: Floats
+    outputs: Floats
     cutoff_hz: float
     attenuation_db: float = 40.0
 
@@ -202,14 +201,14 @@ class ParallelFilter:
         return half_width(self.cutoff_hz, self.attenuation_db)
 
     @cached_property
-    def sample_weights(self) -> FloatArray:
+    def sample_weights(self) -> Floats:
         """Time represented by each sample (m,) [s], capped so that the ends of a gap do not dominate."""
         step = np.diff(self.times)
         typical = float(np.median(step)) if len(step) else 1.0
         step = np.minimum(step, 2.0 * typical)
         return 0.5 * (np.append(step, step[-1:]) + np.append(step[:1], step))
 
-    def apply(self, values: FloatArray) -> FloatArray:
+    def apply(self, values: Floats) -> Floats:
         """Filtered (K, ...) of values (m, ...)."""
         flat = values.reshape(len(values), -1)
         result = np.empty((len(self.outputs), flat.shape[1]))
@@ -217,7 +216,7 @@ class ParallelFilter:
             result[rows] = weights @ flat[samples]
         return result.reshape(len(self.outputs), *values.shape[1:])
 
-    def share(self, flagged: NDArray[np.generic]) -> FloatArray:
+    def share(self, flagged: NDArray[np.generic]) -> Floats:
         """Share (K, ...) of the kernel's absolute weight on flagged samples (m, ...), bool or 0 to 1."""
         flat = flagged.reshape(len(flagged), -1)
         result = np.zeros((len(self.outputs), flat.shape[1]))
@@ -227,7 +226,7 @@ class ParallelFilter:
                 result[rows] = (size @ flat[samples]) / size.sum(axis=1, keepdims=True)
         return result.reshape(len(self.outputs), *flagged.shape[1:])
 
-    def coverage(self) -> FloatArray:
+    def coverage(self) -> Floats:
         """Share (K,) of the kernel's absolute area covered by samples, less than 1 at a gap or an end."""
         whole = np.linspace(-self.half_width, self.half_width, 2001)
         area = float(np.mean(np.abs(self._kernel(np.abs(whole))))) * 2.0 * self.half_width
@@ -236,17 +235,17 @@ class ParallelFilter:
             result[rows] = np.abs(kernel).sum(axis=1) / area
         return result
 
-    def blocks(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, FloatArray]]:
+    def blocks(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, Floats]]:
         """Rows, samples and dense weights (rows, samples) of a few outputs at a time; bounds the memory."""
         for rows, samples, kernel in self._kernels(size):
             total = kernel.sum(axis=1, keepdims=True)
             yield rows, samples, kernel / np.where(total != 0.0, total, 1.0)
 
-    def _kernels(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, FloatArray]]:
+    def _kernels(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, Floats]]:
         """Like `blocks`, not normalised. On a regular grid equal offsets share one kernel."""
         half, weight = self.half_width, self.sample_weights
         regular = _regular(self.times) and _regular(self.outputs)
-        known: dict[tuple[int, int, int], FloatArray] = {}
+        known: dict[tuple[int, int, int], Floats] = {}
         for first in range(0, len(self.outputs), size):
             outputs = self.outputs[first : first + size]
             low = int(np.searchsorted(self.times, outputs[0] - half))
@@ -262,18 +261,18 @@ class ParallelFilter:
             yield slice(first, first + len(outputs)), slice(low, high), kernel
 
     @cached_property
-    def _table(self) -> tuple[FloatArray, FloatArray]:
+    def _table(self) -> tuple[Floats, Floats]:
         time = np.linspace(0.0, self.half_width, 4097)
         return time, np.sinc(2.0 * self.cutoff_hz * time) * _kaiser(
             time / self.half_width, self.attenuation_db
         )
 
-    def _kernel(self, distance: FloatArray) -> FloatArray:
+    def _kernel(self, distance: Floats) -> Floats:
         time, value = self._table
         return np.interp(distance, time, value, right=0.0)
 
 
-def _regular(times: FloatArray) -> bool:
+def _regular(times: Floats) -> bool:
     """Whether the times are equidistant to a nanosecond."""
     if len(times) < 3:
         return True
@@ -286,14 +285,14 @@ def half_width(cutoff_hz: float, attenuation_db: float) -> float:
     return (attenuation_db - 7.95) / (2.285 * 2.0 * np.pi * 0.5 * cutoff_hz) / 2.0
 
 
-def _kaiser(position: FloatArray, attenuation_db: float) -> FloatArray:
+def _kaiser(position: Floats, attenuation_db: float) -> Floats:
     # Kaiser, Proc. IEEE ISCAS (1974), for attenuations above 50 dB and from 21 dB on
     above = max(attenuation_db - 21.0, 0.0)
     beta = 0.1102 * (attenuation_db - 8.7) if attenuation_db > 50.0 else 0.5842 * above**0.4 + 0.07886 * above
     return np.i0(beta * np.sqrt(np.maximum(1.0 - position**2, 0.0))) / np.i0(beta)
 
 
-def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) -> float:
+def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> float:
     """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
 
     velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest
@@ -309,7 +308,7 @@ def excitation_frequency(velocity: FloatArray, dt: float, share: float = 0.999) 
     return highest
 
 
-def optimal_cutoff(position: FloatArray, dt: float, order: int = 4) -> float:
+def optimal_cutoff(position: Floats, dt: float, order: int = 4) -> float:
     """Cut-off [Hz] of the smallest expected square error of the accelerations, from the data.
 
     position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; the excess
@@ -344,7 +343,7 @@ def advice(
     if settings.decimate_hz < 2.0 * excitation_hz:
         found.append(
             f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest "
-            f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms go up to it, raise "
+            f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms extend that far, raise "
             "`decimate_hz`"
         )
     if settings.cutoff_hz < 5.0 * excitation_hz:
@@ -379,7 +378,7 @@ def advice(
     return tuple(found)
 
 
-def _spectrum(signal: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+def _spectrum(signal: Floats, dt: float) -> tuple[Floats, Floats]:
     from scipy.signal import welch
 
     segment = min(len(signal), max(256, round(30.0 / dt)))
@@ -387,6 +386,6 @@ def _spectrum(signal: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     return frequency, power
 
 
-def moving(position: FloatArray, names: Sequence[str], threshold: float = 1e-2) -> tuple[str, ...]:
+def moving(position: Floats, names: Sequence[str], threshold: float = 1e-2) -> tuple[str, ...]:
     """Names of the joints with a position (n, J) range above `threshold` [rad]."""
     return tuple(name for name, span in zip(names, np.ptp(position, axis=0), strict=True) if span > threshold)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import ModelStructure, Side
 from ident.estimators.problem import Nuisance, Problem, RowGroup
 from ident.rows.filters import (
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["commanded", "observe", "stack"]
 
-FloatArray = NDArray[np.float64]
 
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
@@ -64,7 +64,7 @@ def observe(
     groups: list[RowGroup] = []
     nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
-        slopes: dict[int, FloatArray] = {}
+        slopes: dict[int, Floats] = {}
         for side in structure.sides:
             parts = [
                 part
@@ -129,9 +129,9 @@ class _Part:
     matrix (n, K, C), target (K, n), its time derivative (K, n), valid (K, n), row numbers (K,).
     """
 
-    matrix: FloatArray
-    target: FloatArray
-    slope: FloatArray
+    matrix: Floats
+    target: Floats
+    slope: Floats
     valid: NDArray[np.bool_]
     index: NDArray[np.int64]
 
@@ -167,7 +167,7 @@ def _side(
     return _Part(matrix, target, slope, valid, passage.index)
 
 
-def _slope(channel: TorqueChannel, rows: FloatArray, session: PreparedSession) -> FloatArray:
+def _slope(channel: TorqueChannel, rows: Floats, session: PreparedSession) -> Floats:
     """Time derivative (K, n) of the filtered torque, the error per second of a wrong delay."""
     settings = session.settings
     step = 0.04 / settings.decimate_hz
@@ -182,13 +182,13 @@ def _slope(channel: TorqueChannel, rows: FloatArray, session: PreparedSession) -
 
 def _filtered(
     channel: TorqueChannel,
-    rows: FloatArray,
+    rows: Floats,
     side: Side,
     structure: ModelStructure,
     payload: str | None,
     columns: NDArray[np.int64],
     session: PreparedSession,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Floats, Floats]:
     """Filtered regressor (n, K, C) and torque (K, n) of one channel at the times of the rows (K,)."""
     settings = session.settings
     joints = structure.chain.n
@@ -222,7 +222,7 @@ def _filtered(
 
 def _groups(
     session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]
-) -> list[tuple[RowGroup, FloatArray]]:
+) -> list[tuple[RowGroup, Floats]]:
     """Row group and slope of each joint with rows."""
     result = []
     average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
@@ -242,13 +242,13 @@ def _groups(
 
 
 def _averaged(
-    matrix: FloatArray,
-    target: FloatArray,
-    slope: FloatArray,
+    matrix: Floats,
+    target: Floats,
+    slope: Floats,
     index: NDArray[np.int64],
     period_rows: int,
     periods: int,
-) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]]:
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
     """Mean of the rows of equal phase over all periods; phases missing in a period are left out."""
     phase = index % period_rows
     order = np.argsort(phase, kind="stable")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from ident.rows.delay import Delay, DelayData, estimate_delay
+from ident.dynamics.parameters import Floats
 from ident.rows.filters import (
     ParallelFilter,
     SignalSettings,
@@ -31,14 +31,21 @@ from ident.rows.filters import (
     optimal_cutoff,
     thinning,
 )
-from ident.rows.timebase import Stretch, flag_outliers, sample_period, stretches
+from ident.rows.timebase import (
+    Delay,
+    DelayData,
+    Stretch,
+    estimate_delay,
+    flag_outliers,
+    sample_period,
+    stretches,
+)
 
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
 __all__ = ["Passage", "PreparedSession", "TorqueChannel", "prepare"]
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 logger = logging.getLogger(__name__)
@@ -55,11 +62,11 @@ class TorqueChannel:
     """
 
     side: str
-    times: FloatArray
-    q: FloatArray
-    qd: FloatArray
-    qdd: FloatArray
-    torque: FloatArray
+    times: Floats
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
     flagged: BoolArray
 
 
@@ -71,7 +78,7 @@ class Passage:
     joint_valid, motor_valid : (K, J), usable rows.
     """
 
-    rows: FloatArray
+    rows: Floats
     index: NDArray[np.int64]
     joint: TorqueChannel
     joint_valid: BoolArray
@@ -106,11 +113,6 @@ class PreparedSession:
     warnings: tuple[str, ...]
     uid: str = ""
     mean_torque: tuple[float, ...] = ()
-
-    @property
-    def has_joint(self) -> bool:
-        """Whether the session has joint torques of any joint in any row."""
-        return any(bool(passage.joint_valid.any()) for passage in self.passages)
 
     def without_samples(self) -> PreparedSession:
         """The same without its passages, to save memory; enough for the report."""
@@ -260,16 +262,14 @@ class _Motion:
 
     start: float
     dt: float
-    q: FloatArray
-    qd: FloatArray
-    qdd: FloatArray
-    torque: FloatArray
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
     flagged: BoolArray
 
     @classmethod
-    def of(
-        cls, part: Stretch, effort_flags: BoolArray, times: FloatArray, settings: SignalSettings
-    ) -> _Motion:
+    def of(cls, part: Stretch, effort_flags: BoolArray, times: Floats, settings: SignalSettings) -> _Motion:
         joints = effort_flags.shape[1]
         q = low_pass(part.values[:, :joints], part.dt, settings.cutoff_hz, settings.order)
         qd, qdd = differentiate(q, part.dt)
@@ -285,7 +285,7 @@ class _Motion:
         return cls(part.start, part.dt, q, qd, qdd, torque, flagged)
 
     @property
-    def times(self) -> FloatArray:
+    def times(self) -> Floats:
         """Sample times (n,) [s]."""
         return self.start + self.dt * np.arange(len(self.q), dtype=np.float64)
 
@@ -303,7 +303,7 @@ class _Motion:
         )  # fmt: skip
 
     def motor_channel(
-        self, times: FloatArray, torque: FloatArray, flags: BoolArray, delay: float, settings: SignalSettings
+        self, times: Floats, torque: Floats, flags: BoolArray, delay: float, settings: SignalSettings
     ) -> TorqueChannel | None:
         """The motor torque with the motion at its own times minus the delay.
 
@@ -322,9 +322,9 @@ class _Motion:
 
 def _passage(
     motion: _Motion,
-    grid: FloatArray,
+    grid: Floats,
     windows: list[tuple[float, float]],
-    motor_data: tuple[FloatArray, FloatArray, BoolArray] | None,
+    motor_data: tuple[Floats, Floats, BoolArray] | None,
     delay: Delay | None,
     settings: SignalSettings,
 ) -> Passage | None:
@@ -346,7 +346,7 @@ def _passage(
     return Passage(rows, np.flatnonzero(inside), joint, _valid(joint, rows, settings), motor, motor_valid)
 
 
-def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -> BoolArray:
+def _valid(channel: TorqueChannel, rows: Floats, settings: SignalSettings) -> BoolArray:
     """Rows (K, J) with enough measured samples of a moving joint in their filter."""
     factor = thinning(channel.times, settings.decimate_hz)
     times = block_means(channel.times, factor)
@@ -360,7 +360,7 @@ def _valid(channel: TorqueChannel, rows: FloatArray, settings: SignalSettings) -
 
 def _motor(
     session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[Floats, Floats, BoolArray]:
     """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
     assert session.motor is not None
     _check_finite(session.motor, name)
@@ -393,7 +393,7 @@ def _motor(
 
 
 def _delay(
-    motor_data: tuple[FloatArray, FloatArray, BoolArray],
+    motor_data: tuple[Floats, Floats, BoolArray],
     motions: list[_Motion],
     names: tuple[str, ...],
     settings: SignalSettings,
@@ -430,7 +430,7 @@ def _check_finite(columns: JointColumns, name: str) -> None:
             )
 
 
-def _windows(session: Session, times: FloatArray) -> tuple[list[tuple[float, float]], bool]:
+def _windows(session: Session, times: Floats) -> tuple[list[tuple[float, float]], bool]:
     """Spans [s] of the rows: the periods, else the excitation, else everything."""
     for name in ("period", "excitation"):
         spans = session.spans(name)
@@ -446,7 +446,7 @@ def _windows(session: Session, times: FloatArray) -> tuple[list[tuple[float, flo
 
 def _row_grid(
     windows: list[tuple[float, float]], periods: bool, settings: SignalSettings
-) -> tuple[FloatArray, int | None]:
+) -> tuple[Floats, int | None]:
     """Times of the rows [s], and the rows in a period if the periods are equal and consecutive."""
     step = 1.0 / settings.row_rate_hz
     first, last = windows[0][0], windows[-1][1]
@@ -461,7 +461,7 @@ def _row_grid(
     return np.arange(first, last + 1e-9, step), None
 
 
-def _chosen_cutoff(settings: SignalSettings, position: FloatArray, dt: float) -> SignalSettings:
+def _chosen_cutoff(settings: SignalSettings, position: Floats, dt: float) -> SignalSettings:
     cutoff = max(optimal_cutoff(position, dt, settings.order), 1.5 * settings.decimate_hz)
     logger.info("position cut-off %.2f Hz chosen from the spectrum", cutoff)
     return replace(settings, cutoff_hz=cutoff)
