@@ -4,7 +4,7 @@ The rigid part works on the links' energies. From the last link to the first, pa
 motion of a joint are moved to the link before it:
 
 * revolute joint j: a body symmetric about z_j without inertia about it (YY_j = XX_j, MZ_j, M_j) moves in the
-  same way when fixed to link j-1, so YY_j, MZ_j and M_j are regrouped into link j-1 (and XX_j - YY_j stays);
+  same way when fixed to link j-1. So YY_j, MZ_j and M_j are regrouped into link j-1, and XX_j - YY_j stays;
 * prismatic joint j: link j turns with link j-1, so its six inertia entries are regrouped there.
 
 Near the base, with r1 the first revolute joint and r2 the first revolute joint not parallel to it:

@@ -7,8 +7,8 @@ The pose of frame j, with z_j along the axis of joint j, in frame j-1 is (Khalil
 with theta_j = theta0_j + q_j for a revolute joint and r_j = r0_j + q_j for a prismatic one. The names of the
 dynamic parameters refer to these frames. A chain comes from a table of those numbers or from a URDF. Link
 frames of the URDF that obey the convention are used as they are. Otherwise such frames are built on the joint
-axes, and `link_placements` keeps the pose of each URDF link frame in its modified-DH frame, so that inertial
-parameters can be converted both ways.
+axes. `link_placements` keeps the pose of each URDF link frame in its modified-DH frame, for the conversion of
+inertial parameters both ways.
 """
 
 from __future__ import annotations

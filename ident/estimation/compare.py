@@ -27,7 +27,14 @@ from ident.dynamics import regressor
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
-from ident.estimation.validate import SessionScore, mounted, predictor, prepared_session, score_session
+from ident.estimation.validate import (
+    SessionScore,
+    finite,
+    mounted,
+    predictor,
+    prepared_session,
+    score_session,
+)
 from ident.estimators.distributions import normal_tail
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
@@ -90,19 +97,11 @@ class Comparison(Tabular):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
-
-        def finite(value: Any) -> Any:
-            return None if isinstance(value, float) and not math.isfinite(value) else value
-
         return {
             "schema_version": 1,
             "first": self.first,
             "second": self.second,
-            "parameters": [
-                {key: finite(value) for key, value in d.__dict__.items()}
-                | {"significant": d.name in self.significant}
-                for d in self.differences
-            ],
+            "parameters": [{key: finite(value) for key, value in row.items()} for row in self.records()],
             "level": self.level,
             "p": finite(self.p),
             "only_first": list(self.only_first),

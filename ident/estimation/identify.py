@@ -116,15 +116,7 @@ class Identification(Tabular):
     @cached_property
     def model(self) -> DynamicModel:
         """The identified model with all base parameters."""
-        return DynamicModel(
-            self.robot,
-            self.structure,
-            self.base.names,
-            self.estimate.values,
-            self.estimate.covariance.matrix,
-            self.base,
-            self._provenance,
-        )
+        return self._model(self.base.names, self.estimate)
 
     @cached_property
     def essential_model(self) -> DynamicModel:
@@ -134,20 +126,10 @@ class Identification(Tabular):
         """
         if self.essential is None:
             raise ConfigurationError("essential parameters were not sought; set `essential` in the settings")
-        found = self.essential.estimate
-        return DynamicModel(
-            self.robot,
-            self.structure,
-            found.names,
-            found.values,
-            found.covariance.matrix,
-            self.base,
-            self._provenance,
-        )
+        return self._model(self.essential.names, self.essential.estimate)
 
-    @property
-    def _provenance(self) -> dict[str, Any]:
-        return {
+    def _model(self, names: tuple[str, ...], found: Estimate) -> DynamicModel:
+        provenance = {
             "estimator": self.estimate.method,
             "covariance": self.estimate.covariance.kind,
             "sessions": [
@@ -157,6 +139,8 @@ class Identification(Tabular):
             "cutoff_hz": self.settings.signals.cutoff_hz,
             "decimate_hz": self.settings.signals.decimate_hz,
         }
+        matrix = found.covariance.matrix
+        return DynamicModel(self.robot, self.structure, names, found.values, matrix, self.base, provenance)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -219,11 +203,11 @@ class Identification(Tabular):
         violated = [check.name for check in self.assumptions.checks if check.holds is False]
         return "\n".join(
             [
-                f"Identification of {self.robot}, Model {self.settings.model}, {len(self.prepared)} sessions",
+                f"Identification of {self.robot}, Model {self.settings.model}, sessions: {len(self.prepared)}",
                 f"  parameters: {counts}"
                 + ("" if self.essential is None else f", {len(self.essential.names)} essential"),
                 f"  condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}",
-                f"  violated assumptions: {', '.join(violated) or 'none'}; {len(self.warnings)} warnings",
+                f"  violated assumptions: {', '.join(violated) or 'none'}; warnings: {len(self.warnings)}",
                 *(f"  {line.strip()}" for line in repr(self.estimate).splitlines()[:6]),
             ]
         )

@@ -157,13 +157,19 @@ class PayloadEstimate(Tabular):
             )
         ]
 
-    def __repr__(self) -> str:
+    @property
+    def _mass_and_com(self) -> list[str]:
         com = ", ".join(f"{1e3 * c:.1f} ± {1e3 * s:.1f}" for c, s in zip(self.com, self.com_std, strict=True))
+        return [
+            f"  mass {self.mass:.4f} ± {self.mass_std:.4f} kg; {self.verdict}",
+            f"  centre of mass x, y, z: {com} mm",
+        ]
+
+    def __repr__(self) -> str:
         return "\n".join(
             [
                 f"Payload {self.payload!r} of {self.robot} from {self.session}",
-                f"  mass {self.mass:.4f} ± {self.mass_std:.4f} kg; {self.verdict}",
-                f"  centre of mass x, y, z: {com} mm",
+                *self._mass_and_com,
                 f"  physically consistent: {'yes' if self.exact else 'no, see `consistent`'}; residual rms up to "
                 f"{max(self.residual.values()):.3f} Nm",
             ]
@@ -180,12 +186,10 @@ class PayloadEstimate(Tabular):
                 f"  {name:<6}{self.values[k]:>11.5g}{self.std[k]:>10.2g}{arm[k]:>11.2g}"
                 f"{self.consistent[k]:>12.5g}  {self.units[k]}"
             )
-        com = ", ".join(f"{1e3 * c:.1f} ± {1e3 * s:.1f}" for c, s in zip(self.com, self.com_std, strict=True))
         mass, _, tensor = to_com(self.consistent)
         moments = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(tensor))
         lines += [
-            f"  mass {self.mass:.4f} ± {self.mass_std:.4f} kg; {self.verdict}",
-            f"  centre of mass x, y, z: {com} mm",
+            *self._mass_and_com,
             f"  consistent body: {float(mass):.4f} kg, principal moments {moments} kg m^2"
             + (" (the estimate itself)" if self.exact else ""),
             "  residual rms [Nm]: " + ", ".join(f"{key} {value:.3f}" for key, value in self.residual.items()),

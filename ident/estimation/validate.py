@@ -72,7 +72,7 @@ class Score:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content; missing figures are null."""
-        return {key: _finite(value) for key, value in self.__dict__.items()}
+        return {key: finite(value) for key, value in self.__dict__.items()}
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class SessionScore(Tabular):
             "payload": self.payload,
             "predictor": self.predictor,
             "seen": self.seen,
-            "relative": {side: _finite(value) for side, value in self.relative.items()},
+            "relative": {side: finite(value) for side, value in self.relative.items()},
             "standstill": self.standstill,
             "scores": [score.to_dict() for score in self.scores],
             "notes": list(self.notes),
@@ -172,10 +172,10 @@ class Validation(Tabular):
         return [row for score in (*self.scores, *self.competitors) for row in score.records()]
 
     def __repr__(self) -> str:
-        rivals = f", {len(self.competitors)} scores of competitors" if self.competitors else ""
+        rivals = f", scores of competitors: {len(self.competitors)}" if self.competitors else ""
         return "\n".join(
             [
-                f"Validation of the model of {self.robot}: {len(self.scores)} sessions{rivals}",
+                f"Validation of the model of {self.robot}: sessions: {len(self.scores)}{rivals}",
                 *_few([f"  {score!r}" for score in self.scores], 8),
             ]
         )
@@ -219,8 +219,8 @@ def validate(
     sessions : a session, the path of a log, or several of either.
     allow_seen : score sessions the model was fitted to as well, and label them; otherwise they are refused.
 
-    Raises ConfigurationError for arguments of a wrong type, DataError for a session of another robot, with a
-    payload missing in the model, without any channel of the model, or seen by the estimate.
+    Raises ConfigurationError for arguments of a wrong type. Raises DataError for a session of another robot,
+    with a payload missing in the model, without any channel of the model, or seen by the estimate.
     """
     require(model, DynamicModel, "model", "read one with `read_model`, or take `identify(...).model`")
     sessions = as_sessions(sessions)
@@ -460,7 +460,8 @@ def _ratio(part: Any, whole: Any) -> float:
     return float(part / whole) if whole > 0 else math.nan
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """The value, or None for a float that is not finite, for JSON."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -501,7 +502,7 @@ class CrossValidation(Tabular):
     def __repr__(self) -> str:
         return "\n".join(
             [
-                f"Cross-validation: {len(self.scores)} sessions left out in turn, {len(self.skipped)} skipped",
+                f"Cross-validation: sessions left out in turn: {len(self.scores)}, skipped: {len(self.skipped)}",
                 *_few([f"  {score!r}" for score in self.scores], 8),
             ]
         )

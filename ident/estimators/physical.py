@@ -170,8 +170,7 @@ class PhysicallyConsistent:
 
 def _mean_squares(problem: Problem) -> Floats:
     """Mean square torque of each class [Nm^2]."""
-    power = [float(c.factor.r[:, -1] @ c.factor.r[:, -1]) / max(c.factor.rows, 1) for c in problem.classes]
-    return np.maximum(np.array(power), np.finfo(float).tiny)
+    return np.maximum([c.factor.mean_square for c in problem.classes], np.finfo(float).tiny)
 
 
 def nearest_consistent(inertial: Floats, *, margin: float = 1e-2) -> Floats:
@@ -244,8 +243,7 @@ class _Program:
             cones += kinds
         full = np.zeros((n + extra, n + extra))
         full[:n, :n] = hessian
-        # Parameters without effect and without prior get a trace of curvature, so that the solution
-        # is unique.
+        # A trace of curvature makes the solution unique for parameters without effect and prior.
         full[np.arange(n), np.arange(n)] += 1e-12 * max(float(np.diag(hessian).max()), 1e-12)
         solution = _run(
             sparse.csc_matrix(np.triu(full)), linear, np.vstack(parts), np.concatenate(offsets), cones
@@ -365,7 +363,7 @@ def _refit(estimate: Estimate, problem: Problem, values: Floats) -> tuple:
     return tuple(fits)
 
 
-# A payload of unknown inertia: a body of this radius of gyration, with its centre of mass within this distance.
+# Prior of a payload of unknown inertia: mass, radius of gyration and relative standard deviation.
 _PAYLOAD_KG = 3.0
 _PAYLOAD_RADIUS_M = 0.1
 _PAYLOAD_STD = 3.0

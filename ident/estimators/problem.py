@@ -104,6 +104,11 @@ class TriangularFactor:
         return self.r.shape[1] - 1
 
     @property
+    def mean_square(self) -> float:
+        """Mean square of the targets."""
+        return float(self.r[:, -1] @ self.r[:, -1]) / max(self.rows, 1)
+
+    @property
     def normal(self) -> Floats:
         """A^T A, (p, p)."""
         r = self.r[:, :-1]

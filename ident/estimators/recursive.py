@@ -149,10 +149,7 @@ class RecursiveLeastSquares:
 
     def start(self, problem: Problem) -> RecursiveFilter:
         """The filter before the first row."""
-        forgetting = 1.0
-        if self.memory_s is not None:
-            forgetting = float(np.exp(-problem.sample_time_s / self.memory_s))
-        p = len(problem.names)
+        forgetting, p = self._forgetting(problem), len(problem.names)
         if self.prior is None:
             return RecursiveFilter.start(np.zeros(p), np.full(p, self.initial_std), forgetting)
         weak = np.eye(p) / self.initial_std**2
@@ -182,9 +179,7 @@ class RecursiveLeastSquares:
             recursion.update(instant.matrix, instant.target, sigma[instant.classes])
             ages.setdefault(instant.record, {})[instant.time_index] = count
             count += 1
-        forgetting = 1.0
-        if self.memory_s is not None:
-            forgetting = float(np.exp(-problem.sample_time_s / self.memory_s))
+        forgetting = self._forgetting(problem)
         values, root, weights = recursion.values, recursion.root, 1.0 / sigma**2
         coefficients, row_weights = [], []
         for group, residual, number in zip(
@@ -206,6 +201,9 @@ class RecursiveLeastSquares:
             row_weights=row_weights,
             notes=() if self.memory_s is None else (f"forgets with a time constant of {self.memory_s:g} s",),
         )
+
+    def _forgetting(self, problem: Problem) -> float:
+        return 1.0 if self.memory_s is None else float(np.exp(-problem.sample_time_s / self.memory_s))
 
     def _sigma(self, problem: Problem) -> Floats:
         if self.sigma is None:
@@ -282,9 +280,7 @@ class RegressorExtensionMixing:
     def _weights(self, problem: Problem) -> Floats:
         if self.sigma is not None:
             return np.array([1.0 / self.sigma[c.label] ** 2 for c in problem.classes])
-        power = [
-            float(c.factor.r[:, -1] @ c.factor.r[:, -1]) / max(c.factor.rows, 1) for c in problem.classes
-        ]
+        power = [c.factor.mean_square for c in problem.classes]
         return 1.0 / np.maximum(np.array(power), 1e-12 * max(power))
 
 

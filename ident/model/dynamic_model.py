@@ -103,7 +103,7 @@ class DynamicModel(Tabular):
             lines.append(f"  effects: {', '.join(str(entry['cause']) for entry in self.effects)}")
         sessions = self.provenance.get("sessions", ())
         if isinstance(sessions, (list, tuple)) and sessions:
-            lines.append(f"  identified from {len(sessions)} sessions by {self.provenance.get('estimator')}")
+            lines.append(f"  identified by {self.provenance.get('estimator')}, sessions: {len(sessions)}")
         return "\n".join(lines)
 
     @cached_property

@@ -154,12 +154,8 @@ def prepare(
     warnings: list[str] = []
     position_flags, crowded = flag_outliers(position, settings.outlier_scale)
     effort_flags, also = flag_outliers(effort, settings.outlier_scale)
-    for columns, what in ((crowded, "position"), (also, "joint torque")):
-        for column in columns:
-            warnings.append(
-                f"{name}: {session.joint_names[column]} {what} jumps too often for outliers, nothing was "
-                "removed; look at the channel"
-            )
+    warnings += _jumping(name, "position", session.joint_names, crowded)
+    warnings += _jumping(name, "joint torque", session.joint_names, also)
     bad: BoolArray = np.asarray(position_flags.any(axis=1))
     parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
     if not parts:
@@ -380,16 +376,19 @@ def _motor(
     sample_period(times, None, f"{name}: /motor_states")
     effort = session.motor.effort
     flags, crowded = flag_outliers(effort, settings.outlier_scale)
-    for column in crowded:
-        warnings.append(
-            f"{name}: {session.joint_names[column]} motor torque jumps too often for outliers, nothing was "
-            "removed; look at the channel"
-        )
+    warnings += _jumping(name, "motor torque", session.joint_names, crowded)
     effort = effort.copy()
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]
         effort[~good, joint] = np.interp(times[~good], times[good], effort[good, joint])
     return times, effort, flags
+
+
+def _jumping(name: str, what: str, joints: tuple[str, ...], columns: list[int]) -> list[str]:
+    return [
+        f"{name}: {joints[column]} {what} jumps too often for outliers, nothing was removed; look at the channel"
+        for column in columns
+    ]
 
 
 def _delay(
