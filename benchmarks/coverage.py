@@ -28,9 +28,9 @@ import numpy as np
 from emulated_sessions import record_pair
 from estimation_arm import true_base
 
-from ident.identify import ESTIMATORS, Identification, IdentificationSettings, identify
-from ident.kinematics import Chain
-from ident.parameters import split_name
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import split_name
+from ident.estimation.identify import ESTIMATORS, Identification, IdentificationSettings, identify
 from lwr_driver.configuration import find
 from runner.published import TABLE_2
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ident.identify import Identification
+from ident.estimation.identify import Identification
 from runner.published import TABLE_2
 
 __all__ = ["characteristics"]

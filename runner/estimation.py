@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from fri.errors import ConfigurationError
-from ident.base import BaseSet
-from ident.cad_prior import cad_prior
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.structure import Coulomb, Coupling
+from ident.estimation.identify import EstimatorFactory
 from ident.estimators import (
     CovarianceSettings,
     Estimator,
@@ -21,8 +22,7 @@ from ident.estimators import (
     RobustLeastSquares,
     TotalLeastSquares,
 )
-from ident.identify import EstimatorFactory
-from ident.structure import Coulomb, Coupling
+from ident.estimators.physical import cad_prior
 from lwr_driver.session import Session
 
 __all__ = ["EstimatorChoice", "announced", "coulomb", "couplings"]

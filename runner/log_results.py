@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import ConfigurationError
-from ident.identify import Identification
-from ident.model import DynamicModel
-from ident.model_file import write_model
+from ident.estimation.identify import Identification
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import write_model
 from lwr_driver.session import Session
 from runner.plain import plain
 from runner.results import estimated

@@ -14,13 +14,13 @@ from typing import Literal
 
 import numpy as np
 
+from ident.estimation.identify import Identification
 from ident.excitation import ExcitationPlan
 from ident.excitation.arm_model import split_name
 from ident.excitation.planner import Progress as SearchProgress
 from ident.excitation.planner import plan
 from ident.excitation.problem import Knowledge, PlanProblem, Prior
-from ident.identify import Identification
-from ident.model_file import write_model
+from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.configuration import find

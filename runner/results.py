@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.validate import validate
 from ident.estimators.estimate import Estimate
-from ident.identify import Identification, IdentificationSettings, identify
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.model_file import write_model
-from ident.signals.settings import SignalSettings
-from ident.validation import validate
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import write_model
+from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 from runner.characteristics import characteristics

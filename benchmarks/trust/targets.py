@@ -117,7 +117,7 @@ def emulator(data: bytes) -> None:
 
 def urdf(data: bytes) -> None:
     """A robot description."""
-    from ident.kinematics import Chain
+    from ident.dynamics.kinematics import Chain
 
     try:
         text = data.decode()

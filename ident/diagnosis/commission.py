@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from fri.errors import DataError
-from ident.base import BaseSet
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.nominal import Arm
@@ -19,7 +18,8 @@ from ident.diagnosis.recording import Recording, record
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.kinematics import Chain
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.kinematics import Chain
 from ident.model import DynamicModel
 
 if TYPE_CHECKING:

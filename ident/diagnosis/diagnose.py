@@ -29,8 +29,8 @@ from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis, Finding
 from ident.diagnosis.selection import Claim, Null, Selection, best_candidate, select
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
-from ident.kinematics import Chain
 from ident.model import DynamicModel
 
 if TYPE_CHECKING:

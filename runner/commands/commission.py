@@ -68,7 +68,7 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
-    from ident.model_file import write_model
+    from ident.model.model_file import write_model
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm
 

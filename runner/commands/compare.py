@@ -31,8 +31,8 @@ def command(first: Path, second: Path, as_json: bool, level: float) -> None:
     \b
     lwr-run compare robot_a.yaml robot_b.yaml
     """
-    from ident.compare import compare
-    from ident.model_file import read_model
+    from ident.estimation.compare import compare
+    from ident.model.model_file import read_model
 
     labels = (f"{first}", f"{second}")
     result = compare(read_model(first), read_model(second), level=level, labels=labels)

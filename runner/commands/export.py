@@ -40,7 +40,7 @@ def command(
     lwr-run export results/model.yaml lwr.urdf lwr.xml lwr.c lwr.py
     """
     from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
-    from ident.model_file import read_model
+    from ident.model.model_file import read_model
 
     for output in outputs:
         if output.suffix not in _FORMATS:

@@ -9,14 +9,14 @@ from typing import Any
 import click
 
 from fri.errors import ConfigurationError
-from ident.essential import EssentialSettings
+from ident.dynamics.kinematics import Chain
+from ident.estimation.essential import EssentialSettings
+from ident.estimation.identify import ESTIMATORS, IdentificationSettings, identify
+from ident.estimation.mounting import find_mounting
+from ident.estimation.validate import validate
 from ident.estimators import CovarianceSettings
-from ident.identify import ESTIMATORS, IdentificationSettings, identify
-from ident.kinematics import Chain
-from ident.model_file import write_model
-from ident.mounting import find_mounting
-from ident.signals.settings import SignalSettings
-from ident.validation import validate
+from ident.model.model_file import write_model
+from ident.rows.filters import SignalSettings
 from lwr_driver.session import read_session
 from runner.estimation import EstimatorChoice, announced, coulomb, couplings
 from runner.log_results import new_folder, write_log_results

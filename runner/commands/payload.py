@@ -38,8 +38,8 @@ def command(
     lwr-run payload model.yaml loaded.mcap
     lwr-run payload model.yaml loaded.mcap --out with_payload.yaml
     """
-    from ident.model_file import read_model, write_model
-    from ident.payload import identify_payload, with_payload
+    from ident.estimation.payload import identify_payload, with_payload
+    from ident.model.model_file import read_model, write_model
     from lwr_driver.session import read_session
 
     if out is not None and out.exists():

@@ -49,13 +49,12 @@ def command(
     lwr-run validate model.yaml check.mcap
     lwr-run validate model.yaml a.mcap b.mcap --against old.yaml --forward --json
     """
-    from ident.competitors import competitor_scores
-    from ident.cross_validation import cross_validate
-    from ident.forward_simulation import simulate_session
-    from ident.identify import IdentificationSettings
-    from ident.model_file import read_model
-    from ident.signals.settings import SignalSettings
-    from ident.validation import validate
+    from ident.estimation.compare import competitor_scores
+    from ident.estimation.forward_simulation import simulate_session
+    from ident.estimation.identify import IdentificationSettings
+    from ident.estimation.validate import cross_validate, validate
+    from ident.model.model_file import read_model
+    from ident.rows.filters import SignalSettings
     from lwr_driver.session import read_session
 
     tested = read_model(model)

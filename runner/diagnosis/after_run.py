@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import LwrError
-from ident.kinematics import Chain
-from ident.model_file import read_model
+from ident.dynamics.kinematics import Chain
+from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.cell import Cell
 from lwr_driver.configuration import find

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.model import DynamicModel
-from ident.signals.filters import ParallelFilter
-from ident.signals.prepare import Passage, PreparedSession
-from ident.signals.settings import SignalSettings
-from ident.structure import Side
-from ident.validation import Score, mounted, predictor, prepared_session, score_session
+from ident.dynamics.structure import Side
+from ident.estimation.validate import Score, mounted, predictor, prepared_session, score_session
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import ParallelFilter, SignalSettings
+from ident.rows.prepare import Passage, PreparedSession
 from lwr_driver.session import Session
 
 __all__ = ["Curves", "curves"]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.parameters import PER_LINK
+from ident.dynamics.parameters import PER_LINK
 from runner.published import TABLE_2
 from runner.report.correlation import MatrixFigure, correlation_figure
 from runner.report.curves import Curves

@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 
 from fri.errors import ConfigurationError, DataError, LwrError
-from ident.model import DynamicModel
-from ident.model_file import read_model
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import read_model
 from lwr_driver.session import Session, read_session
 from runner.report.curves import Curves, curves
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import Diagnosis, diagnose
+from ident.dynamics.kinematics import Chain
 from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis.deciding import Deciding
 from runner.diagnosis.decision import decisions

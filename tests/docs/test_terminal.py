@@ -28,9 +28,9 @@ from fri.errors import (
     RefusedError,
     RobotError,
 )
+from ident.estimation.identify import ESTIMATORS
 from ident.excitation import ExcitationPlan
-from ident.identify import ESTIMATORS
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.configuration import find
 from runner.cli import VERBS, main
 from runner.laboratory import free_port

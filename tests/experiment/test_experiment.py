@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from experiment_rig import Finished, experiment_file, messages, records, run
 
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.session import read_session
 
 LOAD = {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}

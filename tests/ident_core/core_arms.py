@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from lwr_driver.configuration import find
 
 RIGHT = np.pi / 2
@@ -102,7 +102,7 @@ def states(chain: Chain, samples: int, seed: int = 0) -> tuple[np.ndarray, np.nd
 
 def bodies(n: int, seed: int = 0) -> np.ndarray:
     """(n, 10) inertial parameters of real bodies (random positive definite pseudo-inertia)."""
-    from ident.parameters import from_pseudo_inertia
+    from ident.dynamics.parameters import from_pseudo_inertia
 
     root = np.random.default_rng(seed).normal(size=(n, 4, 4))
     return from_pseudo_inertia(root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(4))

@@ -6,10 +6,10 @@ import yaml
 from core_arms import lwr, panda, puma560, random_chain, scara, shared, states, tx40, ur10
 
 from fri.errors import ConfigurationError, DataError
-from ident.base import closed_form_base, numeric_base
-from ident.base.numeric import rank_at_gap
-from ident.kinematics import Chain
-from ident.structure import Condition, Coupling, ModelStructure
+from ident.dynamics.base_closed_form import closed_form_base
+from ident.dynamics.base_set import numeric_base, rank_at_gap
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Condition, Coupling, ModelStructure
 from lwr_driver.configuration import find
 
 ROUTES = pytest.mark.parametrize("route", [numeric_base, closed_form_base], ids=["numeric", "closed form"])

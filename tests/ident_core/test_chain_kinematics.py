@@ -6,8 +6,8 @@ import pytest
 from core_arms import RIGHT, bodies, lwr, shared, states
 
 from fri.errors import ConfigurationError
-from ident import regressor
-from ident.kinematics import Chain
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 
 INERTIAL = (
     '<inertial><mass value="{m}"/><origin xyz="{x} 0.02 0.05" rpy="0.1 0.2 0.3"/>'
@@ -177,7 +177,7 @@ def test_part_of_a_tree_is_chosen_by_its_tip():
         (urdf([{"type": "floating"}]), "'floating' is not supported"),
         (urdf([{"axis": "0 0 0"}]), "axis has no length"),
         (urdf([{"xyz": "0 0"}]), "must hold 3 finite numbers"),
-        (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', which does not exist"),
+        (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', missing in the file"),
     ],
 )
 def test_unusable_urdfs_are_refused_with_the_reason(text, message):

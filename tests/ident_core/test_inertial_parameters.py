@@ -6,7 +6,7 @@ import pytest
 from core_arms import bodies
 
 from fri.errors import ConfigurationError
-from ident import parameters
+from ident.dynamics import parameters
 
 
 def pose(seed: int) -> np.ndarray:

@@ -6,8 +6,8 @@ import pytest
 from core_arms import bodies, lwr, puma560, random_chain, scara, states
 
 from fri.errors import ConfigurationError, DataError
-from ident import parameters, regressor
-from ident.kinematics import Chain
+from ident.dynamics import parameters, regressor
+from ident.dynamics.kinematics import Chain
 
 
 def pinocchio_regressor(chain: Chain, q, qd, qdd) -> np.ndarray:

@@ -11,9 +11,9 @@ import numpy as np
 import yaml
 from scipy.signal import lfilter
 
-from ident.kinematics import Chain
-from ident.parameters import DRIVE, INERTIAL
-from ident.regressor import torque
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import DRIVE, INERTIAL
+from ident.dynamics.regressor import torque
 from lwr_driver.session import JointColumns, Phase, Session
 
 Array = np.ndarray

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from regression_problems import ar1, design, problem
 
-from ident.assumptions import check_assumptions, repeatability
+from ident.estimation.assumptions import check_assumptions, repeatability
 from ident.estimators import InstrumentalVariables, Problem, RowGroup, WeightedLeastSquares
 
 CHI = np.linspace(-2.0, 2.5, 12)

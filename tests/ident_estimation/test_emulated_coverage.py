@@ -12,7 +12,7 @@ import pytest
 from emulated_sessions import record_pair
 from estimation_arm import chain, true_base
 
-from ident.identify import Identification, identify
+from ident.estimation.identify import Identification, identify
 from runner.published import TABLE_2
 
 pytestmark = pytest.mark.slow

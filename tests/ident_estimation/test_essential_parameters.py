@@ -7,7 +7,7 @@ import pytest
 from regression_problems import ar1, design, problem
 
 from fri.errors import ConfigurationError
-from ident.essential import EssentialSettings, find_essential
+from ident.estimation.essential import EssentialSettings, find_essential
 from ident.estimators import Problem, WeightedLeastSquares
 
 CHI = np.array([0.8, -1.0, 0.5, 2.0, 0.0, 1.0, 0.0, -1.5, 0.0, 0.7, 0.0, -2.0])
@@ -93,5 +93,5 @@ def test_impossible_settings_are_refused(settings):
 
 def test_an_unknown_name_is_refused():
     data = case()
-    with pytest.raises(ConfigurationError, match="no base parameter"):
+    with pytest.raises(ConfigurationError, match="not a base parameter"):
         find_essential(data, WeightedLeastSquares().fit(data), EssentialSettings(keep=("Fvl9",)))

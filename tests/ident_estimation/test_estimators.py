@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from regression_problems import ar1, design, problem
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.parameters import from_com, pseudo_inertia
 from ident.estimators import (
     BodyPrior,
     CovarianceSettings,
@@ -31,7 +32,6 @@ from ident.estimators import (
     WeightedLeastSquares,
     nearest_consistent,
 )
-from ident.parameters import from_com, pseudo_inertia
 
 CHI = np.linspace(-2.0, 2.5, 12)
 SIGMA = np.array([0.05, 0.3, 1.0])

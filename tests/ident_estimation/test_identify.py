@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident.essential import EssentialSettings
+from ident.estimation.essential import EssentialSettings
+from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimators import CovarianceSettings
-from ident.identify import Identification, IdentificationSettings, identify
-from ident.signals import SignalSettings
+from ident.rows import SignalSettings
 
 NOISY = arm.Sensors(position=1e-5, joint=0.1, motor=0.5, correlation_s=0.2, motor_delay_s=0.004)
 # fmt: off

@@ -14,9 +14,9 @@ import estimation_arm as arm
 import numpy as np
 import pytest
 
-from ident.identify import Identification, IdentificationSettings, identify
-from ident.signals.filters import differentiate, low_pass
-from ident.signals.timebase import stretches
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.rows.filters import differentiate, low_pass
+from ident.rows.timebase import stretches
 from lwr_driver.session import JointColumns, Session
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "lwr4_flobaroid"

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.identify import Identification, IdentificationSettings, identify
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.mounting import Mounting, find_mounting
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.mounting import Mounting, find_mounting
 from lwr_driver.configuration import CONFIGS, find
 from lwr_driver.session import Session, read_session
 

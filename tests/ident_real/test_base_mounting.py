@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
+from ident.estimation.identify import IdentificationSettings
+from ident.estimation.mounting import find_mounting
 from ident.estimators import nearest_consistent
-from ident.identify import IdentificationSettings
-from ident.kinematics import Chain
-from ident.mounting import find_mounting
-from ident.regressor import torque
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
 

@@ -15,10 +15,10 @@ import pytest
 from real_lwr4 import DATA, EVERY, chain, mounted, needs_recordings, repeatability, session
 
 from ident.diagnosis import ArmData, Diagnosis, Finding, diagnose
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.structure import Coupling
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 

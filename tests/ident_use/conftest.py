@@ -9,11 +9,11 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from ident import parameters
-from ident.base import numeric_base
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.structure import ModelStructure
+from ident.dynamics import parameters
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import ModelStructure
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import Session, SessionWriter, read_session, session_metadata
 

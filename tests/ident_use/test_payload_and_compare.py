@@ -13,15 +13,15 @@ from click.testing import CliRunner
 from conftest import LOAD  # type: ignore[import-not-found]
 
 from fri.errors import ConfigurationError, DataError
-from ident import parameters
-from ident.base import numeric_base
-from ident.compare import compare
+from ident.dynamics import parameters
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.structure import Condition, ModelStructure
+from ident.estimation.compare import compare
+from ident.estimation.payload import identify_payload, with_payload
 from ident.estimators.covariance import CovarianceSettings
 from ident.model import DynamicModel
-from ident.model_file import read_model, write_model
-from ident.payload import identify_payload, with_payload
-from ident.signals.settings import SignalSettings
-from ident.structure import Condition, ModelStructure
+from ident.model.model_file import read_model, write_model
+from ident.rows.filters import SignalSettings
 from runner.cli import main
 from runner.commands import compare as compare_command
 from runner.commands import export as export_command

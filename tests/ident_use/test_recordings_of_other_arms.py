@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.identify import Identification, IdentificationSettings, identify
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import gravity_torque
+from ident.dynamics.structure import Coupling
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.validate import validate
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.regressor import gravity_torque
-from ident.signals.settings import SignalSettings
-from ident.signals.timebase import flag_outliers
-from ident.structure import Coupling
-from ident.validation import validate
+from ident.rows.filters import SignalSettings
+from ident.rows.timebase import flag_outliers
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import read_session
 

@@ -1,0 +1,38 @@
+"""Signal processing between the session log and the regression."""
+
+from __future__ import annotations
+
+from ident.rows.filters import (
+    ParallelFilter,
+    SignalSettings,
+    advice,
+    differentiate,
+    excitation_frequency,
+    low_pass,
+    optimal_cutoff,
+)
+from ident.rows.observation import observe
+from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+from ident.rows.sessions import Sessions, as_sessions, payload_name
+from ident.rows.timebase import Delay, DelayData, estimate_delay
+
+__all__ = [
+    "Delay",
+    "DelayData",
+    "ParallelFilter",
+    "Passage",
+    "PreparedSession",
+    "Sessions",
+    "SignalSettings",
+    "TorqueChannel",
+    "advice",
+    "as_sessions",
+    "differentiate",
+    "estimate_delay",
+    "excitation_frequency",
+    "low_pass",
+    "observe",
+    "optimal_cutoff",
+    "payload_name",
+    "prepare",
+]
