@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from lwr_driver.arm import JOINTS, Limits
 from lwr_driver.control import Control, Mode, Result, Text, Word
-from lwr_driver.guard import Guard, Violation
+from lwr_driver.guard import Guard, Stop, Violation
 from lwr_driver.ring import NO_PHASE
-from lwr_driver.stop import Stop
 
 __all__ = ["BRAKE", "HOLD", "Commander", "Foreseen"]
 

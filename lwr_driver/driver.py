@@ -44,6 +44,11 @@ from lwr_driver.commander import BRAKE, HOLD
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
 from lwr_driver.link import (
     LinkSettings,
+    LinkState,
+    Measured,
+    Outcome,
+    Progress,
+    Waiting,
     advise_command,
     advise_connect,
     advise_leave,
@@ -52,17 +57,16 @@ from lwr_driver.link import (
     advise_quality,
     advise_rest,
     silence_in_lock_step,
+    snapshot,
 )
 from lwr_driver.loop import LoopSettings
 from lwr_driver.loop_process import LoopProcess, Scheduling
 from lwr_driver.motion import Motion, check_motion, check_start
-from lwr_driver.motor_torque import KrlMotorTorque
-from lwr_driver.realtime import Rights
+from lwr_driver.realtime import Rights, undisturbed
 from lwr_driver.recorder import Recorded, Recorder, SessionRequest
 from lwr_driver.ring import Ring
+from lwr_driver.session.motor_torque import KrlMotorTorque
 from lwr_driver.session.writer import ExitStatus
-from lwr_driver.state import LinkState, Measured, Outcome, Progress, Waiting, snapshot
-from lwr_driver.undisturbed import undisturbed
 
 __all__ = ["Driver", "LinkSettings", "LinkState", "Measured", "Outcome", "Progress", "Waiting"]
 

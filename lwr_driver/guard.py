@@ -12,6 +12,23 @@ points.
 A float32 of magnitude 2 to 4 rad is rounded by up to 1.2e-7 rad. At 1 ms that alone makes 2.4e-4 rad/s, 0.48
 rad/s² and 950 rad/s³ of apparent motion, so each limit is widened by the largest amount that rounding can
 account for, and by nothing else.
+
+The jerk-limited stop, exact in discrete time.
+
+From the last three commanded rows follow the discrete velocity v0 = (q0 - q1)/T and acceleration
+a0 = (q0 - 2 q1 + q2)/T². Ruckig's velocity interface brings (v0, a0) to rest in the shortest time with |a| <=
+A and |j| <= J (Berscheid and Kroeger 2021, each joint by itself), and the rows are q(k) = q(k-1) + T v(kT).
+Then
+
+- first differences are v(kT), and second differences (v(kT) - v(kT - T))/T are means of a, so at most A;
+- third differences are at most J: within the profile as second differences of v, and across the beginning
+  because v(T) - v0 - T a0 is at most J T²/2, which leaves room to let the profile begin at a0 + d with |d| <=
+  J T/2: half a period of jerk gained, without which a stop at the height of an acceleration would overshoot
+  by a0 T/2.
+
+So the stop keeps the limits in the same discrete sense in which the guard and the controller see them. How
+far a stop travels has a closed form, with which a motion is checked beforehand: wherever it is stopped, the
+arm stays inside its position limits.
 """
 
 from __future__ import annotations
@@ -21,10 +38,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from lwr_driver.arm import JOINTS, Limits
 
-__all__ = ["ROUNDING", "Guard", "Violation"]
+__all__ = ["ROUNDING", "Guard", "Stop", "Violation", "stop_extent"]
 
 # Half the spacing of float32 numbers between 2 and 4 rad; joint positions of the arm are below 3 rad.
 ROUNDING = 2.0**-23
@@ -130,3 +148,113 @@ class Guard:
             return Violation("position", joint, float(x[joint]), float(edge[joint]))
         value, bound = abs(self._values[kind, joint]), self._bounds[kind, joint]
         return Violation(tuple(_UNITS)[kind], joint, float(value), float(bound))
+
+
+Rows = NDArray[np.float64]
+
+
+class Stop:
+    """One jerk-limited stop after the other; all memory is taken when it is built.
+
+    limits : acceleration and jerk of the stop; period_s : time of one cycle [s]
+    """
+
+    def __init__(self, limits: Limits, period_s: float) -> None:
+        self._period, self._limits = period_s, limits
+        self._otg = Ruckig(JOINTS, period_s)
+        self._trajectory = Trajectory(JOINTS)
+        start = InputParameter(JOINTS)
+        start.control_interface = ControlInterface.Velocity
+        start.synchronization = Synchronization.No
+        start.current_position = [0.0] * JOINTS
+        start.target_velocity = [0.0] * JOINTS
+        start.target_acceleration = [0.0] * JOINTS
+        start.max_velocity = limits.v_max.tolist()
+        start.max_acceleration = limits.a_max.tolist()
+        start.max_jerk = limits.j_max.tolist()
+        self._start = start
+        self._q = np.zeros(JOINTS)
+        self._cycle = 0
+        self._cycles = 0
+
+    def begin(self, q0: Rows, q1: Rows, q2: Rows) -> None:
+        """Plan the stop from the rows commanded now, one cycle ago and two cycles ago, each (7,) [rad].
+
+        Raises ValueError if no stop can be computed (rows that are not finite).
+        """
+        velocity = (q0 - q1) / self._period
+        acceleration = (q0 - 2.0 * q1 + q2) / self._period**2
+        if not (np.all(np.isfinite(velocity)) and np.all(np.isfinite(acceleration))):
+            raise ValueError("the last commanded rows are not finite")
+        acceleration = _let_go(self._limits, self._period, velocity, acceleration)
+        self._start.current_velocity = velocity.tolist()
+        self._start.current_acceleration = acceleration.tolist()
+        try:
+            result = self._otg.calculate(self._start, self._trajectory)
+        except RuntimeError as error:
+            raise ValueError(f"no stop from {velocity} rad/s, {acceleration} rad/s²: {error}") from error
+        if int(result) < 0:
+            raise ValueError(f"no stop from {velocity} rad/s, {acceleration} rad/s²: {result}")
+        self._q = q0.astype(np.float64)
+        self._cycle = 0
+        self._cycles = int(np.ceil(self._trajectory.duration / self._period - 1e-9))
+
+    def advance(self, cycles: int) -> Rows:
+        """Row `cycles` cycles further on, (7,) [rad]."""
+        for _ in range(min(cycles, self._cycles - self._cycle)):
+            self._cycle += 1
+            velocity = self._trajectory.at_time(self._cycle * self._period)[1]
+            self._q = self._q + self._period * np.array(velocity)
+        return self._q
+
+    @property
+    def finished(self) -> bool:
+        """Whether the commanded position rests."""
+        return self._cycle >= self._cycles
+
+
+def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, Rows]:
+    """Lowest and highest position and highest speed of a stop begun at any row of q.
+
+    q : (n, 7) [rad]; rows before the first are taken equal to it. Returns three (n, 7): lowest position
+    [rad], highest position [rad], highest speed [rad/s]. The positions are bounds, wider than the truth by
+    about a period at the highest speed at most.
+    """
+    padded = np.vstack([q[:1], q[:1], q])
+    v = (padded[2:] - padded[1:-1]) / period_s
+    a = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) / period_s**2
+    a_max, j_max = limits.a_max, limits.j_max
+    a = _let_go(limits, period_s, v, a)
+    # Mirror each case so that the velocity left after letting go of a at full jerk is positive: then jerk
+    # comes first downwards, then acceleration stays at -peak, then jerk leads it back to zero.
+    sign = np.where(v + a * np.abs(a) / (2.0 * j_max) >= 0.0, 1.0, -1.0)
+    v, a = sign * v, sign * a
+    peak = np.minimum(np.sqrt(np.maximum(j_max * v + 0.5 * a**2, 0.0)), np.maximum(a_max, -a))
+    t1, t3 = (a + peak) / j_max, peak / j_max
+    v1 = v + a * t1 - 0.5 * j_max * t1**2
+    v2 = 0.5 * peak**2 / j_max
+    t2 = np.where(peak > 0.0, np.maximum(v1 - v2, 0.0) / np.where(peak > 0.0, peak, 1.0), 0.0)
+    x1 = v * t1 + 0.5 * a * t1**2 - j_max * t1**3 / 6.0
+    x2 = x1 + v1 * t2 - 0.5 * peak * t2**2
+    end = x2 + v2 * t3 - 0.5 * peak * t3**2 + j_max * t3**3 / 6.0
+    # A velocity that begins below zero turns once, in the first phase.
+    root = (a - np.sqrt(np.maximum(a**2 + 2.0 * j_max * v, 0.0))) / j_max
+    turn = np.where(v < 0.0, np.clip(root, 0.0, t1), 0.0)
+    back = v * turn + 0.5 * a * turn**2 - j_max * turn**3 / 6.0
+    peak_speed = np.where(a > 0.0, v + a**2 / (2.0 * j_max), v)
+    # T times the sum of v(kT) passes the integral only where v rises, by the height of the rise at most.
+    above = np.maximum(np.maximum(end, back), 0.0) + period_s * (peak_speed - v)
+    below = np.minimum(np.minimum(end, back), 0.0)
+    lowest = q + np.where(sign > 0.0, below, -above)
+    highest = q + np.where(sign > 0.0, above, -below)
+    return lowest, highest, np.maximum(np.abs(v), peak_speed)
+
+
+def _let_go(limits: Limits, period_s: float, v: Rows, a: Rows) -> Rows:
+    """The acceleration with which the profile begins: a, moved by up to half a period of jerk against the
+    motion.
+    """
+    excess = v + a * np.abs(a) / (2.0 * limits.j_max)
+    half = 0.5 * period_s * limits.j_max
+    moved = np.clip(a - excess / period_s, -limits.a_max, limits.a_max)
+    return np.clip(moved, a - half, a + half)

@@ -1,17 +1,27 @@
-"""How the arm is reached, and what to do when it is not."""
+"""What the driver tells about the link and about a motion: plain values, no connection behind them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from fri.errors import ConfigurationError
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError, LwrError
 from fri.handshake import find_handshake
-from fri.states import ALL_DRIVES
-from lwr_driver.state import LinkState
+from fri.states import ALL_DRIVES, Quality, State
+from fri.states import Control as ControlMode
+from lwr_driver.arm import JOINTS
+from lwr_driver.control import BIN_NS, Control, Mode, Text, Word
 
 __all__ = [
     "LinkSettings",
+    "LinkState",
+    "Measured",
+    "Outcome",
+    "Progress",
+    "Waiting",
     "advise_command",
     "advise_connect",
     "advise_leave",
@@ -20,7 +30,206 @@ __all__ = [
     "advise_quality",
     "advise_rest",
     "silence_in_lock_step",
+    "snapshot",
 ]
+
+_QUANTILES = (0.5, 0.99, 0.999, 1.0)
+
+Joints = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """What a step of the driver waits for: what is awaited, what is seen, since when, and what to do."""
+
+    awaited: str
+    seen: str
+    since_s: float
+    advice: str
+
+    def __str__(self) -> str:
+        return f"waited {self.since_s:.1f} s for {self.awaited}; seen: {self.seen}. {self.advice}"
+
+
+@dataclass(frozen=True, eq=False)
+class LinkState:
+    """Snapshot of the link. Arrays are (7,) float64 in kinematic order.
+
+    state, quality, control : names of the FRI values (`MON`, `CMD`; `UNACCEPTABLE` to `PERFECT`; `POSITION`);
+        `OFF`, `UNACCEPTABLE`, `OTHER` before the first packet
+    mode : what the loop answers: `mirror`, `hold`, `motion`, `stop`, `silent`
+    sequence : number of the last packet, unwrapped, -1 before the first; period_s : the controller's cycle
+        [s]
+    age_s : time since the last packet [s], infinite before the first
+    q, tau, tau_external, q_command : measured position [rad], joint torque sensors [Nm], estimated external
+        torque [Nm], position of the last answer [rad]
+    setpoint : the controller's own set point, command plus FRI offset [rad]; motions begin there
+    tracking_error : largest distance of q from the answer before, since command mode began [rad]
+    latency_s : quantiles 0.5, 0.99, 0.999 and 1 of the time from packet to answer in the loop [s]
+    left : why command mode was left last, empty if it never was or if it is on
+    received to restarts : counters of the link; `late` counts answers that the controller had not seen when
+        it
+        sent its next packet; overruns : rows that the recorder was too slow for
+    """
+
+    state: str
+    quality: str
+    control: str
+    mode: str
+    sequence: int
+    period_s: float
+    age_s: float
+    power: int
+    error: int
+    warning: int
+    safety_limits: float
+    answer_rate: float
+    controller_latency_s: float
+    jitter_s: float
+    miss_rate: float
+    miss_counter: int
+    temperature: Joints
+    q: Joints
+    tau: Joints
+    tau_external: Joints
+    q_command: Joints
+    setpoint: Joints
+    tracking_error: Joints
+    latency_s: dict[float, float]
+    left: str
+    received: int
+    answered: int
+    lost: int
+    repeated: int
+    reordered: int
+    suspect: int
+    malformed: int
+    foreign: int
+    late: int
+    restarts: int
+    overruns: int
+
+    @property
+    def summary(self) -> str:
+        """State, quality, drives and errors in one line."""
+        if self.sequence < 0:
+            return f"no packet yet, {self.malformed} malformed, {self.foreign} from other addresses"
+        silence = f", no packet for {self.age_s:.1f} s" if self.age_s > 1.0 else ""
+        return (
+            f"state {self.state}, quality {self.quality}, control {self.control}, power 0x{self.power:02x}, "
+            f"error 0x{self.error:02x}, answer rate {self.answer_rate:.3f}{silence}"
+        )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a motion is: row sent of rows planned, time [s], name of the phase, state of the link."""
+
+    row: int
+    rows: int
+    time_s: float
+    phase: str
+    state: LinkState
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Means and standard deviations over some cycles; arrays (7,) float64 [rad], [Nm]."""
+
+    cycles: int
+    q: Joints
+    q_std: Joints
+    tau: Joints
+    tau_std: Joints
+    tau_external: Joints
+    q_command: Joints
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How a motion ended.
+
+    status : `success`, `abort` (somebody asked to stop), `fail`
+    reason : why, in words; empty on success
+    last_rows : the last cycles, dtype `lwr_driver.ring.ROW`
+    row : last row of the motion that was sent, -1 if none; rows : of the motion
+    error : what `check` raises, with the last rows as `.rows`; None unless failed
+    """
+
+    status: Literal["success", "abort", "fail"]
+    reason: str
+    last_rows: NDArray[Any]
+    row: int
+    rows: int
+    error: LwrError | None = None
+
+    def check(self) -> Outcome:
+        """This outcome; raises its error if it failed."""
+        if self.error is not None:
+            raise self.error
+        return self
+
+
+def snapshot(control: Control, now_ns: int, overruns: int) -> LinkState:
+    """State of the link from the shared memory, at `now_ns` of CLOCK_MONOTONIC."""
+    words = control.words
+    rows = control.last_rows(1)
+    seen = len(rows) == 1
+    row = rows[0] if seen else np.zeros(1, dtype=rows.dtype)[0]
+    msr, cmd = row["msr"], row["cmd"]
+
+    def joints(values: Any) -> Joints:
+        return np.array(values, dtype=np.float64).reshape(JOINTS)
+
+    return LinkState(
+        state=State(int(msr["state"])).name,
+        quality=Quality(int(msr["quality"])).name,
+        control=ControlMode(int(msr["control"])).name,
+        mode=Mode(int(words[Word.MODE])).name.lower(),
+        sequence=int(row["sequence"]) if seen else -1,
+        period_s=round(float(msr["msr_sample_time"]) * 1e6) * 1e-6,
+        age_s=(now_ns - int(words[Word.HEARD_NS])) * 1e-9 if seen else float("inf"),
+        power=int(msr["power"]),
+        error=int(msr["error"]),
+        warning=int(msr["warning"]),
+        safety_limits=float(msr["safety_limits"]),
+        answer_rate=float(msr["answer_rate"]),
+        controller_latency_s=float(msr["latency"]),
+        jitter_s=float(msr["jitter"]),
+        miss_rate=float(msr["miss_rate"]),
+        miss_counter=int(msr["miss_counter"]),
+        temperature=joints(msr["temperature"]),
+        q=joints(msr["msr_jnt_pos"]),
+        tau=joints(msr["msr_jnt_trq"]),
+        tau_external=joints(msr["est_ext_jnt_trq"]),
+        q_command=joints(cmd["jnt_pos"]),
+        setpoint=joints(msr["cmd_jnt_pos"] + msr["cmd_jnt_pos_fri_offset"]),
+        tracking_error=control.tracking.copy(),
+        latency_s=_latencies(control.latency.copy()),
+        left=control.text(Text.LEFT),
+        received=int(words[Word.RECEIVED]),
+        answered=int(words[Word.ANSWERED]),
+        lost=int(words[Word.LOST]),
+        repeated=int(words[Word.REPEATED]),
+        reordered=int(words[Word.REORDERED]),
+        suspect=int(words[Word.SUSPECT]),
+        malformed=int(words[Word.MALFORMED]),
+        foreign=int(words[Word.FOREIGN]),
+        late=int(words[Word.UNREFLECTED]),
+        restarts=int(words[Word.RESTARTS]),
+        overruns=overruns,
+    )
+
+
+def _latencies(histogram: NDArray[np.int64]) -> dict[float, float]:
+    """Upper edges of the bins in which the quantiles lie [s]; empty before the first answer."""
+    total = int(histogram.sum())
+    if total == 0:
+        return {}
+    cumulated = np.cumsum(histogram)
+    places = [int(np.searchsorted(cumulated, max(1.0, np.ceil(q * total)))) for q in _QUANTILES]
+    return {q: (place + 1) * BIN_NS * 1e-9 for q, place in zip(_QUANTILES, places, strict=True)}
+
 
 _SILENCE_S = 1.0  # without packets for so long, that is the trouble and nothing else
 _POSITION_PROGRAMS = ("lwr_identification", "stanford", "ros_control")

@@ -17,8 +17,7 @@ from ruckig import (
 
 from fri.errors import ConfigurationError, RefusedError
 from lwr_driver.arm import JOINTS, Arm
-from lwr_driver.guard import ROUNDING
-from lwr_driver.stop import stop_extent
+from lwr_driver.guard import ROUNDING, stop_extent
 
 __all__ = ["Extreme", "Motion", "check_motion", "check_start", "extremes", "move_to"]
 
@@ -117,7 +116,7 @@ def extremes(arm: Arm, motion: Motion) -> tuple[Extreme, ...]:
 
     The arm rests at the first row before the motion and at the last row after it. Derivatives are differences
     of rows, as in `lwr_driver.guard`; each limit is widened by what rounding to float32 can account for. A
-    motion that passes can be stopped at any row without leaving the limits (`lwr_driver.stop`).
+    motion that passes can be stopped at any row without leaving the limits (`lwr_driver.guard`).
     """
     limits, period = arm.limits, motion.period_s
     sent = motion.q.astype(np.float32).astype(np.float64)
@@ -208,7 +207,7 @@ def move_to(
     request.duration_discretization = DurationDiscretization.Discrete
     request.current_position, request.target_position = ends[0].tolist(), ends[1].tolist()
     # A little below the limits: rounding uses them up to the last digit, and a stop begun while accelerating
-    # towards full speed passes it by J T²/8 (`lwr_driver.stop`).
+    # towards full speed passes it by J T²/8 (`lwr_driver.guard`).
     keep = 1.0 - 1e-6
     full = keep * limits.v_max - 0.13 * limits.j_max * period_s**2
     request.max_velocity = (speed_scale * np.maximum(full, 0.1 * limits.v_max)).tolist()

@@ -12,13 +12,17 @@ import gc
 import os
 import platform
 import resource
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from fri.errors import NetworkError
 
-__all__ = ["Rights", "Shortage", "assess", "set_up"]
+__all__ = ["Rights", "Shortage", "assess", "set_up", "undisturbed"]
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
@@ -190,3 +194,28 @@ def _prefault() -> None:
     block = bytearray(_PREFAULT_BYTES)
     block[:: resource.getpagesize()] = b"\1" * len(block[:: resource.getpagesize()])
     del block
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold back a KeyboardInterrupt until the block is left.
+
+    Only where Ctrl-C would raise one: in the main thread, with Python's own handler.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    interrupted = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal interrupted
+        interrupted = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if interrupted:
+        raise KeyboardInterrupt

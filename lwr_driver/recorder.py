@@ -23,8 +23,8 @@ from types import FrameType, TracebackType
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError, LwrError
-from lwr_driver.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.ring import Ring
+from lwr_driver.session.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.session.writer import ExitStatus
 
 __all__ = ["Recorded", "Recorder", "SessionRequest"]

@@ -21,7 +21,7 @@ from fri.policy import KrcLimits, KrcPolicy
 from fri.sample import Sample
 from fri.sequence import SequenceTracker
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session, recover
 
 __all__ = ["TARGETS", "check", "corpus"]

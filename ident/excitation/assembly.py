@@ -31,8 +31,8 @@ from ident.excitation.wanted import Criteria, reported_criteria, wanted_target
 from ident.model_file import read_model
 from ident.structure import Condition, ModelStructure
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 
 __all__ = ["Assembled", "assemble"]

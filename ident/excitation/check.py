@@ -43,7 +43,7 @@ class Nearest(Protocol):
 
 
 class PathChecker(Protocol):
-    """What the check needs of a collision checker (`lwr_driver.collision.CollisionChecker`)."""
+    """What the check needs of a collision checker (`lwr_driver.arm.collision.CollisionChecker`)."""
 
     def clearance(self, q: Array) -> Nearest:
         """Smallest distance in one posture (joints,)."""

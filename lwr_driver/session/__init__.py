@@ -6,12 +6,19 @@ killed recorder whole; `describe` says what a file holds.
 
 from __future__ import annotations
 
-from lwr_driver.session.columns import ControllerModelColumns, Gap, JointColumns, Phase, StatusColumns
-from lwr_driver.session.frames import LinkFrames
-from lwr_driver.session.reader import read_session
+from lwr_driver.arm import LinkFrames
+from lwr_driver.session.reader import describe, read_session
 from lwr_driver.session.recovery import Recovery, recover
-from lwr_driver.session.session import Missing, Session
-from lwr_driver.session.summary import SessionSummary, describe
+from lwr_driver.session.session import (
+    ControllerModelColumns,
+    Gap,
+    JointColumns,
+    Missing,
+    Phase,
+    Session,
+    SessionSummary,
+    StatusColumns,
+)
 from lwr_driver.session.writer import SessionWriter, session_metadata
 
 __all__ = [

@@ -1,8 +1,4 @@
-"""The writing side of an MCAP file: whole chunks at once, each on the disk before the next begins.
-
-After every call the file ends with a whole record, so a killed process leaves a file that can be read up to
-there. When a write fails (disk full), what was written of the broken record is cut off again.
-"""
+"""Records of an MCAP file as bytes, after the MCAP specification (https://mcap.dev/spec)."""
 
 from __future__ import annotations
 
@@ -11,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +15,144 @@ import zstandard
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session import mcap_format as mcap
-from lwr_driver.session.mcap_format import Opcode
-from lwr_driver.session.schemas import Schema
+from lwr_driver.session.messages import Schema
 
-__all__ = ["PROFILE", "Container", "Messages"]
+__all__ = [
+    "FOOTER_SIZE",
+    "MAGIC",
+    "MESSAGE_HEAD",
+    "PROFILE",
+    "Container",
+    "Messages",
+    "Opcode",
+    "message_prefix",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""Start of a message record: opcode, length, channel, sequence, log time, publish time; then the message."""
+
+FOOTER_SIZE = 9 + 20 + len(MAGIC)
+"""Bytes of the footer record and the closing magic."""
+
+
+class Opcode(IntEnum):
+    """Record types."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
+    DATA_END = 0x0F
+
+
+def _record(opcode: Opcode, *parts: bytes) -> bytes:
+    """A record of the given content."""
+    content = b"".join(parts)
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def _text(value: str) -> bytes:
+    """A string with its length."""
+    data = value.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _texts(values: Mapping[str, str]) -> bytes:
+    """A map of strings with its length in bytes."""
+    data = b"".join(_text(key) + _text(value) for key, value in values.items())
+    return struct.pack("<I", len(data)) + data
+
+
+def _schema(number: int, name: str, encoding: str, data: bytes) -> bytes:
+    """A schema record."""
+    head = struct.pack("<H", number) + _text(name) + _text(encoding)
+    return _record(Opcode.SCHEMA, head, struct.pack("<I", len(data)), data)
+
+
+def _channel(number: int, schema_number: int, topic: str, encoding: str, info: Mapping[str, str]) -> bytes:
+    """A channel record."""
+    head = struct.pack("<HH", number, schema_number)
+    return _record(Opcode.CHANNEL, head, _text(topic), _text(encoding), _texts(info))
+
+
+def message_prefix(channel_number: int, size: int) -> bytes:
+    """Head of a message record for a message of `size` bytes, counters and times zero."""
+    return MESSAGE_HEAD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size - 9 + size, channel_number, 0, 0, 0)
+
+
+def _attachment(name: str, media_type: str, data: bytes, time_ns: int) -> bytes:
+    """An attachment record with its CRC."""
+    content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
+    content += struct.pack("<Q", len(data)) + data
+    return _record(Opcode.ATTACHMENT, content, struct.pack("<I", zlib.crc32(content)))
+
+
+def _metadata(name: str, values: Mapping[str, str]) -> bytes:
+    """A metadata record."""
+    return _record(Opcode.METADATA, _text(name), _texts(values))
+
+
+def _attachment_index(
+    offset: int, length: int, times: tuple[int, int], size: int, name: str, media_type: str
+) -> bytes:
+    """Where an attachment stands; `times` are its log and create time."""
+    head = struct.pack("<QQQQQ", offset, length, *times, size)
+    return _record(Opcode.ATTACHMENT_INDEX, head, _text(name), _text(media_type))
+
+
+def _metadata_index(offset: int, length: int, name: str) -> bytes:
+    """Where a metadata record stands."""
+    return _record(Opcode.METADATA_INDEX, struct.pack("<QQ", offset, length), _text(name))
+
+
+def _chunk_index(
+    times: tuple[int, int],
+    place: tuple[int, int],
+    index_offsets: Mapping[int, int],
+    index_length: int,
+    compression: str,
+    sizes: tuple[int, int],
+) -> bytes:
+    """Where a chunk stands: (first, last) log time, (offset, length), indexes, (packed, plain) size."""
+    offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
+    head = struct.pack("<QQQQI", *times, *place, len(offsets))
+    return _record(
+        Opcode.CHUNK_INDEX,
+        head,
+        offsets,
+        struct.pack("<Q", index_length),
+        _text(compression),
+        struct.pack("<QQ", *sizes),
+    )
+
+
+def _statistics(
+    counts: Mapping[int, int],
+    schemas: int,
+    attachments: int,
+    metadata_count: int,
+    chunks: int,
+    times: tuple[int, int],
+) -> bytes:
+    """Counts of the whole file; `counts` are the messages of each channel."""
+    head = struct.pack(
+        "<QHIIIIQQ", sum(counts.values()), schemas, len(counts), attachments, metadata_count, chunks, *times
+    )
+    data = b"".join(struct.pack("<HQ", *item) for item in counts.items())
+    return _record(Opcode.STATISTICS, head, struct.pack("<I", len(data)), data)
+
 
 PROFILE = "ros2"
 
@@ -98,7 +228,7 @@ class Container:
                 f"session log {path} cannot be created: {error.strerror}; choose a folder that can be written"
             ) from error
         try:
-            self._write(mcap.MAGIC + mcap.record(Opcode.HEADER, mcap.text(PROFILE), mcap.text(library)))
+            self._write(MAGIC + _record(Opcode.HEADER, _text(PROFILE), _text(library)))
         except BaseException:
             self._file.close()
             path.unlink(missing_ok=True)
@@ -106,17 +236,15 @@ class Container:
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int) -> None:
         """Write an attachment."""
-        content = mcap.attachment(name, media_type, data, time_ns)
-        index = mcap.attachment_index(
-            self.offset, len(content), (time_ns, time_ns), len(data), name, media_type
-        )
+        content = _attachment(name, media_type, data, time_ns)
+        index = _attachment_index(self.offset, len(content), (time_ns, time_ns), len(data), name, media_type)
         self._write(content)
         self._attachments.append(index)
 
     def describe(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        content = mcap.metadata(name, values)
-        index = mcap.metadata_index(self.offset, len(content), name)
+        content = _metadata(name, values)
+        index = _metadata_index(self.offset, len(content), name)
         self._write(content)
         self._metadata.append(index)
 
@@ -136,11 +264,11 @@ class Container:
                 number = len(self._schemas) + 1
                 self._schemas[key] = (
                     number,
-                    mcap.schema(number, schema.name, schema_encoding, schema.text.encode()),
+                    _schema(number, schema.name, schema_encoding, schema.text.encode()),
                 )
             schema_number, schema_record = self._schemas[key]
             number = len(self._channels) + 1
-            content = mcap.channel(number, schema_number, topic, encoding, info or {})
+            content = _channel(number, schema_number, topic, encoding, info or {})
             self._channels[topic] = _Channel(number, schema, content, schema_record)
         return self._channels[topic].number
 
@@ -167,10 +295,10 @@ class Container:
         plain = b"".join([*head, *messages.records])
         packed = self._compressor.compress(plain)
         times = (int(messages.log_time.min()), int(messages.log_time.max()))
-        chunk = mcap.record(
+        chunk = _record(
             Opcode.CHUNK,
             struct.pack("<QQQI", *times, len(plain), zlib.crc32(plain)),
-            mcap.text("zstd"),
+            _text("zstd"),
             struct.pack("<Q", len(packed)),
             packed,
         )
@@ -181,14 +309,14 @@ class Container:
         for number in used.tolist():
             mine = messages.channel == number
             entries = np.stack([messages.log_time[mine], starts[mine]], axis=1).astype("<u8").tobytes()
-            index = mcap.record(Opcode.MESSAGE_INDEX, struct.pack("<HI", number, len(entries)), entries)
+            index = _record(Opcode.MESSAGE_INDEX, struct.pack("<HI", number, len(entries)), entries)
             index_offsets[number], counts[number] = at, int(mine.sum())
             parts.append(index)
             at += len(index)
         place = (self.offset, len(chunk))
         self._write(b"".join(parts))
         self._chunks.append(
-            mcap.chunk_index(
+            _chunk_index(
                 times, place, index_offsets, at - place[0] - place[1], "zstd", (len(packed), len(plain))
             )
         )
@@ -209,7 +337,7 @@ class Container:
             (
                 Opcode.STATISTICS,
                 [
-                    mcap.statistics(
+                    _statistics(
                         self._counts,
                         len({channel.schema_record for channel in written}),
                         len(self._attachments),
@@ -229,11 +357,11 @@ class Container:
                 start = summary_start + len(summary)
                 group = b"".join(records)
                 summary += group
-                offsets += mcap.record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(group)))
+                offsets += _record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(group)))
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, summary_start + len(summary))
         body = summary + offsets + footer
-        end = mcap.record(Opcode.DATA_END, struct.pack("<I", 0))
-        self._write(end + body + struct.pack("<I", zlib.crc32(body)) + mcap.MAGIC)
+        end = _record(Opcode.DATA_END, struct.pack("<I", 0))
+        self._write(end + body + struct.pack("<I", zlib.crc32(body)) + MAGIC)
         self._sync()
         self._file.close()
 

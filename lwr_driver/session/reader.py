@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from lwr_driver.session.cdr import (
+from lwr_driver.session.messages import (
+    TOPICS,
     CdrError,
     CdrReader,
     Layout,
@@ -25,12 +26,20 @@ from lwr_driver.session.cdr import (
     fri_status_layout,
     read_joint_state_layout,
 )
-from lwr_driver.session.columns import ControllerModelColumns, JointColumns, Phase, StatusColumns, stamp
 from lwr_driver.session.scan import Block, ChannelRecord, Scan
-from lwr_driver.session.schemas import TOPICS
-from lwr_driver.session.session import Missing, Session
+from lwr_driver.session.session import (
+    ControllerModelColumns,
+    JointColumns,
+    Missing,
+    Phase,
+    Session,
+    SessionSummary,
+    StatusColumns,
+    stamp,
+    summarise,
+)
 
-__all__ = ["read_session"]
+__all__ = ["describe", "read_session"]
 
 SCHEMA_VERSION = "1"
 _FIELDS = ("position", "velocity", "effort")
@@ -89,6 +98,11 @@ def read_session(
                     f"{channel.topic} holds other messages than its definition says and was not read"
                 )
     return _session(scan, joints, texts, fixed, notes, joint_names)
+
+
+def describe(session: Session | str | Path) -> SessionSummary:
+    """Summary of a session, or of the session in a file. DataError as `read_session`."""
+    return summarise(session if isinstance(session, Session) else read_session(session))
 
 
 def _session(

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session.columns import stamp
-from lwr_driver.session.container import Container, Messages
-from lwr_driver.session.mcap_format import MESSAGE_HEAD, Opcode
+from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, Opcode
+from lwr_driver.session.messages import Schema
 from lwr_driver.session.scan import Block, ChannelRecord, Scan
-from lwr_driver.session.schemas import Schema
+from lwr_driver.session.session import stamp
 
 __all__ = ["Recovery", "copy_messages", "recover", "replacing"]
 

@@ -19,7 +19,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from lwr_driver.session.mcap_format import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opcode
+from lwr_driver.session.container import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opcode
 
 __all__ = ["Block", "ChannelRecord", "Scan", "SchemaRecord"]
 

@@ -1,16 +1,198 @@
-"""A session as it was read: metadata, channels as columns, and what of it is missing."""
+"""What a session holds, as columns of numpy arrays."""
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
+import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import DataError
-from lwr_driver.session.columns import ControllerModelColumns, JointColumns, Phase, StatusColumns
 
-__all__ = ["Missing", "Session"]
+__all__ = [
+    "ChannelSummary",
+    "ControllerModelColumns",
+    "Gap",
+    "JointColumns",
+    "Missing",
+    "Phase",
+    "PhaseSummary",
+    "Session",
+    "SessionSummary",
+    "StatusColumns",
+    "stamp",
+    "summarise",
+]
+
+
+class Phase(NamedTuple):
+    """Beginning of a phase of the experiment: log time [ns] and name."""
+
+    log_time: int
+    name: str
+
+
+class Gap(NamedTuple):
+    """Samples missing before the row `row`: how many, and the log times of the rows around [ns]."""
+
+    row: int
+    lost: int
+    before: int
+    after: int
+
+
+@dataclass(frozen=True)
+class JointColumns:
+    """One channel of joint states, n samples of J joints, in the order of the file.
+
+    log_time, publish_time : (n,) int64, host time and the source's time [ns]
+    sequence : (n,) int64, counter of the source; a gap is a lost sample
+    position [rad], velocity [rad/s], effort [Nm] : (n, J) float64, or (n, 0) where the channel has none
+    source : file, for messages
+    """
+
+    topic: str
+    names: tuple[str, ...]
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    sequence: NDArray[np.int64]
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    effort: NDArray[np.float64]
+    source: str = ""
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+    @property
+    def numbered(self) -> bool:
+        """Whether the source counted its samples; a counter that is always zero is none."""
+        return bool(self.sequence.any())
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Lost samples as the counter tells them; none if the samples are not numbered."""
+        if not self.numbered:
+            return ()
+        steps = np.diff(self.sequence)
+        return tuple(
+            Gap(int(row) + 1, int(steps[row]) - 1, int(self.log_time[row]), int(self.log_time[row + 1]))
+            for row in np.flatnonzero(steps > 1)
+        )
+
+    @property
+    def lost(self) -> int:
+        """Number of lost samples between the first and the last."""
+        return sum(gap.lost for gap in self.gaps)
+
+    @property
+    def period_s(self) -> float:
+        """Median time between samples by the source's clock, or the host's if the source gives none [s]."""
+        if len(self) < 2:
+            return float("nan")
+        times = self.publish_time if np.ptp(self.publish_time) > 0 else self.log_time
+        return float(np.median(np.diff(times))) * 1e-9
+
+    def select(self, names: Sequence[str]) -> JointColumns:
+        """The same samples with the joints `names` in this order.
+
+        DataError names a joint that is not there.
+        """
+        wanted = tuple(names)
+        if wanted == self.names:
+            return self
+        for name in wanted:
+            if name not in self.names:
+                near = difflib.get_close_matches(name, self.names, n=1)
+                advice = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(self.names)}"
+                raise DataError(
+                    f"{self.source}: {self.topic} at {stamp(self.log_time)} has no joint {name!r}; {advice}"
+                )
+        columns = [self.names.index(name) for name in wanted]
+
+        def pick(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return values[:, columns] if values.shape[1] else values
+
+        return dataclasses.replace(
+            self,
+            names=wanted,
+            position=pick(self.position),
+            velocity=pick(self.velocity),
+            effort=pick(self.effort),
+        )
+
+    def rows(self, start: int, stop: int) -> JointColumns:
+        """The samples with `start` <= log time < `stop` [ns]."""
+        low, high = np.searchsorted(self.log_time, [start, stop], side="left")
+        part = slice(int(low), int(high))
+        return dataclasses.replace(
+            self,
+            log_time=self.log_time[part],
+            publish_time=self.publish_time[part],
+            sequence=self.sequence[part],
+            position=self.position[part],
+            velocity=self.velocity[part],
+            effort=self.effort[part],
+        )
+
+
+@dataclass(frozen=True)
+class StatusColumns:
+    """The channel `/fri/status`, n cycles. Names and units are those of `lwr_msgs/msg/FriStatus`."""
+
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    state: NDArray[np.uint16]
+    quality: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    sample_time: NDArray[np.float64]
+    answer_rate: NDArray[np.float32]
+    latency: NDArray[np.float32]
+    jitter: NDArray[np.float32]
+    miss_rate: NDArray[np.float32]
+    miss_counter: NDArray[np.uint32]
+    power: NDArray[np.uint16]
+    control: NDArray[np.uint16]
+    error: NDArray[np.uint16]
+    warning: NDArray[np.uint16]
+    temperature: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+
+@dataclass(frozen=True)
+class ControllerModelColumns:
+    """The channel `/fri/controller_model`, n samples of the controller's own model, float64.
+
+    mass_matrix (n, 7, 7) [kg m2], gravity (n, 7) [Nm], jacobian (n, 6, 7), estimated_external_torque (n, 7)
+    [Nm]
+    """
+
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    mass_matrix: NDArray[np.float64]
+    gravity: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    estimated_external_torque: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+
+def stamp(times: NDArray[np.int64] | int) -> str:
+    """A log time for a message, in seconds; of an array the first."""
+    if isinstance(times, np.ndarray):
+        if not len(times):
+            return "(empty)"
+        times = int(times[0])
+    return f"t = {times // 10**9}.{times % 10**9:09d} s"
 
 
 @dataclass(frozen=True)
@@ -119,3 +301,143 @@ class Session:
             for phase, stop in zip(self.phases, stops, strict=False)
             if phase.name == name or phase.name.startswith(name + " ")
         )
+
+
+@dataclass(frozen=True)
+class ChannelSummary:
+    """Samples of one topic: number, rate [Hz], lost samples, and the longest pause between two [s]."""
+
+    topic: str
+    samples: int
+    rate_hz: float
+    lost: int
+    longest_pause_s: float
+    holds: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PhaseSummary:
+    """A phase: name, beginning after the first joint state, and duration [s]."""
+
+    name: str
+    begin_s: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class SessionSummary:
+    """Everything `lwr-run info` says of a session; `str()` is the text, `as_dict()` the data.
+
+    size_bytes : size of the file; position_range, effort_rms : per joint [rad], [Nm]
+    """
+
+    path: Path
+    size_bytes: int
+    utc_first: str
+    duration_s: float
+    joint_names: tuple[str, ...]
+    channels: tuple[ChannelSummary, ...]
+    phases: tuple[PhaseSummary, ...]
+    position_range: tuple[tuple[float, float], ...]
+    effort_rms: tuple[float, ...]
+    motor_effort_rms: tuple[float, ...]
+    attachments: Mapping[str, int]
+    metadata: Mapping[str, str]
+    end: Mapping[str, str] | None
+    missing: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain data, for JSON."""
+        return {**asdict(self), "path": str(self.path)}
+
+    def __str__(self) -> str:
+        data = self.metadata
+        status = "unknown: the recorder died" if self.end is None else self.end.get("exit_status", "unknown")
+        reason = f" ({self.end['reason']})" if self.end and self.end.get("reason") else ""
+        mass = f", {data['payload_mass']} kg" if data.get("payload_mass") else ""
+        lines = [
+            f"{self.path}  {self.size_bytes / 1e6:.1f} MB",
+            f"  robot        {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
+            f"  payload      {data.get('payload', 'unknown')}{mass}",
+            f"  experiment   {data.get('experiment', '') or '-'}",
+            f"  recorded     {self.utc_first}, {self.duration_s:.3f} s",
+            f"  ended        {status}{reason}",
+            f"  motor torque {data.get('motor_torque_source', 'unknown')}",
+            "",
+            f"  {'topic':<24}{'samples':>9}{'Hz':>9}{'lost':>7}{'longest pause':>16}",
+        ]
+        lines += [
+            f"  {item.topic:<24}{item.samples:>9}{item.rate_hz:>9.1f}{item.lost:>7}"
+            f"{item.longest_pause_s * 1e3:>13.1f} ms"
+            for item in self.channels
+        ]
+        lines += ["", f"  {'joint':<12}{'from':>9}{'to':>9} rad{'sensor rms':>13}{'motor rms':>12} Nm"]
+        for index, name in enumerate(self.joint_names):
+            low, high = self.position_range[index]
+            efforts = [
+                f"{rms[index]:.3f}" if rms else "-" for rms in (self.effort_rms, self.motor_effort_rms)
+            ]
+            lines.append(f"  {name:<12}{low:>9.4f}{high:>9.4f}    {efforts[0]:>13}{efforts[1]:>12}")
+        if self.phases:
+            lines += ["", f"  {'phase':<24}{'begins':>9}{'lasts':>9} s"]
+            lines += [f"  {item.name:<24}{item.begin_s:>9.3f}{item.duration_s:>9.3f}" for item in self.phases]
+        if self.attachments:
+            lines += [
+                "",
+                "  attached     " + ", ".join(f"{k} ({v} bytes)" for k, v in self.attachments.items()),
+            ]
+        lines += ["", *(f"  missing      {line}" for line in self.missing or ("nothing",))]
+        return "\n".join(lines)
+
+
+def summarise(session: Session) -> SessionSummary:
+    """Summary of a session whose file is still there."""
+    joint, motor = session.joint, session.motor
+    channels = [_channel(item) for item in (joint, motor, session.command) if item is not None]
+    for topic, other in (
+        ("/fri/status", session.status),
+        ("/fri/controller_model", session.controller_model),
+    ):
+        if other is not None:
+            channels.append(_times(topic, other.log_time, 0, ()))
+    stops = [*(phase.log_time for phase in session.phases[1:]), int(joint.log_time[-1])]
+    first = datetime.datetime.fromtimestamp(session.start / 1e9, datetime.UTC)
+    return SessionSummary(
+        path=session.path,
+        size_bytes=session.path.stat().st_size,
+        utc_first=first.strftime("%Y-%m-%d %H:%M:%S.%f UTC"),
+        duration_s=session.duration_s,
+        joint_names=session.joint_names,
+        channels=tuple(channels),
+        phases=tuple(
+            PhaseSummary(phase.name, (phase.log_time - session.start) * 1e-9, (stop - phase.log_time) * 1e-9)
+            for phase, stop in zip(session.phases, stops, strict=False)
+        ),
+        position_range=tuple(
+            (float(low), float(high))
+            for low, high in zip(joint.position.min(axis=0), joint.position.max(axis=0), strict=True)
+        ),
+        effort_rms=_rms(joint),
+        motor_effort_rms=() if motor is None or motor.names != joint.names else _rms(motor),
+        attachments={name: len(data) for name, data in session.attachments.items()},
+        metadata=session.metadata,
+        end=session.end,
+        missing=session.missing.lines,
+    )
+
+
+def _rms(columns: JointColumns) -> tuple[float, ...]:
+    if not columns.effort.shape[1]:
+        return ()
+    return tuple(np.sqrt(np.mean(columns.effort**2, axis=0)).tolist())
+
+
+def _channel(columns: JointColumns) -> ChannelSummary:
+    holds = tuple(name for name in ("position", "velocity", "effort") if getattr(columns, name).shape[1])
+    return _times(columns.topic, columns.log_time, columns.lost, holds)
+
+
+def _times(topic: str, log_time: np.ndarray[Any, Any], lost: int, holds: tuple[str, ...]) -> ChannelSummary:
+    steps = np.diff(log_time) * 1e-9
+    rate = float(1.0 / np.median(steps)) if len(steps) and np.median(steps) > 0 else 0.0
+    return ChannelSummary(topic, len(log_time), rate, lost, float(steps.max()) if len(steps) else 0.0, holds)

@@ -21,8 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session import mcap_format as mcap
-from lwr_driver.session.cdr import (
+from lwr_driver.arm import LinkFrames
+from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, message_prefix
+from lwr_driver.session.messages import (
+    TOPICS,
     Layout,
     LayoutBuilder,
     controller_model_layout,
@@ -30,10 +32,7 @@ from lwr_driver.session.cdr import (
     joint_state_layout,
     tf_layout,
 )
-from lwr_driver.session.columns import stamp
-from lwr_driver.session.container import Container, Messages
-from lwr_driver.session.frames import LinkFrames
-from lwr_driver.session.schemas import TOPICS
+from lwr_driver.session.session import stamp
 
 __all__ = ["CHUNK_PERIOD_S", "SLOW_PERIOD_NS", "ExitStatus", "SessionWriter", "session_metadata"]
 
@@ -427,7 +426,7 @@ class SessionWriter:
         layout_key = (topic, key)
         if layout_key not in self._layouts:
             layout = build()
-            prefix = mcap.message_prefix(number, layout.size)
+            prefix = message_prefix(number, layout.size)
             self._layouts[layout_key] = layout.relaid(prefix, _PREFIX_FIELDS)
         layout = self._layouts[layout_key]
         values = {"channel_sequence": numbers, "log_time": times, "publish_time": published, **columns}
@@ -497,4 +496,4 @@ class SessionWriter:
         )
 
 
-assert struct.calcsize("<BQHIQQ") == mcap.MESSAGE_HEAD.size == 31
+assert struct.calcsize("<BQHIQQ") == MESSAGE_HEAD.size == 31

@@ -17,7 +17,7 @@ from ident.discrepancy import Diagnosis, Finding
 from ident.excitation import ExcitationPlan
 from ident.excitation.motion import ParametricMotion
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import parse
 from lwr_driver.motion import Motion
 from lwr_driver.session import Session

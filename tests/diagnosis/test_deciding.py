@@ -14,7 +14,7 @@ from ident.discrepancy import Finding
 from ident.effects import EFFECTS
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.diagnosis.deciding import _KINDS, Deciding, offers, open_findings
 from runner.diagnosis.decision import decision_text, decisions
 from runner.diagnosis.words import quantity_text

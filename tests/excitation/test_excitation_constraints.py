@@ -17,8 +17,8 @@ from ident.excitation.motion import Samples
 from ident.excitation.program import Program
 from ident.excitation.torque import torque_bounds
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from ident.excitation.capsules import space_of
 from ident.excitation.mechanism import Mechanism, tip_path
 from ident.excitation.space import Space, distances, row_gradient
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Box, Cell, PayloadShape
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Box, Cell, PayloadShape
+from lwr_driver.arm.collision import CollisionChecker
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from fri.krl import Interpreter
 from fri.krl_machine import AXES, NoMachinery, SourceProgram
 from fri.packets import JOINT_NAMES, new_cmd, new_msr
 from fri.states import Control, State
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from sim_backend.krl_program import krl_program
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from lwr_driver.session.columns import JointColumns
+from lwr_driver.session.session import JointColumns
 
 __all__ = ["FreshTorques", "KrlMotorTorque", "KrlTorqueDecoder", "TorqueMatch", "match_torques"]
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from lwr_driver.ring import NO_PHASE
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from lwr_driver.session.writer import ExitStatus, SessionWriter
 
 __all__ = ["Recorded", "Recording", "SessionRequest", "utc_offset_ns"]

@@ -11,7 +11,7 @@ error of its rate. `tau_m_JOINT` is the motor torque referred to the joint side,
 `q_JOINT` is the measured joint position, the same quantity that FRI reports [rad]. The columns may stand in
 any order; each joint of the session has both.
 
-The clock is found by comparing the positions with those of `/joint_states` (`lwr_driver.alignment`). The
+The clock is found by comparing the positions with those of `/joint_states` (`lwr_driver.session.alignment`). The
 samples go into `/motor_states` as they are, none made up, none resampled, each with the log time that belongs
 to it and, as its publish time, the time of the trace.
 """
@@ -28,16 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from lwr_driver.alignment import Alignment, Track, align
-from lwr_driver.motor_torque import TorqueMatch, match_torques
-from lwr_driver.session.cdr import joint_state_layout
-from lwr_driver.session.columns import JointColumns, stamp
-from lwr_driver.session.container import Container, Messages
-from lwr_driver.session.mcap_format import MESSAGE_HEAD, Opcode
+from lwr_driver.session.alignment import Alignment, Track, align
+from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, Opcode
+from lwr_driver.session.messages import JOINT_STATE, joint_state_layout
+from lwr_driver.session.motor_torque import TorqueMatch, match_torques
 from lwr_driver.session.reader import read_session
 from lwr_driver.session.recovery import copy_messages, replacing
 from lwr_driver.session.scan import Scan
-from lwr_driver.session.schemas import JOINT_STATE
+from lwr_driver.session.session import JointColumns, stamp
 
 __all__ = ["Trace", "TraceImport", "import_trace", "read_trace"]
 
@@ -148,7 +146,7 @@ def import_trace(
     """Align a trace with a session and write the session anew with `/motor_states` in it.
 
     out : the new file; default is to replace the session itself, in one step
-    tolerance_s : see `lwr_driver.alignment.align`
+    tolerance_s : see `lwr_driver.session.alignment.align`
 
     DataError if the session has motor torques already or did not end properly, if the trace is not as it must
     be, if the two cannot be aligned beyond doubt, or if the torque columns follow the torques of other

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.arm import JOINTS, Arm
-from lwr_driver.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell, PayloadShape
 
 __all__ = ["Clearance", "CollisionChecker"]
 
