@@ -1,4 +1,4 @@
-"""The driver: the connection to the arm as a lifecycle, on top of a real-time process and a recorder process.
+"""The driver: the connection to the arm, on top of a real-time process and a recorder process.
 
 ::
 
@@ -13,7 +13,7 @@
         driver.end_record(outcome.status, outcome.reason)
         outcome.check()
 
-A motion that ended, for whatever reason, is never taken up again.
+A motion is never resumed after its end.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
 from lwr_driver.commander import BRAKE, HOLD
+from lwr_driver.configuration import as_path, expect
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
 from lwr_driver.link import (
     LinkSettings,
@@ -76,7 +77,7 @@ LOCK_STEP_EPOCH_NS = 1_577_836_800 * 10**9
 """Log time of packet 0 in lock step: the first of January 2020."""
 
 ROWS_KEPT = 50
-"""Cycles that an error or an outcome carries."""
+"""Cycles attached to an error or an outcome."""
 
 _POLL_S = 0.002
 _NOTIFY_S = 0.5
@@ -96,14 +97,14 @@ _PHASES = {HOLD: "hold", BRAKE: "brake"}
 class Driver:
     """Connection to one arm. A context manager: leaving it always stops the arm and ends both processes.
 
-    arm : limits that guard every cycle
-    link : how the arm is reached
+    arm : limits for the guard of every cycle
+    link : settings of the connection
     notify : called with a Waiting about twice a second while a step waits
-    motor_torque : where the motor torques stand in the KRL variables; None records none
+    motor_torque : places of the motor torques in the KRL variables; None records none
 
-    Steps that wait raise OperatorError if `request_stop` or `drop_link` is called meanwhile, NetworkError if
-    the link or a process is gone, RobotError if the controller does not do what is asked. Errors carry the
-    last cycles as `.rows`.
+    A waiting step raises OperatorError after `request_stop` or `drop_link`, NetworkError if the link or a
+    process is gone, RobotError if the controller does not follow a request. Errors carry the last cycles as
+    `.rows`.
     """
 
     def __init__(
@@ -114,6 +115,8 @@ class Driver:
         notify: Callable[[Waiting], None] | None = None,
         motor_torque: KrlMotorTorque | None = None,
     ) -> None:
+        expect(arm, Arm, "arm of the driver", "give `Arm.load()`")
+        expect(link, LinkSettings, "link of the driver", 'give `LinkSettings(address="192.168.0.100")`')
         self.arm, self.link, self.motor_torque = arm, link, motor_torque
         self.rights: Rights | None = None
         self._notify = notify
@@ -124,6 +127,10 @@ class Driver:
         self._recording = False
         self._stops_seen = 0
         self._notes_seen = 0
+
+    def __repr__(self) -> str:
+        link, seen = self.link, "not connected" if self._loop is None else self.state().summary
+        return f"Driver of {self.arm.name}\n  link   {link.address}:{link.port}, {link.handshake}\n  state  {seen}"
 
     def __enter__(self) -> Driver:
         return self
@@ -136,7 +143,7 @@ class Driver:
     # -- lifecycle -------------------------------------------------------------------------------------------
 
     def connect(self, *, timeout_s: float = 60.0) -> LinkState:
-        """Start loop and recorder and wait for the first packet; everything is ended again if that fails."""
+        """Start loop and recorder and wait for the first packet; on failure both are ended again."""
         if self._loop is not None:
             return self.state()
         link = self.link
@@ -180,12 +187,12 @@ class Driver:
 
     @property
     def port(self) -> int:
-        """UDP port on which the loop listens."""
+        """UDP port of the loop."""
         return self._need(self._loop).port
 
     @property
     def ring_name(self) -> str:
-        """Name of the shared memory with every cycle, for onlookers (`Ring.attach`, `Ring.peek`)."""
+        """Name of the shared memory with every cycle, for observers (`Ring.attach`, `Ring.peek`)."""
         name: str = self._need(self._ring).name
         return name
 
@@ -231,7 +238,7 @@ class Driver:
     # -- steps -----------------------------------------------------------------------------------------------
 
     def wait_quality(self, quality: str = "OK", *, cycles: int = 100, timeout_s: float = 60.0) -> LinkState:
-        """Wait until the controller has rated the link `quality` or better for `cycles` cycles on end."""
+        """Wait until the controller rates the link `quality` or better for `cycles` successive cycles."""
         try:
             least = Quality[quality.upper()]
         except KeyError:
@@ -250,7 +257,7 @@ class Driver:
 
     @property
     def sets_load(self) -> bool:
-        """Whether the KRL program takes load data over the link, see `set_load`."""
+        """Whether the KRL program accepts load data over the link, see `set_load`."""
         return isinstance(find_handshake(self.link.handshake), IdentificationHandshake)
 
     def set_load(
@@ -261,10 +268,12 @@ class Driver:
         *,
         timeout_s: float = 10.0,
     ) -> LinkState:
-        """Put load data in force on the controller, which compensates gravity with them; in monitor mode.
+        """Set load data for the gravity compensation of the controller; in monitor mode.
 
-        mass : [kg]. com : centre of mass in the flange frame [m]. inertia : JX JY JZ about it, along the axes
-        of the flange frame [kg m2]. Raises ConfigurationError where the KRL program takes none.
+        mass : [kg]; com : centre of mass in the flange frame [m]
+        inertia : JX JY JZ about it, along the axes of the flange frame [kg m2]
+
+        Raises ConfigurationError if the KRL program accepts none.
         """
         if not self.sets_load:
             raise ConfigurationError(
@@ -296,7 +305,7 @@ class Driver:
                 advice=advise_command,
             )
         except BaseException:
-            # The request must not be granted after nobody waits for it any more.
+            # The request must not be granted later, with nobody waiting for it.
             if self._loop is not None:
                 with contextlib.suppress(LwrError):
                     self._wait(
@@ -316,9 +325,9 @@ class Driver:
         `progress` is called about ten times a second; an exception from it stops the arm and is passed on.
 
         Raises RefusedError, before anything moves, if the motion breaks a limit or begins elsewhere, and
-        RobotError if command mode is not on. What happens once it moves is in the outcome, not in an
-        exception.
+        RobotError outside command mode. Failures after the beginning are in the outcome, not raised.
         """
+        expect(motion, Motion, "motion to execute", "give a `Motion`, such as from `move_to`")
         control, state = self._need(self._control), self.state()
         if int(control.words[Word.STOP]) != self._stops_seen:
             self._stops_seen = int(control.words[Word.STOP])
@@ -375,14 +384,14 @@ class Driver:
     def request_stop(self) -> None:
         """Ask for a jerk-limited stop and return at once; from any thread or signal handler.
 
-        It holds until a step notices it: a motion is stopped, a waiting step raises OperatorError, and a
-        motion that has not begun does not begin.
+        It holds until a step notices it: a motion is stopped or does not begin, a waiting step raises
+        OperatorError.
         """
         if self._control is not None:
             self._control.words[Word.STOP] += 1
 
     def drop_link(self) -> None:
-        """Answer no more, for good: the controller brakes by itself. From any thread or signal handler."""
+        """Stop answering for good: the controller brakes by itself. From any thread or signal handler."""
         if self._control is not None:
             self._control.words[Word.DROP] = 1
 
@@ -409,9 +418,7 @@ class Driver:
         return self._rows(count)
 
     def latency_histogram(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Reply latencies since the connection began: upper edges of the bins [s] and counts; the last bin
-        holds all that is longer.
-        """
+        """Reply latencies since `connect`: upper edges of the bins [s] and counts; the last bin is open."""
         counts = self._need(self._control).latency.copy()
         edges = np.arange(1, len(counts) + 1, dtype=np.float64) * (BIN_NS * 1e-9)
         return edges, counts
@@ -421,10 +428,10 @@ class Driver:
     def record(
         self, path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes] | None = None
     ) -> None:
-        """Begin a session log at `path` with the next cycle; `metadata` as from `session_metadata`."""
+        """Begin a session log at `path` with the next cycle; `metadata` from `session_metadata`."""
         self._need(self._recorder).open(
             SessionRequest(
-                path=path,
+                path=as_path(path, "session log"),
                 joint_names=self.arm.joint_names,
                 metadata=dict(metadata),
                 robot_description=self.arm.urdf,
@@ -461,9 +468,9 @@ class Driver:
         stoppable: bool = True,
         patience_s: float | None = None,
     ) -> None:
-        """Post a job and wait for its end; the error says what was awaited, what is seen, and what to do.
+        """Post a job and wait for its end; an error names the aim, the present state and the remedy.
 
-        The time limit counts cycles where there is a cycle, so that it means the same in lock step.
+        The time limit counts cycles as soon as there are any, so it has the same meaning in lock step.
         """
         state = self.state()
         limit = round(timeout_s / state.period_s) if state.period_s > 0.0 else 0
@@ -550,7 +557,7 @@ class Driver:
         return _PHASES.get(number) or names.get(number, "")
 
     def _recorder_trouble(self) -> LwrError | None:
-        """What is wrong with the recording; then the motion is stopped, for without data it is in vain."""
+        """A failure of the recording; it stops the motion, useless without data."""
         if not self._recording:
             return None
         try:
@@ -561,7 +568,7 @@ class Driver:
         return None
 
     def _give_up(self, error: BaseException) -> None:
-        """Stop what still moves before an exception leaves."""
+        """Stop a moving arm before an exception is passed on."""
         log.info("motion given up: %s", error)
         with contextlib.suppress(LwrError):
             self._wait(
@@ -611,7 +618,7 @@ class Driver:
 
 
 class _Watch:
-    """Notices that the loop process has ended, or in lock step that the other side has gone."""
+    """Notices the end of the loop process and, in lock step, of the other side."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -631,7 +638,7 @@ class _Watch:
             return
         cycles = int(driver._need(driver._control).words[Word.CYCLES])
         now = time.monotonic()
-        # A pause of this process itself tells nothing of the others, which may have stood still as well.
+        # A pause of this process is no silence of the others: they may have paused as well.
         self._silence_s += min(now - self._looked, _LONGEST_LOOK_S)
         self._looked = now
         if cycles != self._cycles:

@@ -1,4 +1,4 @@
-"""What the driver tells about the link and about a motion: plain values, no connection behind them."""
+"""The link to the arm: its settings, its state, the outcome of a motion, and advice while a step waits."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Joints = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Waiting:
-    """What a step of the driver waits for: what is awaited, what is seen, since when, and what to do."""
+    """A waiting step of the driver: its aim, the present state, the time so far, and the remedy."""
 
     awaited: str
     seen: str
@@ -57,19 +57,18 @@ class LinkState:
 
     state, quality, control : names of the FRI values (`MON`, `CMD`; `UNACCEPTABLE` to `PERFECT`; `POSITION`);
         `OFF`, `UNACCEPTABLE`, `OTHER` before the first packet
-    mode : what the loop answers: `mirror`, `hold`, `motion`, `stop`, `silent`
+    mode : kind of answer: `mirror`, `hold`, `motion`, `stop`, `silent`
     sequence : number of the last packet, unwrapped, -1 before the first; period_s : the controller's cycle
         [s]
     age_s : time since the last packet [s], infinite before the first
     q, tau, tau_external, q_command : measured position [rad], joint torque sensors [Nm], estimated external
         torque [Nm], position of the last answer [rad]
     setpoint : the controller's own set point, command plus FRI offset [rad]; motions begin there
-    tracking_error : largest distance of q from the answer before, since command mode began [rad]
+    tracking_error : largest distance of q from the answer before, in this command mode [rad]
     latency_s : quantiles 0.5, 0.99, 0.999 and 1 of the time from packet to answer in the loop [s]
-    left : why command mode was left last, empty if it never was or if it is on
-    received to restarts : counters of the link; `late` counts answers that the controller had not seen when
-        it
-        sent its next packet; overruns : rows that the recorder was too slow for
+    left : reason of the last end of command mode, empty in command mode or before the first
+    received to restarts : counters of the link; late : answers not yet seen by the controller at its next
+        packet; overruns : rows lost to a slow recorder
     """
 
     state: str
@@ -123,7 +122,7 @@ class LinkState:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a motion is: row sent of rows planned, time [s], name of the phase, state of the link."""
+    """Progress of a motion: row sent of rows planned, time [s], name of the phase, state of the link."""
 
     row: int
     rows: int
@@ -147,13 +146,13 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """How a motion ended.
+    """End of a motion.
 
-    status : `success`, `abort` (somebody asked to stop), `fail`
-    reason : why, in words; empty on success
+    status : `success`, `abort` (on request), `fail`
+    reason : in words; empty on success
     last_rows : the last cycles, dtype `lwr_driver.ring.ROW`
-    row : last row of the motion that was sent, -1 if none; rows : of the motion
-    error : what `check` raises, with the last rows as `.rows`; None unless failed
+    row : last row sent, -1 if none; rows : of the motion
+    error : raised by `check`, with the last rows as `.rows`; None unless failed
     """
 
     status: Literal["success", "abort", "fail"]
@@ -222,7 +221,7 @@ def snapshot(control: Control, now_ns: int, overruns: int) -> LinkState:
 
 
 def _latencies(histogram: NDArray[np.int64]) -> dict[float, float]:
-    """Upper edges of the bins in which the quantiles lie [s]; empty before the first answer."""
+    """Upper edges of the bins with the quantiles [s]; empty before the first answer."""
     total = int(histogram.sum())
     if total == 0:
         return {}
@@ -231,27 +230,25 @@ def _latencies(histogram: NDArray[np.int64]) -> dict[float, float]:
     return {q: (place + 1) * BIN_NS * 1e-9 for q, place in zip(_QUANTILES, places, strict=True)}
 
 
-_SILENCE_S = 1.0  # without packets for so long, that is the trouble and nothing else
+_SILENCE_S = 1.0  # after so long without a packet, silence is the cause of any trouble
 _POSITION_PROGRAMS = ("lwr_identification", "stanford", "ros_control")
 
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """How the arm is reached and how fast the answer must be.
+    """Settings of the connection to the arm.
 
-    address, port : where this computer listens; only this address is bound. Port 0 takes a free one
-    controller : IP address of the controller; None takes the first that speaks, and then only that
+    address, port : of this computer; only this address is bound, port 0 takes a free one
+    controller : IP address of the controller; None accepts the first sender, and then only that one
     lock_step : the other side waits for each answer and nothing runs between commands (the emulator only)
     handshake : KRL program on the controller: `lwr_identification`, `stanford`, `ros_control`
-    realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; in lock step
-        they
-        do not matter and are not asked for
+    realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; not needed in
+        lock step
     priority : of SCHED_FIFO; cpu : processor of the loop, None chooses an isolated one or the last
-    link_timeout_s : silence after which the link counts as lost [s]; ten cycles are always granted
-    tracking_limit_rad : distance between command and arm at which a motion is stopped [rad]
+    link_timeout_s : the link counts as lost after so much silence [s], ten cycles at least
+    tracking_limit_rad : largest distance between command and arm in a motion [rad]
     longest_motion_s : memory for motions, at 1 ms; longer cycles allow for longer motions [s]
-    lock_step_patience_s : real time without a packet after which the other side counts as gone in lock step
-        [s]
+    lock_step_patience_s : in lock step the other side counts as gone after so much real time [s]
     """
 
     address: str = "192.168.0.100"
@@ -281,7 +278,7 @@ class LinkSettings:
 
 
 def advise_connect(state: LinkState) -> str:
-    """What to do while no packet comes."""
+    """Advice while no packet comes."""
     if state.malformed:
         return "The packets are not FRI 1.0: check which software runs on the controller"
     if state.foreign:
@@ -294,21 +291,21 @@ def advise_connect(state: LinkState) -> str:
 
 
 def advise_monitor(state: LinkState) -> str:
-    """What to do while cycles are counted at rest."""
+    """Advice while cycles are counted at rest."""
     if state.age_s > _SILENCE_S:
         return advise_connect(state)
     return "Nothing to do: packets come, the arm rests and is measured"
 
 
 def advise_rest(state: LinkState) -> str:
-    """What to do while the arm comes to rest."""
+    """Advice while the arm comes to rest."""
     if state.age_s > _SILENCE_S:
         return "No packet comes, so the controller brakes by itself; look at the pendant"
     return "The arm brakes within its jerk limit; if it does not, press the emergency stop"
 
 
 def advise_quality(state: LinkState) -> str:
-    """What to do while the controller rates the link as bad."""
+    """Advice while the controller rates the link as bad."""
     if state.age_s > _SILENCE_S:
         return advise_connect(state)
     if state.foreign:
@@ -316,15 +313,15 @@ def advise_quality(state: LinkState) -> str:
     if state.late > state.received // 100:
         return "Answers come too late: close other programs, see the real-time rights, or use a longer cycle"
     seen = ((state.lost, "lost"), (state.malformed, "malformed"), (state.miss_counter, "unanswered in time"))
-    told = ", ".join(f"{count} {what}" for count, what in seen if count)
+    listed = ", ".join(f"{count} {word}" for count, word in seen if count)
     return (
-        f"Nothing to do at the pendant{f' ({told})' if told else ''}; check cable and network card, and that "
+        f"Nothing to do at the pendant{f' ({listed})' if listed else ''}; check cable and network card, and that "
         "only one client answers"
     )
 
 
 def advise_command(state: LinkState) -> str:
-    """What to do while command mode does not come."""
+    """Advice while command mode does not come."""
     if state.age_s > _SILENCE_S:
         return advise_connect(state)
     if state.state == "CMD" and (state.power != ALL_DRIVES or state.error):
@@ -337,18 +334,18 @@ def advise_command(state: LinkState) -> str:
 
 
 def advise_load(state: LinkState) -> str:
-    """What to do while load data are not taken."""
+    """Advice while load data are not accepted."""
     if state.age_s > _SILENCE_S:
         return advise_connect(state)
     return "The KRL program takes them in monitor mode, up to its LWR_LOAD_MAX: see its data list"
 
 
 def advise_leave(state: LinkState) -> str:
-    """What to do while command mode does not end."""
+    """Advice while command mode does not end."""
     return "The KRL program does not react: stop it at the pendant"
 
 
 def silence_in_lock_step(state: LinkState, silence_s: float) -> str:
-    """What to say when nothing has come for so long [s] in lock step, where the other side waits for us."""
+    """Message after `silence_s` without a packet in lock step [s]."""
     cause = f"{state.malformed} malformed packets came" if state.malformed else "the emulator is gone"
     return f"no packet for {silence_s:.1f} s in lock step; {cause}"

@@ -29,16 +29,11 @@ __all__ = [
     "link_inertias",
 ]
 
-_LATER = {
-    "Box": "cell",
-    "Cell": "cell",
-    "PayloadShape": "cell",
-    "Clearance": "collision",
-    "CollisionChecker": "collision",
-}
+_HOMES = {"cell": ("Box", "Cell", "PayloadShape"), "collision": ("Clearance", "CollisionChecker")}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,7 +1,6 @@
-"""The arm as a description: names, limits, gears, stiffness and the URDF, checked once when it is loaded.
+"""The arm as a description: names, limits, gears, stiffness and the URDF, checked once on loading.
 
-Nothing here needs pinocchio: the real-time process reads its limits from the same object, and must stay
-light.
+Nothing here needs pinocchio: the real-time process takes its limits from this module and must stay light.
 """
 
 from __future__ import annotations
@@ -41,7 +40,9 @@ class _JointEntry:
     def __post_init__(self) -> None:
         lower, upper = self.position_deg
         if not lower < upper:
-            raise ConfigurationError(f"joint {self.name}: position_deg {lower} to {upper} is no range")
+            raise ConfigurationError(
+                f"joint {self.name}: position_deg {lower} to {upper} is no range; the lower end comes first"
+            )
         for field in (
             "velocity_deg_s",
             "acceleration_rad_s2",
@@ -83,7 +84,7 @@ class _ArmFile:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What may be commanded: each (7,) float64.
+    """Limits of every command, each (7,) float64.
 
     q_low, q_high [rad]; v_max [rad/s]; a_max [rad/s²]; j_max [rad/s³]
     """
@@ -97,9 +98,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class LinkInertia:
-    """Inertial entry of one URDF link: mass [kg], centre of mass [m] and inertia about it [kg m²], link
-    axes.
-    """
+    """Inertia of one URDF link in link axes: mass [kg], centre of mass [m], inertia about it [kg m²]."""
 
     link: str
     mass: float
@@ -107,11 +106,11 @@ class LinkInertia:
     inertia: Vector
 
     def defect(self, tolerance: float = 1e-9) -> str | None:
-        """Why no rigid body has this inertia, or None if one does.
+        """The reason why no rigid body has this inertia, or None if one can.
 
         A body of positive density has a positive definite pseudo-inertia (Wensing, Kim and Slotine 2018):
-        mass above zero and Σ = ½ tr(I) 1 - I positive semidefinite, which contains the triangle inequality of
-        the principal moments.
+        mass above zero and Σ = ½ tr(I) 1 - I positive semidefinite. The latter contains the triangle
+        inequality of the principal moments.
         """
         if not self.mass > 0.0:
             return f"mass {self.mass} kg is not above zero"
@@ -125,12 +124,12 @@ class LinkInertia:
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Arm:
-    """The arm that the driver commands. Arrays are (7,), read-only, in kinematic order A1 A2 E1 A3 A4 A5 A6.
+    """Description of the arm. Arrays are (7,), read-only, in kinematic order A1 A2 E1 A3 A4 A5 A6.
 
-    q_min, q_max : position limits [rad]; `q_low`, `q_high` are these less `margin` [rad]
-    v_max, a_max, j_max : limits of what the driver ever commands [rad/s], [rad/s²], [rad/s³]
+    q_min, q_max : position limits [rad]; `q_low`, `q_high` are narrower by `margin` [rad]
+    v_max, a_max, j_max : limits of every command [rad/s], [rad/s²], [rad/s³]
     tau_max : joint torque limits [Nm]; gear_ratio : motor turns per joint turn
     stiffness : joint stiffness [Nm/rad]; resonance_hz : lowest structural resonance [Hz]
     """
@@ -150,27 +149,40 @@ class Arm:
     urdf: str
     urdf_path: Path
 
+    def __repr__(self) -> str:
+        rows = (
+            ("q from [deg]", np.degrees(self.q_min)),
+            ("q to [deg]", np.degrees(self.q_max)),
+            ("qd [deg/s]", np.degrees(self.v_max)),
+            ("qdd [rad/s²]", self.a_max),
+            ("jerk [rad/s³]", self.j_max),
+            ("tau [Nm]", self.tau_max),
+        )
+        names = "".join(f"{name:>8}" for name in self.joint_names)
+        limits = (f"  {title:<14}" + "".join(f"{value:8.5g}" for value in values) for title, values in rows)
+        return "\n".join([f"Arm {self.name} ({self.urdf_path.name})", f"  {'joint':<14}{names}", *limits])
+
     @property
     def q_low(self) -> Vector:
-        """Lowest position that is ever commanded [rad], (7,)."""
+        """Lowest commanded position [rad], (7,)."""
         return self.q_min + self.margin
 
     @property
     def q_high(self) -> Vector:
-        """Highest position that is ever commanded [rad], (7,)."""
+        """Highest commanded position [rad], (7,)."""
         return self.q_max - self.margin
 
     @property
     def limits(self) -> Limits:
-        """The limits of every command: position limits less the margin, and the rest as they are."""
+        """Limits of every command: positions within the margin, the rest unchanged."""
         return Limits(self.q_low, self.q_high, self.v_max, self.a_max, self.j_max)
 
     @classmethod
     def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
-        """Read and check an arm file and the URDF that it names.
+        """Read and check an arm file and its URDF.
 
         Raises ConfigurationError if a limit is not sane, the joint names differ from the URDF's chain, a
-        link's inertia belongs to no rigid body, or the URDF has no collision geometry.
+        link's inertia is impossible, or the URDF has no collision geometry.
         """
         path = find(name, beside=beside)
         content = parse(_ArmFile, read_mapping(path), str(path))
@@ -205,9 +217,9 @@ class Arm:
 
 
 def link_inertias(urdf: str, where: str = "URDF") -> dict[str, LinkInertia]:
-    """Inertial entries of the links of a URDF text by link name; links without one are left out.
+    """Inertias in a URDF text by link name, as far as links have one.
 
-    Raises ConfigurationError if the text is not XML or an entry is incomplete or not a finite number.
+    Raises ConfigurationError if the text is not XML or an entry is incomplete or not finite.
     """
     inertias = {}
     for link in _root(urdf, where).findall("link"):
@@ -325,10 +337,10 @@ class _Joint:
 
 
 class LinkFrames:
-    """Pose of every link relative to its parent, as `/tf` wants it: no chain has to be multiplied.
+    """Pose of every link relative to its parent, for `/tf`: no chain to multiply.
 
-    A joint with origin (p, r) and axis a at position q has the translation p and the rotation r * (cos q/2, a
-    sin q/2) (quaternions); a prismatic joint has the translation p + q R(r) a and the rotation r.
+    A joint with origin (p, r) and axis a at position q has the translation p and the rotation
+    r * (cos q/2, a sin q/2) (quaternions); a prismatic joint has p + q R(r) a and r.
 
     pairs : (parent, child) links in the order of the URDF
     """
@@ -363,13 +375,13 @@ class LinkFrames:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The moving joints of the URDF in its order."""
+        """Moving joints in the order of the URDF."""
         return tuple(joint.name for joint in self._joints if joint.kind != "fixed")
 
     def poses(self, joint_names: Sequence[str], q: ArrayLike) -> NDArray[np.float64]:
         """Poses x y z [m], quaternion x y z w of every link relative to its parent: (n, links, 7).
 
-        joint_names : names of the columns of `q`; joints of the URDF that are not among them stay at zero
+        joint_names : names of the columns of `q`; all other joints of the URDF stay at zero
         q : (n, J) float64, joint positions [rad] or [m]
         """
         positions = np.asarray(q, dtype=np.float64)

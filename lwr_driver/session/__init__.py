@@ -1,13 +1,13 @@
-"""The session log: one MCAP file for one motion of the arm with one payload. Writer and reader side by side.
+"""The session log: one MCAP file for one motion of the arm with one payload.
 
-`SessionWriter` writes; `read_session` reads into columns of numpy arrays; `recover` makes the file of a
-killed recorder whole; `describe` says what a file holds.
+`SessionWriter` writes a log, `read_session` reads it into numpy arrays, `describe` summarises it, `recover`
+repairs the log of a killed recorder, and `as_sessions` accepts sessions and paths alike.
 """
 
 from __future__ import annotations
 
 from lwr_driver.arm import LinkFrames
-from lwr_driver.session.reader import describe, read_session
+from lwr_driver.session.reader import as_sessions, describe, read_session
 from lwr_driver.session.recovery import Recovery, recover
 from lwr_driver.session.session import (
     ControllerModelColumns,
@@ -33,6 +33,7 @@ __all__ = [
     "SessionSummary",
     "SessionWriter",
     "StatusColumns",
+    "as_sessions",
     "describe",
     "read_session",
     "recover",

@@ -1,15 +1,14 @@
-"""Finding the clock of one recording in another from what both have measured: joint positions.
+"""Alignment of the clocks of two recordings by the joint positions in both.
 
-Two recordings of the same motion, each on a clock of its own. The offset is searched as the lag at which the
-positions agree best (concordance by FFT, each joint's mean taken out), over every lag with enough overlap.
-Each lag that comes near the best is then refined below the sampling period by Gauss-Newton on
+Two recordings show the same motion, each on a clock of its own. The offset is searched as the lag of best
+agreement of the positions (concordance by FFT, without each joint's mean), over every lag with enough
+overlap. Each lag close to the best is then refined below the sampling period by Gauss-Newton on
 
     p_fine(t + delay + rate (t - t_mid)) - p_coarse(t) - bias_j  ->  min,
 
 with delay and rate common to all joints, and the best must win clearly. The standard deviations come from a
-jackknife over blocks of time, which sees residuals that are correlated in time (elastic deflection, friction)
-for what they are. A constant delay between the two position measurements themselves cannot be seen by any of
-this.
+jackknife over blocks of time, valid for residuals correlated in time (elastic deflection, friction). A
+constant delay between the two position measurements themselves is not identifiable.
 """
 
 from __future__ import annotations
@@ -64,11 +63,11 @@ class Alignment:
 
     delay_s : t_reference - t_other in the middle of the overlap; delay_std_s : its standard deviation, the
         larger of those in the middle and at the ends of the overlap
-    rate_error, rate_error_std : seconds that the reference gains on the other clock per second
+    rate_error, rate_error_std : gain of the reference on the other clock [s/s]
     middle_s : that middle on the clock of `other`; overlap_s : duration of the overlap
-    residual_rad : root mean square of what positions still differ by
+    residual_rad : root mean square of the remaining difference of positions
     runner_up_rad : the same at the second-best lag, infinite if there is none
-    correlation : per joint; nan for a joint that stands still, whose order cannot be verified
+    correlation : per joint; nan for a joint at rest, with unverified order
     """
 
     delay_s: float
@@ -97,12 +96,10 @@ class Alignment:
 def align(reference: Track, other: Track, *, tolerance_s: float | None = None) -> Alignment:
     """Align the clock of `other` with that of `reference`; both have the same joints in the same order.
 
-    tolerance_s : largest standard deviation of the delay that is accepted; default is half a period of
-        `other`
+    tolerance_s : largest accepted standard deviation of the delay; default is half a period of `other`
 
-    DataError if the arm stands still, if the joints follow each other in another order or with another sign,
-    if the recordings do not show the same motion, if two delays explain them nearly as well (a periodic
-    motion), or if the delay stays vaguer than the tolerance.
+    DataError if the arm stands still, the order or sign of joints differs, the motions differ, two delays fit
+    nearly as well (a periodic motion), or the standard deviation of the delay exceeds the tolerance.
     """
     tolerance = 0.5 * other.period if tolerance_s is None else tolerance_s
     _check_motion(reference)
@@ -253,7 +250,7 @@ def _correlations(a: NDArray[np.float64], b: NDArray[np.float64], lag: int) -> t
 def _check_joints(
     reference: Track, other: Track, a: NDArray[np.float64], b: NDArray[np.float64], lag: int, score: float
 ) -> None:
-    """Raise if a joint does not follow itself at the best lag, and say which one it follows."""
+    """Raise if a joint does not follow itself at the best lag, naming the joint it follows."""
     own = np.array(_correlations(a, b, lag))
     moving = np.isfinite(own)
     if score >= _AGREEMENT and moving.any() and (own[moving] >= _CANDIDATE).all():
@@ -281,7 +278,7 @@ def _check_joints(
 def _best_order(
     a: NDArray[np.float64], b: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """The assignment of columns of `b` to those of `a`, at any lag, under which all that move agree."""
+    """The assignment of columns of `b` to those of `a`, at any lag, with agreement of all moving joints."""
     a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
     lags, first, stop, size = _lagged(a0, b0)
     fa, fb = np.fft.rfft(a0, size, axis=0), np.fft.rfft(b0, size, axis=0)
@@ -312,7 +309,7 @@ def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     middle = 0.5 * (begin + end)
     time, target = coarse.time[rows], coarse.position[rows]
-    # Slopes of noisy samples would be noise; those of a smoothed copy serve as instruments instead.
+    # Slopes of noisy samples would be noise; slopes of a smoothed copy serve as instruments.
     width = max(1, round(_SMOOTH_S / fine.period))
     smooth = dataclasses.replace(
         fine, position=uniform_filter1d(fine.position, width, axis=0, mode="nearest")
@@ -360,7 +357,7 @@ def _interpolated(track: Track, time: NDArray[np.float64]) -> tuple[NDArray[np.f
 def _normal_equations(
     error: NDArray[np.float64], slope: NDArray[np.float64], time: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Normal equations of (delay, rate) for each block of time, each joint's bias taken out; residual rms."""
+    """Normal equations of (delay, rate) for each block of time, without each joint's bias; residual rms."""
     rows = len(time)
     if rows < 2 * _BLOCKS:
         raise np.linalg.LinAlgError("too few samples")

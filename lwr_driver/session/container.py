@@ -1,4 +1,8 @@
-"""Records of an MCAP file as bytes, after the MCAP specification (https://mcap.dev/spec)."""
+"""The writing side of an MCAP file (https://mcap.dev/spec): whole chunks at once, each on the disk in turn.
+
+After every call the file ends with a whole record, so the file of a killed process is readable up to there.
+After a failed write (disk full) the broken record is cut off again.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +62,7 @@ class Opcode(IntEnum):
 
 
 def _record(opcode: Opcode, *parts: bytes) -> bytes:
-    """A record of the given content."""
+    """A record of this content."""
     content = b"".join(parts)
     return struct.pack("<BQ", opcode, len(content)) + content
 
@@ -201,7 +205,7 @@ class _Channel:
 class Container:
     """An MCAP file being written. Refuses to overwrite a file.
 
-    fsync : force each chunk to the disk itself, so that even a power cut loses the open chunk only
+    fsync : force each chunk to the disk itself: even a power cut loses the open chunk only
     level : zstd compression level
     """
 
@@ -257,7 +261,7 @@ class Container:
         encoding: str = "cdr",
         info: Mapping[str, str] | None = None,
     ) -> int:
-        """Number of the channel `topic`; it is announced in the first chunk with one of its messages."""
+        """Number of the channel `topic`; the first chunk with one of its messages announces it."""
         if topic not in self._channels:
             key = f"{schema.name}\0{schema_encoding}\0{schema.text}"
             if key not in self._schemas:

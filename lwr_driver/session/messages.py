@@ -1,4 +1,15 @@
-"""The message definitions of the session log, `ros2msg`, each complete in itself."""
+"""The messages of the session log: their definitions (`ros2msg`), and CDR packed by columns with numpy.
+
+Messages of a topic with constant names and array lengths have one size, with every field at the same place.
+`Layout` holds such a message as a template of bytes and the places of its fields. Packing copies the template
+n times and writes the columns into it; unpacking checks all bytes outside the fields against the template and
+reads the columns. Rows are moved as plain bytes, never as structured arrays with gaps: copies of these leave
+out the bytes between the fields.
+
+CDR: 4 bytes of encapsulation (byte order and version), then the fields. A number is aligned to its own size
+(XCDR2: at most 4) counted from the end of the encapsulation, a string has its length with the closing zero, a
+sequence its count; an empty sequence has no padding after its count.
+"""
 
 from __future__ import annotations
 
@@ -146,7 +157,7 @@ _ENCAPSULATIONS: dict[bytes, tuple[str, int]] = {
 """Byte order and largest alignment of plain CDR; XCDR2 has two sets of numbers, of versions 1.2 and 1.3."""
 
 _TAIL_PADDING = 7
-"""Bytes that a serializer may add to the end of a message."""
+"""Most bytes of padding at the end of a message."""
 
 
 class CdrError(ValueError):
@@ -196,11 +207,11 @@ class Layout:
         return rows
 
     def view(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
-        """The messages `rows` (n, size) as records that share their memory."""
+        """The messages `rows` (n, size) as records on the same memory."""
         return np.ndarray((len(rows),), dtype=self._dtype, buffer=rows.data)  # type: ignore[attr-defined]
 
     def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which of the messages `rows` (n, size) have these constants: names, counts, byte order, padding."""
+        """Mask of the messages `rows` (n, size) with these constants: names, counts, byte order, padding."""
         constant: NDArray[np.intp] = self._constant  # type: ignore[attr-defined]
         expected: NDArray[np.uint8] = self._expected  # type: ignore[attr-defined]
         return np.asarray((rows[:, constant] == expected).all(axis=1))
@@ -230,19 +241,19 @@ class LayoutBuilder:
         return self
 
     def sequence(self, name: str, code: str, count: int) -> LayoutBuilder:
-        """A sequence that always has `count` numbers; no field if that is none."""
+        """A sequence of always `count` numbers; no field if that is zero."""
         self._count(count)
         return self.numbers(name, code, (count,))
 
     def text(self, value: str) -> LayoutBuilder:
-        """A string that is always the same."""
+        """A constant string."""
         data = value.encode() + b"\x00"
         self._count(len(data))
         self._bytes += data
         return self
 
     def texts(self, values: Sequence[str]) -> LayoutBuilder:
-        """A sequence of strings that is always the same."""
+        """A constant sequence of strings."""
         self._count(len(values))
         for value in values:
             self.text(value)
@@ -253,12 +264,12 @@ class LayoutBuilder:
         return self.numbers(f"{prefix}sec", "<i4").numbers(f"{prefix}nanosec", "<u4").text(frame_id)
 
     def count(self, value: int) -> LayoutBuilder:
-        """The count of a sequence whose elements follow."""
+        """The count of a sequence; its elements follow."""
         self._count(value)
         return self
 
     def layout(self) -> Layout:
-        """What was built."""
+        """The layout of all fields so far."""
         return Layout(bytes(self._bytes), dict(self._fields))
 
     def _align(self, size: int) -> None:
@@ -310,7 +321,7 @@ def tf_layout(frames: Sequence[tuple[str, str]]) -> Layout:
 
 
 class CdrReader:
-    """Reads one message of any encapsulation field by field; `CdrError` where the bytes make no sense."""
+    """Reads one message of any encapsulation field by field; `CdrError` for impossible bytes."""
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 4:
@@ -322,7 +333,7 @@ class CdrReader:
         self._at = 4
 
     def place(self, size: int, count: int) -> int:
-        """Offset of `count` numbers of `size` bytes each, which are stepped over."""
+        """Offset of `count` numbers of `size` bytes each; steps over them."""
         if count == 0:
             return self._at
         align = min(size, self._widest)
@@ -360,7 +371,7 @@ class CdrReader:
         return tuple(self.text() for _ in range(count))
 
     def finish(self) -> None:
-        """Raise if more is left than padding."""
+        """Raise if more than padding is left."""
         left = len(self._data) - self._at
         if left > _TAIL_PADDING:
             raise CdrError(f"{left} bytes follow the last field")
@@ -369,8 +380,7 @@ class CdrReader:
 def read_joint_state_layout(data: bytes) -> tuple[Layout, tuple[str, ...]]:
     """Layout and joint names of a `sensor_msgs/msg/JointState` message, in any plain CDR encapsulation.
 
-    Arrays that are empty are no fields of the layout. `CdrError` if an array is neither empty nor as long as
-    the names.
+    Empty arrays are no fields of the layout. `CdrError` if another array differs in length from the names.
     """
     reader = CdrReader(data)
     order = reader.order

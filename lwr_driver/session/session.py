@@ -1,10 +1,12 @@
-"""What a session holds, as columns of numpy arrays."""
+"""A session log in memory: metadata, channels as columns of numpy arrays, phases, and missing samples."""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
 import difflib
+import html
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import DataError
+from fri.errors import ConfigurationError, DataError
 
 __all__ = [
     "ChannelSummary",
@@ -30,6 +32,9 @@ __all__ = [
     "summarise",
 ]
 
+_WIDEST = 120
+"""Characters of a line of a `repr`."""
+
 
 class Phase(NamedTuple):
     """Beginning of a phase of the experiment: log time [ns] and name."""
@@ -39,7 +44,7 @@ class Phase(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """Samples missing before the row `row`: how many, and the log times of the rows around [ns]."""
+    """Lost samples before row `row`: their number, and the log times of the rows before and after [ns]."""
 
     row: int
     lost: int
@@ -47,13 +52,13 @@ class Gap(NamedTuple):
     after: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class JointColumns:
     """One channel of joint states, n samples of J joints, in the order of the file.
 
     log_time, publish_time : (n,) int64, host time and the source's time [ns]
     sequence : (n,) int64, counter of the source; a gap is a lost sample
-    position [rad], velocity [rad/s], effort [Nm] : (n, J) float64, or (n, 0) where the channel has none
+    position [rad], velocity [rad/s], effort [Nm] : (n, J) float64, or (n, 0) if the channel has none
     source : file, for messages
     """
 
@@ -70,14 +75,23 @@ class JointColumns:
     def __len__(self) -> int:
         return len(self.log_time)
 
+    def __repr__(self) -> str:
+        rate, lost = _pace(self.log_time)[0], f", {self.lost} lost" if self.lost else ""
+        return f"{self.topic}: {len(self)} samples at {rate:.1f} Hz{lost} ({', '.join(self.held)})"
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the fields with values."""
+        return tuple(name for name in ("position", "velocity", "effort") if getattr(self, name).shape[1])
+
     @property
     def numbered(self) -> bool:
-        """Whether the source counted its samples; a counter that is always zero is none."""
+        """Whether the source counts its samples; a constant zero is no counter."""
         return bool(self.sequence.any())
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
-        """Lost samples as the counter tells them; none if the samples are not numbered."""
+        """Lost samples by the counter of the source; empty without a counter."""
         if not self.numbered:
             return ()
         steps = np.diff(self.sequence)
@@ -93,17 +107,14 @@ class JointColumns:
 
     @property
     def period_s(self) -> float:
-        """Median time between samples by the source's clock, or the host's if the source gives none [s]."""
+        """Median time between samples by the clock of the source, else of the host [s]."""
         if len(self) < 2:
             return float("nan")
         times = self.publish_time if np.ptp(self.publish_time) > 0 else self.log_time
         return float(np.median(np.diff(times))) * 1e-9
 
     def select(self, names: Sequence[str]) -> JointColumns:
-        """The same samples with the joints `names` in this order.
-
-        DataError names a joint that is not there.
-        """
+        """The same samples with the joints `names` in this order; DataError for an unknown joint."""
         wanted = tuple(names)
         if wanted == self.names:
             return self
@@ -144,7 +155,7 @@ class JointColumns:
 
 @dataclass(frozen=True)
 class StatusColumns:
-    """The channel `/fri/status`, n cycles. Names and units are those of `lwr_msgs/msg/FriStatus`."""
+    """The channel `/fri/status`, n cycles; names and units as in `lwr_msgs/msg/FriStatus`."""
 
     log_time: NDArray[np.int64]
     publish_time: NDArray[np.int64]
@@ -169,7 +180,7 @@ class StatusColumns:
 
 @dataclass(frozen=True)
 class ControllerModelColumns:
-    """The channel `/fri/controller_model`, n samples of the controller's own model, float64.
+    """The channel `/fri/controller_model`: n samples of the controller's own model, float64.
 
     mass_matrix (n, 7, 7) [kg m2], gravity (n, 7) [Nm], jacobian (n, 6, 7), estimated_external_torque (n, 7)
     [Nm]
@@ -187,7 +198,7 @@ class ControllerModelColumns:
 
 
 def stamp(times: NDArray[np.int64] | int) -> str:
-    """A log time for a message, in seconds; of an array the first."""
+    """A log time, or the first of an array, in seconds for a message."""
     if isinstance(times, np.ndarray):
         if not len(times):
             return "(empty)"
@@ -197,13 +208,13 @@ def stamp(times: NDArray[np.int64] | int) -> str:
 
 @dataclass(frozen=True)
 class Missing:
-    """What a session lacks; false if it is whole.
+    """Missing parts of a session; false if it is whole.
 
     ended : the recorder wrote `session_end`
     closed : the file has its summary and footer
-    bytes_unread : bytes behind the last whole record that could be read
-    lost_from, lost_to : log times of the chunk that was cut, where its head can still be read [ns]
-    samples : lost samples of each topic, as the source's counters tell them
+    bytes_unread : bytes behind the last readable record
+    lost_from, lost_to : log times of a truncated chunk, if its head is readable [ns]
+    samples : lost samples of each topic by the counters of the source
     notes : further remarks, each a sentence
     """
 
@@ -220,7 +231,7 @@ class Missing:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What is missing, one sentence each."""
+        """One sentence for each missing part."""
         lines = []
         if not self.ended:
             lines.append(
@@ -232,7 +243,7 @@ class Missing:
             lines.append(f"{self.bytes_unread} bytes at the end of the file are not whole and were not read")
         if self.lost_from is not None and self.lost_to is not None:
             seconds = (self.lost_to - self.lost_from) * 1e-9
-            lines.append(f"the chunk that was cut spans {seconds:.3f} s of log time")
+            lines.append(f"the truncated chunk spans {seconds:.3f} s of log time")
         lines += [f"{topic}: {count} samples lost" for topic, count in self.samples.items() if count]
         return (*lines, *self.notes)
 
@@ -240,14 +251,14 @@ class Missing:
         return "; ".join(self.lines) or "nothing"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Session:
     """One motion of the arm with one payload.
 
     metadata : the record `session`; end : the record `session_end`, None if the recorder died
-    joint_names : joints of `/joint_states` in its order; the other channels have theirs in the same order
+    joint_names : joints of `/joint_states` in its order; the other channels keep this order
     joint : `/joint_states`; motor, command : `/motor_states` and `/joint_command`, None if absent
-    phases : beginnings of phases; empty if the session is to be used whole
+    phases : beginnings of phases; empty if the whole session is one
     attachments : file name -> content
     """
 
@@ -265,6 +276,56 @@ class Session:
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     missing: Missing = field(default_factory=Missing)
 
+    def __repr__(self) -> str:
+        data = self.metadata
+        duration = f"{self.duration_s:.3f} s" if len(self.joint) else "empty"
+        recorded = f"{_utc(self.start)}, {duration}" if len(self.joint) else duration
+        phases = ", ".join(dict.fromkeys(phase.name.split()[0] for phase in self.phases if phase.name))
+        lines = [
+            f"Session {self.path}",
+            f"  robot     {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
+            f"  payload   {_payload(data)}",
+            f"  recorded  {recorded}",
+            f"  joints    {' '.join(self.joint_names)}",
+            *(f"  channel   {item!r}" for item in (self.joint, self.motor, self.command) if item is not None),
+            f"  phases    {len(self.phases)}{f': {phases}' if phases else ''}",
+            f"  missing   {self.missing}",
+        ]
+        return "\n".join(line if len(line) <= _WIDEST else f"{line[: _WIDEST - 3]}..." for line in lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+    def to_dataframe(self, topic: str = "/joint_states") -> Any:
+        """A channel of joints as a pandas DataFrame, one row per sample.
+
+        topic : `/joint_states`, `/motor_states` or `/joint_command`
+
+        The index is log time since the first joint state [s]; the columns are `position_JOINT` [rad],
+        `velocity_JOINT` [rad/s] and `effort_JOINT` [Nm], as far as the channel holds them.
+        ConfigurationError for an absent channel, or without pandas.
+        """
+        channels = {item.topic: item for item in (self.joint, self.motor, self.command) if item is not None}
+        if topic not in channels:
+            raise ConfigurationError(
+                f"{self.path}: no channel {topic!r}; choose one of {', '.join(channels)}"
+            )
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise ConfigurationError(
+                "data frames need pandas, which is not installed; `pip install pandas`, or use the arrays of "
+                "`session.joint`"
+            ) from error
+        channel = channels[topic]
+        columns = {
+            f"{field}_{name}": getattr(channel, field)[:, column]
+            for field in channel.held
+            for column, name in enumerate(channel.names)
+        }
+        time = pandas.Index((channel.log_time - self.start) * 1e-9, name="time_s")
+        return pandas.DataFrame(columns, index=time)
+
     @property
     def start(self) -> int:
         """Log time of the first joint state [ns]."""
@@ -276,9 +337,9 @@ class Session:
         return float(self.joint.log_time[-1] - self.joint.log_time[0]) * 1e-9
 
     def select(self, joint_names: Sequence[str]) -> Session:
-        """This session with the joints `joint_names` in this order in all channels.
+        """This session with only the joints `joint_names`, in this order, in all channels.
 
-        DataError names a joint that a channel does not have. Joints that are not asked for are left out.
+        DataError for a joint missing in a channel.
         """
         names = tuple(joint_names)
         if not names or len(set(names)) != len(names):
@@ -294,7 +355,7 @@ class Session:
         )
 
     def spans(self, name: str) -> tuple[tuple[int, int], ...]:
-        """[start, stop) log times [ns] of every phase `name`, and of those numbered `name N`."""
+        """[start, stop) log times [ns] of every phase `name` or `name N`."""
         stops = [*(phase.log_time for phase in self.phases[1:]), int(self.joint.log_time[-1]) + 1]
         return tuple(
             (phase.log_time, stop)
@@ -326,7 +387,7 @@ class PhaseSummary:
 
 @dataclass(frozen=True)
 class SessionSummary:
-    """Everything `lwr-run info` says of a session; `str()` is the text, `as_dict()` the data.
+    """The content of `lwr-run info`; `str()` is the text, `as_dict()` the data.
 
     size_bytes : size of the file; position_range, effort_rms : per joint [rad], [Nm]
     """
@@ -347,18 +408,17 @@ class SessionSummary:
     missing: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """The same as plain data, for JSON."""
+        """Plain data, for JSON."""
         return {**asdict(self), "path": str(self.path)}
 
     def __str__(self) -> str:
         data = self.metadata
         status = "unknown: the recorder died" if self.end is None else self.end.get("exit_status", "unknown")
         reason = f" ({self.end['reason']})" if self.end and self.end.get("reason") else ""
-        mass = f", {data['payload_mass']} kg" if data.get("payload_mass") else ""
         lines = [
             f"{self.path}  {self.size_bytes / 1e6:.1f} MB",
             f"  robot        {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
-            f"  payload      {data.get('payload', 'unknown')}{mass}",
+            f"  payload      {_payload(data)}",
             f"  experiment   {data.get('experiment', '') or '-'}",
             f"  recorded     {self.utc_first}, {self.duration_s:.3f} s",
             f"  ended        {status}{reason}",
@@ -393,19 +453,22 @@ class SessionSummary:
 def summarise(session: Session) -> SessionSummary:
     """Summary of a session whose file is still there."""
     joint, motor = session.joint, session.motor
-    channels = [_channel(item) for item in (joint, motor, session.command) if item is not None]
+    channels = [
+        _channel(item.topic, item.log_time, item.lost, item.held)
+        for item in (joint, motor, session.command)
+        if item is not None
+    ]
     for topic, other in (
         ("/fri/status", session.status),
         ("/fri/controller_model", session.controller_model),
     ):
         if other is not None:
-            channels.append(_times(topic, other.log_time, 0, ()))
+            channels.append(_channel(topic, other.log_time, 0, ()))
     stops = [*(phase.log_time for phase in session.phases[1:]), int(joint.log_time[-1])]
-    first = datetime.datetime.fromtimestamp(session.start / 1e9, datetime.UTC)
     return SessionSummary(
         path=session.path,
         size_bytes=session.path.stat().st_size,
-        utc_first=first.strftime("%Y-%m-%d %H:%M:%S.%f UTC"),
+        utc_first=_utc(session.start),
         duration_s=session.duration_s,
         joint_names=session.joint_names,
         channels=tuple(channels),
@@ -432,12 +495,23 @@ def _rms(columns: JointColumns) -> tuple[float, ...]:
     return tuple(np.sqrt(np.mean(columns.effort**2, axis=0)).tolist())
 
 
-def _channel(columns: JointColumns) -> ChannelSummary:
-    holds = tuple(name for name in ("position", "velocity", "effort") if getattr(columns, name).shape[1])
-    return _times(columns.topic, columns.log_time, columns.lost, holds)
+def _payload(metadata: Mapping[str, str]) -> str:
+    mass = f", {metadata['payload_mass']} kg" if metadata.get("payload_mass") else ""
+    return f"{metadata.get('payload', 'unknown')}{mass}"
 
 
-def _times(topic: str, log_time: np.ndarray[Any, Any], lost: int, holds: tuple[str, ...]) -> ChannelSummary:
+def _utc(log_time: int) -> str:
+    first = datetime.datetime.fromtimestamp(log_time / 1e9, datetime.UTC)
+    return first.strftime("%Y-%m-%d %H:%M:%S.%f UTC")
+
+
+def _channel(topic: str, log_time: NDArray[np.int64], lost: int, held: tuple[str, ...]) -> ChannelSummary:
+    rate, pause = _pace(log_time)
+    return ChannelSummary(topic, len(log_time), rate, lost, pause, held)
+
+
+def _pace(log_time: NDArray[np.int64]) -> tuple[float, float]:
+    """Median rate of the samples [Hz] and longest pause between two of them [s]."""
     steps = np.diff(log_time) * 1e-9
     rate = float(1.0 / np.median(steps)) if len(steps) and np.median(steps) > 0 else 0.0
-    return ChannelSummary(topic, len(log_time), rate, lost, float(steps.max()) if len(steps) else 0.0, holds)
+    return rate, float(steps.max()) if len(steps) else 0.0

@@ -1,4 +1,4 @@
-"""Import of a trace file of the controller: motor torques recorded on its own clock, put into a session log.
+"""Import of motor torques from a trace file of the controller, on its own clock, into a session log.
 
 The file is CSV with one header line; lines before it that begin with `#` are comments::
 
@@ -6,14 +6,14 @@ The file is CSV with one header line; lines before it that begin with `#` are co
     time_s,tau_m_A1,tau_m_A2,...,q_A1,q_A2,...
     812.437500,1.25,-33.5,...,0.100000000,0.250000000,...
 
-`time_s` is the controller's clock [s], strictly increasing, with an offset nobody knows and perhaps a small
-error of its rate. `tau_m_JOINT` is the motor torque referred to the joint side, gear ratio included [Nm].
-`q_JOINT` is the measured joint position, the same quantity that FRI reports [rad]. The columns may stand in
-any order; each joint of the session has both.
+`time_s` is the controller's clock [s], strictly increasing, with an unknown offset and perhaps a small error
+of its rate. `tau_m_JOINT` is the motor torque referred to the joint side, gear ratio included [Nm]. `q_JOINT`
+is the measured joint position, as in FRI [rad]. The columns may stand in any order; each joint of the session
+has both.
 
-The clock is found by comparing the positions with those of `/joint_states` (`lwr_driver.session.alignment`). The
-samples go into `/motor_states` as they are, none made up, none resampled, each with the log time that belongs
-to it and, as its publish time, the time of the trace.
+The clock follows from a comparison of the positions with `/joint_states` (`lwr_driver.session.alignment`).
+The samples go into `/motor_states` unchanged, without resampling, each with its log time and, as its publish
+time, the time of the trace.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from lwr_driver.configuration import as_path
 from lwr_driver.session.alignment import Alignment, Track, align
 from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, Opcode
 from lwr_driver.session.messages import JOINT_STATE, joint_state_layout
@@ -56,11 +57,11 @@ class Trace:
 
 @dataclass(frozen=True)
 class TraceImport:
-    """What an import did.
+    """Result of an import.
 
     samples : motor torques in the session now; outside : samples of the trace before or after the session
-    jitter_s : how far the log times scatter about the controller's clock, median absolute deviation
-    torques : how the motor torques compare with the joint torque sensors; empty if the session has none
+    jitter_s : median absolute deviation of the log times from the controller's clock
+    torques : comparison of motor torques and joint torque sensors; empty if the session has no sensors
     """
 
     out: Path
@@ -88,10 +89,9 @@ class TraceImport:
 def read_trace(path: str | Path, joint_names: Sequence[str]) -> Trace:
     """The trace file `path`, its columns in the order of `joint_names`.
 
-    DataError for a file that cannot be read, columns that are missing or unknown, values that are not finite,
-    and time that does not rise.
+    DataError for an unreadable file, missing or unknown columns, values not finite, and time not rising.
     """
-    path = Path(path)
+    path = as_path(path, "trace file")
     try:
         content = path.read_bytes()
         lines = content.decode("utf-8-sig").splitlines()
@@ -148,12 +148,11 @@ def import_trace(
     out : the new file; default is to replace the session itself, in one step
     tolerance_s : see `lwr_driver.session.alignment.align`
 
-    DataError if the session has motor torques already or did not end properly, if the trace is not as it must
-    be, if the two cannot be aligned beyond doubt, or if the torque columns follow the torques of other
-    joints.
+    DataError if the session has motor torques already or no proper end, the trace is invalid, the alignment
+    is uncertain, or the torque columns follow the torques of other joints.
     """
-    session_path = Path(session_path)
-    out = session_path if out is None else Path(out)
+    session_path = as_path(session_path, "session log")
+    out = session_path if out is None else as_path(out, "session log")
     session = read_session(session_path)
     if session.motor is not None:
         raise DataError(
@@ -222,7 +221,7 @@ def _columns(path: Path, header: list[str], joint_names: Sequence[str]) -> list[
 
 
 def _clock(source: NDArray[np.float64], log_time: NDArray[np.int64]) -> tuple[float, int, float]:
-    """Line log_time = start + slope source through most samples; packets that were read late do not bend it.
+    """Line log_time = start + slope source through most samples, robust against packets read late.
 
     Returns slope, start [ns], and the median absolute deviation [s].
     """
