@@ -184,7 +184,7 @@ class Control:
                 "`longest_motion_s`"
             )
         if len(phases) > _PHASES:
-            raise ConfigurationError(f"motion of {len(phases)} phases; {_PHASES} can be told apart")
+            raise ConfigurationError(f"motion of {len(phases)} phases; {_PHASES} is the limit")
         self.plan[: len(q)] = q
         for place, (row, number) in enumerate(phases):
             self.phase_rows[place], self.phase_ids[place] = row, number

@@ -429,9 +429,10 @@ class Driver:
         self, path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes] | None = None
     ) -> None:
         """Begin a session log at `path` with the next cycle; `metadata` from `session_metadata`."""
+        path = as_path(path, "session log")
         self._need(self._recorder).open(
             SessionRequest(
-                path=as_path(path, "session log"),
+                path=path,
                 joint_names=self.arm.joint_names,
                 metadata=dict(metadata),
                 robot_description=self.arm.urdf,

@@ -214,8 +214,8 @@ def _concordance(
     energy_b = (_window_sums(b**2, first - lags, stop - lags) - sum_b**2 / count).sum(axis=1)
     cross = cross - (sum_a * sum_b / count).sum(axis=1)
     share = min(float((a**2).sum()), float((b**2).sum()))
-    lively = np.minimum(energy_a, energy_b) >= _LEAST_ENERGY * share
-    scores = np.where(lively, 2.0 * cross / np.maximum(energy_a + energy_b, 1e-300), -1.0)
+    moving = np.minimum(energy_a, energy_b) >= _LEAST_ENERGY * share
+    scores = np.where(moving, 2.0 * cross / np.maximum(energy_a + energy_b, 1e-300), -1.0)
     return lags, scores
 
 
