@@ -117,10 +117,7 @@ class Commander:
         return self.mode in (Mode.MOTION, Mode.STOP)
 
     def enter(
-        self,
-        setpoint: NDArray[np.float32],
-        safety_limits: float,
-        step: NDArray[np.float64] | None = None,
+        self, setpoint: NDArray[np.float32], safety_limits: float, step: NDArray[np.float64] | None = None
     ) -> NDArray[np.float32] | None:
         """Begin to command with the controller's own set point; returns the value to send.
 

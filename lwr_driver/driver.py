@@ -23,20 +23,12 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import (
-    ConfigurationError,
-    LwrError,
-    NetworkError,
-    OperatorError,
-    RefusedError,
-    RobotError,
-)
+from fri.errors import ConfigurationError, LwrError, NetworkError, OperatorError, RefusedError, RobotError
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
@@ -135,9 +127,7 @@ class Driver:
     def __enter__(self) -> Driver:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # -- lifecycle -------------------------------------------------------------------------------------------
@@ -172,14 +162,8 @@ class Driver:
             self.rights = self._loop.rights
             for shortage in (*self.rights.missing, *self.rights.advice):
                 log.warning("%s", shortage)
-            self._wait(
-                Job.CYCLES,
-                a=1,
-                timeout_s=timeout_s,
-                awaited=f"the first packet on UDP {link.address}:{self._loop.port}",
-                advice=advise_connect,
-                failure=NetworkError,
-            )
+            awaited = f"the first packet on UDP {link.address}:{self._loop.port}"
+            self._wait(Job.CYCLES, awaited, advise_connect, timeout_s, a=1, failure=NetworkError)
         except BaseException:
             self.close()
             raise
@@ -226,14 +210,12 @@ class Driver:
         if words[Word.DROP] or Mode(int(words[Word.MODE])) not in (Mode.HOLD, Mode.MOTION, Mode.STOP):
             return
         for job in (Job.HALT, Job.LEAVE):
-            self._wait(
-                job,
-                timeout_s=_CLOSE_PATIENCE_S,
-                patience_s=_CLOSE_PATIENCE_S,
-                awaited="rest",
-                advice=advise_rest,
-                stoppable=False,
-            )
+            self._wait_for_rest(job, patience_s=_CLOSE_PATIENCE_S)
+
+    def _wait_for_rest(
+        self, job: Job, timeout_s: float = _CLOSE_PATIENCE_S, patience_s: float | None = None
+    ) -> None:
+        self._wait(job, "rest", advise_rest, timeout_s, stoppable=False, patience_s=patience_s)
 
     # -- steps -----------------------------------------------------------------------------------------------
 
@@ -244,14 +226,9 @@ class Driver:
         except KeyError:
             known = ", ".join(item.name for item in Quality)
             raise ConfigurationError(f"quality {quality!r} is unknown; choose one of {known}") from None
+        awaited = f"quality {least.name} for {cycles} cycles"
         self._wait(
-            Job.QUALITY,
-            a=cycles,
-            b=int(least),
-            timeout_s=timeout_s,
-            awaited=f"quality {least.name} for {cycles} cycles",
-            advice=advise_quality,
-            failure=NetworkError,
+            Job.QUALITY, awaited, advise_quality, timeout_s, a=cycles, b=int(least), failure=NetworkError
         )
         return self.state()
 
@@ -284,12 +261,7 @@ class Driver:
         if mode != "mirror":
             raise RobotError(f"load data cannot change in mode {mode}; leave command mode first")
         control.plan[0] = (mass, *(1000.0 * value for value in com), *inertia)
-        self._wait(
-            Job.LOAD,
-            timeout_s=timeout_s,
-            awaited=f"load data of {mass:g} kg in force",
-            advice=advise_load,
-        )
+        self._wait(Job.LOAD, f"load data of {mass:g} kg in force", advise_load, timeout_s)
         return self.state()
 
     def enter_command(self, *, timeout_s: float = 120.0) -> LinkState:
@@ -298,23 +270,12 @@ class Driver:
         From then on the arm holds where the controller has it.
         """
         try:
-            self._wait(
-                Job.START,
-                timeout_s=timeout_s,
-                awaited="command mode with drives on",
-                advice=advise_command,
-            )
+            self._wait(Job.START, "command mode with drives on", advise_command, timeout_s)
         except BaseException:
             # The request must not be granted later, with nobody waiting for it.
             if self._loop is not None:
                 with contextlib.suppress(LwrError):
-                    self._wait(
-                        Job.LEAVE,
-                        timeout_s=_CLOSE_PATIENCE_S,
-                        awaited="rest",
-                        advice=advise_rest,
-                        stoppable=False,
-                    )
+                    self._wait_for_rest(Job.LEAVE)
             raise
         return self.state()
 
@@ -363,20 +324,14 @@ class Driver:
         """Means over `cycles` cycles, in monitor mode or while holding in command mode."""
         if cycles < 1:
             raise ConfigurationError(f"mean over {cycles} cycles; take one at least")
-        self._wait(
-            Job.CYCLES,
-            a=cycles,
-            timeout_s=max(10.0, 20.0 * cycles * self.state().period_s),
-            awaited=f"{cycles} cycles",
-            advice=advise_monitor,
-            failure=NetworkError,
-        )
+        limit_s = max(10.0, 20.0 * cycles * self.state().period_s)
+        self._wait(Job.CYCLES, f"{cycles} cycles", advise_monitor, limit_s, a=cycles, failure=NetworkError)
         q, q_std, tau, tau_std, external, command = self._need(self._control).measured.copy()
         return Measured(cycles, q, q_std, tau, tau_std, external, command)
 
     def stop(self) -> LinkState:
         """Stop within the limits and wait until the commanded position rests."""
-        self._wait(Job.HALT, timeout_s=10.0, awaited="rest", advice=advise_rest, stoppable=False)
+        self._wait_for_rest(Job.HALT, 10.0)
         words = self._need(self._control).words
         self._stops_seen = int(words[Word.STOP])
         return self.state()
@@ -399,13 +354,7 @@ class Driver:
         """Ask the KRL program to stop commanding and wait for monitor mode; no effect after `drop_link`."""
         if Mode(int(self._need(self._control).words[Word.MODE])) is Mode.SILENT:
             return self.state()
-        self._wait(
-            Job.LEAVE,
-            timeout_s=timeout_s,
-            awaited="monitor mode",
-            advice=advise_leave,
-            stoppable=False,
-        )
+        self._wait(Job.LEAVE, "monitor mode", advise_leave, timeout_s, stoppable=False)
         return self.state()
 
     def state(self) -> LinkState:
@@ -459,10 +408,10 @@ class Driver:
     def _wait(
         self,
         job: Job,
-        *,
-        timeout_s: float,
         awaited: str,
         advice: Callable[[LinkState], str],
+        timeout_s: float,
+        *,
         a: int = 0,
         b: int = 0,
         failure: type[LwrError] = RobotError,
@@ -572,14 +521,7 @@ class Driver:
         """Stop a moving arm before an exception is passed on."""
         log.info("motion given up: %s", error)
         with contextlib.suppress(LwrError):
-            self._wait(
-                Job.HALT,
-                timeout_s=_CLOSE_PATIENCE_S,
-                awaited="rest",
-                advice=advise_rest,
-                stoppable=False,
-                patience_s=1.0,
-            )
+            self._wait_for_rest(Job.HALT, patience_s=1.0)
 
     def _failed(self, motion: Motion, error: LwrError) -> Outcome:
         row = int(self._need(self._control).words[Word.ROW])

@@ -33,6 +33,17 @@ __all__ = [
     "snapshot",
 ]
 
+_COUNTERS = (
+    "received",
+    "answered",
+    "lost",
+    "repeated",
+    "reordered",
+    "suspect",
+    "malformed",
+    "foreign",
+    "restarts",
+)
 _QUANTILES = (0.5, 0.99, 0.999, 1.0)
 
 Joints = NDArray[np.float64]
@@ -180,6 +191,9 @@ def snapshot(control: Control, now_ns: int, overruns: int) -> LinkState:
     def joints(values: Any) -> Joints:
         return np.array(values, dtype=np.float64).reshape(JOINTS)
 
+    numbers: dict[str, Any] = {name: int(words[Word[name.upper()]]) for name in _COUNTERS}
+    numbers |= {name: int(msr[name]) for name in ("power", "error", "warning", "miss_counter")}
+    numbers |= {name: float(msr[name]) for name in ("safety_limits", "answer_rate", "miss_rate")}
     return LinkState(
         state=State(int(msr["state"])).name,
         quality=Quality(int(msr["quality"])).name,
@@ -188,15 +202,8 @@ def snapshot(control: Control, now_ns: int, overruns: int) -> LinkState:
         sequence=int(row["sequence"]) if seen else -1,
         period_s=round(float(msr["msr_sample_time"]) * 1e6) * 1e-6,
         age_s=(now_ns - int(words[Word.HEARD_NS])) * 1e-9 if seen else float("inf"),
-        power=int(msr["power"]),
-        error=int(msr["error"]),
-        warning=int(msr["warning"]),
-        safety_limits=float(msr["safety_limits"]),
-        answer_rate=float(msr["answer_rate"]),
         controller_latency_s=float(msr["latency"]),
         jitter_s=float(msr["jitter"]),
-        miss_rate=float(msr["miss_rate"]),
-        miss_counter=int(msr["miss_counter"]),
         temperature=joints(msr["temperature"]),
         q=joints(msr["msr_jnt_pos"]),
         tau=joints(msr["msr_jnt_trq"]),
@@ -206,17 +213,9 @@ def snapshot(control: Control, now_ns: int, overruns: int) -> LinkState:
         tracking_error=control.tracking.copy(),
         latency_s=_latencies(control.latency.copy()),
         left=control.text(Text.LEFT),
-        received=int(words[Word.RECEIVED]),
-        answered=int(words[Word.ANSWERED]),
-        lost=int(words[Word.LOST]),
-        repeated=int(words[Word.REPEATED]),
-        reordered=int(words[Word.REORDERED]),
-        suspect=int(words[Word.SUSPECT]),
-        malformed=int(words[Word.MALFORMED]),
-        foreign=int(words[Word.FOREIGN]),
         late=int(words[Word.UNREFLECTED]),
-        restarts=int(words[Word.RESTARTS]),
         overruns=overruns,
+        **numbers,
     )
 
 

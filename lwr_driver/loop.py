@@ -51,18 +51,8 @@ _REPORTED = (
     ("malformed", "malformed"),
     ("foreign", "foreign"),
 )
-_COUNTERS = (
-    (Word.LOST, "lost"),
-    (Word.REPEATED, "repeated"),
-    (Word.REORDERED, "reordered"),
-    (Word.SUSPECT, "suspect"),
-    (Word.MALFORMED, "malformed"),
-    (Word.FOREIGN, "foreign"),
-    (Word.RESTARTS, "restarts"),
-    (Word.UNREFLECTED, "unreflected"),
-    (Word.ANSWERED, "answered"),
-    (Word.RECEIVED, "received"),
-)
+_COUNTED = ("lost", "repeated", "reordered", "suspect", "malformed", "foreign", "restarts", "unreflected")
+_COUNTERS = tuple((Word[name.upper()], name) for name in (*_COUNTED, "answered", "received"))
 
 
 @dataclass(frozen=True)

@@ -63,12 +63,7 @@ class LoopProcess:
     """
 
     def __init__(
-        self,
-        settings: LoopSettings,
-        limits: Limits,
-        control: Control,
-        ring: Ring,
-        scheduling: Scheduling,
+        self, settings: LoopSettings, limits: Limits, control: Control, ring: Ring, scheduling: Scheduling
     ) -> None:
         self._control = control
         order = {

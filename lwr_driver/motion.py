@@ -22,6 +22,8 @@ from lwr_driver.guard import ROUNDING, stop_extent
 
 __all__ = ["Extreme", "Motion", "check_motion", "check_start", "extremes", "move_to"]
 
+Rows = NDArray[np.float64]
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -238,14 +240,7 @@ def _at_rest_around(q: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.vstack([q[:1], q[:1], q[:1], q, q[-1:], q[-1:], q[-1:]])
 
 
-def _nearest(
-    arm: Arm,
-    motion: Motion,
-    quantity: str,
-    lowest: NDArray[np.float64],
-    highest: NDArray[np.float64],
-    slack: float,
-) -> Extreme:
+def _nearest(arm: Arm, motion: Motion, quantity: str, lowest: Rows, highest: Rows, slack: float) -> Extreme:
     """The row and joint with the least room to a position limit."""
     limits = arm.limits
     below, above = lowest - limits.q_low, limits.q_high - highest
@@ -253,40 +248,20 @@ def _nearest(
     upper = above[row, joint] <= below[row, joint]
     value, limit = (highest, limits.q_high) if upper else (lowest, limits.q_low)
     ok = min(below[row, joint], above[row, joint]) >= -slack
-    return _extreme(arm, motion, quantity, "rad", row, joint, value[row, joint], limit[joint], bool(ok))
+    found = float(value[row, joint]), float(limit[joint]), "rad", bool(ok)
+    return Extreme(quantity, arm.joint_names[joint], row, row * motion.period_s, *found)
 
 
 def _largest(
-    arm: Arm,
-    motion: Motion,
-    quantity: str,
-    unit: str,
-    value: NDArray[np.float64],
-    limit: NDArray[np.float64],
-    shift: int,
-    ok: bool,
+    arm: Arm, motion: Motion, quantity: str, unit: str, value: Rows, limit: Rows, shift: int, ok: bool
 ) -> Extreme:
     """The row and joint with the largest share of a limit; entry i of `value` belongs to row i + shift."""
     index, joint = _place((value / limit).argmax(), value.shape)
     row = min(max(index + shift, 0), len(motion) - 1)
-    return _extreme(arm, motion, quantity, unit, row, joint, value[index, joint], limit[joint], ok)
+    found = float(value[index, joint]), float(limit[joint]), unit, ok
+    return Extreme(quantity, arm.joint_names[joint], row, row * motion.period_s, *found)
 
 
 def _place(flat: np.intp, shape: tuple[int, ...]) -> tuple[int, int]:
     row, joint = np.unravel_index(flat, shape)
     return int(row), int(joint)
-
-
-def _extreme(
-    arm: Arm,
-    motion: Motion,
-    quantity: str,
-    unit: str,
-    row: int,
-    joint: int,
-    value: float,
-    limit: float,
-    ok: bool,
-) -> Extreme:
-    name, time_s = arm.joint_names[joint], row * motion.period_s
-    return Extreme(quantity, name, row, time_s, float(value), float(limit), unit, ok)

@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from multiprocessing import resource_tracker, shared_memory
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -244,9 +243,7 @@ class Ring:
     def __enter__(self) -> Ring:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._owner:
             self.unlink()
         else:

@@ -9,8 +9,6 @@ from typing import Literal
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = ["Box", "Cell", "PayloadShape"]
-
 Triple = tuple[float, float, float]
 
 

@@ -21,8 +21,6 @@ from lwr_driver.arm import JOINTS, Arm
 from lwr_driver.arm.cell import Cell, PayloadShape
 from lwr_driver.configuration import expect
 
-__all__ = ["Clearance", "CollisionChecker"]
-
 _APART = 3  # joints between two links of a checked pair
 _PAYLOAD_APART = 2  # the payload extends further back than the flange
 _FIRST_MOVING = 2  # first link to come near ground or boxes; link 1 turns about its own axis

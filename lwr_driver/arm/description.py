@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = ["JOINTS", "Arm", "Limits", "LinkFrames", "LinkInertia", "link_inertias"]
-
 JOINTS = 7
 
 Vector = NDArray[np.float64]
@@ -43,16 +41,8 @@ class _JointEntry:
             raise ConfigurationError(
                 f"joint {self.name}: position_deg {lower} to {upper} is no range; the lower end comes first"
             )
-        for field in (
-            "velocity_deg_s",
-            "acceleration_rad_s2",
-            "jerk_rad_s3",
-            "torque_nm",
-            "gear_ratio",
-            "stiffness_nm_rad",
-        ):
-            value = getattr(self, field)
-            if not value > 0.0:
+        for field, value in vars(self).items():
+            if field not in ("name", "position_deg") and not value > 0.0:
                 raise ConfigurationError(f"joint {self.name}: {field} is {value}; it must be above zero")
 
 
@@ -231,9 +221,8 @@ def link_inertias(urdf: str, where: str = "URDF") -> dict[str, LinkInertia]:
         mass, inertia = entry.find("mass"), entry.find("inertia")
         if mass is None or inertia is None:
             raise ConfigurationError(f"{place}: `mass` and `inertia` are both needed")
-        origin = entry.find("origin")
-        centre = _numbers(origin.get("xyz", "0 0 0") if origin is not None else "0 0 0", 3, place)
-        turn = _rotation(_numbers(origin.get("rpy", "0 0 0") if origin is not None else "0 0 0", 3, place))
+        centre, rpy = _origin(entry, place)
+        turn = _rotation(rpy)
         xx, xy, xz, yy, yz, zz = (
             _numbers(inertia.get(key, ""), 1, f"{place}: {key}")[0]
             for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -300,6 +289,13 @@ def _attribute(element: Any, key: str, where: str) -> str:
     return str(value)
 
 
+def _origin(element: Any, where: str) -> tuple[Vector, Vector]:
+    """Translation [m] and roll, pitch, yaw [rad] of an element's origin; zero without one."""
+    origin = element.find("origin")
+    xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))
+    return _numbers(xyz, 3, where), _numbers(rpy, 3, where)
+
+
 def _numbers(text: str, count: int, where: str) -> Vector:
     try:
         values = np.array([float(word) for word in text.split()])
@@ -362,10 +358,9 @@ class LinkFrames:
             if parent is None or child is None:
                 raise ConfigurationError(f"robot description: joint {name!r} lacks its parent or child link")
             pairs.append((parent.get("link", ""), child.get("link", "")))
-            origin, axis = joint.find("origin"), joint.find("axis")
+            axis = joint.find("axis")
             place = f"robot description: joint {name!r}"
-            xyz = _numbers(origin.get("xyz", "0 0 0") if origin is not None else "0 0 0", 3, place)
-            rpy = _numbers(origin.get("rpy", "0 0 0") if origin is not None else "0 0 0", 3, place)
+            xyz, rpy = _origin(joint, place)
             direction = _numbers(axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3, place)
             norm = float(np.linalg.norm(direction))
             if norm == 0.0:

@@ -23,8 +23,6 @@ from scipy.optimize import linear_sum_assignment
 
 from fri.errors import DataError
 
-__all__ = ["Alignment", "Track", "align"]
-
 _STILL_RAD = 1e-3
 _COARSE_S = 0.01
 _LEAST_OVERLAP = 0.5
@@ -77,8 +75,8 @@ class Alignment:
     middle_s: float
     overlap_s: float
     residual_rad: float
-    runner_up_rad: float
-    correlation: tuple[float, ...]
+    runner_up_rad: float = float("inf")
+    correlation: tuple[float, ...] = ()
 
     def at(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Times of the clock of `other` on the clock of the reference [s]."""
@@ -121,49 +119,30 @@ def align(reference: Track, other: Track, *, tolerance_s: float | None = None) -
         raise DataError(
             f"{other.name}: no delay against {reference.name} can be refined; record a livelier motion"
         )
-    fits.sort(key=lambda fit: fit.residual)
+    fits.sort(key=lambda fit: fit.residual_rad)
     first = fits[0]
-    others = [fit for fit in fits[1:] if abs(fit.delay - first.delay) > 2.0 * step]
-    runner_up = others[0].residual if others else float("inf")
-    if runner_up < _CLEAR * first.residual:
+    others = [fit for fit in fits[1:] if abs(fit.delay_s - first.delay_s) > 2.0 * step]
+    runner_up = others[0].residual_rad if others else float("inf")
+    if runner_up < _CLEAR * first.residual_rad:
         raise DataError(
-            f"{other.name}: the delay against {reference.name} is ambiguous: {first.delay:.4f} s leaves "
-            f"{first.residual:.2e} rad rms and {others[0].delay:.4f} s leaves {runner_up:.2e} rad, less than "
+            f"{other.name}: the delay against {reference.name} is ambiguous: {first.delay_s:.4f} s leaves "
+            f"{first.residual_rad:.2e} rad rms and {others[0].delay_s:.4f} s leaves {runner_up:.2e} rad, less than "
             f"{_CLEAR:g} times as much; a periodic motion must be recorded with its approach or its end"
         )
-    if first.delay_std > tolerance:
+    if first.delay_std_s > tolerance:
         raise DataError(
             f"{other.name}: the delay against {reference.name} is known to "
-            f"{first.delay_std * 1e3:.3f} ms only, "
+            f"{first.delay_std_s * 1e3:.3f} ms only, "
             f"{tolerance * 1e3:.3f} ms are needed; record a longer or faster motion"
         )
-    if abs(first.rate) > _LARGEST_RATE:
+    if abs(first.rate_error) > _LARGEST_RATE:
         raise DataError(
-            f"{other.name}: its clock would run {first.rate * 1e6:.0f} ppm off that of {reference.name}, "
+            f"{other.name}: its clock would run {first.rate_error * 1e6:.0f} ppm off that of {reference.name}, "
             f"{_LARGEST_RATE * 1e6:.0f} ppm is the limit; check the time column and its unit"
         )
-    return Alignment(
-        delay_s=first.delay,
-        delay_std_s=first.delay_std,
-        rate_error=first.rate,
-        rate_error_std=first.rate_std,
-        middle_s=first.middle,
-        overlap_s=first.overlap,
-        residual_rad=first.residual,
-        runner_up_rad=runner_up,
-        correlation=_correlations(a, b, int(lags[best])),
+    return dataclasses.replace(
+        first, runner_up_rad=runner_up, correlation=_correlations(a, b, int(lags[best]))
     )
-
-
-@dataclass(frozen=True)
-class _Fit:
-    delay: float
-    rate: float
-    delay_std: float
-    rate_std: float
-    middle: float
-    overlap: float
-    residual: float
 
 
 def _check_motion(track: Track) -> None:
@@ -297,7 +276,7 @@ def _best_order(
     return columns.astype(np.int64), values
 
 
-def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
+def _refined(reference: Track, other: Track, delay: float, step: float) -> Alignment:
     """Gauss-Newton from a coarse delay; the finer sampled track is interpolated at the other's times."""
     forward = reference.period <= other.period
     fine, coarse = (reference, other) if forward else (other, reference)
@@ -329,14 +308,14 @@ def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
     spread = _jackknife(normal, right)
     half = 0.5 * (end - begin)
     at_end = float(np.sqrt(spread[0, 0] + half**2 * spread[1, 1] + 2.0 * half * abs(spread[0, 1])))
-    return _Fit(
-        delay=sign * shift,
-        rate=rate if forward else 1.0 / (1.0 + rate) - 1.0,
-        delay_std=max(at_end, float(np.sqrt(spread[0, 0]))),
-        rate_std=float(np.sqrt(spread[1, 1])),
-        middle=middle if forward else middle + shift,
-        overlap=float(end - begin),
-        residual=residual,
+    return Alignment(
+        delay_s=sign * shift,
+        delay_std_s=max(at_end, float(np.sqrt(spread[0, 0]))),
+        rate_error=rate if forward else 1.0 / (1.0 + rate) - 1.0,
+        rate_error_std=float(np.sqrt(spread[1, 1])),
+        middle_s=middle if forward else middle + shift,
+        overlap_s=float(end - begin),
+        residual_rad=residual,
     )
 
 

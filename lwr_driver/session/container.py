@@ -21,17 +21,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from lwr_driver.session.messages import Schema
 
-__all__ = [
-    "FOOTER_SIZE",
-    "MAGIC",
-    "MESSAGE_HEAD",
-    "PROFILE",
-    "Container",
-    "Messages",
-    "Opcode",
-    "message_prefix",
-]
-
 MAGIC = b"\x89MCAP0\r\n"
 
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
@@ -79,83 +68,9 @@ def _texts(values: Mapping[str, str]) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def _schema(number: int, name: str, encoding: str, data: bytes) -> bytes:
-    """A schema record."""
-    head = struct.pack("<H", number) + _text(name) + _text(encoding)
-    return _record(Opcode.SCHEMA, head, struct.pack("<I", len(data)), data)
-
-
-def _channel(number: int, schema_number: int, topic: str, encoding: str, info: Mapping[str, str]) -> bytes:
-    """A channel record."""
-    head = struct.pack("<HH", number, schema_number)
-    return _record(Opcode.CHANNEL, head, _text(topic), _text(encoding), _texts(info))
-
-
 def message_prefix(channel_number: int, size: int) -> bytes:
     """Head of a message record for a message of `size` bytes, counters and times zero."""
     return MESSAGE_HEAD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size - 9 + size, channel_number, 0, 0, 0)
-
-
-def _attachment(name: str, media_type: str, data: bytes, time_ns: int) -> bytes:
-    """An attachment record with its CRC."""
-    content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
-    content += struct.pack("<Q", len(data)) + data
-    return _record(Opcode.ATTACHMENT, content, struct.pack("<I", zlib.crc32(content)))
-
-
-def _metadata(name: str, values: Mapping[str, str]) -> bytes:
-    """A metadata record."""
-    return _record(Opcode.METADATA, _text(name), _texts(values))
-
-
-def _attachment_index(
-    offset: int, length: int, times: tuple[int, int], size: int, name: str, media_type: str
-) -> bytes:
-    """Where an attachment stands; `times` are its log and create time."""
-    head = struct.pack("<QQQQQ", offset, length, *times, size)
-    return _record(Opcode.ATTACHMENT_INDEX, head, _text(name), _text(media_type))
-
-
-def _metadata_index(offset: int, length: int, name: str) -> bytes:
-    """Where a metadata record stands."""
-    return _record(Opcode.METADATA_INDEX, struct.pack("<QQ", offset, length), _text(name))
-
-
-def _chunk_index(
-    times: tuple[int, int],
-    place: tuple[int, int],
-    index_offsets: Mapping[int, int],
-    index_length: int,
-    compression: str,
-    sizes: tuple[int, int],
-) -> bytes:
-    """Where a chunk stands: (first, last) log time, (offset, length), indexes, (packed, plain) size."""
-    offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
-    head = struct.pack("<QQQQI", *times, *place, len(offsets))
-    return _record(
-        Opcode.CHUNK_INDEX,
-        head,
-        offsets,
-        struct.pack("<Q", index_length),
-        _text(compression),
-        struct.pack("<QQ", *sizes),
-    )
-
-
-def _statistics(
-    counts: Mapping[int, int],
-    schemas: int,
-    attachments: int,
-    metadata_count: int,
-    chunks: int,
-    times: tuple[int, int],
-) -> bytes:
-    """Counts of the whole file; `counts` are the messages of each channel."""
-    head = struct.pack(
-        "<QHIIIIQQ", sum(counts.values()), schemas, len(counts), attachments, metadata_count, chunks, *times
-    )
-    data = b"".join(struct.pack("<HQ", *item) for item in counts.items())
-    return _record(Opcode.STATISTICS, head, struct.pack("<I", len(data)), data)
 
 
 PROFILE = "ros2"
@@ -240,17 +155,19 @@ class Container:
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int) -> None:
         """Write an attachment."""
-        content = _attachment(name, media_type, data, time_ns)
-        index = _attachment_index(self.offset, len(content), (time_ns, time_ns), len(data), name, media_type)
+        content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
+        content += struct.pack("<Q", len(data)) + data
+        content = _record(Opcode.ATTACHMENT, content, struct.pack("<I", zlib.crc32(content)))
+        head = struct.pack("<QQQQQ", self.offset, len(content), time_ns, time_ns, len(data))
         self._write(content)
-        self._attachments.append(index)
+        self._attachments.append(_record(Opcode.ATTACHMENT_INDEX, head, _text(name), _text(media_type)))
 
     def describe(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        content = _metadata(name, values)
-        index = _metadata_index(self.offset, len(content), name)
+        content = _record(Opcode.METADATA, _text(name), _texts(values))
+        place = struct.pack("<QQ", self.offset, len(content))
         self._write(content)
-        self._metadata.append(index)
+        self._metadata.append(_record(Opcode.METADATA_INDEX, place, _text(name)))
 
     def channel(
         self,
@@ -265,14 +182,13 @@ class Container:
         if topic not in self._channels:
             key = f"{schema.name}\0{schema_encoding}\0{schema.text}"
             if key not in self._schemas:
-                number = len(self._schemas) + 1
-                self._schemas[key] = (
-                    number,
-                    _schema(number, schema.name, schema_encoding, schema.text.encode()),
-                )
+                number, data = len(self._schemas) + 1, schema.text.encode()
+                head = struct.pack("<H", number) + _text(schema.name) + _text(schema_encoding)
+                self._schemas[key] = number, _record(Opcode.SCHEMA, head, struct.pack("<I", len(data)), data)
             schema_number, schema_record = self._schemas[key]
             number = len(self._channels) + 1
-            content = _channel(number, schema_number, topic, encoding, info or {})
+            head = struct.pack("<HH", number, schema_number)
+            content = _record(Opcode.CHANNEL, head, _text(topic), _text(encoding), _texts(info or {}))
             self._channels[topic] = _Channel(number, schema, content, schema_record)
         return self._channels[topic].number
 
@@ -317,13 +233,17 @@ class Container:
             index_offsets[number], counts[number] = at, int(mine.sum())
             parts.append(index)
             at += len(index)
-        place = (self.offset, len(chunk))
-        self._write(b"".join(parts))
-        self._chunks.append(
-            _chunk_index(
-                times, place, index_offsets, at - place[0] - place[1], "zstd", (len(packed), len(plain))
-            )
+        offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
+        chunk_index = _record(
+            Opcode.CHUNK_INDEX,
+            struct.pack("<QQQQI", *times, self.offset, len(chunk), len(offsets)),
+            offsets,
+            struct.pack("<Q", at - self.offset - len(chunk)),
+            _text("zstd"),
+            struct.pack("<QQ", len(packed), len(plain)),
         )
+        self._write(b"".join(parts))
+        self._chunks.append(chunk_index)
         for channel in fresh:
             channel.written = True
         for number, count in counts.items():
@@ -334,23 +254,23 @@ class Container:
     def finish(self) -> None:
         """Write the end of the data, the summary and the footer, and close."""
         written = [channel for channel in self._channels.values() if channel.written]
+        schemas = list(dict.fromkeys(channel.schema_record for channel in written))
+        numbers = (
+            len(schemas),
+            len(self._counts),
+            len(self._attachments),
+            len(self._metadata),
+            len(self._chunks),
+        )
+        times = self._times or (0, 0)
+        head = struct.pack("<QHIIIIQQ", sum(self._counts.values()), *numbers, *times)
+        counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
+        statistics = _record(Opcode.STATISTICS, head, struct.pack("<I", len(counts)), counts)
         summary_start = self.offset + 9 + 4
         groups: list[tuple[Opcode, list[bytes]]] = [
-            (Opcode.SCHEMA, list(dict.fromkeys(channel.schema_record for channel in written))),
+            (Opcode.SCHEMA, schemas),
             (Opcode.CHANNEL, [channel.record for channel in written]),
-            (
-                Opcode.STATISTICS,
-                [
-                    _statistics(
-                        self._counts,
-                        len({channel.schema_record for channel in written}),
-                        len(self._attachments),
-                        len(self._metadata),
-                        len(self._chunks),
-                        self._times or (0, 0),
-                    )
-                ],
-            ),
+            (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, self._chunks),
             (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),

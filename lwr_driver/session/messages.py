@@ -21,25 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CONTROLLER_MODEL",
-    "FRI_STATUS",
-    "JOINT_STATE",
-    "STRING",
-    "TF_MESSAGE",
-    "TOPICS",
-    "CdrError",
-    "CdrReader",
-    "Layout",
-    "LayoutBuilder",
-    "Schema",
-    "controller_model_layout",
-    "fri_status_layout",
-    "joint_state_layout",
-    "read_joint_state_layout",
-    "tf_layout",
-]
-
 
 @dataclass(frozen=True)
 class Schema:
@@ -242,19 +223,18 @@ class LayoutBuilder:
 
     def sequence(self, name: str, code: str, count: int) -> LayoutBuilder:
         """A sequence of always `count` numbers; no field if that is zero."""
-        self._count(count)
-        return self.numbers(name, code, (count,))
+        return self.count(count).numbers(name, code, (count,))
 
     def text(self, value: str) -> LayoutBuilder:
         """A constant string."""
         data = value.encode() + b"\x00"
-        self._count(len(data))
+        self.count(len(data))
         self._bytes += data
         return self
 
     def texts(self, values: Sequence[str]) -> LayoutBuilder:
         """A constant sequence of strings."""
-        self._count(len(values))
+        self.count(len(values))
         for value in values:
             self.text(value)
         return self
@@ -265,7 +245,8 @@ class LayoutBuilder:
 
     def count(self, value: int) -> LayoutBuilder:
         """The count of a sequence; its elements follow."""
-        self._count(value)
+        self._align(4)
+        self._bytes += struct.pack("<I", value)
         return self
 
     def layout(self) -> Layout:
@@ -274,10 +255,6 @@ class LayoutBuilder:
 
     def _align(self, size: int) -> None:
         self._bytes += bytes(-(len(self._bytes) - 4) % size)
-
-    def _count(self, value: int) -> None:
-        self._align(4)
-        self._bytes += struct.pack("<I", value)
 
 
 def joint_state_layout(names: Sequence[str], *, position: bool, velocity: bool, effort: bool) -> Layout:

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from lwr_driver.session.session import JointColumns
 
-__all__ = ["FreshTorques", "KrlMotorTorque", "KrlTorqueDecoder", "TorqueMatch", "match_torques"]
-
 _SLOTS = 16
 _LONGEST_STEP = 1000
 _FOLLOWS = 0.9

@@ -39,8 +39,6 @@ from lwr_driver.session.session import (
     summarise,
 )
 
-__all__ = ["as_sessions", "describe", "read_session"]
-
 SCHEMA_VERSION = "1"
 _FIELDS = ("position", "velocity", "effort")
 _NEEDED = {"/joint_states": "position", "/motor_states": "effort", "/joint_command": "position"}

@@ -18,8 +18,6 @@ from lwr_driver.ring import NO_PHASE
 from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from lwr_driver.session.writer import ExitStatus, SessionWriter
 
-__all__ = ["Recorded", "Recording", "SessionRequest", "utc_offset_ns"]
-
 _STATUS_FIELDS = (
     "state",
     "quality",

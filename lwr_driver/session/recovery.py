@@ -17,8 +17,6 @@ from lwr_driver.session.messages import Schema
 from lwr_driver.session.scan import Block, ChannelRecord, Scan
 from lwr_driver.session.session import stamp
 
-__all__ = ["Recovery", "copy_messages", "recover", "replacing"]
-
 
 @dataclass(frozen=True)
 class Recovery:

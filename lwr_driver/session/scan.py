@@ -22,8 +22,6 @@ from fri.errors import DataError
 from lwr_driver.configuration import as_path
 from lwr_driver.session.container import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opcode
 
-__all__ = ["Block", "ChannelRecord", "Scan", "SchemaRecord"]
-
 _LARGEST_CHUNK = 1 << 28
 _LOOSE_BYTES = 4 << 20
 _HEAD = np.dtype(

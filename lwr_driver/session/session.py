@@ -17,21 +17,6 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 
-__all__ = [
-    "ChannelSummary",
-    "ControllerModelColumns",
-    "Gap",
-    "JointColumns",
-    "Missing",
-    "Phase",
-    "PhaseSummary",
-    "Session",
-    "SessionSummary",
-    "StatusColumns",
-    "stamp",
-    "summarise",
-]
-
 _WIDEST = 120
 """Characters of a line of a `repr`."""
 

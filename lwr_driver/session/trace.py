@@ -38,8 +38,6 @@ from lwr_driver.session.recovery import copy_messages, replacing
 from lwr_driver.session.scan import Scan
 from lwr_driver.session.session import JointColumns, stamp
 
-__all__ = ["Trace", "TraceImport", "import_trace", "read_trace"]
-
 TIME, TORQUE, POSITION = "time_s", "tau_m_", "q_"
 
 

@@ -34,8 +34,6 @@ from lwr_driver.session.messages import (
 )
 from lwr_driver.session.session import stamp
 
-__all__ = ["CHUNK_PERIOD_S", "SLOW_PERIOD_NS", "ExitStatus", "SessionWriter", "session_metadata"]
-
 CHUNK_PERIOD_S = 0.5
 SLOW_PERIOD_NS = 20_000_000
 """Period of the slow channels: 50 Hz."""
@@ -52,11 +50,7 @@ _MEDIA_TYPES = {
     ".json": "application/json",
 }
 _LATEST_NS = 2**31 * 10**9
-_PREFIX_FIELDS = {
-    "channel_sequence": ("<u4", 11),
-    "log_time": ("<u8", 15),
-    "publish_time": ("<u8", 23),
-}
+_PREFIX_FIELDS = {"channel_sequence": ("<u4", 11), "log_time": ("<u8", 15), "publish_time": ("<u8", 23)}
 
 
 def session_metadata(
