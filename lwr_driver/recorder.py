@@ -130,11 +130,6 @@ class Recorder:
         return self._process.pid
 
     @property
-    def path(self) -> Path | None:
-        """File of the open session."""
-        return self._path
-
-    @property
     def lag(self) -> int:
         """Rows published by the loop and not yet taken."""
         return self.ring.head - self.ring.tail

@@ -108,7 +108,6 @@ class Scan:
     def __init__(self, path: str | os.PathLike[str], *, skip_damage: bool = False) -> None:
         self.path = as_path(path, "session log")
         self.profile = ""
-        self.library = ""
         self.channels: dict[int, ChannelRecord] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.attachments: dict[str, tuple[str, int, bytes]] = {}
@@ -118,7 +117,6 @@ class Scan:
         self.lost_from: int | None = None
         self.lost_to: int | None = None
         self.skipped: list[str] = []
-        self.chunks = 0
         self._skip_damage = skip_damage
         self._schemas: dict[int, SchemaRecord] = {}
         self._decompressor = zstandard.ZstdDecompressor()
@@ -223,7 +221,6 @@ class Scan:
     ) -> Generator[Block, None, tuple[int, str] | None]:
         """Yields the block of a chunk; returns the damage not yet followed by a good chunk."""
         at, content = chunk
-        self.chunks += 1
         try:
             data = self._decompress(content)
             block = self._block(at, data, index)
@@ -367,7 +364,7 @@ class Scan:
         try:
             reader = _Fields(content)
             if opcode == Opcode.HEADER:
-                self.profile, self.library = reader.text(), reader.text()
+                self.profile = reader.text()
             elif opcode == Opcode.SCHEMA:
                 number = reader.number("<H")
                 self._schemas[number] = SchemaRecord(reader.text(), reader.text(), reader.bytes("<I"))

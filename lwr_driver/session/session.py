@@ -111,30 +111,15 @@ class JointColumns:
                     f"{self.source}: {self.topic} at {stamp(self.log_time)} has no joint {name!r}; {advice}"
                 )
         columns = [self.names.index(name) for name in wanted]
-
-        def pick(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return values[:, columns] if values.shape[1] else values
-
-        return dataclasses.replace(
-            self,
-            names=wanted,
-            position=pick(self.position),
-            velocity=pick(self.velocity),
-            effort=pick(self.effort),
-        )
+        picked = {name: getattr(self, name)[:, columns] for name in self.held}
+        return dataclasses.replace(self, names=wanted, **picked)
 
     def rows(self, start: int, stop: int) -> JointColumns:
         """The samples with `start` <= log time < `stop` [ns]."""
         low, high = np.searchsorted(self.log_time, [start, stop], side="left")
-        part = slice(int(low), int(high))
+        fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
         return dataclasses.replace(
-            self,
-            log_time=self.log_time[part],
-            publish_time=self.publish_time[part],
-            sequence=self.sequence[part],
-            position=self.position[part],
-            velocity=self.velocity[part],
-            effort=self.effort[part],
+            self, **{name: getattr(self, name)[int(low) : int(high)] for name in fields}
         )
 
 

@@ -118,7 +118,6 @@ class SessionWriter:
         robot_description: str | None = None,
         attachments: Mapping[str, bytes] | None = None,
         start_ns: int = 0,
-        chunk_period_s: float = CHUNK_PERIOD_S,
         fsync: bool = False,
     ) -> None:
         self.path = as_path(path, "session log")
@@ -136,7 +135,7 @@ class SessionWriter:
         self.closed = False
         self._failure: DataError | None = None
         self._last_sequence: int | None = None
-        self._period_ns = round(chunk_period_s * 1e9)
+        self._period_ns = round(CHUNK_PERIOD_S * 1e9)
         self._frames = None if robot_description is None else LinkFrames(robot_description)
         self._description = robot_description
         self._layouts: dict[object, Layout] = {}
@@ -251,28 +250,13 @@ class SessionWriter:
         """
         if self._frames is None:
             return
-        self.write_tf(
-            log_time,
-            self._frames.pairs,
-            self._frames.poses(self.joint_names, np.atleast_2d(np.asarray(position, dtype=np.float64))),
-            publish_time=publish_time,
-        )
-
-    def write_tf(
-        self,
-        log_time: ArrayLike,
-        pairs: Sequence[tuple[str, str]],
-        poses: NDArray[np.float64],
-        *,
-        publish_time: ArrayLike | None = None,
-    ) -> None:
-        """Poses (n, frames, 7), x y z [m] and quaternion x y z w, of child frames in their parents."""
-        frames = tuple(pairs)
+        pairs = self._frames.pairs
+        poses = self._frames.poses(self.joint_names, np.atleast_2d(np.asarray(position, dtype=np.float64)))
         times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
-        columns: dict[str, Any] = {f"pose_{index}": poses[:, index] for index in range(len(frames))}
-        for index in range(len(frames)):
+        columns: dict[str, Any] = {f"pose_{index}": poses[:, index] for index in range(len(pairs))}
+        for index in range(len(pairs)):
             columns[f"{index}_sec"], columns[f"{index}_nanosec"] = times // 10**9, times % 10**9
-        self._add("/tf", frames, lambda: tf_layout(frames), times, columns, publish_time, None)
+        self._add("/tf", pairs, lambda: tf_layout(pairs), times, columns, publish_time, None)
 
     def slow(self, topic: str, publish_time: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Rows for a 50 Hz topic, as a mask: the first of every 20 ms of the source's clock, across calls."""
