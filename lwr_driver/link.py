@@ -44,9 +44,54 @@ _COUNTERS = (
     "foreign",
     "restarts",
 )
+_SILENCE_S = 1.0  # after so long without a packet, silence is the cause of any trouble
+_POSITION_PROGRAMS = ("lwr_identification", "stanford", "ros_control")
 _QUANTILES = (0.5, 0.99, 0.999, 1.0)
 
 Joints = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """Settings of the connection to the arm.
+
+    address, port : of this computer; only this address is bound, port 0 takes a free one
+    controller : IP address of the controller; None accepts the first sender, and then only that one
+    lock_step : the other side waits for each answer and nothing runs between commands (the emulator only)
+    handshake : KRL program on the controller: `lwr_identification`, `stanford`, `ros_control`
+    realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; not needed in
+        lock step
+    priority : of SCHED_FIFO; cpu : processor of the loop, None chooses an isolated one or the last
+    link_timeout_s : the link counts as lost after so much silence [s], ten cycles at least
+    tracking_limit_rad : largest distance between command and arm in a motion [rad]
+    longest_motion_s : memory for motions, at 1 ms; longer cycles allow for longer motions [s]
+    lock_step_patience_s : in lock step the other side counts as gone after so much real time [s]
+    """
+
+    address: str = "192.168.0.100"
+    port: int = 49938
+    controller: str | None = None
+    lock_step: bool = False
+    handshake: str = "stanford"
+    realtime: Literal["require", "allow"] = "require"
+    priority: int = 80
+    cpu: int | None = None
+    link_timeout_s: float = 0.1
+    tracking_limit_rad: float = 0.2
+    longest_motion_s: float = 900.0
+    lock_step_patience_s: float = 15.0
+
+    def __post_init__(self) -> None:
+        if find_handshake(self.handshake).name not in _POSITION_PROGRAMS:
+            raise ConfigurationError(
+                f"KRL program {self.handshake!r} runs the arm in impedance control; the driver commands "
+                f"positions. Use one of {', '.join(_POSITION_PROGRAMS)}"
+            )
+        for name in ("link_timeout_s", "tracking_limit_rad", "longest_motion_s", "lock_step_patience_s"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be above zero")
+        if not 1 <= self.priority <= 99:
+            raise ConfigurationError(f"priority {self.priority} is not within 1 to 99")
 
 
 @dataclass(frozen=True)
@@ -227,53 +272,6 @@ def _latencies(histogram: NDArray[np.int64]) -> dict[float, float]:
     cumulated = np.cumsum(histogram)
     places = [int(np.searchsorted(cumulated, max(1.0, np.ceil(q * total)))) for q in _QUANTILES]
     return {q: (place + 1) * BIN_NS * 1e-9 for q, place in zip(_QUANTILES, places, strict=True)}
-
-
-_SILENCE_S = 1.0  # after so long without a packet, silence is the cause of any trouble
-_POSITION_PROGRAMS = ("lwr_identification", "stanford", "ros_control")
-
-
-@dataclass(frozen=True)
-class LinkSettings:
-    """Settings of the connection to the arm.
-
-    address, port : of this computer; only this address is bound, port 0 takes a free one
-    controller : IP address of the controller; None accepts the first sender, and then only that one
-    lock_step : the other side waits for each answer and nothing runs between commands (the emulator only)
-    handshake : KRL program on the controller: `lwr_identification`, `stanford`, `ros_control`
-    realtime : `require` refuses to run without real-time rights, `allow` runs with a warning; not needed in
-        lock step
-    priority : of SCHED_FIFO; cpu : processor of the loop, None chooses an isolated one or the last
-    link_timeout_s : the link counts as lost after so much silence [s], ten cycles at least
-    tracking_limit_rad : largest distance between command and arm in a motion [rad]
-    longest_motion_s : memory for motions, at 1 ms; longer cycles allow for longer motions [s]
-    lock_step_patience_s : in lock step the other side counts as gone after so much real time [s]
-    """
-
-    address: str = "192.168.0.100"
-    port: int = 49938
-    controller: str | None = None
-    lock_step: bool = False
-    handshake: str = "stanford"
-    realtime: Literal["require", "allow"] = "require"
-    priority: int = 80
-    cpu: int | None = None
-    link_timeout_s: float = 0.1
-    tracking_limit_rad: float = 0.2
-    longest_motion_s: float = 900.0
-    lock_step_patience_s: float = 15.0
-
-    def __post_init__(self) -> None:
-        if find_handshake(self.handshake).name not in _POSITION_PROGRAMS:
-            raise ConfigurationError(
-                f"KRL program {self.handshake!r} runs the arm in impedance control; the driver commands "
-                f"positions. Use one of {', '.join(_POSITION_PROGRAMS)}"
-            )
-        for name in ("link_timeout_s", "tracking_limit_rad", "longest_motion_s", "lock_step_patience_s"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be above zero")
-        if not 1 <= self.priority <= 99:
-            raise ConfigurationError(f"priority {self.priority} is not within 1 to 99")
 
 
 def advise_connect(state: LinkState) -> str:

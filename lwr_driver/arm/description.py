@@ -244,7 +244,7 @@ def _check_urdf(arm: Arm, where: str) -> None:
         )
     inertias = link_inertias(arm.urdf, where)
     for joint, lower, upper in zip(moving, arm.q_min, arm.q_max, strict=True):
-        child = _attribute(joint.find("child"), "link", where)
+        child = getattr(joint.find("child"), "attrib", {}).get("link", "(none)")
         if child not in inertias:
             raise ConfigurationError(
                 f"{where}: link {child} is moved by {joint.get('name')} but has no inertial"
@@ -280,13 +280,6 @@ def _root(urdf: str, where: str) -> Any:
         return ElementTree.fromstring(urdf)
     except ElementTree.ParseError as error:
         raise ConfigurationError(f"{where}: not valid XML: {error}") from error
-
-
-def _attribute(element: Any, key: str, where: str) -> str:
-    value = None if element is None else element.get(key)
-    if value is None:
-        raise ConfigurationError(f"{where}: an element lacks its attribute `{key}`")
-    return str(value)
 
 
 def _origin(element: Any, where: str) -> tuple[Vector, Vector]:

@@ -19,12 +19,14 @@ import zstandard
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session.messages import Schema
+from lwr_driver.session.messages import Layout, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
 
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """Start of a message record: opcode, length, channel, sequence, log time, publish time; then the message."""
+
+_HEAD_FIELDS = {"channel_sequence": ("<u4", 11), "log_time": ("<u8", 15), "publish_time": ("<u8", 23)}
 
 FOOTER_SIZE = 9 + 20 + len(MAGIC)
 """Bytes of the footer record and the closing magic."""
@@ -68,9 +70,10 @@ def _texts(values: Mapping[str, str]) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def message_prefix(channel_number: int, size: int) -> bytes:
-    """Head of a message record for a message of `size` bytes, counters and times zero."""
-    return MESSAGE_HEAD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size - 9 + size, channel_number, 0, 0, 0)
+def record_layout(layout: Layout, channel_number: int) -> Layout:
+    """Layout of the message records of a channel: their head with its fields, then the message."""
+    head = MESSAGE_HEAD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size - 9 + layout.size, channel_number, 0, 0, 0)
+    return layout.relaid(head, _HEAD_FIELDS)
 
 
 PROFILE = "ros2"

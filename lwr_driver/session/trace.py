@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from lwr_driver.configuration import as_path
 from lwr_driver.session.alignment import Alignment, Track, align
-from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, Opcode
+from lwr_driver.session.container import Container, Messages, record_layout
 from lwr_driver.session.messages import JOINT_STATE, joint_state_layout
 from lwr_driver.session.motor_torque import TorqueMatch, match_torques
 from lwr_driver.session.reader import read_session
@@ -261,17 +261,15 @@ def _write(session_path: Path, out: Path, metadata: dict[str, str], motor: Joint
 
 
 def _messages(container: Container, motor: JointColumns) -> Messages:
-    layout = joint_state_layout(motor.names, position=False, velocity=False, effort=True)
-    rows = layout.pack(
-        {"sec": motor.log_time // 10**9, "nanosec": motor.log_time % 10**9, "effort": motor.effort},
-        len(motor),
-    )
     number = container.channel(motor.topic, JOINT_STATE)
-    length = MESSAGE_HEAD.size - 9 + layout.size
-    records = [
-        MESSAGE_HEAD.pack(Opcode.MESSAGE, length, number, *times) + row.tobytes()
-        for row, *times in zip(
-            rows, motor.sequence.tolist(), motor.log_time.tolist(), motor.publish_time.tolist(), strict=True
-        )
-    ]
+    layout = joint_state_layout(motor.names, position=False, velocity=False, effort=True)
+    columns = {
+        "channel_sequence": motor.sequence,
+        "log_time": motor.log_time,
+        "publish_time": motor.publish_time,
+        "sec": motor.log_time // 10**9,
+        "nanosec": motor.log_time % 10**9,
+        "effort": motor.effort,
+    }
+    records = [row.tobytes() for row in record_layout(layout, number).pack(columns, len(motor))]
     return Messages(records, np.full(len(records), number, dtype=np.int64), motor.log_time)

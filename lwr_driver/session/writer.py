@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import struct
 import uuid
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError, DataError
 from lwr_driver.arm import LinkFrames
 from lwr_driver.configuration import as_path
-from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, message_prefix
+from lwr_driver.session.container import Container, Messages, record_layout
 from lwr_driver.session.messages import (
     TOPICS,
     Layout,
@@ -50,7 +49,6 @@ _MEDIA_TYPES = {
     ".json": "application/json",
 }
 _LATEST_NS = 2**31 * 10**9
-_PREFIX_FIELDS = {"channel_sequence": ("<u4", 11), "log_time": ("<u8", 15), "publish_time": ("<u8", 23)}
 
 
 def session_metadata(
@@ -399,9 +397,7 @@ class SessionWriter:
         number = self._container.channel(topic, TOPICS[topic])
         layout_key = (topic, key)
         if layout_key not in self._layouts:
-            layout = build()
-            prefix = message_prefix(number, layout.size)
-            self._layouts[layout_key] = layout.relaid(prefix, _PREFIX_FIELDS)
+            self._layouts[layout_key] = record_layout(build(), number)
         layout = self._layouts[layout_key]
         values = {"channel_sequence": numbers, "log_time": times, "publish_time": published, **columns}
         if "sec" in layout.fields:
@@ -468,6 +464,3 @@ class SessionWriter:
         return Messages(
             [records[row] for row in order.tolist()], np.concatenate(channels)[order], log_times[order]
         )
-
-
-assert struct.calcsize("<BQHIQQ") == MESSAGE_HEAD.size == 31
