@@ -33,9 +33,7 @@ def expect(value: Any, kind: type, subject: str, advice: str) -> None:
 
 def as_path(value: Any, subject: str) -> Path:
     """`value` as a path; ConfigurationError unless it is a text or a path."""
-    if isinstance(value, (str, Path)):
-        return Path(value)
-    path = value.__fspath__() if isinstance(value, os.PathLike) else None
+    path = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
     if not isinstance(path, str):
         raise ConfigurationError(
             f"{subject}: expected a path, found {_found(value)}; give it as text or pathlib.Path"

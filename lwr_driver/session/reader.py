@@ -103,11 +103,9 @@ def as_sessions(value: Session | str | os.PathLike[str] | Iterable[Any]) -> list
 
     ConfigurationError for anything else; DataError as `read_session`.
     """
-    if isinstance(value, (Session, str, os.PathLike)):
-        return [_as_session(value)]
-    if isinstance(value, Iterable) and not isinstance(value, (bytes, Mapping)):
+    if isinstance(value, Iterable) and not isinstance(value, (str, bytes, Mapping)):
         return [_as_session(item) for item in value]
-    raise _no_session(value)
+    return [_as_session(value)]
 
 
 def describe(session: Session | str | os.PathLike[str]) -> SessionSummary:
@@ -120,12 +118,8 @@ def _as_session(value: Any) -> Session:
         return value
     if isinstance(value, (str, os.PathLike)):
         return read_session(value)
-    raise _no_session(value)
-
-
-def _no_session(value: Any) -> ConfigurationError:
     shown = repr(value)
-    return ConfigurationError(
+    raise ConfigurationError(
         f"sessions: {shown if len(shown) <= 80 else f'{shown[:80]}...'} is neither a session nor a path; give "
         "a Session, the path of a session log (.mcap), or a list of these"
     )
