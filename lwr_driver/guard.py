@@ -14,8 +14,8 @@ nothing else.
 
 The stop is exact in discrete time. From the last three commanded rows follow the discrete velocity
 v0 = (q0 - q1)/T and acceleration a0 = (q0 - 2 q1 + q2)/T². Ruckig's velocity interface brings (v0, a0) to
-rest in the shortest time with |a| <= A and |j| <= J (Berscheid and Kroeger 2021, each joint by itself), and
-the rows are q(k) = q(k-1) + T v(kT). Then
+rest in the shortest time with |a| <= A and |j| <= J (Berscheid and Kroeger 2021), each joint by itself. The
+rows are q(k) = q(k-1) + T v(kT). Then
 
 - first differences are v(kT), and second differences (v(kT) - v(kT - T))/T are means of a, so at most A;
 - third differences are at most J: within the profile as second differences of v, and across the beginning

@@ -1,7 +1,7 @@
 """The session log: one MCAP file for one motion of the arm with one payload.
 
-`SessionWriter` writes a log, `read_session` reads it into numpy arrays, `describe` summarises it, `recover`
-repairs the log of a killed recorder, and `as_sessions` accepts sessions and paths alike.
+`SessionWriter` writes a log, `read_session` reads it into numpy arrays, `describe` summarises it. `recover`
+repairs the log of a killed recorder. `as_sessions` accepts sessions and paths alike.
 """
 
 from __future__ import annotations

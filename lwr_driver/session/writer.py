@@ -1,7 +1,7 @@
 """Writing a session log from columns of numpy arrays.
 
 Used by the recorder and by the import of foreign recordings. Messages are collected by topic and written as
-chunks of 0.5 s of log time, so the bytes of a log depend on the samples alone, not on their arrival.
+chunks of 0.5 s of log time. So the bytes of a log depend on the samples alone, not on their arrival.
 """
 
 from __future__ import annotations
