@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fri.errors import OperatorError, RobotError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.experiment import Run
 from runner.experiment_file import Experiment
 from runner.laboratory import Laboratory

@@ -16,14 +16,14 @@ import numpy.typing as npt
 
 from fri.errors import LwrError, RefusedError, RobotError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, Outcome
 from lwr_driver.driver import Progress as MotionProgress
 from lwr_driver.motion import Motion
-from lwr_driver.motor_torque import match_torques
 from lwr_driver.realtime import Rights
 from lwr_driver.session import read_session, session_metadata
-from lwr_driver.trace import import_trace
+from lwr_driver.session.motor_torque import match_torques
+from lwr_driver.session.trace import import_trace
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.interrupt import Interrupts
 from runner.operator import Operator

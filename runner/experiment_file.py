@@ -14,9 +14,9 @@ import pinocchio as pin
 
 from fri.errors import ConfigurationError
 from fri.handshake import find_handshake
-from lwr_driver.cell import PayloadShape
+from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
-from lwr_driver.motor_torque import KrlMotorTorque
+from lwr_driver.session.motor_torque import KrlMotorTorque
 
 __all__ = [
     "DiagnosisPlan",

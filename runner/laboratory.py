@@ -9,9 +9,9 @@ from types import TracebackType
 
 from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.driver import Driver, LinkSettings, Waiting
-from lwr_driver.motor_torque import KrlMotorTorque
+from lwr_driver.session.motor_torque import KrlMotorTorque
 from runner.experiment import Bench
 from runner.experiment_file import Experiment
 from runner.operator import EmulatedOperator, Operator, Person

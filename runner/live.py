@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from fri.states import Quality, State
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell, PayloadShape
 from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
 from runner.experiment_file import Experiment, Payload

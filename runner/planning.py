@@ -9,8 +9,8 @@ from pathlib import Path
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan, feasible_fourier
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from runner.experiment_file import Experiment, Payload, SessionPlan

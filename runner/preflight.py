@@ -15,10 +15,10 @@ import pinocchio as pin
 
 from fri.errors import RefusedError
 from lwr_driver.arm import Arm
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.collision import CollisionChecker
+from lwr_driver.link import LinkState
 from lwr_driver.motion import Motion, extremes
 from lwr_driver.realtime import Rights
-from lwr_driver.state import LinkState
 from runner.experiment_file import Payload
 from runner.payload import Rest, gravity_torque
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.motion import Motion
 from runner.experiment_file import Experiment, SessionPlan
 from runner.planning import checker

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import Clearance
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import Clearance
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.motion import Motion
 from runner.experiment_file import Experiment, Payload

@@ -22,7 +22,7 @@ from ident.excitation.planner import plan
 from ident.excitation.problem import Knowledge, PlanProblem, Prior
 from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from runner.experiment import Record, Run

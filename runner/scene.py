@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell, PayloadShape
 from runner.experiment_file import Payload
 
 __all__ = [

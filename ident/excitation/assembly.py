@@ -34,8 +34,8 @@ from ident.excitation.program import Bound, Setup
 from ident.model.model_file import read_model
 from ident.rows.prepare import prepare
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.session import read_session
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lwr_driver.trace import import_trace
+from lwr_driver.session.trace import import_trace
 from runner.options import json_option
 from runner.plain import as_json as to_json
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.experiment_file import DEFAULT, Experiment
 from runner.options import json_option
 from runner.plain import as_json as to_json

@@ -13,7 +13,7 @@ import click
 
 from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.diagnosis.after_run import conclude_run
 from runner.experiment import Bench, Record, Run
 from runner.experiment_file import DEFAULT, Experiment

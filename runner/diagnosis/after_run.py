@@ -18,7 +18,7 @@ from fri.errors import LwrError
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session

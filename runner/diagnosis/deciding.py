@@ -19,7 +19,7 @@ from ident.effects import Experiment as Discriminating
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import ParametricMotion
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import parse
 from lwr_driver.motion import Motion
 from lwr_driver.session import Session

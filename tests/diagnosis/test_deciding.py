@@ -15,7 +15,7 @@ from ident.effects import EFFECTS
 from ident.effects.words import quantity_text
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.diagnosis.deciding import Deciding, offers, open_findings
 from runner.diagnosis.decision import decision_text, decisions
 from runner.experiment_file import Experiment

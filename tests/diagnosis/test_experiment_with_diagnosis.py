@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from fri.errors import DataError
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session
 from runner.cli import main
 from runner.commissioning import record_sets

@@ -19,7 +19,7 @@ from click.testing import CliRunner
 from fri.errors import NetworkError, RobotError
 from fri.packets import MSR_ID, MSR_SIZE, new_msr
 from lwr_driver.arm import Arm
-from lwr_driver.state import LinkState
+from lwr_driver.link import LinkState
 from runner.cli import main
 from runner.computer import Finding, examine_computer, find_interface
 from runner.doctor import Examination, Patient, judge_heard, judge_link

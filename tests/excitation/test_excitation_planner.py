@@ -39,7 +39,7 @@ from ident.excitation.search import judge, polish
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Box, Cell
+from lwr_driver.arm.cell import Box, Cell
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import SessionWriter, session_metadata
 

@@ -8,7 +8,7 @@ from motions import excitation
 from session_samples import JOINTS
 
 from fri.errors import DataError
-from lwr_driver.alignment import Track, align
+from lwr_driver.session.alignment import Track, align
 
 END = 23.0
 

@@ -10,8 +10,8 @@ from session_samples import JOINTS, signals
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import parse
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder, match_torques
 from lwr_driver.session import JointColumns
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder, match_torques
 
 
 def cycles(counters, config, seed=0):

@@ -13,10 +13,10 @@ import pytest
 from session_samples import EPOCH, JOINTS, METADATA, URDF, rows
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.motor_torque import KrlMotorTorque
 from lwr_driver.recorder import Recorder, SessionRequest
 from lwr_driver.ring import Ring
 from lwr_driver.session import read_session
+from lwr_driver.session.motor_torque import KrlMotorTorque
 
 PATIENCE_S = 60.0
 

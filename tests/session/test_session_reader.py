@@ -15,8 +15,8 @@ from session_samples import EPOCH, JOINTS, METADATA, signals, write_session
 
 from fri.errors import DataError
 from lwr_driver.session import SessionWriter, describe, read_session
+from lwr_driver.session.messages import JOINT_STATE, STRING
 from lwr_driver.session.scan import Scan
-from lwr_driver.session.schemas import JOINT_STATE, STRING
 
 
 def test_what_was_written_is_read(tmp_path):

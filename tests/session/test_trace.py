@@ -11,7 +11,7 @@ from session_samples import EPOCH, JOINTS, METADATA
 
 from fri.errors import DataError
 from lwr_driver.session import SessionWriter, read_session
-from lwr_driver.trace import import_trace, read_trace
+from lwr_driver.session.trace import import_trace, read_trace
 
 OFFSET, RATE = 812.4375, 1.5e-5
 HEADER = ["time_s", *(f"tau_m_{name}" for name in JOINTS), *(f"q_{name}" for name in JOINTS)]

@@ -1,15 +1,14 @@
-"""Finding the clock of one recording in another from what both have measured: joint positions.
+"""Alignment of the clocks of two recordings by the joint positions in both.
 
-Two recordings of the same motion, each on a clock of its own. The offset is searched as the lag at which the
-positions agree best (concordance by FFT, each joint's mean taken out), over every lag with enough overlap.
-Each lag that comes near the best is then refined below the sampling period by Gauss-Newton on
+Two recordings show the same motion, each on a clock of its own. The offset is searched as the lag of best
+agreement of the positions (concordance by FFT, without each joint's mean), over every lag with enough
+overlap. Each lag close to the best is then refined below the sampling period by Gauss-Newton on
 
     p_fine(t + delay + rate (t - t_mid)) - p_coarse(t) - bias_j  ->  min,
 
 with delay and rate common to all joints, and the best must win clearly. The standard deviations come from a
-jackknife over blocks of time, which sees residuals that are correlated in time (elastic deflection, friction)
-for what they are. A constant delay between the two position measurements themselves cannot be seen by any of
-this.
+jackknife over blocks of time, valid for residuals correlated in time (elastic deflection, friction). A
+constant delay between the two position measurements themselves is not identifiable.
 """
 
 from __future__ import annotations
@@ -23,8 +22,6 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import linear_sum_assignment
 
 from fri.errors import DataError
-
-__all__ = ["Alignment", "Track", "align"]
 
 _STILL_RAD = 1e-3
 _COARSE_S = 0.01
@@ -64,11 +61,11 @@ class Alignment:
 
     delay_s : t_reference - t_other in the middle of the overlap; delay_std_s : its standard deviation, the
         larger of those in the middle and at the ends of the overlap
-    rate_error, rate_error_std : seconds that the reference gains on the other clock per second
+    rate_error, rate_error_std : gain of the reference on the other clock [s/s]
     middle_s : that middle on the clock of `other`; overlap_s : duration of the overlap
-    residual_rad : root mean square of what positions still differ by
+    residual_rad : root mean square of the remaining difference of positions
     runner_up_rad : the same at the second-best lag, infinite if there is none
-    correlation : per joint; nan for a joint that stands still, whose order cannot be verified
+    correlation : per joint; nan for a joint at rest, with unverified order
     """
 
     delay_s: float
@@ -78,8 +75,8 @@ class Alignment:
     middle_s: float
     overlap_s: float
     residual_rad: float
-    runner_up_rad: float
-    correlation: tuple[float, ...]
+    runner_up_rad: float = float("inf")
+    correlation: tuple[float, ...] = ()
 
     def at(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Times of the clock of `other` on the clock of the reference [s]."""
@@ -97,12 +94,10 @@ class Alignment:
 def align(reference: Track, other: Track, *, tolerance_s: float | None = None) -> Alignment:
     """Align the clock of `other` with that of `reference`; both have the same joints in the same order.
 
-    tolerance_s : largest standard deviation of the delay that is accepted; default is half a period of
-        `other`
+    tolerance_s : largest accepted standard deviation of the delay; default is half a period of `other`
 
-    DataError if the arm stands still, if the joints follow each other in another order or with another sign,
-    if the recordings do not show the same motion, if two delays explain them nearly as well (a periodic
-    motion), or if the delay stays vaguer than the tolerance.
+    DataError if the arm stands still, the order or sign of joints differs, the motions differ, two delays fit
+    nearly as well (a periodic motion), or the standard deviation of the delay exceeds the tolerance.
     """
     tolerance = 0.5 * other.period if tolerance_s is None else tolerance_s
     _check_motion(reference)
@@ -124,49 +119,30 @@ def align(reference: Track, other: Track, *, tolerance_s: float | None = None) -
         raise DataError(
             f"{other.name}: no delay against {reference.name} can be refined; record a livelier motion"
         )
-    fits.sort(key=lambda fit: fit.residual)
+    fits.sort(key=lambda fit: fit.residual_rad)
     first = fits[0]
-    others = [fit for fit in fits[1:] if abs(fit.delay - first.delay) > 2.0 * step]
-    runner_up = others[0].residual if others else float("inf")
-    if runner_up < _CLEAR * first.residual:
+    others = [fit for fit in fits[1:] if abs(fit.delay_s - first.delay_s) > 2.0 * step]
+    runner_up = others[0].residual_rad if others else float("inf")
+    if runner_up < _CLEAR * first.residual_rad:
         raise DataError(
-            f"{other.name}: the delay against {reference.name} is ambiguous: {first.delay:.4f} s leaves "
-            f"{first.residual:.2e} rad rms and {others[0].delay:.4f} s leaves {runner_up:.2e} rad, less than "
+            f"{other.name}: the delay against {reference.name} is ambiguous: {first.delay_s:.4f} s leaves "
+            f"{first.residual_rad:.2e} rad rms and {others[0].delay_s:.4f} s leaves {runner_up:.2e} rad, less than "
             f"{_CLEAR:g} times as much; a periodic motion must be recorded with its approach or its end"
         )
-    if first.delay_std > tolerance:
+    if first.delay_std_s > tolerance:
         raise DataError(
             f"{other.name}: the delay against {reference.name} is known to "
-            f"{first.delay_std * 1e3:.3f} ms only, "
+            f"{first.delay_std_s * 1e3:.3f} ms only, "
             f"{tolerance * 1e3:.3f} ms are needed; record a longer or faster motion"
         )
-    if abs(first.rate) > _LARGEST_RATE:
+    if abs(first.rate_error) > _LARGEST_RATE:
         raise DataError(
-            f"{other.name}: its clock would run {first.rate * 1e6:.0f} ppm off that of {reference.name}, "
+            f"{other.name}: its clock would run {first.rate_error * 1e6:.0f} ppm off that of {reference.name}, "
             f"{_LARGEST_RATE * 1e6:.0f} ppm is the limit; check the time column and its unit"
         )
-    return Alignment(
-        delay_s=first.delay,
-        delay_std_s=first.delay_std,
-        rate_error=first.rate,
-        rate_error_std=first.rate_std,
-        middle_s=first.middle,
-        overlap_s=first.overlap,
-        residual_rad=first.residual,
-        runner_up_rad=runner_up,
-        correlation=_correlations(a, b, int(lags[best])),
+    return dataclasses.replace(
+        first, runner_up_rad=runner_up, correlation=_correlations(a, b, int(lags[best]))
     )
-
-
-@dataclass(frozen=True)
-class _Fit:
-    delay: float
-    rate: float
-    delay_std: float
-    rate_std: float
-    middle: float
-    overlap: float
-    residual: float
 
 
 def _check_motion(track: Track) -> None:
@@ -217,8 +193,8 @@ def _concordance(
     energy_b = (_window_sums(b**2, first - lags, stop - lags) - sum_b**2 / count).sum(axis=1)
     cross = cross - (sum_a * sum_b / count).sum(axis=1)
     share = min(float((a**2).sum()), float((b**2).sum()))
-    lively = np.minimum(energy_a, energy_b) >= _LEAST_ENERGY * share
-    scores = np.where(lively, 2.0 * cross / np.maximum(energy_a + energy_b, 1e-300), -1.0)
+    moving = np.minimum(energy_a, energy_b) >= _LEAST_ENERGY * share
+    scores = np.where(moving, 2.0 * cross / np.maximum(energy_a + energy_b, 1e-300), -1.0)
     return lags, scores
 
 
@@ -253,7 +229,7 @@ def _correlations(a: NDArray[np.float64], b: NDArray[np.float64], lag: int) -> t
 def _check_joints(
     reference: Track, other: Track, a: NDArray[np.float64], b: NDArray[np.float64], lag: int, score: float
 ) -> None:
-    """Raise if a joint does not follow itself at the best lag, and say which one it follows."""
+    """Raise if a joint does not follow itself at the best lag, naming the joint it follows."""
     own = np.array(_correlations(a, b, lag))
     moving = np.isfinite(own)
     if score >= _AGREEMENT and moving.any() and (own[moving] >= _CANDIDATE).all():
@@ -281,7 +257,7 @@ def _check_joints(
 def _best_order(
     a: NDArray[np.float64], b: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """The assignment of columns of `b` to those of `a`, at any lag, under which all that move agree."""
+    """The assignment of columns of `b` to those of `a`, at any lag, with agreement of all moving joints."""
     a0, b0 = a - a.mean(axis=0), b - b.mean(axis=0)
     lags, first, stop, size = _lagged(a0, b0)
     fa, fb = np.fft.rfft(a0, size, axis=0), np.fft.rfft(b0, size, axis=0)
@@ -300,7 +276,7 @@ def _best_order(
     return columns.astype(np.int64), values
 
 
-def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
+def _refined(reference: Track, other: Track, delay: float, step: float) -> Alignment:
     """Gauss-Newton from a coarse delay; the finer sampled track is interpolated at the other's times."""
     forward = reference.period <= other.period
     fine, coarse = (reference, other) if forward else (other, reference)
@@ -312,7 +288,7 @@ def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     middle = 0.5 * (begin + end)
     time, target = coarse.time[rows], coarse.position[rows]
-    # Slopes of noisy samples would be noise; those of a smoothed copy serve as instruments instead.
+    # Slopes of noisy samples would be noise; slopes of a smoothed copy serve as instruments.
     width = max(1, round(_SMOOTH_S / fine.period))
     smooth = dataclasses.replace(
         fine, position=uniform_filter1d(fine.position, width, axis=0, mode="nearest")
@@ -332,14 +308,14 @@ def _refined(reference: Track, other: Track, delay: float, step: float) -> _Fit:
     spread = _jackknife(normal, right)
     half = 0.5 * (end - begin)
     at_end = float(np.sqrt(spread[0, 0] + half**2 * spread[1, 1] + 2.0 * half * abs(spread[0, 1])))
-    return _Fit(
-        delay=sign * shift,
-        rate=rate if forward else 1.0 / (1.0 + rate) - 1.0,
-        delay_std=max(at_end, float(np.sqrt(spread[0, 0]))),
-        rate_std=float(np.sqrt(spread[1, 1])),
-        middle=middle if forward else middle + shift,
-        overlap=float(end - begin),
-        residual=residual,
+    return Alignment(
+        delay_s=sign * shift,
+        delay_std_s=max(at_end, float(np.sqrt(spread[0, 0]))),
+        rate_error=rate if forward else 1.0 / (1.0 + rate) - 1.0,
+        rate_error_std=float(np.sqrt(spread[1, 1])),
+        middle_s=middle if forward else middle + shift,
+        overlap_s=float(end - begin),
+        residual_rad=residual,
     )
 
 
@@ -360,7 +336,7 @@ def _interpolated(track: Track, time: NDArray[np.float64]) -> tuple[NDArray[np.f
 def _normal_equations(
     error: NDArray[np.float64], slope: NDArray[np.float64], time: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Normal equations of (delay, rate) for each block of time, each joint's bias taken out; residual rms."""
+    """Normal equations of (delay, rate) for each block of time, without each joint's bias; residual rms."""
     rows = len(time)
     if rows < 2 * _BLOCKS:
         raise np.linalg.LinAlgError("too few samples")

@@ -1,6 +1,4 @@
-"""What stands around the arm: ground, boxes, and the shape of the payload. Positions are in the frame
-`base_link`.
-"""
+"""The surroundings of the arm: ground, boxes, and the shape of the payload; positions in `base_link`."""
 
 from __future__ import annotations
 
@@ -10,8 +8,6 @@ from typing import Literal
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
-
-__all__ = ["Box", "Cell", "PayloadShape"]
 
 Triple = tuple[float, float, float]
 
@@ -54,10 +50,10 @@ class PayloadShape:
 
 @dataclass(frozen=True)
 class Cell:
-    """The surroundings that every motion is checked against.
+    """The surroundings for the collision check of every motion.
 
-    ground_z_m : height of the ground [m]; None where there is none within reach
-    margin_m : distance that every checked motion keeps [m]
+    ground_z_m : height of the ground [m]; None if it is out of the arm's range
+    margin_m : least distance of every motion [m]
     """
 
     schema_version: int = 1

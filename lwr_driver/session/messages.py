@@ -1,12 +1,12 @@
-"""CDR messages of fixed layout, packed and unpacked by columns with numpy.
+"""The messages of the session log: their definitions (`ros2msg`), and CDR packed by columns with numpy.
 
-A topic whose messages all have the same names and the same array lengths has messages of one size in which
-every field stands at the same place. `Layout` holds such a message as a template of bytes and the places of
-its fields. Packing copies the template n times and writes the columns into it; unpacking checks that all
-bytes outside the fields equal the template and reads the columns. Rows are moved as plain bytes, never as
-structured arrays with gaps, whose copies leave out what lies between the fields.
+Messages of a topic with constant names and array lengths have one size, with every field at the same place.
+`Layout` holds such a message as a template of bytes and the places of its fields. Packing copies the template
+n times and writes the columns into it; unpacking checks all bytes outside the fields against the template and
+reads the columns. Rows are moved as plain bytes, never as structured arrays with gaps: copies of these leave
+out the bytes between the fields.
 
-CDR: 4 bytes of encapsulation (byte order and version), then the fields; a number is aligned to its own size
+CDR: 4 bytes of encapsulation (byte order and version), then the fields. A number is aligned to its own size
 (XCDR2: at most 4) counted from the end of the encapsulation, a string has its length with the closing zero, a
 sequence its count; an empty sequence has no padding after its count.
 """
@@ -21,17 +21,111 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CdrError",
-    "CdrReader",
-    "Layout",
-    "LayoutBuilder",
-    "controller_model_layout",
-    "fri_status_layout",
-    "joint_state_layout",
-    "read_joint_state_layout",
-    "tf_layout",
-]
+
+@dataclass(frozen=True)
+class Schema:
+    """Name and text of a message definition."""
+
+    name: str
+    text: str
+
+
+_RULE = "=" * 80
+
+_TIME = f"""{_RULE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+_HEADER = f"""{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME}"""
+
+JOINT_STATE = Schema(
+    "sensor_msgs/msg/JointState",
+    f"""std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+{_HEADER}""",
+)
+
+STRING = Schema("std_msgs/msg/String", "string data\n")
+
+TF_MESSAGE = Schema(
+    "tf2_msgs/msg/TFMessage",
+    f"""geometry_msgs/TransformStamped[] transforms
+{_RULE}
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+{_RULE}
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+{_RULE}
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+{_RULE}
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+{_HEADER}""",
+)
+
+FRI_STATUS = Schema(
+    "lwr_msgs/msg/FriStatus",
+    f"""# State and statistics of the controller's FRI session, as received in one cycle.
+std_msgs/Header header
+uint16 state          # 0 OFF, 1 MON, 2 CMD
+uint16 quality        # 0 UNACCEPTABLE, 1 BAD, 2 OK, 3 PERFECT
+uint32 sequence       # packet count of the controller, unwrapped
+float64 sample_time   # [s]
+float32 answer_rate   # answered packets, 0 to 1
+float32 latency       # [s]
+float32 jitter        # [s]
+float32 miss_rate     # missing answers, 0 to 1
+uint32 miss_counter
+uint16 power          # bit i: drive of joint i is on
+uint16 control        # control mode
+uint16 error          # bit i: error of drive i
+uint16 warning        # bit i: warning of drive i
+float32[7] temperature
+{_HEADER}""",
+)
+
+CONTROLLER_MODEL = Schema(
+    "lwr_msgs/msg/ControllerModel",
+    f"""# The controller's own model at the measured position.
+std_msgs/Header header
+float32[49] mass_matrix             # row-major 7 x 7 [kg m2]
+float32[7] gravity                  # joint torques [Nm]
+float32[42] jacobian                # row-major 6 x 7, rows X Y Z RZ RY RX
+float32[7] estimated_external_torque  # [Nm]
+{_HEADER}""",
+)
+
+TOPICS: dict[str, Schema] = {
+    "/joint_states": JOINT_STATE,
+    "/motor_states": JOINT_STATE,
+    "/joint_command": JOINT_STATE,
+    "/experiment/phase": STRING,
+    "/fri/status": FRI_STATUS,
+    "/fri/controller_model": CONTROLLER_MODEL,
+    "/robot_description": STRING,
+    "/tf": TF_MESSAGE,
+}
+"""The topics of the session log and their message definitions."""
+
 
 _ENCAPSULATIONS: dict[bytes, tuple[str, int]] = {
     b"\x00\x00": (">", 8),
@@ -44,7 +138,7 @@ _ENCAPSULATIONS: dict[bytes, tuple[str, int]] = {
 """Byte order and largest alignment of plain CDR; XCDR2 has two sets of numbers, of versions 1.2 and 1.3."""
 
 _TAIL_PADDING = 7
-"""Bytes that a serializer may add to the end of a message."""
+"""Most bytes of padding at the end of a message."""
 
 
 class CdrError(ValueError):
@@ -94,11 +188,11 @@ class Layout:
         return rows
 
     def view(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
-        """The messages `rows` (n, size) as records that share their memory."""
+        """The messages `rows` (n, size) as records on the same memory."""
         return np.ndarray((len(rows),), dtype=self._dtype, buffer=rows.data)  # type: ignore[attr-defined]
 
     def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which of the messages `rows` (n, size) have these constants: names, counts, byte order, padding."""
+        """Mask of the messages `rows` (n, size) with these constants: names, counts, byte order, padding."""
         constant: NDArray[np.intp] = self._constant  # type: ignore[attr-defined]
         expected: NDArray[np.uint8] = self._expected  # type: ignore[attr-defined]
         return np.asarray((rows[:, constant] == expected).all(axis=1))
@@ -128,20 +222,19 @@ class LayoutBuilder:
         return self
 
     def sequence(self, name: str, code: str, count: int) -> LayoutBuilder:
-        """A sequence that always has `count` numbers; no field if that is none."""
-        self._count(count)
-        return self.numbers(name, code, (count,))
+        """A sequence of always `count` numbers; no field if that is zero."""
+        return self.count(count).numbers(name, code, (count,))
 
     def text(self, value: str) -> LayoutBuilder:
-        """A string that is always the same."""
+        """A constant string."""
         data = value.encode() + b"\x00"
-        self._count(len(data))
+        self.count(len(data))
         self._bytes += data
         return self
 
     def texts(self, values: Sequence[str]) -> LayoutBuilder:
-        """A sequence of strings that is always the same."""
-        self._count(len(values))
+        """A constant sequence of strings."""
+        self.count(len(values))
         for value in values:
             self.text(value)
         return self
@@ -151,20 +244,17 @@ class LayoutBuilder:
         return self.numbers(f"{prefix}sec", "<i4").numbers(f"{prefix}nanosec", "<u4").text(frame_id)
 
     def count(self, value: int) -> LayoutBuilder:
-        """The count of a sequence whose elements follow."""
-        self._count(value)
+        """The count of a sequence; its elements follow."""
+        self._align(4)
+        self._bytes += struct.pack("<I", value)
         return self
 
     def layout(self) -> Layout:
-        """What was built."""
+        """The layout of all fields so far."""
         return Layout(bytes(self._bytes), dict(self._fields))
 
     def _align(self, size: int) -> None:
         self._bytes += bytes(-(len(self._bytes) - 4) % size)
-
-    def _count(self, value: int) -> None:
-        self._align(4)
-        self._bytes += struct.pack("<I", value)
 
 
 def joint_state_layout(names: Sequence[str], *, position: bool, velocity: bool, effort: bool) -> Layout:
@@ -208,7 +298,7 @@ def tf_layout(frames: Sequence[tuple[str, str]]) -> Layout:
 
 
 class CdrReader:
-    """Reads one message of any encapsulation field by field; `CdrError` where the bytes make no sense."""
+    """Reads one message of any encapsulation field by field; `CdrError` for impossible bytes."""
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 4:
@@ -220,7 +310,7 @@ class CdrReader:
         self._at = 4
 
     def place(self, size: int, count: int) -> int:
-        """Offset of `count` numbers of `size` bytes each, which are stepped over."""
+        """Offset of `count` numbers of `size` bytes each; steps over them."""
         if count == 0:
             return self._at
         align = min(size, self._widest)
@@ -258,7 +348,7 @@ class CdrReader:
         return tuple(self.text() for _ in range(count))
 
     def finish(self) -> None:
-        """Raise if more is left than padding."""
+        """Raise if more than padding is left."""
         left = len(self._data) - self._at
         if left > _TAIL_PADDING:
             raise CdrError(f"{left} bytes follow the last field")
@@ -267,8 +357,7 @@ class CdrReader:
 def read_joint_state_layout(data: bytes) -> tuple[Layout, tuple[str, ...]]:
     """Layout and joint names of a `sensor_msgs/msg/JointState` message, in any plain CDR encapsulation.
 
-    Arrays that are empty are no fields of the layout. `CdrError` if an array is neither empty nor as long as
-    the names.
+    Empty arrays are no fields of the layout. `CdrError` if another array differs in length from the names.
     """
     reader = CdrReader(data)
     order = reader.order

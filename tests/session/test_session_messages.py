@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
-from lwr_driver.session import cdr, schemas
+from lwr_driver.session import messages
 
 NAMES = st.lists(
     st.text(min_size=1, max_size=12).filter(lambda s: "\0" not in s and s.isprintable()),
@@ -16,7 +16,7 @@ NAMES = st.lists(
     max_size=9,
     unique=True,
 )
-DECODE = generate_dynamic(schemas.JOINT_STATE.name, schemas.JOINT_STATE.text)[schemas.JOINT_STATE.name]
+DECODE = generate_dynamic(messages.JOINT_STATE.name, messages.JOINT_STATE.text)[messages.JOINT_STATE.name]
 
 
 @settings(max_examples=60, deadline=None)
@@ -33,7 +33,7 @@ def test_packed_joint_states_decode_elsewhere(names, present, seed):
         if there
     }
     flags = {field: field in arrays for field in ("position", "velocity", "effort")}
-    layout = cdr.joint_state_layout(names, **flags)
+    layout = messages.joint_state_layout(names, **flags)
     packed = layout.pack({"sec": [7, 8, 9], "nanosec": [1, 2, 3], **arrays}, 3)
     for row in range(3):
         message = DECODE(packed[row].tobytes())
@@ -46,7 +46,9 @@ def test_packed_joint_states_decode_elsewhere(names, present, seed):
 @settings(max_examples=60, deadline=None)
 @given(names=NAMES, frame=st.text(max_size=9).filter(lambda s: "\0" not in s), velocity=st.booleans())
 def test_messages_of_another_serializer_are_laid_out_right(names, frame, velocity):
-    encode = serialize_dynamic(schemas.JOINT_STATE.name, schemas.JOINT_STATE.text)[schemas.JOINT_STATE.name]
+    encode = serialize_dynamic(messages.JOINT_STATE.name, messages.JOINT_STATE.text)[
+        messages.JOINT_STATE.name
+    ]
     values = [0.5 + index for index in range(len(names))]
     message = {
         "header": {"stamp": {"sec": 3, "nanosec": 4}, "frame_id": frame},
@@ -56,7 +58,7 @@ def test_messages_of_another_serializer_are_laid_out_right(names, frame, velocit
         "effort": [-value for value in values],
     }
     data = encode(message)
-    layout, found = cdr.read_joint_state_layout(data)
+    layout, found = messages.read_joint_state_layout(data)
     records = layout.view(np.frombuffer(data, dtype=np.uint8)[None])
     assert found == tuple(names)
     assert records["effort"][0].tolist() == [-value for value in values]
@@ -104,7 +106,7 @@ def by_hand(order: str, kind: bytes, widest: int) -> bytes:
 )
 def test_every_plain_encapsulation_is_read(order, kind, widest):
     data = by_hand(order, kind, widest)
-    layout, names = cdr.read_joint_state_layout(data)
+    layout, names = messages.read_joint_state_layout(data)
     record = layout.view(np.frombuffer(data, dtype=np.uint8)[None])[0]
     assert names == ("left", "right")
     assert (record["sec"], record["nanosec"]) == (11, 22)
@@ -114,8 +116,8 @@ def test_every_plain_encapsulation_is_read(order, kind, widest):
 
 
 def test_parameter_lists_are_refused():
-    with pytest.raises(cdr.CdrError, match="0x0003 is not plain CDR"):
-        cdr.read_joint_state_layout(b"\0\3\0\0" + bytes(40))
+    with pytest.raises(messages.CdrError, match="0x0003 is not plain CDR"):
+        messages.read_joint_state_layout(b"\0\3\0\0" + bytes(40))
 
 
 def test_array_longer_than_names_is_refused():
@@ -124,8 +126,8 @@ def test_array_longer_than_names_is_refused():
     assert data[at : at + 4] == struct.pack("<I", 2) or data[at + 4 : at + 8] == struct.pack("<I", 2)
     place = at if data[at : at + 4] == struct.pack("<I", 2) else at + 4
     data[place : place + 4] = struct.pack("<I", 3)
-    with pytest.raises(cdr.CdrError):
-        cdr.read_joint_state_layout(bytes(data))
+    with pytest.raises(messages.CdrError):
+        messages.read_joint_state_layout(bytes(data))
 
 
 @settings(max_examples=300, deadline=None)
@@ -133,8 +135,8 @@ def test_array_longer_than_names_is_refused():
 def test_random_bytes_are_an_error_of_ours_or_a_message(data):
     for start in (b"", b"\0\1\0\0", b"\0\0\0\0"):
         try:
-            layout, names = cdr.read_joint_state_layout(start + data)
-        except cdr.CdrError:
+            layout, names = messages.read_joint_state_layout(start + data)
+        except messages.CdrError:
             continue
         assert layout.size == len(start + data)
         assert all(isinstance(name, str) for name in names)
@@ -142,7 +144,7 @@ def test_random_bytes_are_an_error_of_ours_or_a_message(data):
 
 def test_pack_keeps_the_bytes_between_fields():
     # A structured array with gaps loses these bytes in a copy; the names stand there.
-    layout = cdr.joint_state_layout(("A1", "A2"), position=True, velocity=False, effort=False)
+    layout = messages.joint_state_layout(("A1", "A2"), position=True, velocity=False, effort=False)
     packed = layout.pack({"sec": [1] * 5, "nanosec": [2] * 5, "position": np.ones((5, 2))}, 5)
     assert layout.matches(packed).all()
     assert all(b"A1\0" in row.tobytes() and b"A2\0" in row.tobytes() for row in packed)

@@ -1,23 +1,21 @@
-"""The arm as a description: names, limits, gears, stiffness and the URDF, checked once when it is loaded.
+"""The arm as a description: names, limits, gears, stiffness and the URDF, checked once on loading.
 
-Nothing here needs pinocchio: the real-time process reads its limits from the same object, and must stay
-light.
+Nothing here needs pinocchio: the real-time process takes its limits from this module and must stay light.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
-
-__all__ = ["JOINTS", "Arm", "Limits", "LinkInertia", "link_inertias"]
 
 JOINTS = 7
 
@@ -40,17 +38,11 @@ class _JointEntry:
     def __post_init__(self) -> None:
         lower, upper = self.position_deg
         if not lower < upper:
-            raise ConfigurationError(f"joint {self.name}: position_deg {lower} to {upper} is no range")
-        for field in (
-            "velocity_deg_s",
-            "acceleration_rad_s2",
-            "jerk_rad_s3",
-            "torque_nm",
-            "gear_ratio",
-            "stiffness_nm_rad",
-        ):
-            value = getattr(self, field)
-            if not value > 0.0:
+            raise ConfigurationError(
+                f"joint {self.name}: position_deg {lower} to {upper} is no range; the lower end comes first"
+            )
+        for field, value in vars(self).items():
+            if field not in ("name", "position_deg") and not value > 0.0:
                 raise ConfigurationError(f"joint {self.name}: {field} is {value}; it must be above zero")
 
 
@@ -82,7 +74,7 @@ class _ArmFile:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What may be commanded: each (7,) float64.
+    """Limits of every command, each (7,) float64.
 
     q_low, q_high [rad]; v_max [rad/s]; a_max [rad/s²]; j_max [rad/s³]
     """
@@ -96,9 +88,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class LinkInertia:
-    """Inertial entry of one URDF link: mass [kg], centre of mass [m] and inertia about it [kg m²], link
-    axes.
-    """
+    """Inertia of one URDF link in link axes: mass [kg], centre of mass [m], inertia about it [kg m²]."""
 
     link: str
     mass: float
@@ -106,11 +96,11 @@ class LinkInertia:
     inertia: Vector
 
     def defect(self, tolerance: float = 1e-9) -> str | None:
-        """Why no rigid body has this inertia, or None if one does.
+        """The reason why no rigid body has this inertia, or None if one can.
 
         A body of positive density has a positive definite pseudo-inertia (Wensing, Kim and Slotine 2018):
-        mass above zero and Σ = ½ tr(I) 1 - I positive semidefinite, which contains the triangle inequality of
-        the principal moments.
+        mass above zero and Σ = ½ tr(I) 1 - I positive semidefinite. The latter contains the triangle
+        inequality of the principal moments.
         """
         if not self.mass > 0.0:
             return f"mass {self.mass} kg is not above zero"
@@ -124,12 +114,12 @@ class LinkInertia:
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Arm:
-    """The arm that the driver commands. Arrays are (7,), read-only, in kinematic order A1 A2 E1 A3 A4 A5 A6.
+    """Description of the arm. Arrays are (7,), read-only, in kinematic order A1 A2 E1 A3 A4 A5 A6.
 
-    q_min, q_max : position limits [rad]; `q_low`, `q_high` are these less `margin` [rad]
-    v_max, a_max, j_max : limits of what the driver ever commands [rad/s], [rad/s²], [rad/s³]
+    q_min, q_max : position limits [rad]; `q_low`, `q_high` are narrower by `margin` [rad]
+    v_max, a_max, j_max : limits of every command [rad/s], [rad/s²], [rad/s³]
     tau_max : joint torque limits [Nm]; gear_ratio : motor turns per joint turn
     stiffness : joint stiffness [Nm/rad]; resonance_hz : lowest structural resonance [Hz]
     """
@@ -149,27 +139,40 @@ class Arm:
     urdf: str
     urdf_path: Path
 
+    def __repr__(self) -> str:
+        rows = (
+            ("q from [deg]", np.degrees(self.q_min)),
+            ("q to [deg]", np.degrees(self.q_max)),
+            ("qd [deg/s]", np.degrees(self.v_max)),
+            ("qdd [rad/s²]", self.a_max),
+            ("jerk [rad/s³]", self.j_max),
+            ("tau [Nm]", self.tau_max),
+        )
+        names = "".join(f"{name:>8}" for name in self.joint_names)
+        limits = (f"  {title:<14}" + "".join(f"{value:8.5g}" for value in values) for title, values in rows)
+        return "\n".join([f"Arm {self.name} ({self.urdf_path.name})", f"  {'joint':<14}{names}", *limits])
+
     @property
     def q_low(self) -> Vector:
-        """Lowest position that is ever commanded [rad], (7,)."""
+        """Lowest commanded position [rad], (7,)."""
         return self.q_min + self.margin
 
     @property
     def q_high(self) -> Vector:
-        """Highest position that is ever commanded [rad], (7,)."""
+        """Highest commanded position [rad], (7,)."""
         return self.q_max - self.margin
 
     @property
     def limits(self) -> Limits:
-        """The limits of every command: position limits less the margin, and the rest as they are."""
+        """Limits of every command: positions within the margin, the rest unchanged."""
         return Limits(self.q_low, self.q_high, self.v_max, self.a_max, self.j_max)
 
     @classmethod
     def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
-        """Read and check an arm file and the URDF that it names.
+        """Read and check an arm file and its URDF.
 
         Raises ConfigurationError if a limit is not sane, the joint names differ from the URDF's chain, a
-        link's inertia belongs to no rigid body, or the URDF has no collision geometry.
+        link's inertia is impossible, or the URDF has no collision geometry.
         """
         path = find(name, beside=beside)
         content = parse(_ArmFile, read_mapping(path), str(path))
@@ -204,9 +207,9 @@ class Arm:
 
 
 def link_inertias(urdf: str, where: str = "URDF") -> dict[str, LinkInertia]:
-    """Inertial entries of the links of a URDF text by link name; links without one are left out.
+    """Inertias in a URDF text by link name, as far as links have one.
 
-    Raises ConfigurationError if the text is not XML or an entry is incomplete or not a finite number.
+    Raises ConfigurationError if the text is not XML or an entry is incomplete or not finite.
     """
     inertias = {}
     for link in _root(urdf, where).findall("link"):
@@ -218,9 +221,8 @@ def link_inertias(urdf: str, where: str = "URDF") -> dict[str, LinkInertia]:
         mass, inertia = entry.find("mass"), entry.find("inertia")
         if mass is None or inertia is None:
             raise ConfigurationError(f"{place}: `mass` and `inertia` are both needed")
-        origin = entry.find("origin")
-        centre = _numbers(origin.get("xyz", "0 0 0") if origin is not None else "0 0 0", 3, place)
-        turn = _rotation(_numbers(origin.get("rpy", "0 0 0") if origin is not None else "0 0 0", 3, place))
+        centre, rpy = _origin(entry, place)
+        turn = _rotation(rpy)
         xx, xy, xz, yy, yz, zz = (
             _numbers(inertia.get(key, ""), 1, f"{place}: {key}")[0]
             for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -242,7 +244,7 @@ def _check_urdf(arm: Arm, where: str) -> None:
         )
     inertias = link_inertias(arm.urdf, where)
     for joint, lower, upper in zip(moving, arm.q_min, arm.q_max, strict=True):
-        child = _attribute(joint.find("child"), "link", where)
+        child = getattr(joint.find("child"), "attrib", {}).get("link", "(none)")
         if child not in inertias:
             raise ConfigurationError(
                 f"{where}: link {child} is moved by {joint.get('name')} but has no inertial"
@@ -280,11 +282,11 @@ def _root(urdf: str, where: str) -> Any:
         raise ConfigurationError(f"{where}: not valid XML: {error}") from error
 
 
-def _attribute(element: Any, key: str, where: str) -> str:
-    value = None if element is None else element.get(key)
-    if value is None:
-        raise ConfigurationError(f"{where}: an element lacks its attribute `{key}`")
-    return str(value)
+def _origin(element: Any, where: str) -> tuple[Vector, Vector]:
+    """Translation [m] and roll, pitch, yaw [rad] of an element's origin; zero without one."""
+    origin = element.find("origin")
+    xyz, rpy = ("0 0 0" if origin is None else origin.get(key, "0 0 0") for key in ("xyz", "rpy"))
+    return _numbers(xyz, 3, where), _numbers(rpy, 3, where)
 
 
 def _numbers(text: str, count: int, where: str) -> Vector:
@@ -312,3 +314,103 @@ def _fixed(values: Any) -> Vector:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    kind: str
+    origin: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    axis: NDArray[np.float64]
+
+
+class LinkFrames:
+    """Pose of every link relative to its parent, for `/tf`: no chain to multiply.
+
+    A joint with origin (p, r) and axis a at position q has the translation p and the rotation
+    r * (cos q/2, a sin q/2) (quaternions); a prismatic joint has p + q R(r) a and r.
+
+    pairs : (parent, child) links in the order of the URDF
+    """
+
+    def __init__(self, urdf: str) -> None:
+        try:
+            robot = ElementTree.fromstring(urdf)
+        except ElementTree.ParseError as error:
+            raise ConfigurationError(f"robot description is not XML: {error}") from error
+        self._joints: list[_Joint] = []
+        pairs: list[tuple[str, str]] = []
+        for joint in robot.iterfind("joint"):
+            name, kind = joint.get("name", ""), joint.get("type", "")
+            if kind not in ("revolute", "continuous", "prismatic", "fixed"):
+                raise ConfigurationError(
+                    f"robot description: joint {name!r} of type {kind!r} is not understood"
+                )
+            parent, child = joint.find("parent"), joint.find("child")
+            if parent is None or child is None:
+                raise ConfigurationError(f"robot description: joint {name!r} lacks its parent or child link")
+            pairs.append((parent.get("link", ""), child.get("link", "")))
+            axis = joint.find("axis")
+            place = f"robot description: joint {name!r}"
+            xyz, rpy = _origin(joint, place)
+            direction = _numbers(axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3, place)
+            norm = float(np.linalg.norm(direction))
+            if norm == 0.0:
+                raise ConfigurationError(f"robot description: joint {name!r} has an axis of length zero")
+            self._joints.append(_Joint(name, kind, xyz, _from_rpy(rpy), direction / norm))
+        self.pairs: tuple[tuple[str, str], ...] = tuple(pairs)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Moving joints in the order of the URDF."""
+        return tuple(joint.name for joint in self._joints if joint.kind != "fixed")
+
+    def poses(self, joint_names: Sequence[str], q: ArrayLike) -> NDArray[np.float64]:
+        """Poses x y z [m], quaternion x y z w of every link relative to its parent: (n, links, 7).
+
+        joint_names : names of the columns of `q`; all other joints of the URDF stay at zero
+        q : (n, J) float64, joint positions [rad] or [m]
+        """
+        positions = np.asarray(q, dtype=np.float64)
+        column = {name: index for index, name in enumerate(joint_names)}
+        out = np.empty((len(positions), len(self._joints), 7))
+        for index, joint in enumerate(self._joints):
+            out[:, index, :3] = joint.origin
+            out[:, index, 3:] = joint.rotation
+            if joint.kind == "fixed" or joint.name not in column:
+                continue
+            value = positions[:, column[joint.name]]
+            if joint.kind == "prismatic":
+                out[:, index, :3] += value[:, None] * _rotate(joint.rotation, joint.axis)
+            else:
+                turn = np.empty((len(value), 4))
+                turn[:, :3] = np.sin(0.5 * value)[:, None] * joint.axis
+                turn[:, 3] = np.cos(0.5 * value)
+                out[:, index, 3:] = _multiply(joint.rotation, turn)
+        return out
+
+
+def _from_rpy(rpy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternion x y z w of the rotation Rz(yaw) Ry(pitch) Rx(roll)."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(0.5 * rpy), np.cos(0.5 * rpy)
+    return np.array(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def _multiply(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Product of the quaternion `a` (4,) with each of `b` (n, 4)."""
+    vector = a[3] * b[:, :3] + b[:, 3:] * a[:3] + np.cross(a[:3], b[:, :3])
+    scalar = a[3] * b[:, 3] - b[:, :3] @ a[:3]
+    return np.concatenate([vector, scalar[:, None]], axis=1)
+
+
+def _rotate(rotation: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    twice = 2.0 * np.cross(rotation[:3], vector)
+    return vector + rotation[3] * twice + np.cross(rotation[:3], twice)

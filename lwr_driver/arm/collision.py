@@ -1,8 +1,7 @@
-"""Collision of the arm with itself, the ground and the things of the cell, by pinocchio and coal.
+"""Distances of the arm to itself, the ground and the boxes of the cell, by pinocchio and coal.
 
-Bodies of the arm that are three joints apart or more are watched against each other (nearer ones share a
-joint housing and touch by construction); the moving part from the second link on is watched against ground
-and boxes.
+Links three joints apart or more are checked against each other; nearer ones share a joint housing and touch
+by construction. Links from the second on are checked against ground and boxes.
 """
 
 from __future__ import annotations
@@ -19,23 +18,22 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.arm import JOINTS, Arm
-from lwr_driver.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell, PayloadShape
+from lwr_driver.configuration import expect
 
-__all__ = ["Clearance", "CollisionChecker"]
-
-_APART = 3  # joints between two links that are watched against each other
-_PAYLOAD_APART = 2  # the payload reaches back further than the flange
-_FIRST_MOVING = 2  # the first link that can come near ground or boxes; link 1 turns about its own axis
-_STEP = math.radians(0.5)  # motion of any joint between two postures that are checked
+_APART = 3  # joints between two links of a checked pair
+_PAYLOAD_APART = 2  # the payload extends further back than the flange
+_FIRST_MOVING = 2  # first link to come near ground or boxes; link 1 turns about its own axis
+_STEP = math.radians(0.5)  # largest motion of a joint between two checked postures
 
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """The smallest distance: between which two bodies, where, and at which row of a path.
+    """The smallest distance, its two bodies, and its place in a path.
 
-    distance : [m]; below zero the bodies overlap
-    pair : names of the two bodies, links of the arm, `payload`, `ground` or boxes of the cell
-    points : (2, 3), the nearest points [m], in `base_link`
+    distance : [m]; negative if the bodies overlap
+    pair : names of the two bodies: links, `payload`, `ground` or boxes of the cell
+    points : (2, 3), the nearest points in `base_link` [m]
     q : (7,), the posture [rad]; row and time_s : place in the path, 0 for a single posture
     """
 
@@ -56,10 +54,12 @@ class Clearance:
 class CollisionChecker:
     """Distances of the arm to itself, to the ground and to the boxes of the cell.
 
-    arm : its URDF holds the geometry; cell : what stands around it; payload : what hangs on the flange
+    arm : its URDF holds the geometry; cell : the surroundings; payload : the shape on the flange
     """
 
     def __init__(self, arm: Arm, cell: Cell, payload: PayloadShape | None = None) -> None:
+        expect(arm, Arm, "arm of a collision check", "give `Arm.load()`")
+        expect(cell, Cell, "cell of a collision check", "give `Cell.load()`")
         self.arm, self.cell, self.payload = arm, cell, payload
         self._model = pin.buildModelFromXML(arm.urdf)
         if self._model.nq != JOINTS:
@@ -69,7 +69,7 @@ class CollisionChecker:
         if geometry.ngeoms == 0 or geometry.ngeoms != wanted:
             raise ConfigurationError(
                 f"{arm.urdf_path}: {geometry.ngeoms} of {wanted} collision shapes could be read; a check "
-                "against the rest would pass whatever happens. Use sphere, cylinder or box"
+                "against the rest proves nothing. Use sphere, cylinder or box"
             )
         self._links = [int(shape.parentJoint) for shape in geometry.geometryObjects]
         self._names = [self._model.frames[shape.parentFrame].name for shape in geometry.geometryObjects]
@@ -85,12 +85,12 @@ class CollisionChecker:
 
     @property
     def geometry(self) -> pin.GeometryModel:
-        """The shapes and the watched pairs, for planners that want derivatives; not to be changed."""
+        """Shapes and checked pairs, for planners with derivatives; not to be changed."""
         return self._geometry
 
     @property
     def pairs(self) -> int:
-        """Number of pairs of shapes that are watched."""
+        """Number of checked pairs of shapes."""
         return len(self._pairs)
 
     def clearance(self, q: NDArray[np.float64]) -> Clearance:
@@ -106,11 +106,10 @@ class CollisionChecker:
         return Clearance(float(result.min_distance), pair, points, posture.copy())
 
     def check_path(self, q: NDArray[np.float64], *, period_s: float = 0.0) -> Clearance:
-        """Tightest moment of the path q, (n, 7) [rad], rows `period_s` apart [s].
+        """Smallest distance along the path q, (n, 7) [rad], rows `period_s` apart [s].
 
-        Measured at postures with at most half a degree of motion of any joint between them: between two of
-        them no point of the arm comes nearer than their distances by more than a few millimetres, which the
-        margin covers.
+        It is computed at postures at most half a degree apart in any joint. In between, a point of the arm
+        comes nearer by a few millimetres at most; the margin of the cell covers these.
         """
         path = np.asarray(q, dtype=np.float64)
         if path.ndim != 2 or path.shape[1] != JOINTS or len(path) == 0 or not np.all(np.isfinite(path)):
@@ -179,7 +178,7 @@ def _subsample(path: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     if travelled[-1] == 0.0:
         return path[:1], np.zeros(1)
     marks = np.linspace(0.0, travelled[-1], max(2, math.ceil(travelled[-1] / _STEP) + 1))
-    # Where a joint turns round the arm is nearest to something more often than elsewhere.
+    # The smallest distance is often at the reversal of a joint.
     direction = np.sign(np.diff(path, axis=0))
     turns = np.flatnonzero(np.any(direction[1:] * direction[:-1] < 0.0, axis=1)) + 1
     marks = np.union1d(marks, travelled[turns])

@@ -1,10 +1,10 @@
-"""Motor torques from KRL variables: the samples that a KRL program publishes in `$FRI_TO_REA[]`.
+"""Motor torques from KRL variables: samples published by a KRL program in `$FRI_TO_REA[]`.
 
 FRI has no motor torque of its own. A KRL program on the controller can write one value per joint into the
 REAL variables and count its passes in an INT variable. The variables hold their values over many FRI cycles;
-a value is fresh in the cycle in which the counter has changed, and only then. What comes out is one sample
-for each fresh value, with the time of the cycle that brought it first and the counter, unwrapped, as its
-number. The age of the value when it arrives is that of the KRL loop and cannot be seen here.
+a value is fresh only in the cycle of a change of the counter. The result is one sample for each fresh value,
+with the time of its first cycle and the unwrapped counter as its number. The age of the value on arrival is
+up to the KRL loop and unknown here.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from lwr_driver.session.columns import JointColumns
-
-__all__ = ["FreshTorques", "KrlMotorTorque", "KrlTorqueDecoder", "TorqueMatch", "match_torques"]
+from lwr_driver.session.session import JointColumns
 
 _SLOTS = 16
 _LONGEST_STEP = 1000
@@ -26,19 +24,18 @@ _CLEARLY = 4.0
 _LOADED = 0.8
 _GAIN = 3.0
 _SMOOTHING_S = 0.1
-_CREEP = 0.01  # below this speed [rad/s] the sign of the friction is not told
+_CREEP = 0.01  # below this speed [rad/s] the sign of the friction is uncertain
 
 
 @dataclass(frozen=True)
 class KrlMotorTorque:
-    """Where the motor torques stand in the KRL variables.
+    """Places of the motor torques in the KRL variables.
 
     reals : number n of `$FRI_TO_REA[n]` for each joint in kinematic order, 1 to 16
     scale : torque referred to the joint side per unit of the variable, for each joint [Nm/unit]: gear ratio
-    times
-        torque constant where the variable is a current in ampere
+        times torque constant for a current in ampere
     sign : +1 or -1 for each joint
-    counter_int : number n of `$FRI_TO_INT[n]`, which rises by one with each fresh set of values
+    counter_int : number n of `$FRI_TO_INT[n]`, rising by one with each fresh set of values
     counter_modulus : the counter runs from 0 to this minus one
     """
 
@@ -79,11 +76,11 @@ class FreshTorques:
 
 
 class KrlTorqueDecoder:
-    """Takes the hold out of the KRL variables, batch by batch; the result does not depend on the batches.
+    """Extracts fresh values from the held KRL variables; the result does not depend on the batches.
 
-    fresh : samples so far; lost : values that came and went between two cycles; restarts : times the counter
-    jumped (the KRL program was started anew); torn : cycles whose values changed without the counter, a KRL
-    program that writes the counter first
+    fresh : samples so far; lost : values overwritten between two cycles
+    restarts : jumps of the counter (a new start of the KRL program)
+    torn : cycles with new values without a new counter (a KRL program writing the counter first)
     """
 
     def __init__(self, config: KrlMotorTorque) -> None:
@@ -107,7 +104,7 @@ class KrlTorqueDecoder:
     ) -> FreshTorques:
         """The fresh samples among n cycles; `krl_real`, `krl_int` : (n, 16) as received.
 
-        The values of the very first cycle are not taken: when they became fresh is not known.
+        The values of the very first cycle are not taken: their age is unknown.
         """
         modulus = self.config.counter_modulus
         counter = krl_int[:, self.config.counter_int - 1].astype(np.int64)
@@ -116,7 +113,7 @@ class KrlTorqueDecoder:
             return self._pick(log_time, publish_time, values, np.zeros(0, dtype=np.int64), [])
         before = counter[0] if self._counter is None else self._counter
         steps = np.diff(counter, prepend=before)
-        # Bits are compared, so that NaN equals itself.
+        # Comparison by bits: NaN equals itself.
         bits = values.view(np.uint32)
         held = bits[:1] if self._values is None else self._values.view(np.uint32)
         changed = (np.diff(bits.astype(np.int64), axis=0, prepend=held.astype(np.int64)) != 0).any(axis=1)
@@ -157,17 +154,17 @@ class KrlTorqueDecoder:
 
 @dataclass(frozen=True)
 class TorqueMatch:
-    """How the motor torque of a joint compares with the joint torque sensors.
+    """Comparison of the motor torque of a joint with the joint torque sensors.
 
     The motor of a joint carries its sensor's torque, inertia and friction (equation 2 of the model),
 
-        tau = gain tau_l + Ia qdd + Fv qd + Fc sign(qd) + off,
+        tau = gain tau_l + Ia qdd + Fv qd + Fc sign(qd) + off.
 
-    which is fitted with the sensor and the motion of every joint.
+    The equation is fitted with the sensor and the motion of every joint.
 
     correlation : multiple correlation of the fit with the joint's own sensor and motion; gain : its gain
     load : partial correlation of the sensor alone, beside inertia and friction
-    follows, follows_correlation : the joint whose sensor and motion explain it best
+    follows, follows_correlation : the joint with the best explanation by sensor and motion
     """
 
     joint: str
@@ -179,7 +176,7 @@ class TorqueMatch:
 
     @property
     def swapped(self) -> bool:
-        """Whether another joint explains it far better than its own: leaves a quarter of the variance."""
+        """Whether another joint explains it far better: it leaves at most a quarter of the variance."""
         own, other = 1.0 - self.correlation**2, 1.0 - self.follows_correlation**2
         return self.follows != self.joint and self.follows_correlation >= _FOLLOWS and own > _CLEARLY * other
 
@@ -203,7 +200,7 @@ class TorqueMatch:
 def match_torques(joint: JointColumns, motor: JointColumns) -> tuple[TorqueMatch, ...]:
     """Compare motor torques with the joint torque sensors, interpolated at the times of the motor torques.
 
-    Where the positions are not recorded, friction and inertia are left out.
+    Without recorded positions, friction and inertia are left out.
     """
     sensors, motions = _at_times(joint, motor)
     torques = motor.effort - motor.effort.mean(axis=0)

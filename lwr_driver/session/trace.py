@@ -1,4 +1,4 @@
-"""Import of a trace file of the controller: motor torques recorded on its own clock, put into a session log.
+"""Import of motor torques from a trace file of the controller, on its own clock, into a session log.
 
 The file is CSV with one header line; lines before it that begin with `#` are comments::
 
@@ -6,14 +6,14 @@ The file is CSV with one header line; lines before it that begin with `#` are co
     time_s,tau_m_A1,tau_m_A2,...,q_A1,q_A2,...
     812.437500,1.25,-33.5,...,0.100000000,0.250000000,...
 
-`time_s` is the controller's clock [s], strictly increasing, with an offset nobody knows and perhaps a small
-error of its rate. `tau_m_JOINT` is the motor torque referred to the joint side, gear ratio included [Nm].
-`q_JOINT` is the measured joint position, the same quantity that FRI reports [rad]. The columns may stand in
-any order; each joint of the session has both.
+`time_s` is the controller's clock [s], strictly increasing, with an unknown offset and perhaps a small error
+of its rate. `tau_m_JOINT` is the motor torque referred to the joint side, gear ratio included [Nm]. `q_JOINT`
+is the measured joint position, as in FRI [rad]. The columns may stand in any order; each joint of the session
+has both.
 
-The clock is found by comparing the positions with those of `/joint_states` (`lwr_driver.alignment`). The
-samples go into `/motor_states` as they are, none made up, none resampled, each with the log time that belongs
-to it and, as its publish time, the time of the trace.
+The clock follows from a comparison of the positions with `/joint_states` (`lwr_driver.session.alignment`).
+The samples go into `/motor_states` unchanged, without resampling, each with its log time and, as its publish
+time, the time of the trace.
 """
 
 from __future__ import annotations
@@ -28,18 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from lwr_driver.alignment import Alignment, Track, align
-from lwr_driver.motor_torque import TorqueMatch, match_torques
-from lwr_driver.session.cdr import joint_state_layout
-from lwr_driver.session.columns import JointColumns, stamp
-from lwr_driver.session.container import Container, Messages
-from lwr_driver.session.mcap_format import MESSAGE_HEAD, Opcode
+from lwr_driver.configuration import as_path
+from lwr_driver.session.alignment import Alignment, Track, align
+from lwr_driver.session.container import Container, Messages, record_layout
+from lwr_driver.session.messages import JOINT_STATE, joint_state_layout
+from lwr_driver.session.motor_torque import TorqueMatch, match_torques
 from lwr_driver.session.reader import read_session
 from lwr_driver.session.recovery import copy_messages, replacing
 from lwr_driver.session.scan import Scan
-from lwr_driver.session.schemas import JOINT_STATE
-
-__all__ = ["Trace", "TraceImport", "import_trace", "read_trace"]
+from lwr_driver.session.session import JointColumns, stamp
 
 TIME, TORQUE, POSITION = "time_s", "tau_m_", "q_"
 
@@ -58,11 +55,11 @@ class Trace:
 
 @dataclass(frozen=True)
 class TraceImport:
-    """What an import did.
+    """Result of an import.
 
     samples : motor torques in the session now; outside : samples of the trace before or after the session
-    jitter_s : how far the log times scatter about the controller's clock, median absolute deviation
-    torques : how the motor torques compare with the joint torque sensors; empty if the session has none
+    jitter_s : median absolute deviation of the log times from the controller's clock
+    torques : comparison of motor torques and joint torque sensors; empty if the session has no sensors
     """
 
     out: Path
@@ -90,10 +87,9 @@ class TraceImport:
 def read_trace(path: str | Path, joint_names: Sequence[str]) -> Trace:
     """The trace file `path`, its columns in the order of `joint_names`.
 
-    DataError for a file that cannot be read, columns that are missing or unknown, values that are not finite,
-    and time that does not rise.
+    DataError for an unreadable file, missing or unknown columns, values not finite, and time not rising.
     """
-    path = Path(path)
+    path = as_path(path, "trace file")
     try:
         content = path.read_bytes()
         lines = content.decode("utf-8-sig").splitlines()
@@ -148,14 +144,13 @@ def import_trace(
     """Align a trace with a session and write the session anew with `/motor_states` in it.
 
     out : the new file; default is to replace the session itself, in one step
-    tolerance_s : see `lwr_driver.alignment.align`
+    tolerance_s : see `lwr_driver.session.alignment.align`
 
-    DataError if the session has motor torques already or did not end properly, if the trace is not as it must
-    be, if the two cannot be aligned beyond doubt, or if the torque columns follow the torques of other
-    joints.
+    DataError if the session has motor torques already or no proper end, the trace is invalid, the alignment
+    is uncertain, or the torque columns follow the torques of other joints.
     """
-    session_path = Path(session_path)
-    out = session_path if out is None else Path(out)
+    session_path = as_path(session_path, "session log")
+    out = session_path if out is None else as_path(out, "session log")
     session = read_session(session_path)
     if session.motor is not None:
         raise DataError(
@@ -224,7 +219,7 @@ def _columns(path: Path, header: list[str], joint_names: Sequence[str]) -> list[
 
 
 def _clock(source: NDArray[np.float64], log_time: NDArray[np.int64]) -> tuple[float, int, float]:
-    """Line log_time = start + slope source through most samples; packets that were read late do not bend it.
+    """Line log_time = start + slope source through most samples, robust against packets read late.
 
     Returns slope, start [ns], and the median absolute deviation [s].
     """
@@ -266,17 +261,15 @@ def _write(session_path: Path, out: Path, metadata: dict[str, str], motor: Joint
 
 
 def _messages(container: Container, motor: JointColumns) -> Messages:
-    layout = joint_state_layout(motor.names, position=False, velocity=False, effort=True)
-    rows = layout.pack(
-        {"sec": motor.log_time // 10**9, "nanosec": motor.log_time % 10**9, "effort": motor.effort},
-        len(motor),
-    )
     number = container.channel(motor.topic, JOINT_STATE)
-    length = MESSAGE_HEAD.size - 9 + layout.size
-    records = [
-        MESSAGE_HEAD.pack(Opcode.MESSAGE, length, number, *times) + row.tobytes()
-        for row, *times in zip(
-            rows, motor.sequence.tolist(), motor.log_time.tolist(), motor.publish_time.tolist(), strict=True
-        )
-    ]
+    layout = joint_state_layout(motor.names, position=False, velocity=False, effort=True)
+    columns = {
+        "channel_sequence": motor.sequence,
+        "log_time": motor.log_time,
+        "publish_time": motor.publish_time,
+        "sec": motor.log_time // 10**9,
+        "nanosec": motor.log_time % 10**9,
+        "effort": motor.effort,
+    }
+    records = [row.tobytes() for row in record_layout(layout, number).pack(columns, len(motor))]
     return Messages(records, np.full(len(records), number, dtype=np.int64), motor.log_time)

@@ -1,6 +1,6 @@
-"""From rows of the ring to a session log: what is recorded of a cycle, and under which time.
+"""From rows of the ring to a session log: the messages of a cycle, and their times.
 
-Everything here depends on the rows alone, so equal rows give equal files, however they were handed over.
+Everything here depends on the rows alone: equal rows give equal files, in any batches.
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from lwr_driver.ring import NO_PHASE
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from lwr_driver.session.writer import ExitStatus, SessionWriter
-
-__all__ = ["Recorded", "Recording", "SessionRequest", "utc_offset_ns"]
 
 _STATUS_FIELDS = (
     "state",
@@ -35,7 +33,7 @@ _STATUS_FIELDS = (
     "temperature",
 )
 NO_PHASE_NAME = "monitor"
-"""Phase of the cycles that follow another phase and belong to none themselves."""
+"""Phase of cycles without one, after another phase."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +41,9 @@ class SessionRequest:
     """A session to be recorded.
 
     path : the new file; joint_names : of the arm in kinematic order; metadata : see `session_metadata`
-    robot_description : URDF text, also the source of `/tf`; attachments : file name -> content
-    phase_names : what the numbers in the rows' `phase` mean
-    motor_torque : where the motor torques stand in the KRL variables; None records none
+    robot_description : URDF text, also for `/tf`; attachments : file name -> content
+    phase_names : names for the numbers in the rows' `phase`
+    motor_torque : places of the motor torques in the KRL variables; None records none
     virtual_epoch_ns : in lock step, the log time of packet 0; log times then count packets from there [ns]
     fsync : force each chunk to the disk
     """
@@ -63,13 +61,12 @@ class SessionRequest:
 
 @dataclass(frozen=True)
 class Recorded:
-    """How a recording ended.
+    """End of a recording.
 
-    samples : rows in the log; missed : packets of the controller that are not in it
-    overruns : rows that the loop dropped because the ring was full; rejected : rows whose packet count did
-    not rise
-    motor_samples, motor_lost : fresh motor torques in the log, and those that were overtaken
-    error : why the file could not be written to its end; empty if it was
+    samples : rows in the log; missed : packets of the controller not in it
+    overruns : rows dropped by the loop, the ring being full; rejected : rows without a rising packet count
+    motor_samples, motor_lost : fresh motor torques in the log, and overwritten ones
+    error : reason of an incomplete file; empty for a complete one
     """
 
     path: Path
@@ -87,8 +84,7 @@ class Recorded:
 class Recording:
     """One session being recorded. Errors as `SessionWriter`.
 
-    utc_offset_ns : UTC minus CLOCK_MONOTONIC; measured once and then kept, so that no clock jump reaches the
-    log
+    utc_offset_ns : UTC minus CLOCK_MONOTONIC, measured once, so no clock jump gets into the log
     """
 
     def __init__(self, request: SessionRequest, utc_offset: int) -> None:
@@ -113,12 +109,12 @@ class Recording:
         )
 
     def add_phases(self, names: tuple[str, ...]) -> int:
-        """Give further phase names a meaning; returns the number of the first."""
+        """Add phase names; returns the number of the first."""
         self._phase_names += names
         return len(self._phase_names) - len(names)
 
     def write(self, rows: NDArray[Any]) -> None:
-        """Record rows of dtype `ROW` in the order in which they were published."""
+        """Record rows of dtype `ROW` in the order of their publication."""
         rows = self._rising(rows)
         if not len(rows):
             return
@@ -163,7 +159,7 @@ class Recording:
         writer.advance(int(log_time[-1]))
 
     def close(self, exit_status: ExitStatus, reason: str, overruns: int = 0) -> Recorded:
-        """End the session. A file that could not be written to its end says so in `Recorded.error`."""
+        """End the session; `Recorded.error` tells of an incomplete file."""
         decoder, error = self._decoder, ""
         more = {"overruns": str(overruns), "rejected": str(self.rejected)}
         if decoder is not None:
@@ -191,7 +187,7 @@ class Recording:
         )
 
     def _rising(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """The rows whose packet count rises; the others are counted, a session cannot hold them."""
+        """The rows with a rising packet count; the others are counted and dropped."""
         if not len(rows):
             return rows
         sequence = rows["sequence"]
@@ -210,14 +206,14 @@ class Recording:
     def _controller_times(
         self, sequence: NDArray[np.int64], sample_time: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """The controller's clock: packet count times sample time, going on where the sample time changes."""
+        """The controller's clock: packet count times sample time, continuous across its changes."""
         count, time_ns = self._counted or (int(sequence[0]), int(sequence[0] * sample_time[0]))
         times: NDArray[np.int64] = time_ns + np.cumsum(np.diff(sequence, prepend=count) * sample_time)
         self._counted = int(sequence[-1]), int(times[-1])
         return times
 
     def _log_times(self, rows: NDArray[Any], publish_time: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Strictly increasing log times: packets read in the same nanosecond come out one apart."""
+        """Strictly increasing log times: packets read in the same nanosecond are put one apart."""
         epoch = self.request.virtual_epoch_ns
         times = rows["t_recv"] + self._utc_offset if epoch is None else publish_time + epoch
         count = np.arange(len(times))
