@@ -16,18 +16,11 @@ from ident.assumptions import Assumptions, check_assumptions
 from ident.base import BaseSet, numeric_base
 from ident.cad_prior import cad_prior
 from ident.essential import Essential, EssentialSettings, find_essential
+from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate, Estimator
 from ident.estimators.instrumental import InstrumentalVariables
-from ident.estimators.mixing import RegressorExtensionMixing
-from ident.estimators.ordinary import OrdinaryLeastSquares
-from ident.estimators.physical import PhysicallyConsistent
-from ident.estimators.prior import MaximumAPosteriori
 from ident.estimators.problem import Problem
-from ident.estimators.recursive import RecursiveLeastSquares
-from ident.estimators.robust import RobustLeastSquares
-from ident.estimators.total import TotalLeastSquares
-from ident.estimators.weighted import WeightedLeastSquares
 from ident.instruments import commanded
 from ident.kinematics import Chain
 from ident.model import DynamicModel
@@ -39,29 +32,13 @@ from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "identify"]
+__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "estimator_factory", "identify"]
 
 FloatArray = NDArray[np.float64]
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
 
-_ESTIMATORS: dict[str, EstimatorFactory] = {
-    "ols": lambda base, problem, covariance: OrdinaryLeastSquares(covariance),
-    "wls": lambda base, problem, covariance: WeightedLeastSquares(covariance),
-    "huber": lambda base, problem, covariance: RobustLeastSquares("huber", covariance=covariance),
-    "tukey": lambda base, problem, covariance: RobustLeastSquares("tukey", covariance=covariance),
-    "tls": lambda base, problem, covariance: TotalLeastSquares(covariance=covariance),
-    "recursive": lambda base, problem, covariance: RecursiveLeastSquares(covariance=covariance),
-    "mixing": lambda base, problem, covariance: RegressorExtensionMixing(covariance=covariance),
-    "map": lambda base, problem, covariance: MaximumAPosteriori(
-        cad_prior(base).prior("pullback"), 1.0, covariance
-    ),
-    "physical": lambda base, problem, covariance: PhysicallyConsistent(
-        cad_prior(base), covariance=covariance
-    ),
-}
-ESTIMATORS = (*_ESTIMATORS, "iv")
 _WIDE_CONDITION = 100.0
 
 
@@ -350,10 +327,23 @@ def identify(
     )
 
 
+def estimator_factory(name: str, *, prior_std: float = 0.2, **options: Any) -> EstimatorFactory:
+    """Factory of the estimator `name` with some of its options (`ident.estimators.ESTIMATORS`).
+
+    prior_std : standard deviation of the URDF's inertials as a share of themselves.
+    """
+    kind = ESTIMATORS[name]
+
+    def factory(base: BaseSet, problem: Problem, covariance: CovarianceSettings) -> Estimator:
+        prior = {"prior": cad_prior(base, relative_std=prior_std)} if kind.body_prior else {}
+        return kind.make(covariance=covariance, **prior, **options)
+
+    return factory
+
+
 def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
-    """The estimator; for instrumental variables, which need more than this, the WLS to compare them with."""
     name = settings.estimator
-    factory = _ESTIMATORS["wls" if name == "iv" else name] if isinstance(name, str) else name
+    factory = estimator_factory(name) if isinstance(name, str) else name
     return factory(base, problem, settings.covariance)
 
 

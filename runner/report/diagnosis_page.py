@@ -8,6 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from runner.computer import versions
 from runner.diagnosis.phrases import described
 from runner.diagnosis.words import joints_text
 from runner.report.diagnosis import diagnosis_parts
@@ -15,7 +16,6 @@ from runner.report.diagnosis_folder import DiagnosisFolder
 from runner.report.markup import section
 from runner.report.page import page_html, write_page
 from runner.report.verdicts import Level, Verdict, error_change, extension_gain, largest_gain
-from runner.versions import versions
 
 __all__ = ["diagnosis_html", "diagnosis_verdicts", "write_diagnosis_report"]
 

@@ -19,8 +19,7 @@ from runner.diagnosis.deciding import _KINDS, Deciding, offers, open_findings
 from runner.diagnosis.decision import decision_text, decisions
 from runner.diagnosis.words import quantity_text
 from runner.experiment_file import Experiment
-from runner.planning import excitation_rows, plan_excitation
-from runner.preparation import session_motion
+from runner.planning import excitation_rows, plan_excitation, session_motion
 
 Place = tuple[str, tuple[int, ...]]
 

@@ -160,7 +160,7 @@ def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) 
         ([{"name": "check", "validation": True}], "every session is for validation"),
         (
             [{"name": "unloaded"}, {"name": "check", "validation": True, "payload": LOAD}],
-            "'paper_load', which no session before it identifies",
+            "'paper_load', not identified by another session",
         ),
     ],
 )

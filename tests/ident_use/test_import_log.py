@@ -16,7 +16,7 @@ from ident.import_log import LogMapping, import_log
 from ident.kinematics import Chain
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
-from runner.commands.import_log import command
+from runner.commands.logs import import_command as command
 
 JOINTS = ["a", "b"]
 PLAIN: dict[str, Any] = {
