@@ -57,15 +57,22 @@ class IdentifySettings:
             key.check(content, path)
         return settings
 
-    def identification(self, model: int, estimator: str) -> IdentificationSettings:
-        """The settings for `ident`, with the model and the estimator of the command line."""
+    def __post_init__(self) -> None:
+        for first, second in self.couplings:
+            if first == second:
+                raise ConfigurationError(
+                    f"`couplings` has {first} twice in a pair; name two joints, such as [A5, A6]"
+                )
+
+    def identification(self, model: int, estimator: str, *, file: str = "settings") -> IdentificationSettings:
+        """The settings for `ident`, with the model and the estimator of the command line. file : for errors."""
         given = {name: value for name, value in vars(self.estimator).items() if value is not None}
-        for name in given:
+        for name, value in given.items():
             if name not in ESTIMATORS[estimator].options:
                 takers = [other for other, kind in ESTIMATORS.items() if name in kind.options]
                 raise ConfigurationError(
-                    f"`estimator.{name}` is for {' and '.join(takers)}, not for {estimator}; leave the key out or "
-                    f"choose --estimator {takers[0]}"
+                    f"{file}: `estimator.{name}` is {value}, an option of {' and '.join(takers)}, not of {estimator}; "
+                    f"leave the key out or choose --estimator {takers[0]}"
                 )
         return IdentificationSettings(
             model=model,

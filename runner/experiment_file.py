@@ -289,6 +289,12 @@ class Experiment:
         """The announced payloads by name."""
         return {plan.payload.name: plan.payload for plan in self.sessions if plan.payload is not None}
 
+    @property
+    def heaviest(self) -> Payload | None:
+        """The announced payload with the largest mass, or None."""
+        payloads = sorted(self.payloads().values(), key=lambda payload: payload.mass)
+        return payloads[-1] if payloads else None
+
 
 def _positive(name: str, value: float, unit: str) -> None:
     if value <= 0:

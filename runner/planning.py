@@ -118,10 +118,9 @@ def _plan_unseen(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationPlan
 
 def _simple(experiment: Experiment, arm: Arm, cell: Cell, seed: int, periods: int) -> ExcitationPlan:
     settings = experiment.excitation
-    payloads = sorted(experiment.payloads().values(), key=lambda payload: payload.mass)
     return feasible_fourier(
         arm,
-        checker(arm, cell, payloads[-1] if payloads else None),
+        checker(arm, cell, experiment.heaviest),
         period_s=settings.period_s,
         harmonics=settings.harmonics,
         periods=periods,

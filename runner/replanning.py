@@ -140,13 +140,11 @@ def next_problem(
     experiment.
     """
     wanted = PlanProblem.load(find(experiment.replan.problem, beside=experiment.folder))
-    payload = _heaviest(experiment)
+    payload = experiment.heaviest
     sessions = [session for session in experiment.sessions if not session.validation]
-    loads: list[Literal["unloaded", "loaded"]] = []
-    for session in sessions:
-        load: Literal["unloaded", "loaded"] = "unloaded" if session.payload is None else "loaded"
-        if load not in loads:
-            loads.append(load)
+    loads: list[Literal["unloaded", "loaded"]] = [
+        "unloaded" if session.payload is None else "loaded" for session in sessions
+    ]
     unseen = {session.name for session in experiment.sessions if session.validation}
     prior = tuple(Prior(session=str(r.path.resolve())) for r in records if r.name not in unseen)
     clearance = 0.0 if wanted.clearance_m is None else wanted.clearance_m
@@ -158,7 +156,7 @@ def next_problem(
         motion=replace(wanted.motion, periods=experiment.excitation.periods),
         knowledge=_knowledge(wanted.knowledge, payload, found, model),
         parameters=_names(found, payload),
-        sessions=tuple(loads),
+        sessions=tuple(dict.fromkeys(loads)),
         model=experiment.identification.model,
         clearance_m=max(clearance, experiment.moves.clearance_m, cell.margin_m),
         prior=prior,
@@ -169,11 +167,6 @@ def _always(motion: ExcitationPlan, periods: int) -> Callable[[SessionPlan, floa
     """The same motion for every session."""
     rows = excitation_rows(motion, periods)
     return lambda session, period_s: rows(period_s)
-
-
-def _heaviest(experiment: Experiment) -> Payload | None:
-    payloads = sorted(experiment.payloads().values(), key=lambda payload: payload.mass)
-    return payloads[-1] if payloads else None
 
 
 def _knowledge(wanted: Knowledge, payload: Payload | None, found: Identification, model: Path) -> Knowledge:

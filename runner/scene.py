@@ -1,6 +1,6 @@
 """The arm and its cell as primitive shapes in a viser scene, for preview and live view.
 
-viser is part of the extra `view`; no other module needs it.
+viser is part of the extra `view`; only preview and live view import this module.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def stop_server(server: Any) -> None:
 
 
 def line_colour(colour: Colour) -> Colour:
-    """The value shown as this colour by viser for lines with individual colours, taken as linear light."""
+    """The colour as linear light, expected by viser for lines with individual colours."""
     red, green, blue = (round(255 * (value / 255) ** 2.2) for value in colour)
     return red, green, blue
 

@@ -100,7 +100,7 @@ def to_json(value: Any) -> str:
 class StatusLine:
     """One line, rewritten in place on a terminal; elsewhere one line per phase.
 
-    stream : standard error by default, apart from results. interval_s : shortest time between rewrites.
+    stream : standard error by default; results go to standard output. interval_s : shortest time between rewrites.
     """
 
     def __init__(self, stream: TextIO | None = None, interval_s: float = 0.2) -> None:

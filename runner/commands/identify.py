@@ -91,7 +91,7 @@ def command(
     lwr-run identify unloaded.mcap loaded.mcap --essential --settings my_settings.yaml
     """
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
-    wanted = read.identification(model, estimator)
+    wanted = read.identification(model, estimator, file=settings or "")
     if essential and wanted.essential is None:
         raise ConfigurationError(
             f"--essential needs the essential parameters, and {settings} has `essential: null`; leave one out"

@@ -12,7 +12,7 @@ Every function takes a folder of results, or a `ResultFolder` to share the work 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -26,7 +26,7 @@ from ident.parameters import PER_LINK
 from runner.published import TABLE_2
 from runner.report.folder import Curves, ResultFolder
 from runner.report.interactive import DIVERGING, heatmap_chart, heatmap_figure
-from runner.report.plot import Band, Line, Mark, Panel, Points, thin
+from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
 from runner.report.svg import Figure
 
 __all__ = [
@@ -60,57 +60,35 @@ _SCALE_WIDTH = 56.0
 def velocity_figure(results: Results, session: str | None = None) -> Figure:
     """Figure 2a of the paper: joint velocities as logged and filtered, by joint."""
     one = _choose(results, session, "joint")
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+
+    def panel(k: int, joint: str) -> Panel:
         fastest = float(np.max(np.abs(one.qd[:, k])))
-        panels.append(
-            Panel(
-                joint,
-                "time [s]",
-                "velocity [rad/s]",
-                (
-                    Line(
-                        "logged",
-                        "differences of the logged positions",
-                        *thin(one.time, one.raw_velocity[:, k], _POINTS),
-                    ),
-                    Line("measured", "filtered", *thin(one.time, one.qd[:, k], _POINTS)),
-                ),
-                f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s.",
-                f"at most {fastest:.2f} rad/s",
-            )
+        marks = (
+            _line("logged", "differences of the logged positions", one.time, one.raw_velocity[:, k]),
+            _line("measured", "filtered", one.time, one.qd[:, k]),
         )
-    return Figure(f"velocity-{one.session}", f"Joint velocities, session {one.session}", tuple(panels))
+        alt = f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s."
+        return Panel(joint, "time [s]", "velocity [rad/s]", marks, alt, f"at most {fastest:.2f} rad/s")
+
+    return _by_joint(one, f"velocity-{one.session}", f"Joint velocities, session {one.session}", panel)
 
 
 def motion_figure(results: Results, session: str | None = None, side: str = "joint") -> Figure:
     """Figure 2b of the paper: torque as logged and filtered, by joint."""
     one = _choose(results, session, side)
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+    title = side.capitalize()
+
+    def panel(k: int, joint: str) -> Panel:
         mean = float(np.mean(np.abs(one.torque[:, k])))
-        panels.append(
-            Panel(
-                joint,
-                "time [s]",
-                "torque [Nm]",
-                (
-                    Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
-                    Line(
-                        "measured",
-                        f"low-pass {one.cutoff_hz:g} Hz",
-                        *thin(one.grid, one.measured[:, k], _POINTS),
-                    ),
-                ),
-                f"{side.capitalize()} torque of {joint} over time, session {one.session}: mean magnitude "
-                f"{mean:.2f} Nm.",
-                f"mean |τ| {mean:.2f} Nm",
-            )
+        marks = (
+            _line("logged", "as logged", one.time, one.torque[:, k]),
+            _line("measured", f"low-pass {one.cutoff_hz:g} Hz", one.grid, one.measured[:, k]),
         )
-    return Figure(
-        f"torque-logged-{one.session}-{side}",
-        f"{side.capitalize()} torques, session {one.session}",
-        tuple(panels),
+        alt = f"{title} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm."
+        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, f"mean |τ| {mean:.2f} Nm")
+
+    return _by_joint(
+        one, f"torque-logged-{one.session}-{side}", f"{title} torques, session {one.session}", panel
     )
 
 
@@ -123,31 +101,27 @@ def torque_figure(results: Results, session: str | None = None, side: str | None
     and computed torque passed the same low-pass; the samples as logged stand behind them.
     """
     one = _choose(results, session, side, unseen_first=True)
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+
+    def panel(k: int, joint: str) -> Panel:
         error = one.relative_error(k)
         score = one.scores[k]
         rms = float(np.sqrt(np.nanmean(error**2)))
-        panels.append(
-            Panel(
-                joint,
-                "time [s]",
-                "torque [Nm]",
-                (
-                    Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
-                    Line("measured", "measured", *thin(one.grid, one.measured[:, k], _POINTS)),
-                    Line("computed", "computed", *thin(one.grid, one.computed[:, k], _POINTS)),
-                    Line("error", "relative error", *thin(one.grid, error, _POINTS), lower=True),
-                ),
-                f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
-                f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms.",
-                f"residual {score.band_rms:.2g} Nm, error {rms:.2f} %",
-                lower_label="error [%]",
-            )
+        marks = (
+            _line("logged", "as logged", one.time, one.torque[:, k]),
+            _line("measured", "measured", one.grid, one.measured[:, k]),
+            _line("computed", "computed", one.grid, one.computed[:, k]),
+            _line("error", "relative error", one.grid, error, lower=True),
         )
+        alt = (
+            f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
+            f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms."
+        )
+        note = f"residual {score.band_rms:.2g} Nm, error {rms:.2f} %"
+        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, note, lower_label="error [%]")
+
     kind = "held-out session" if one.unseen else "session"
     caption = f"Measured and computed {one.side} torque with relative error, {kind} {one.session}"
-    return Figure(f"torque-{one.session}-{one.side}", caption, tuple(panels))
+    return _by_joint(one, f"torque-{one.session}-{one.side}", caption, panel)
 
 
 def residual_figure(
@@ -158,37 +132,34 @@ def residual_figure(
     Over time: every extreme as logged, and the residual in the pass band. Against position and velocity: mean
     and spread (5 to 95 %) of the latter in bins, against position for each direction of motion on its own.
     """
-    if against not in ("time", "position", "velocity"):
+    labels = {"time": "time [s]", "position": "position [rad]", "velocity": "velocity [rad/s]"}
+    if against not in labels:
         raise ConfigurationError(f"residuals against {against!r}: choose time, position or velocity")
     one = _choose(results, session, side)
     residual = one.measured - one.computed
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+
+    def panel(k: int, joint: str) -> Panel:
         rms = float(np.sqrt(np.nanmean(residual[:, k] ** 2)))
-        marks: tuple[Mark, ...]
-        if against == "time":
-            label = "time [s]"
-            marks = (
-                Line("logged", "as logged", *thin(one.time, one.error[:, k], _POINTS)),
-                Line("measured", f"low-pass {one.cutoff_hz:g} Hz", *thin(one.grid, residual[:, k], _POINTS)),
-            )
-        else:
-            label = "position [rad]" if against == "position" else "velocity [rad/s]"
-            marks = _binned(one, residual[:, k], k, against)
-        panels.append(
-            Panel(
-                joint,
-                label,
-                "residual [Nm]",
-                marks,
-                f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {rms:.3g} "
-                "Nm "
-                "rms.",
-                f"{rms:.3g} Nm rms",
-            )
+        marks: tuple[Mark, ...] = (
+            _line("logged", "as logged", one.time, one.error[:, k]),
+            _line("measured", f"low-pass {one.cutoff_hz:g} Hz", one.grid, residual[:, k]),
         )
+        if against != "time":
+            marks = _binned(one, residual[:, k], k, against)
+        note = f"{rms:.3g} Nm rms"
+        alt = f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {note}."
+        return Panel(joint, labels[against], "residual [Nm]", marks, alt, note)
+
     caption = f"Residual {one.side} torque against {against}, session {one.session}"
-    return Figure(f"residual-{against}-{one.session}-{one.side}", caption, tuple(panels))
+    return _by_joint(one, f"residual-{against}-{one.session}-{one.side}", caption, panel)
+
+
+def _line(role: Role, label: str, x: Floats, y: Floats, *, lower: bool = False) -> Line:
+    return Line(role, label, *thin(x, y, _POINTS), lower=lower)
+
+
+def _by_joint(one: Curves, name: str, caption: str, panel: Callable[[int, str], Panel]) -> Figure:
+    return Figure(name, caption, tuple(panel(k, joint) for k, joint in enumerate(one.joint_names)))
 
 
 def parameter_figure(results: Results) -> Figure:
@@ -204,53 +175,37 @@ def parameter_figure(results: Results) -> Figure:
         if not mine:
             continue
         x = np.array([1.0 + links.index(_link(e["name"])) for e in mine])
-        values = np.array([e["estimate"] for e in mine])
         marks: list[Mark] = [
             Points(
                 "estimate",
                 "estimate with 95 % interval",
                 x,
-                values,
+                np.array([e["estimate"] for e in mine]),
                 np.array([interval_95(e) for e in mine]),
                 tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine),
             )
         ]
-        known = [(place, e) for place, e in zip(x, mine, strict=True) if "truth" in e]
-        if known:
-            marks.append(
-                Points(
-                    "truth",
-                    "true value of the emulated arm",
-                    np.array([place for place, _ in known]),
-                    np.array([e["truth"] for _, e in known]),
-                    None,
-                    tuple(f"{e['name']} {e['truth']:.4g} {e['unit']}" for _, e in known),
-                )
-            )
-        printed = [(place, e["name"]) for place, e in zip(x, mine, strict=True) if e["name"] in published]
-        if printed:
-            marks.append(
-                Points(
-                    "published",
-                    "published (Table 2)",
-                    np.array([place for place, _ in printed]),
-                    np.array([published[name] for _, name in printed]),
-                    None,
-                    tuple(f"{name} {published[name]:g}" for _, name in printed),
-                )
-            )
+        placed = list(zip(x, mine, strict=True))
+        known = [
+            (p, e["truth"], f"{e['name']} {e['truth']:.4g} {e['unit']}") for p, e in placed if "truth" in e
+        ]
+        printed = [
+            (p, published[e["name"]], f"{e['name']} {published[e['name']]:g}")
+            for p, e in placed
+            if e["name"] in published
+        ]
+        others: tuple[tuple[Role, str, list[Any]], ...] = (
+            ("truth", "true value of the emulated arm", known),
+            ("published", "published (Table 2)", printed),
+        )
+        for role, label, points in others:
+            if points:
+                places, values, texts = zip(*points, strict=True)
+                marks.append(Points(role, label, np.array(places), np.array(values), None, texts))
         unit = pretty_unit(mine[0]["unit"])
         listed = ", ".join(f"{e['name']} {e['estimate']:.3g}" for e in mine)
-        panels.append(
-            Panel(
-                symbol,
-                "link",
-                unit,
-                tuple(marks),
-                f"Estimates of {symbol} by link with their 95 % intervals: {listed} {unit}.",
-                x_names=links,
-            )
-        )
+        alt = f"Estimates of {symbol} by link with their 95 % intervals: {listed} {unit}."
+        panels.append(Panel(symbol, "link", unit, tuple(marks), alt, x_names=links))
     return Figure("parameters", "Base parameters with their 95 % intervals", tuple(panels))
 
 

@@ -279,7 +279,7 @@ class ResultFolder:
 
     @property
     def lock_step(self) -> bool:
-        """Whether the emulator waited for each answer, without meaningful reply times."""
+        """Whether the emulator waited for each answer; reply times are then meaningless."""
         return self.emulated and bool((self._experiment or {}).get("lock_step", True))
 
     @property

@@ -97,9 +97,9 @@ def page_html(
     parts: Sequence[tuple[str, str]],
     software: str,
 ) -> str:
-    """A whole page: what it is about, the verdict with its table, links to its parts, and the parts.
+    """A whole page: title, verdict with its table, links to the parts, and the parts.
 
-    subtitle, content : HTML. parts : anchor and title of what may be in the content.
+    subtitle, content : HTML. parts : anchors and titles of possible sections of the content.
     """
     script = plotly_script()
     links = "".join(

@@ -71,7 +71,7 @@ def session_section(results: ResultFolder) -> str:
     )  # fmt: skip
     parts = [table(head, rows, "Sessions and their link")]
     if results.lock_step:
-        text = "Lock step: the emulator waited for every reply, so the reply times say nothing of a link."
+        text = "Lock step: the emulator waited for every reply, so the reply times are not those of a link."
         parts.append(paragraph(text, "soft"))
     if results.unread:
         parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
@@ -245,15 +245,8 @@ def torque_section(results: ResultFolder) -> str:
     if not results.curves:
         return ""
     head = (
-        "joint",
-        "rms [Nm]",
-        "rms, % of torque",
-        "bias [Nm]",
-        "worst [Nm]",
-        "at [s]",
-        "in the band [Nm]",
-        "floor [Nm]",
-    )
+        "joint", "rms [Nm]", "rms, % of torque", "bias [Nm]", "worst [Nm]", "at [s]", "in the band [Nm]", "floor [Nm]",
+    )  # fmt: skip
     if any(one.unseen for one in results.curves):
         origin = "The held-out motion is first."
     else:
@@ -275,11 +268,9 @@ def torque_section(results: ResultFolder) -> str:
                 score.joint,
                 Number(score.rms, ".3f"),
                 Number(100 * score.relative, ".2f"),
-                Number(score.bias, ".3f"),
-                Number(score.worst, ".3f"),
+                *(Number(v, ".3f") for v in (score.bias, score.worst)),
                 Number(score.worst_time_s, ".2f"),
-                Number(score.band_rms, ".4f"),
-                Number(score.floor_rms, ".4f"),
+                *(Number(v, ".4f") for v in (score.band_rms, score.floor_rms)),
             ]
             for score in one.scores
         ]
