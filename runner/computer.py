@@ -22,15 +22,9 @@ from fri.errors import LwrError, NetworkError, RefusedError
 from lwr_driver.realtime import assess
 
 __all__ = [
-    "Finding",
-    "Interface",
-    "Verdict",
-    "examine_computer",
-    "find_interface",
-    "git_commit",
-    "software",
+    "Finding", "Interface", "Verdict", "examine_computer", "find_interface", "git_commit", "software",
     "versions",
-]
+]  # fmt: skip
 
 _PACKAGES = ("numpy", "scipy", "pin", "ruckig", "numba", "mcap")
 _DISTRIBUTION = "lwr-identification"

@@ -27,16 +27,9 @@ from lwr_driver.link import advise_quality
 from runner.computer import Finding, Verdict, examine_computer, find_interface
 
 __all__ = [
-    "Examination",
-    "Heard",
-    "LinkTest",
-    "Patient",
-    "examine",
-    "exercise",
-    "judge_heard",
-    "judge_link",
+    "Examination", "Heard", "LinkTest", "Patient", "examine", "exercise", "judge_heard", "judge_link",
     "listen",
-]
+]  # fmt: skip
 
 _HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
 _LARGEST = 65535

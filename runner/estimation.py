@@ -91,7 +91,8 @@ class IdentifySettings:
 class Key:
     """A key of a settings file: unit, meaning and range.
 
-    above, least, most : limits of a number. otherwise : meaning of the default null, or the built-in default.
+    above, least, most : limits of a number; with `above` the upper limit is excluded too.
+    otherwise : meaning of the default null.
     """
 
     name: str

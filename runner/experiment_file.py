@@ -19,17 +19,9 @@ from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.motor_torque import KrlMotorTorque
 
 __all__ = [
-    "DiagnosisPlan",
-    "Excitation",
-    "Experiment",
-    "Identification",
-    "Link",
-    "MotorTorque",
-    "Moves",
-    "Payload",
-    "Replan",
-    "SessionPlan",
-]
+    "DiagnosisPlan", "Excitation", "Experiment", "Identification", "Link", "MotorTorque", "Moves",
+    "Payload", "Replan", "SessionPlan",
+]  # fmt: skip
 
 DEFAULT = "experiments/default.yaml"
 

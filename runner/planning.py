@@ -29,17 +29,9 @@ from runner.preflight import (
 )
 
 __all__ = [
-    "PLAN",
-    "VALIDATION_PLAN",
-    "Excitations",
-    "checker",
-    "dwell",
-    "excitation_rows",
-    "plan_excitation",
-    "route",
-    "session_motion",
-    "way",
-]
+    "PLAN", "VALIDATION_PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation",
+    "route", "session_motion", "way",
+]  # fmt: skip
 
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"

@@ -31,22 +31,10 @@ from lwr_driver.state import LinkState
 from runner.experiment_file import Payload
 
 __all__ = [
-    "Item",
-    "PayloadCheck",
-    "Preflight",
-    "Rest",
-    "check_disk",
-    "check_gravity",
-    "check_link",
-    "check_motion_limits",
-    "check_path",
-    "check_payload",
-    "check_rights",
-    "check_start",
-    "check_torque",
-    "gravity_torque",
-    "load_data",
-]
+    "Item", "PayloadCheck", "Preflight", "Rest", "check_disk", "check_gravity", "check_link",
+    "check_motion_limits", "check_path", "check_payload", "check_rights", "check_start", "check_torque",
+    "gravity_torque", "load_data",
+]  # fmt: skip
 
 Vector = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]

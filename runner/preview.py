@@ -24,7 +24,7 @@ from runner.experiment import Progress
 from runner.experiment_file import Experiment, Payload
 from runner.planning import Excitations, checker, excitation_rows, session_motion
 from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
-from runner.report.markup import table
+from runner.report.markup import conditions_table
 from runner.report.plot import STYLES, Line, Panel, Points
 from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
@@ -212,6 +212,7 @@ def preview_html(planned: Planned) -> str:
     mark = "\N{CHECK MARK}" if ok else "\N{MULTIPLICATION X}"
     tight = planned.tightest
     joints = "".join(map(panel_svg, _joint_panels(planned)))
+    conditions = conditions_table(map(vars, planned.preflight.items), "Conditions before the motion")
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
@@ -226,7 +227,7 @@ def preview_html(planned: Planned) -> str:
         f"<p>{planned.motion.duration_s:.1f} s. Tightest moment: <b>{1000 * tight.distance:.0f} mm</b>, "
         f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; "
         f"{1000 * planned.margin:.0f} mm must be "
-        f"kept.</p>{_conditions(planned)}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
+        f"kept.</p>{conditions}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
         f"<h2>Joints within their limits</h2><div class=joints>{joints}</div>"
         "</section></main></body></html>\n"
     )
@@ -310,14 +311,6 @@ def _colour(distance: float, margin: float) -> Colour:
     if distance < margin:
         return ALARM
     return _NEAR if distance < 3.0 * margin else _FREE
-
-
-def _conditions(planned: Planned) -> str:
-    rows = [
-        [item.subject, item.value, item.limit, "held" if item.ok else "NOT HELD"]
-        for item in planned.preflight.items
-    ]
-    return table(("condition", "found", "limit", ""), rows, "Conditions before the motion")
 
 
 def _clearance_panel(planned: Planned) -> Panel:

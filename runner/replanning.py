@@ -29,7 +29,7 @@ from runner.experiment import Record, Run
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import excitation_rows
 from runner.preflight import check_start
-from runner.results import estimate, identified_model, summarise, write_results
+from runner.results import estimate, named_model, summarise, write_results
 from runner.terminal import StatusLine
 
 __all__ = ["Rounds", "next_problem", "planned_near_home", "rounds_begun", "show_search"]
@@ -96,7 +96,7 @@ class Rounds:
         summary = summarise(self.experiment, records, found)
         write_results(self.folder, self.experiment, self.arm, summary, found)
         model = self.folder / MODEL.format(number - 1)
-        write_model(identified_model(found, self.arm.name), model)
+        write_model(named_model(found.model, self.arm.name), model)
         problem = next_problem(self.experiment, self.cell, records, found, model)
         status.show(
             f"planning round {number}", 0.0, "Ctrl-C ends the search and keeps the best motion so far"

@@ -30,15 +30,9 @@ from runner.terminal import plain
 from sim_backend.truth import truth
 
 __all__ = [
-    "agreement",
-    "estimate",
-    "identified_model",
-    "new_folder",
-    "summarise",
-    "true_base",
-    "write_log_results",
-    "write_results",
-]
+    "agreement", "estimate", "named_model", "new_folder", "summarise", "true_base",
+    "write_log_results", "write_results",
+]  # fmt: skip
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
@@ -145,8 +139,7 @@ def write_results(
     summary["link"] = {**_earlier_link(folder, summary), **summary["link"]}
     report = _report(experiment, summary, found)
     if found is not None:
-        model = identified_model(found, arm.name)
-        write_model(model, folder / "model.yaml")
+        write_model(named_model(found.model, arm.name), folder / "model.yaml")
     (folder / "report.txt").write_text(report, encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     return report
@@ -164,10 +157,9 @@ def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     return {name: link[name] for name in names if name in kept and name in link}
 
 
-def identified_model(found: Identification, robot: str) -> DynamicModel:
-    """The identified model with covariance and provenance."""
-    provenance = {**found.model.provenance, "software": software()}
-    return dataclasses.replace(found.model, robot=robot, provenance=provenance)
+def named_model(model: DynamicModel, robot: str) -> DynamicModel:
+    """The identified model with the name of the robot, and this software in its provenance."""
+    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, "software": software()})
 
 
 def _estimates(estimate: Estimate) -> list[dict[str, Any]]:

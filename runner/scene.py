@@ -22,16 +22,9 @@ from lwr_driver.cell import Cell, PayloadShape
 from runner.experiment_file import Payload
 
 __all__ = [
-    "ALARM",
-    "BODY",
-    "GHOST",
-    "ArmShape",
-    "Colour",
-    "add_cell",
-    "line_colour",
-    "start_server",
+    "ALARM", "BODY", "GHOST", "ArmShape", "Colour", "add_cell", "line_colour", "start_server",
     "stop_server",
-]
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import click
@@ -15,9 +14,8 @@ from ident.model_file import write_model
 from ident.mounting import find_mounting
 from ident.validation import validate
 from lwr_driver.session import read_session
-from runner.computer import software
 from runner.estimation import IdentifySettings, announced
-from runner.results import new_folder, write_log_results
+from runner.results import named_model, new_folder, write_log_results
 from runner.terminal import json_option, to_json
 
 _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for name, kind in ESTIMATORS.items())
@@ -105,9 +103,9 @@ def command(
     chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
     mounting = find_mounting(logs, chain, wanted) if tilt else None
     found = identify(logs, chain, wanted) if mounting is None else mounting.identification
-    result = found.essential_model if essential else found.model
-    provenance = {**result.provenance, "software": software()}
-    result = dataclasses.replace(result, robot=logs[0].metadata.get("robot", "arm"), provenance=provenance)
+    result = named_model(
+        found.essential_model if essential else found.model, logs[0].metadata.get("robot", "arm")
+    )
     content, text = found.to_dict(), found.summary()
     if mounting is not None:
         content["mounting"], text = mounting.to_dict(), f"{text}\n\n{mounting}"

@@ -14,14 +14,9 @@ from fri.errors import ConfigurationError
 from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits
 
 __all__ = [
-    "DIVERGING",
-    "INSTALL",
-    "heatmap_chart",
-    "heatmap_figure",
-    "panel_chart",
-    "plotly_figure",
+    "DIVERGING", "INSTALL", "heatmap_chart", "heatmap_figure", "panel_chart", "plotly_figure",
     "plotly_script",
-]
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from runner.report.interactive import panel_chart
 from runner.report.svg import Figure, legend_key
 
-__all__ = ["Number", "figure_html", "fold", "paragraph", "section", "table"]
+__all__ = ["Number", "chart_html", "conditions_table", "figure_html", "fold", "paragraph", "section", "table"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,12 @@ def table(
         f"<table{name}><caption class=hidden>{escape(label)}</caption><thead>{lines[0]}</thead>"
         f"<tbody>{''.join(lines[1:])}</tbody></table></div>"
     )
+
+
+def conditions_table(items: Iterable[Mapping[str, Any]], label: str) -> str:
+    """The conditions of a preflight, each with `subject`, `value`, `limit` and `ok`."""
+    rows = [[i["subject"], i["value"], i["limit"], "held" if i["ok"] else "NOT HELD"] for i in items]
+    return table(("condition", "found", "limit", ""), rows, label)
 
 
 def figure_html(figure: Figure, *, tall: bool = False) -> str:

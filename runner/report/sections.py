@@ -17,19 +17,22 @@ from runner.report.figures import (
     velocity_figure,
 )
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, Number, chart_html, figure_html, fold, paragraph, section, table
+from runner.report.markup import (
+    Cell,
+    Number,
+    chart_html,
+    conditions_table,
+    figure_html,
+    fold,
+    paragraph,
+    section,
+    table,
+)
 
 __all__ = [
-    "assumption_section",
-    "motion_section",
-    "parameter_section",
-    "provenance_section",
-    "residual_section",
-    "session_section",
-    "table_1_section",
-    "table_2_section",
-    "torque_section",
-]
+    "assumption_section", "motion_section", "parameter_section", "provenance_section", "residual_section",
+    "session_section", "table_1_section", "table_2_section", "torque_section",
+]  # fmt: skip
 
 _PAIRS = 12
 _SLOWEST_S = 2e-3
@@ -76,17 +79,9 @@ def session_section(results: ResultFolder) -> str:
     if results.unread:
         parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
     for name, items in results.preflights.items():
-        conditions = [
-            [i["subject"], i["value"], i["limit"], "held" if i["ok"] else "NOT HELD"] for i in items
-        ]
-        parts.append(
-            fold(
-                f"Conditions before the motion of {name}: {sum(i['ok'] for i in items)} of {len(items)} held",
-                table(
-                    ("condition", "found", "limit", ""), conditions, f"Conditions before the motion of {name}"
-                ),
-            )
-        )
+        label = f"Conditions before the motion of {name}"
+        held = f"{sum(i['ok'] for i in items)} of {len(items)} held"
+        parts.append(fold(f"{label}: {held}", conditions_table(items, label)))
     return section("sessions", "Sessions, link and limits", *parts)
 
 
