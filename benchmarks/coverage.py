@@ -30,7 +30,8 @@ from estimation_arm import true_base
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import split_name
-from ident.estimation.identify import ESTIMATORS, Identification, IdentificationSettings, identify
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimators import ESTIMATORS
 from lwr_driver.configuration import find
 from runner.published import TABLE_2
 

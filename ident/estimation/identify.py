@@ -17,14 +17,12 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
+from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
+from ident.estimators.errors_in_variables import InstrumentalVariables
 from ident.estimators.estimate import Estimate, Estimator
-from ident.estimators.least_squares import OrdinaryLeastSquares, RobustLeastSquares, WeightedLeastSquares
-from ident.estimators.physical import PhysicallyConsistent, cad_prior
-from ident.estimators.prior import MaximumAPosteriori
+from ident.estimators.physical import cad_prior
 from ident.estimators.problem import Problem
-from ident.estimators.recursive import RecursiveLeastSquares, RegressorExtensionMixing
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
@@ -32,28 +30,12 @@ from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
 from lwr_driver.session import Session
 
-__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "identify"]
+__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "estimator_factory", "identify"]
 
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
 
-_ESTIMATORS: dict[str, EstimatorFactory] = {
-    "ols": lambda base, problem, covariance: OrdinaryLeastSquares(covariance),
-    "wls": lambda base, problem, covariance: WeightedLeastSquares(covariance),
-    "huber": lambda base, problem, covariance: RobustLeastSquares("huber", covariance=covariance),
-    "tukey": lambda base, problem, covariance: RobustLeastSquares("tukey", covariance=covariance),
-    "tls": lambda base, problem, covariance: TotalLeastSquares(covariance=covariance),
-    "recursive": lambda base, problem, covariance: RecursiveLeastSquares(covariance=covariance),
-    "mixing": lambda base, problem, covariance: RegressorExtensionMixing(covariance=covariance),
-    "map": lambda base, problem, covariance: MaximumAPosteriori(
-        cad_prior(base).prior("pullback"), 1.0, covariance
-    ),
-    "physical": lambda base, problem, covariance: PhysicallyConsistent(
-        cad_prior(base), covariance=covariance
-    ),
-}
-ESTIMATORS = (*_ESTIMATORS, "iv")
 _WIDE_CONDITION = 100.0
 
 
@@ -339,10 +321,24 @@ def identify(
     )
 
 
+def estimator_factory(name: str, *, prior_std: float = 0.2, **options: Any) -> EstimatorFactory:
+    """Factory of the estimator `name` with some of its options (`ident.estimators.ESTIMATORS`).
+
+    prior_std : standard deviation of the URDF's inertials as a share of themselves.
+    """
+    kind = ESTIMATORS[name]
+
+    def factory(base: BaseSet, problem: Problem, covariance: CovarianceSettings) -> Estimator:
+        prior = {"prior": cad_prior(base, relative_std=prior_std)} if kind.body_prior else {}
+        return kind.make(covariance=covariance, **prior, **options)
+
+    return factory
+
+
 def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
     """The estimator; for instrumental variables the WLS they are compared with."""
     name = settings.estimator
-    factory = _ESTIMATORS["wls" if name == "iv" else name] if isinstance(name, str) else name
+    factory = estimator_factory(name) if isinstance(name, str) else name
     return factory(base, problem, settings.covariance)
 
 

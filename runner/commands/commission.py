@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.options import coupling_option, gear_ratio_option, json_option
-from runner.plain import as_json as to_json
+from runner.terminal import coupling_option, gear_ratio_option, json_option, to_json
 
 if TYPE_CHECKING:
     from ident.diagnosis import Reference

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from runner.options import GroupedCommand, coupling_option, gear_ratio_option, json_option
+from runner.terminal import GroupedCommand, coupling_option, gear_ratio_option, json_option
 
 __all__ = ["command"]
 

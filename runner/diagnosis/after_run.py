@@ -25,10 +25,9 @@ from lwr_driver.session import JointColumns, Phase, Session, read_session
 from runner.diagnosis.deciding import SURE, Deciding, offers, open_findings
 from runner.diagnosis.decision import Answer, decision_text, decisions
 from runner.diagnosis.study import DIAGNOSIS, Study, study
-from runner.experiment import Bench, Record, Run
+from runner.experiment import Bench, Progress, Record, Run
 from runner.experiment_file import Experiment, SessionPlan
 from runner.planning import Excitations, excitation_rows
-from runner.progress import Progress
 
 __all__ = ["DECIDING", "DECISION", "FOLDER", "Conclusion", "conclude_run"]
 

@@ -25,8 +25,7 @@ from lwr_driver.motion import Motion
 from lwr_driver.session import Session
 from runner.diagnosis.deciding_motions import chirp, poses, reversal_ladder, slow_sweep
 from runner.experiment_file import Experiment, Payload, SessionPlan
-from runner.planning import checker, excitation_rows, plan_excitation
-from runner.preparation import session_motion
+from runner.planning import checker, excitation_rows, plan_excitation, session_motion
 
 __all__ = ["SURE", "Deciding", "offers", "offers_of_sessions", "open_findings"]
 

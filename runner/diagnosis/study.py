@@ -108,8 +108,7 @@ class Study:
     def write(self, folder: Path) -> None:
         """Write everything into `folder`: numbers, model, text, plots, residuals, deciding motions."""
         from runner.report.look_alike_figures import look_alike_figure
-        from runner.report.replay_figures import replay_figures
-        from runner.report.residual_figures import residual_figures
+        from runner.report.residual_figures import replay_figures, residual_figures
 
         folder.mkdir(parents=True, exist_ok=True)
         kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAYED)

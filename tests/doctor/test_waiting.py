@@ -23,9 +23,8 @@ from lwr_driver.link import (
     advise_rest,
 )
 from runner.experiment_file import Experiment, Payload
-from runner.laboratory import Laboratory
-from runner.operator import Person
-from runner.status import StatusLine
+from runner.laboratory import Laboratory, Person
+from runner.terminal import StatusLine
 
 ADVICE = (
     advise_command,

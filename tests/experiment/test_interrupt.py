@@ -12,7 +12,7 @@ from experiment_rig import experiment_file
 
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
-from runner.interrupt import Interrupts
+from runner.terminal import Interrupts
 
 
 def interrupted(tmp_path: Path) -> tuple[int, str, Session]:
