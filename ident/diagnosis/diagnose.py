@@ -21,8 +21,8 @@ from ident.diagnosis.bench import (
 )
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import Baseline, Simulate, conclude, timing_finding
+from ident.diagnosis.data_quality import sample_loss
 from ident.diagnosis.evidence import Rows, Score
-from ident.diagnosis.hygiene import sample_loss
 from ident.diagnosis.nominal import Arm
 from ident.diagnosis.recording import Recording, record
 from ident.diagnosis.reference import Reference

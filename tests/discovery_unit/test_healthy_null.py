@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis.commission import delay_std
+from ident.diagnosis.commission import delay_std, with_far_presliding
 from ident.diagnosis.nominal import Arm
-from ident.diagnosis.presliding import with_far_presliding
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain

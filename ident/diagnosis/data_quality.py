@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["SampleLoss", "Stuck", "clipped_at", "held_times", "sample_loss", "stuck_at"]
+__all__ = ["SampleLoss", "Stuck", "clipped_at", "held_times", "passed_band", "sample_loss", "stuck_at"]
 
 # Number and share of samples amiss in a session from which on they are a finding.
 _LEAST, _SHARE = 3, 0.0005
@@ -187,3 +187,33 @@ def _repeated(effort: NDArray[np.float64]) -> int:
     each = np.mean(np.diff(effort, axis=0) == 0.0, axis=0)
     expected = float(np.prod(np.maximum(each - same.mean(), 0.0))) * len(same)
     return max(0, int(same.sum() - np.ceil(expected + 3.0 * np.sqrt(expected))))
+
+
+Floats = NDArray[np.float64]
+
+# Share of the power above a quarter of the sampling rate below which no sensor's noise is left: the step of
+# a 17-bit converter makes more.
+_SILENT = 1e-10
+# Share of the power that lies above the band's edge.
+_BEYOND = 1e-6
+_LEAST = 64
+
+
+def passed_band(values: Floats, dt: float) -> float | None:
+    """Upper edge [Hz] of what a low-pass left of the signals (N, k), None where they were not filtered.
+
+    A measured torque holds the noise of its sensor at every frequency. Where the upper half of the band is
+    silent, somebody took it out, and with it whatever happened faster than the edge.
+    """
+    if len(values) < _LEAST:
+        return None
+    moving = np.ptp(values, axis=0) > 0.0
+    if not moving.any():
+        return None
+    signal = values[:, moving] - values[:, moving].mean(axis=0)
+    power = np.abs(np.fft.rfft(signal * np.hanning(len(signal))[:, None], axis=0)) ** 2
+    above = np.cumsum(power[::-1], axis=0)[::-1] / power.sum(axis=0)
+    frequency = np.fft.rfftfreq(len(signal), dt)
+    if np.any(above[np.searchsorted(frequency, 0.25 / dt)] > _SILENT):
+        return None
+    return float(np.max(frequency[np.argmax(above < _BEYOND, axis=0)]))
