@@ -31,7 +31,8 @@ def tables() -> str:
     parts = []
     for side, title in SIDES.items():
         rows = [row(name, effect) for name, effect in EFFECTS.items() if effect.side == side]
-        head = "| cause | physics | parameters | looks like | discriminating experiment |\n| --- | --- | --- | --- | --- |"
+        titles = ("cause", "physics", "parameters", "looks like", "discriminating experiment")
+        head = f"| {' | '.join(titles)} |\n|{' --- |' * len(titles)}"
         parts.append(f"### {title}\n\n{head}\n" + "\n".join(rows) + "\n")
     return "\n".join(parts)
 
