@@ -163,10 +163,7 @@ class BaseSet:
                 f"(threshold {self.threshold:.1e} of the largest)"
             )
         lines += [f"  {relation}" for relation in self.relations()]
-        for label, columns in (
-            ("not identifiable", self.not_identifiable),
-            ("left out", self.excluded),
-        ):
+        for label, columns in (("not identifiable", self.not_identifiable), ("left out", self.excluded)):
             if len(columns):
                 lines.append(f"{label}: " + " ".join(names[column] for column in columns))
         return "\n".join(lines)
@@ -281,8 +278,7 @@ def numeric_base(
     samples : random states for each condition; the default gives three rows for each column.
 
     Columns are scaled to norm 1. The rank is at the largest ratio of consecutive singular values, the smaller
-    below 1e-8 of the largest. Raises DataError without a clear gap (a factor of 1e3), for a nearly degenerate
-    geometry.
+    below 1e-8 of the largest. Raises DataError without a clear gap (1e3), for a nearly degenerate geometry.
     """
     stack = tuple(conditions) if conditions is not None else structure.conditions()
     if not stack:

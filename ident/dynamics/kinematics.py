@@ -141,11 +141,7 @@ def _foot(frame: Floats, point: Floats, axis: Floats) -> Floats:
 
 
 def _common_normal(
-    link: Floats,
-    entry: Floats,
-    axis: Floats,
-    next_point: Floats,
-    next_axis: Floats,
+    link: Floats, entry: Floats, axis: Floats, next_point: Floats, next_axis: Floats
 ) -> tuple[Floats, Floats]:
     """Direction of x_j and origin of frame j."""
     cross = np.cross(axis, next_axis)
@@ -311,8 +307,7 @@ class Chain:
     ) -> Chain:
         """Chain from a URDF: a path, or the text itself (it begins with `<`).
 
-        root, tip : link names; by default the root of the tree and the end of its only chain of movable
-            joints.
+        root, tip : link names; default the root of the tree and the end of its only chain of movable joints.
         gravity : (3,) in the axes of the root link [m/s^2].
         snap_rad : angles alpha and theta this near to a multiple of pi/2 are rounded to it, because files
             write 1.5708; 0 takes every digit as it stands.

@@ -412,11 +412,7 @@ def score_controller_model(prepared: PreparedSession, session: Session) -> Sessi
         return np.asarray(inertial + channel.gravity[message], dtype=np.float64)
 
     return score_session(
-        replace(prepared, passages=tuple(passages)),
-        predict,
-        ("joint",),
-        session,
-        "controller's M(q), g(q)",
+        replace(prepared, passages=tuple(passages)), predict, ("joint",), session, "controller's M(q), g(q)"
     )
 
 

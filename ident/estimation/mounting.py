@@ -176,11 +176,7 @@ def _turned(gravity: Floats, axes: Floats, tilt: Floats) -> Floats:
 
 
 def _step(
-    found: Identification,
-    sessions: Sequence[Session],
-    axes: Floats,
-    tilt: Floats,
-    prior_std_rad: float,
+    found: Identification, sessions: Sequence[Session], axes: Floats, tilt: Floats, prior_std_rad: float
 ) -> tuple[Floats, Covariance]:
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity

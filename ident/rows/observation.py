@@ -242,12 +242,7 @@ def _groups(
 
 
 def _averaged(
-    matrix: Floats,
-    target: Floats,
-    slope: Floats,
-    index: NDArray[np.int64],
-    period_rows: int,
-    periods: int,
+    matrix: Floats, target: Floats, slope: Floats, index: NDArray[np.int64], period_rows: int, periods: int
 ) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
     """Mean of the rows of equal phase over all periods; phases missing in a period are left out."""
     phase = index % period_rows

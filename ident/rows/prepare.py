@@ -57,8 +57,7 @@ _DISAGREEMENT = 2.0
 class TorqueChannel:
     """Torque of one side as measured, and the filtered motion at its sample times.
 
-    times : (m,) [s], delay removed; q, qd, qdd, torque : (m, J); flagged : (m, J), bridged or outlying
-        samples.
+    times : (m,) [s], delay removed. q, qd, qdd, torque : (m, J). flagged : (m, J), bridged or outliers.
     """
 
     side: str
@@ -90,10 +89,8 @@ class Passage:
 class PreparedSession:
     """A session ready for any regressor.
 
-    row_time_s : time between rows; period_rows : rows in one period of the excitation, None if it has no
-        periods.
-    delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
-        rows.
+    row_time_s : time between rows. period_rows : rows in a period of the excitation, None without periods.
+    delay : of the motor channel, None without one. counts : lost samples, outliers, dropped rows.
     moving : moving joints. warnings : sentences for the report. uid : of the session, from its metadata.
     mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
     """
