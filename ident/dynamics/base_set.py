@@ -78,6 +78,15 @@ class BaseSet:
         """SI units of the base parameters."""
         return tuple(self.structure.units[column] for column in self.columns)
 
+    def __repr__(self) -> str:
+        return f"Base set: {self._counts()}"
+
+    def _counts(self) -> str:
+        return (
+            f"{self.structure.n_columns - len(self.excluded)} parameters = {len(self.not_identifiable)} not "
+            f"identifiable + {len(self.dependent)} regrouped + {len(self.columns)} base parameters ({self.method})"
+        )
+
     @cached_property
     def matrix(self) -> Floats:
         """K (b, n_columns): base parameters = K @ standard parameters."""
@@ -152,11 +161,7 @@ class BaseSet:
     def summary(self) -> str:
         """Counts, gap at the rank, relations and parameters without effect, as text."""
         names = self.structure.names
-        total = self.structure.n_columns - len(self.excluded)
-        lines = [
-            f"{total} parameters = {len(self.not_identifiable)} not identifiable + "
-            f"{len(self.dependent)} regrouped + {len(self.columns)} base parameters ({self.method})"
-        ]
+        lines = [self._counts()]
         if np.isfinite(self.gap):
             lines.append(
                 f"singular values fall by {self.gap:.1e} at rank {len(self.columns)} "

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.parameters import Floats
+from ident.dynamics.tables import Tabular
 from ident.dynamics.urdf import Joint, read_urdf
 
 __all__ = ["STANDARD_GRAVITY", "Chain", "build_frames", "exact_cos_sin", "mdh_transform", "table_as_is"]
@@ -179,7 +180,7 @@ STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class Chain(Tabular):
     """A serial arm: n joints, modified-DH constants, gravity.
 
     joint_names : n names, from the base to the tip.
@@ -241,6 +242,11 @@ class Chain:
             )
         placements.setflags(write=False)
         object.__setattr__(self, "link_placements", placements)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each joint: name, link, kind, and alpha, d, theta, r."""
+        rows: list[dict[str, Any]] = self.to_dict()["joints"]
+        return rows
 
     def __repr__(self) -> str:
         kinds = "".join("P" if prismatic else "R" for prismatic in self.prismatic)

@@ -199,6 +199,9 @@ class Problem:
         """Number r of rows."""
         return sum(len(group.target) for group in self.groups)
 
+    def __repr__(self) -> str:
+        return f"Problem: {self.rows} rows of {len(self.groups)} groups, {len(self.names)} parameters"
+
     @cached_property
     def classes(self) -> tuple[RowClass, ...]:
         """Variance classes in the order of their first group. Refuses non-finite entries."""

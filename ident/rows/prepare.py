@@ -44,7 +44,7 @@ from ident.rows.timebase import (
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["Passage", "PreparedSession", "TorqueChannel", "prepare"]
+__all__ = ["Passage", "PreparedSession", "TorqueChannel", "clock_ns", "prepare"]
 
 BoolArray = NDArray[np.bool_]
 
@@ -111,6 +111,12 @@ class PreparedSession:
     uid: str = ""
     mean_torque: tuple[float, ...] = ()
 
+    def __repr__(self) -> str:
+        return (
+            f"Prepared session {self.name}: {self.counts['rows']} rows, cut-off {self.cutoff_hz:.3g} Hz, "
+            f"excitation up to {self.excitation_hz:.3g} Hz"
+        )
+
     def without_samples(self) -> PreparedSession:
         """The same without its passages, to save memory; enough for the report."""
         return replace(self, passages=())
@@ -135,8 +141,8 @@ def prepare(
     settings = settings or SignalSettings()
     name = session.path.name
     _check_finite(session.joint, name)
-    origin = int(_clock(session.joint)[0])
-    times = np.asarray((_clock(session.joint) - origin) * 1e-9, dtype=np.float64)
+    origin = int(clock_ns(session.joint)[0])
+    times = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
     position, effort = session.joint.position, session.joint.effort
     sensed = bool(effort.shape[1])
     if not sensed:
@@ -359,7 +365,7 @@ def _motor(
     _check_finite(session.motor, name)
     if not session.motor.effort.shape[1]:
         raise DataError(f"{name}: /motor_states has no effort; record motor torques or choose Model 1")
-    clock, reference = _clock(session.motor), _clock(session.joint)
+    clock, reference = clock_ns(session.motor), clock_ns(session.joint)
     times = np.asarray((clock - origin) * 1e-9, dtype=np.float64)
     span = (reference[-1] - reference[0]) * 1e-9
     overlap = min(times[-1], span) - max(times[0], 0.0)
@@ -411,7 +417,7 @@ def _delay(
     )
 
 
-def _clock(columns: JointColumns) -> NDArray[np.int64]:
+def clock_ns(columns: JointColumns) -> NDArray[np.int64]:
     """The source's times [ns], or the host's without them."""
     return columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
 
