@@ -1,4 +1,4 @@
-"""The rooms of `ident` import only what stands below them, and no two of its modules import each other."""
+"""The rooms of `ident` import only lower ones, and no two of its modules import each other."""
 
 from __future__ import annotations
 
