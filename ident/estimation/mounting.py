@@ -29,7 +29,7 @@ from ident.estimators.estimate import Covariance
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.rows.observation import observe
-from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import Sessions, as_sessions, require
 from lwr_driver.session import Session
 
@@ -229,17 +229,15 @@ def _columns(
 
 
 def _at_rest(session: PreparedSession) -> PreparedSession:
-    return replace(session, passages=tuple(_passage_at_rest(passage) for passage in session.passages))
+    def still(channel: TorqueChannel) -> TorqueChannel:
+        zero = np.zeros_like(channel.qd)
+        return replace(channel, qd=zero, qdd=zero)
 
-
-def _passage_at_rest(passage: Passage) -> Passage:
-    motor = None if passage.motor is None else _channel_at_rest(passage.motor)
-    return replace(passage, joint=_channel_at_rest(passage.joint), motor=motor)
-
-
-def _channel_at_rest(channel: TorqueChannel) -> TorqueChannel:
-    still = np.zeros_like(channel.qd)
-    return replace(channel, qd=still, qdd=still)
+    passages = tuple(
+        replace(p, joint=still(p.joint), motor=None if p.motor is None else still(p.motor))
+        for p in session.passages
+    )
+    return replace(session, passages=passages)
 
 
 def _prior(found: Identification, tilt: Floats, prior_std_rad: float) -> Prior:

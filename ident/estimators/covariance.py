@@ -170,7 +170,7 @@ def jackknife(
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
     coefficients : weight times residual of each row. row_weights : factor of a row's a a^T in the inverse of
-        `bread`. matrices : instruments in place of one regressor. correlation : (p, p) for the correlations.
+        `bread`. matrices : instruments in place of one factor a. correlation : (p, p) for the correlations.
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
