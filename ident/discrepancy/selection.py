@@ -19,7 +19,7 @@ from ident.discrepancy.evidence import Evidence, Key, Rows, Score
 from ident.discrepancy.imperfection import beyond_law
 from ident.discrepancy.settings import DiagnosisSettings
 from ident.effects import EFFECTS
-from ident.estimators.distributions import normal_tail
+from ident.estimators.estimate import normal_tail
 
 __all__ = ["Claim", "Null", "Selection", "confidence", "gains", "hopeful", "reach", "select"]
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
-from ident.estimators.distributions import chi_square_tail, fisher_tail, normal_tail, student_tail
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, normal_tail, student_tail
 from ident.estimators.problem import Problem
 
 __all__ = ["Assumptions", "Check", "check_assumptions", "repeatability"]

@@ -35,7 +35,7 @@ from ident.estimation.validate import (
     prepared_session,
     score_session,
 )
-from ident.estimators.distributions import normal_tail
+from ident.estimators.estimate import normal_tail
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.dynamics.tables import Tabular
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.distributions import fisher_limit
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, fisher_limit
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem
 

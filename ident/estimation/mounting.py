@@ -24,8 +24,7 @@ from ident.dynamics.parameters import Floats
 from ident.effects.base_tilt import sideways_gravity
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.distributions import fisher_tail
-from ident.estimators.estimate import Covariance
+from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.rows.observation import observe

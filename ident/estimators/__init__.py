@@ -6,15 +6,18 @@ Each takes its settings in the constructor and has `fit(problem) -> Estimate`.
 from __future__ import annotations
 
 from ident.estimators.covariance import CovarianceSettings, correlation_time
-from ident.estimators.distributions import (
+from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
+from ident.estimators.estimate import (
+    ClassFit,
+    Covariance,
+    Estimate,
+    Estimator,
     chi_square_tail,
     fisher_limit,
     fisher_tail,
     normal_tail,
     student_tail,
 )
-from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
-from ident.estimators.estimate import ClassFit, Covariance, Estimate, Estimator
 from ident.estimators.least_squares import OrdinaryLeastSquares, RobustLeastSquares, WeightedLeastSquares
 from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior, nearest_consistent
 from ident.estimators.prior import MaximumAPosteriori, Prior
