@@ -29,7 +29,6 @@ __all__ = [
     "rank_at_gap",
 ]
 
-
 _NEGLIGIBLE = 1e-10
 
 

@@ -32,7 +32,6 @@ __all__ = ["Projection", "project", "reference_bodies"]
 
 logger = logging.getLogger(__name__)
 
-
 _SQRT2 = float(np.sqrt(2.0))
 # Rows and columns of the upper triangle, column after column: the order of the solver's cone.
 _TRIANGLE = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))

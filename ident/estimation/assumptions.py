@@ -21,7 +21,6 @@ from ident.estimators.problem import Problem
 
 __all__ = ["Assumptions", "Check", "check_assumptions", "repeatability"]
 
-
 _LEVEL = 0.01
 _WIDE_CONDITION = 100.0
 

@@ -44,7 +44,6 @@ from lwr_driver.session import Session
 
 __all__ = ["Comparison", "Difference", "compare", "competitor_scores", "score_cad", "score_controller_model"]
 
-
 _SAME_ROW = 1e-8
 
 

@@ -31,7 +31,6 @@ from lwr_driver.session import Session
 
 __all__ = ["ForwardSimulation", "simulate", "simulate_session"]
 
-
 _WIDTH_RAD_S = 5e-3
 _IMPLICIT = 0.6
 _LOST_RAD = 1.0

@@ -34,7 +34,6 @@ from lwr_driver.session import Session
 
 __all__ = ["Mounting", "find_mounting"]
 
-
 _NAMES = ("tilt_1", "tilt_2")
 
 

@@ -30,7 +30,6 @@ __all__ = [
     "student_tail",
 ]
 
-
 Value = TypeVar("Value", float, Floats)
 
 

@@ -21,7 +21,6 @@ from ident.dynamics.parameters import Floats
 
 __all__ = ["Floats", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
 
-
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
 

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["commanded", "observe", "stack"]
 
-
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
 
