@@ -17,7 +17,7 @@ import numpy as np
 from fri.errors import ConfigurationError
 from ident.diagnosis.evidence import Floats
 from ident.dynamics.base_set import BaseSet
-from ident.estimators.distributions import fisher_limit
+from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel
 
 __all__ = ["DELAY_STD_S", "Reference"]

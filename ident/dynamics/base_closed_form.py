@@ -10,8 +10,7 @@ motion of a joint are moved to the link before it:
 Near the base, with r1 the first revolute joint and r2 the first revolute joint not parallel to it:
 
 * prismatic, j < r1: the link does not turn, so its first moments have no effect;
-* revolute, r1 <= j < r2: of the tensor only ZZ_j acts; MX_j and MY_j act unless their axis stands still and
-  lies along gravity;
+* revolute, r1 <= j < r2: of the tensor only ZZ_j acts; MX_j and MY_j act unless their axis is fixed along gravity;
 * prismatic, r1 < j < r2: the first moment along z_r1 has no effect (one of MX_j, MY_j, MZ_j is regrouped into
   the others); when z_j is parallel to z_r1, MX_j and MY_j are regrouped into link j-1.
 
@@ -42,7 +41,6 @@ from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, frame_change
 from ident.dynamics.structure import Condition, ModelStructure, Side
 
 __all__ = ["closed_form_base"]
-
 
 _SAME = 1e-9
 _TENSOR = range(6)

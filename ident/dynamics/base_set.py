@@ -29,7 +29,6 @@ __all__ = [
     "rank_at_gap",
 ]
 
-
 _NEGLIGIBLE = 1e-10
 
 
@@ -77,6 +76,15 @@ class BaseSet:
     def units(self) -> tuple[str, ...]:
         """SI units of the base parameters."""
         return tuple(self.structure.units[column] for column in self.columns)
+
+    def __repr__(self) -> str:
+        return f"Base set: {self._counts()}"
+
+    def _counts(self) -> str:
+        return (
+            f"{self.structure.n_columns - len(self.excluded)} parameters = {len(self.not_identifiable)} not "
+            f"identifiable + {len(self.dependent)} regrouped + {len(self.columns)} base parameters ({self.method})"
+        )
 
     @cached_property
     def matrix(self) -> Floats:
@@ -152,21 +160,14 @@ class BaseSet:
     def summary(self) -> str:
         """Counts, gap at the rank, relations and parameters without effect, as text."""
         names = self.structure.names
-        total = self.structure.n_columns - len(self.excluded)
-        lines = [
-            f"{total} parameters = {len(self.not_identifiable)} not identifiable + "
-            f"{len(self.dependent)} regrouped + {len(self.columns)} base parameters ({self.method})"
-        ]
+        lines = [self._counts()]
         if np.isfinite(self.gap):
             lines.append(
                 f"singular values fall by {self.gap:.1e} at rank {len(self.columns)} "
                 f"(threshold {self.threshold:.1e} of the largest)"
             )
         lines += [f"  {relation}" for relation in self.relations()]
-        for label, columns in (
-            ("not identifiable", self.not_identifiable),
-            ("left out", self.excluded),
-        ):
+        for label, columns in (("not identifiable", self.not_identifiable), ("left out", self.excluded)):
             if len(columns):
                 lines.append(f"{label}: " + " ".join(names[column] for column in columns))
         return "\n".join(lines)
@@ -281,8 +282,7 @@ def numeric_base(
     samples : random states for each condition; the default gives three rows for each column.
 
     Columns are scaled to norm 1. The rank is at the largest ratio of consecutive singular values, the smaller
-    below 1e-8 of the largest. Raises DataError without a clear gap (a factor of 1e3), for a nearly degenerate
-    geometry.
+    below 1e-8 of the largest. Raises DataError without a clear gap (1e3), for a nearly degenerate geometry.
     """
     stack = tuple(conditions) if conditions is not None else structure.conditions()
     if not stack:

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.parameters import Floats
+from ident.dynamics.tables import Tabular
 from ident.dynamics.urdf import Joint, read_urdf
 
 __all__ = ["STANDARD_GRAVITY", "Chain", "build_frames", "exact_cos_sin", "mdh_transform", "table_as_is"]
@@ -141,11 +142,7 @@ def _foot(frame: Floats, point: Floats, axis: Floats) -> Floats:
 
 
 def _common_normal(
-    link: Floats,
-    entry: Floats,
-    axis: Floats,
-    next_point: Floats,
-    next_axis: Floats,
+    link: Floats, entry: Floats, axis: Floats, next_point: Floats, next_axis: Floats
 ) -> tuple[Floats, Floats]:
     """Direction of x_j and origin of frame j."""
     cross = np.cross(axis, next_axis)
@@ -183,7 +180,7 @@ STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class Chain(Tabular):
     """A serial arm: n joints, modified-DH constants, gravity.
 
     joint_names : n names, from the base to the tip.
@@ -245,6 +242,11 @@ class Chain:
             )
         placements.setflags(write=False)
         object.__setattr__(self, "link_placements", placements)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each joint: name, link, kind, and alpha, d, theta, r."""
+        rows: list[dict[str, Any]] = self.to_dict()["joints"]
+        return rows
 
     def __repr__(self) -> str:
         kinds = "".join("P" if prismatic else "R" for prismatic in self.prismatic)
@@ -311,8 +313,7 @@ class Chain:
     ) -> Chain:
         """Chain from a URDF: a path, or the text itself (it begins with `<`).
 
-        root, tip : link names; by default the root of the tree and the end of its only chain of movable
-            joints.
+        root, tip : link names; default the root of the tree and the end of its only chain of movable joints.
         gravity : (3,) in the axes of the root link [m/s^2].
         snap_rad : angles alpha and theta this near to a multiple of pi/2 are rounded to it, because files
             write 1.5708; 0 takes every digit as it stands.

@@ -117,11 +117,8 @@ def _steiner(u: Floats, v: Floats) -> Floats:
     return dot * np.eye(3) - 0.5 * (outer + np.swapaxes(outer, -1, -2))
 
 
-def to_com(
-    parameters: ArrayLike,
-) -> tuple[Floats, Floats, Floats]:
-    """Mass [kg] (...,), centre of mass [m] (..., 3) and inertia about it [kg m^2] (..., 3, 3), axes of the
-    link.
+def to_com(parameters: ArrayLike) -> tuple[Floats, Floats, Floats]:
+    """Mass [kg] (...,), centre of mass [m] (..., 3) and inertia about it [kg m^2] (..., 3, 3), link axes.
 
     The centre of mass of a body without mass and first moments is the origin. Raises ConfigurationError for
     first moments with zero mass.
@@ -165,11 +162,9 @@ def frame_change(placement: ArrayLike) -> Floats:
 
 
 def pseudo_inertia(parameters: ArrayLike) -> Floats:
-    """Pseudo-inertia matrix (..., 4, 4): [[tr(J)/2 1 - J, h], [h', m]] with J about the origin, h first
-    moments.
+    """Pseudo-inertia matrix (..., 4, 4): [[tr(J)/2 1 - J, h], [h', m]], J about the origin, h first moments.
 
-    It is positive definite exactly when the ten parameters can belong to a rigid body of positive mass
-    density.
+    It is positive definite exactly for the parameters of a rigid body of positive mass density.
     """
     inertial = _inertial(parameters)
     tensor = _tensor(inertial)
@@ -208,8 +203,7 @@ class Consistency:
 
     link : the name used in messages. mass : [kg].
     smallest_eigenvalue : of the pseudo-inertia matrix; positive for a real body.
-    principal : (3,) principal moments of inertia about the centre of mass [kg m^2], ascending (NaN without
-        mass).
+    principal : (3,) principal moments about the centre of mass [kg m^2], ascending (NaN without mass).
     consistent : mass positive and pseudo-inertia positive semi-definite to the tolerance.
     reason : why not, in words; empty when consistent.
     """

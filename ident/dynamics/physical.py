@@ -32,7 +32,6 @@ __all__ = ["Projection", "project", "reference_bodies"]
 
 logger = logging.getLogger(__name__)
 
-
 _SQRT2 = float(np.sqrt(2.0))
 # Rows and columns of the upper triangle, column after column: the order of the solver's cone.
 _TRIANGLE = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
@@ -71,14 +70,12 @@ def project(
 
     matrix : (b, 10 k), K: base parameters of the bodies' inertial parameters. base : (b,), chi.
     reference : (k, 10) consistent bodies P0.
-    covariance : (b, b) of `base`; without it the scale of a parameter is the contribution of the reference
-        bodies.
+    covariance : (b, b) of `base`; without it a parameter's scale is the reference bodies' contribution.
     margin : smallest pseudo-inertia allowed, as a share of that of the reference body.
     firmness : weight w of the reference bodies when the base parameters must move; with 0.1 a body differs by
         three times its own size for one standard deviation.
 
-    Raises ConfigurationError for wrong shapes or an inconsistent reference body, DataError when the solver
-    finds no bodies.
+    Raises ConfigurationError for wrong shapes or an inconsistent reference body, DataError without a solution.
     """
     bodies = np.atleast_2d(np.asarray(reference, dtype=np.float64))
     k_matrix, chi = np.asarray(matrix, dtype=np.float64), np.asarray(base, dtype=np.float64)
@@ -119,8 +116,7 @@ def reference_bodies(
 ) -> Floats:
     """Consistent bodies (k, 10) near the given ones, for inconsistent CAD models and published parameters.
 
-    Masses are raised to `smallest_mass_kg` and the principal second moments of mass about the centre of mass
-    to mass x `gyration_m`^2.
+    Masses are raised to `smallest_mass_kg`, principal second moments of mass to mass x `gyration_m`^2.
     """
     found = []
     for body in np.atleast_2d(np.asarray(bodies, dtype=np.float64)):

@@ -106,8 +106,7 @@ def fill_rigid(
 ) -> None:
     """`rigid_regressor` without checks and without an array of its own.
 
-    out : (>= C, >= 1, n, >= N) float64 C-contiguous; [column, 0, joint, sample] is written, except structural
-        zeros.
+    out : (>= C, >= 1, n, >= N) float64 C-contiguous; writes [column, 0, joint, sample] except structural zeros.
     """
     _fill(_fixed(q), _fixed(qd), _fixed(qdd), *_constants(chain), chain.gravity, _fixed(columns), out)
 

@@ -11,8 +11,7 @@ arm without one of the channels.
 
 **Columns.** The 17 standard parameters of each link in the order of `parameters.PER_LINK`, link after link;
 then 17 for each payload, a body of its own (link n + 1, n + 2, ...) in the frame of the last link. Its columns
-equal those of link n in sessions with the payload and are zero in the others. Last come three columns for each
-coupling of joints.
+equal those of link n in sessions with the payload and are zero in the others. Three for each coupling follow.
 
 **Rows.** Session after session in the order given; in a session side after side (motor before joint); in a
 side joint after joint; in a joint sample after sample. So `W.reshape` never mixes, and the rows of one joint

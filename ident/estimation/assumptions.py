@@ -7,7 +7,7 @@ deviation and the cause to look for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
-from ident.estimators.distributions import chi_square_tail, fisher_tail, normal_tail, student_tail
-from ident.estimators.estimate import Estimate
+from ident.dynamics.tables import Tabular
+from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, normal_tail, student_tail
 from ident.estimators.problem import Problem
 
 __all__ = ["Assumptions", "Check", "check_assumptions", "repeatability"]
-
 
 _LEVEL = 0.01
 _WIDE_CONDITION = 100.0
@@ -44,13 +43,17 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Assumptions:
+class Assumptions(Tabular):
     """The verdicts of one run."""
 
     checks: tuple[Check, ...]
 
     def __getitem__(self, name: str) -> Check:
         return next(check for check in self.checks if check.name == name)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each assumption."""
+        return [check.__dict__ | {"holds": check.verdict} for check in self.checks]
 
     def __repr__(self) -> str:
         return "Assumptions: " + ", ".join(f"{check.name} {check.verdict}" for check in self.checks)
@@ -134,10 +137,16 @@ class _Series:
         )
 
 
-def _worst(series: _Series, p_values: Sequence[float]) -> tuple[int, float]:
-    """Class with the smallest p-value, and that value corrected for the number of classes."""
-    index = int(np.argmin(p_values))
-    return index, float(min(1.0, p_values[index] * len(p_values)))
+def _worst(
+    name: str, tests: Sequence[tuple[float, float]], finding: Callable[[int, float], str], consequence: str
+) -> Check:
+    """Check by the class with the smallest p-value, corrected for the number of classes.
+
+    tests : statistic and p-value of each class. finding : text for a class and the corrected p-value.
+    """
+    index = int(np.argmin([p_value for _, p_value in tests]))
+    p_value = float(min(1.0, tests[index][1] * len(tests)))
+    return Check(name, p_value > _LEVEL, finding(index, p_value), consequence, tests[index][0], p_value)
 
 
 def _mean(series: _Series) -> Check:
@@ -145,22 +154,20 @@ def _mean(series: _Series) -> Check:
         float(np.mean(e) / (np.std(e) / np.sqrt(max(n, 2.0)) + 1e-300))
         for e, n in zip(series.residuals, series.n_eff, strict=True)
     ]
-    p_values = [2.0 * normal_tail(abs(score)) for score in scores]
-    index, p_value = _worst(series, p_values)
-    return Check(
+    return _worst(
         "zero mean",
-        p_value > _LEVEL,
-        f"largest mean {np.mean(series.residuals[index]):.3g} Nm ({series.labels[index]}), "
-        f"{abs(scores[index]):.1f} standard errors",
+        [(abs(score), 2.0 * normal_tail(abs(score))) for score in scores],
+        lambda k, p: (
+            f"largest mean {np.mean(series.residuals[k]):.3g} Nm ({series.labels[k]}), "
+            f"{abs(scores[k]):.1f} standard errors"
+        ),
         "an offset is missing from the model there",
-        abs(scores[index]),
-        p_value,
     )
 
 
 def _serial_correlation(series: _Series) -> Check:
     """Ljung and Box (1978) over ten lags; Durbin and Watson (1950) for the eye."""
-    p_values, statistics, watson = [], [], []
+    tests, watson = [], []
     for e, times, records in zip(series.residuals, series.times, series.records, strict=True):
         power = float(e @ e) + 1e-300
         joined = (np.diff(times) == 1) & (np.diff(records) == 0)
@@ -173,24 +180,22 @@ def _serial_correlation(series: _Series) -> Check:
             rho = float(e[lag:][near] @ e[:-lag][near]) / power
             total += rho**2 / pairs
         statistic = len(e) * (len(e) + 2) * total
-        statistics.append(statistic)
-        p_values.append(chi_square_tail(statistic, lags))
-    index, p_value = _worst(series, p_values)
+        tests.append((statistic, chi_square_tail(statistic, lags)))
     share = [n / max(len(e), 1) for n, e in zip(series.n_eff, series.residuals, strict=True)]
-    return Check(
+    return _worst(
         "serially uncorrelated",
-        p_value > _LEVEL,
-        f"Ljung-Box p {p_value:.2g} ({series.labels[index]}, Durbin-Watson {watson[index]:.2f}); effective "
-        f"rows {100 * min(share):.0f} to {100 * max(share):.0f} % of all",
+        tests,
+        lambda k, p: (
+            f"Ljung-Box p {p:.2g} ({series.labels[k]}, Durbin-Watson {watson[k]:.2f}); effective "
+            f"rows {100 * min(share):.0f} to {100 * max(share):.0f} % of all"
+        ),
         "the textbook standard deviations are too small; the stated robust ones hold",
-        statistics[index],
-        p_value,
     )
 
 
 def _equal_variance(series: _Series) -> Check:
     """Breusch and Pagan (1979, studentised) on torque size and time; n_eff in place of n."""
-    p_values, statistics = [], []
+    tests = []
     for e, fitted, times, n_eff in zip(
         series.residuals, series.fitted, series.times, series.n_eff, strict=True
     ):
@@ -200,40 +205,29 @@ def _equal_variance(series: _Series) -> Check:
         rest = square - matrix @ np.linalg.lstsq(matrix, square, rcond=None)[0]
         spread = float(np.sum((square - square.mean()) ** 2)) + 1e-300
         statistic = float(n_eff) * max(0.0, 1.0 - float(rest @ rest) / spread)
-        statistics.append(statistic)
-        p_values.append(chi_square_tail(statistic, 2))
-    index, p_value = _worst(series, p_values)
-    return Check(
+        tests.append((statistic, chi_square_tail(statistic, 2)))
+    return _worst(
         "equal variance",
-        p_value > _LEVEL,
-        f"Breusch-Pagan p {p_value:.2g} ({series.labels[index]}: against torque and time)",
-        "the error grows with torque or drifts in time (load-dependent friction, warm-up): look at that "
-        "joint",
-        statistics[index],
-        p_value,
+        tests,
+        lambda k, p: f"Breusch-Pagan p {p:.2g} ({series.labels[k]}: against torque and time)",
+        "the error grows with torque or drifts in time (load-dependent friction, warm-up): look at that joint",
     )
 
 
 def _normality(series: _Series) -> Check:
     """Jarque and Bera (1980) with the effective number of rows."""
-    p_values, statistics, shapes = [], [], []
+    tests, shapes = [], []
     for e, n_eff in zip(series.residuals, series.n_eff, strict=True):
         centred = (e - e.mean()) / (e.std() + 1e-300)
         skew, excess = float(np.mean(centred**3)), float(np.mean(centred**4) - 3.0)
         statistic = float(n_eff) / 6.0 * (skew**2 + excess**2 / 4.0)
-        statistics.append(statistic)
-        shapes.append((skew, excess))
-        p_values.append(chi_square_tail(statistic, 2))
-    index, p_value = _worst(series, p_values)
-    skew, excess = shapes[index]
-    return Check(
+        shapes.append(f"skewness {skew:.2f}, excess kurtosis {excess:.2f}")
+        tests.append((statistic, chi_square_tail(statistic, 2)))
+    return _worst(
         "normality",
-        p_value > _LEVEL,
-        f"Jarque-Bera p {p_value:.2g} ({series.labels[index]}: skewness {skew:.2f}, excess kurtosis "
-        f"{excess:.2f})",
+        tests,
+        lambda k, p: f"Jarque-Bera p {p:.2g} ({series.labels[k]}: {shapes[k]})",
         "outliers or reversal spikes; compare with the robust estimator (`huber`)",
-        statistics[index],
-        p_value,
     )
 
 

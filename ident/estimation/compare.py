@@ -35,7 +35,7 @@ from ident.estimation.validate import (
     prepared_session,
     score_session,
 )
-from ident.estimators.distributions import normal_tail
+from ident.estimators.estimate import normal_tail
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel
@@ -43,7 +43,6 @@ from ident.rows.sessions import Sessions, as_sessions, payload_name, require
 from lwr_driver.session import Session
 
 __all__ = ["Comparison", "Difference", "compare", "competitor_scores", "score_cad", "score_controller_model"]
-
 
 _SAME_ROW = 1e-8
 
@@ -412,11 +411,7 @@ def score_controller_model(prepared: PreparedSession, session: Session) -> Sessi
         return np.asarray(inertial + channel.gravity[message], dtype=np.float64)
 
     return score_session(
-        replace(prepared, passages=tuple(passages)),
-        predict,
-        ("joint",),
-        session,
-        "controller's M(q), g(q)",
+        replace(prepared, passages=tuple(passages)), predict, ("joint",), session, "controller's M(q), g(q)"
     )
 
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from ident.dynamics.tables import Tabular
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.distributions import fisher_limit
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, fisher_limit
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem
 
@@ -64,7 +64,7 @@ class Elimination:
 
 
 @dataclass(frozen=True)
-class Essential:
+class Essential(Tabular):
     """The essential parameters, estimated again without the others.
 
     columns : positions of the essential parameters in the base set. estimate : WLS of the reduced problem.
@@ -81,6 +81,10 @@ class Essential:
     def names(self) -> tuple[str, ...]:
         """Names of the essential parameters."""
         return self.estimate.names
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each eliminated parameter."""
+        return [entry.__dict__ for entry in self.eliminated]
 
     def __repr__(self) -> str:
         names = " ".join(e.name for e in self.eliminated[:12]) + (" ..." if len(self.eliminated) > 12 else "")

@@ -31,7 +31,6 @@ from lwr_driver.session import Session
 
 __all__ = ["ForwardSimulation", "simulate", "simulate_session"]
 
-
 _WIDTH_RAD_S = 5e-3
 _IMPLICIT = 0.6
 _LOST_RAD = 1.0
@@ -121,8 +120,7 @@ def simulate_session(
     """Simulate the longest uninterrupted stretch of a session.
 
     The reference is the commanded motion if the arm followed it to 0.1 rad, else the measured one. Motor torque is
-    simulated if the model has it, else joint torque. Raises DataError when the mass matrix of the model is not
-    positive definite.
+    simulated if the model has it, else joint torque. Raises DataError without a positive definite mass matrix.
     """
     prepared = prepared_session(model, session, settings)
     side: Side = "motor" if "motor" in model.structure.sides and prepared.has_motor else "joint"

@@ -199,7 +199,7 @@ class Identification(Tabular):
         counts = self.counts
         lines = [
             f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} "
-            f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base",
+            f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base"
         ]
         for session, payload in zip(self.prepared, self.payloads, strict=True):
             delay = f", motor channel {session.delay}" if session.delay is not None else ""
@@ -224,8 +224,7 @@ def identify(
     """Identify the arm `chain` from one or more sessions, stacked.
 
     sessions : a session, the path of a log, or several of either. The payload of each comes from its metadata
-        (`none`: the bare arm). A session without motor torques adds its joint rows only, one without joint
-        torques its motor rows.
+        (`none`: the bare arm). A session without motor or joint torques adds the rows of the other side only.
 
     Raises ConfigurationError for arguments of a wrong type, DataError for unusable sessions.
     """
@@ -294,10 +293,7 @@ def identify(
             )
         estimate = instrumental
     assumptions = check_assumptions(
-        problem,
-        plain,
-        instrumental=instrumental,
-        period_rows=_common_period(prepared),
+        problem, plain, instrumental=instrumental, period_rows=_common_period(prepared)
     )
     essential = None
     if settings.essential is not None:

@@ -24,17 +24,15 @@ from ident.dynamics.parameters import Floats
 from ident.effects.link import sideways_gravity
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.distributions import fisher_tail
-from ident.estimators.estimate import Covariance
+from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.rows.observation import observe
-from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import Sessions, as_sessions, require
 from lwr_driver.session import Session
 
 __all__ = ["Mounting", "find_mounting"]
-
 
 _NAMES = ("tilt_1", "tilt_2")
 
@@ -176,11 +174,7 @@ def _turned(gravity: Floats, axes: Floats, tilt: Floats) -> Floats:
 
 
 def _step(
-    found: Identification,
-    sessions: Sequence[Session],
-    axes: Floats,
-    tilt: Floats,
-    prior_std_rad: float,
+    found: Identification, sessions: Sequence[Session], axes: Floats, tilt: Floats, prior_std_rad: float
 ) -> tuple[Floats, Covariance]:
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
@@ -233,17 +227,15 @@ def _columns(
 
 
 def _at_rest(session: PreparedSession) -> PreparedSession:
-    return replace(session, passages=tuple(_passage_at_rest(passage) for passage in session.passages))
+    def still(channel: TorqueChannel) -> TorqueChannel:
+        zero = np.zeros_like(channel.qd)
+        return replace(channel, qd=zero, qdd=zero)
 
-
-def _passage_at_rest(passage: Passage) -> Passage:
-    motor = None if passage.motor is None else _channel_at_rest(passage.motor)
-    return replace(passage, joint=_channel_at_rest(passage.joint), motor=motor)
-
-
-def _channel_at_rest(channel: TorqueChannel) -> TorqueChannel:
-    still = np.zeros_like(channel.qd)
-    return replace(channel, qd=still, qdd=still)
+    passages = tuple(
+        replace(p, joint=still(p.joint), motor=None if p.motor is None else still(p.motor))
+        for p in session.passages
+    )
+    return replace(session, passages=passages)
 
 
 def _prior(found: Identification, tilt: Floats, prior_std_rad: float) -> Prior:

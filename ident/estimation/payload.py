@@ -37,7 +37,6 @@ from lwr_driver.session import Session
 
 __all__ = ["PayloadEstimate", "identify_payload", "with_payload"]
 
-
 _BODY = len(INERTIAL)
 _LINK = len(PER_LINK)
 

@@ -54,8 +54,7 @@ class Score:
 
     rms, bias : root mean square and mean. relative : rms of the residual over rms of the torque.
     worst, worst_time_s : largest residual and its time from the first sample of the log.
-    band_rms : rms in the band of the estimation. floor_rms : scatter between periods in that band, NaN for
-        an excitation without periods.
+    band_rms : rms in the band of the estimation. floor_rms : scatter between periods there, NaN without periods.
     samples : number of samples, without those at standstill.
     """
 
@@ -253,13 +252,7 @@ def predictor(model: DynamicModel, payload: str | None) -> Predictor:
 
     def predict(channel: TorqueChannel, side: Side) -> Floats:
         return model.torque(
-            channel.q,
-            channel.qd,
-            channel.qdd,
-            payload=payload,
-            side=side,
-            time=channel.times,
-            measured=True,
+            channel.q, channel.qd, channel.qdd, payload=payload, side=side, time=channel.times, measured=True
         )
 
     return predict

@@ -11,9 +11,19 @@ from typing import Any
 
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
-from ident.estimators.estimate import ClassFit, Covariance, Estimate, Estimator
+from ident.estimators.estimate import (
+    ClassFit,
+    Covariance,
+    Estimate,
+    Estimator,
+    chi_square_tail,
+    fisher_limit,
+    fisher_tail,
+    normal_tail,
+    student_tail,
+)
 from ident.estimators.least_squares import OrdinaryLeastSquares, RobustLeastSquares, WeightedLeastSquares
-from ident.estimators.physical import BodyPrior, PhysicallyConsistent, nearest_consistent
+from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior, nearest_consistent
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.estimators.problem import Nuisance, Problem, RowClass, RowGroup, TriangularFactor
 from ident.estimators.recursive import RecursiveFilter, RecursiveLeastSquares, RegressorExtensionMixing, Track
@@ -44,7 +54,14 @@ __all__ = [
     "Track",
     "TriangularFactor",
     "WeightedLeastSquares",
+    "cad_prior",
+    "chi_square_tail",
+    "correlation_time",
+    "fisher_limit",
+    "fisher_tail",
     "nearest_consistent",
+    "normal_tail",
+    "student_tail",
 ]
 
 

@@ -30,15 +30,7 @@ from ident.dynamics.parameters import Floats
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import Problem, RowGroup
 
-__all__ = [
-    "CovarianceSettings",
-    "Scores",
-    "bootstrap",
-    "effective_rows",
-    "hac",
-    "jackknife",
-    "textbook",
-]
+__all__ = ["CovarianceSettings", "Scores", "bootstrap", "effective_rows", "hac", "jackknife", "textbook"]
 
 _LONGEST = 4000
 _CHUNK = 8192
@@ -69,10 +61,7 @@ class Scores:
 
     @classmethod
     def of(
-        cls,
-        problem: Problem,
-        coefficients: Sequence[Floats],
-        matrices: Sequence[Floats] | None = None,
+        cls, problem: Problem, coefficients: Sequence[Floats], matrices: Sequence[Floats] | None = None
     ) -> Scores:
         """Scores with a coefficient for each row (weight times residual); `matrices` replace the regressors."""
         spans: dict[int, tuple[int, int]] = {}
@@ -181,8 +170,7 @@ def jackknife(
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
     coefficients : weight times residual of each row. row_weights : factor of a row's a a^T in the inverse of
-        `bread`. matrices : instruments in place of one of the regressors. correlation : (p, p) covariance for
-        the correlations.
+        `bread`. matrices : instruments in place of one factor a. correlation : (p, p) for the correlations.
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
@@ -221,8 +209,7 @@ def jackknife(
 class _Blocks:
     """Blocks of time of all records.
 
-    length : of a block in samples. spans : (first sample, number of samples up to the first repetition, number
-        of blocks) by record.
+    length : of a block in samples. spans : (first sample, samples before a repetition, blocks) by record.
     """
 
     length: int

@@ -1,19 +1,36 @@
-"""The result of an estimator, and the interface of all estimators."""
+"""The result of an estimator, the interface of all estimators, and the distributions of intervals and tests.
+
+Tails and quantiles come from `scipy.special`, without the slow import of `scipy.stats`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from scipy import special
 
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
-from ident.estimators.distributions import normal_quantile, student_quantile
 from ident.estimators.problem import Problem
 
-__all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
+__all__ = [
+    "ClassFit",
+    "Covariance",
+    "Estimate",
+    "Estimator",
+    "chi_square_tail",
+    "fisher_limit",
+    "fisher_tail",
+    "normal_quantile",
+    "normal_tail",
+    "student_quantile",
+    "student_tail",
+]
+
+Value = TypeVar("Value", float, Floats)
 
 
 @dataclass(frozen=True)
@@ -179,3 +196,38 @@ def rsd_percent(values: Floats, std: Floats) -> Floats:
     """100 std / |value|, equation (15); infinite for a value of zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values != 0.0, 100.0 * std / np.abs(values), np.inf)
+
+
+def normal_tail(z: Value) -> Value:
+    """Probability of a standard normal variable above z, for a number or elementwise."""
+    return special.ndtr(-z)  # type: ignore[no-any-return]
+
+
+def normal_quantile(p: float) -> float:
+    """Quantile p of the standard normal distribution."""
+    return float(special.ndtri(p))
+
+
+def student_tail(t: float, freedom: float) -> float:
+    """Probability of Student's t with `freedom` degrees of freedom above t."""
+    return float(special.stdtr(freedom, -t))
+
+
+def student_quantile(p: float, freedom: float) -> float:
+    """Quantile p of Student's t with `freedom` degrees of freedom."""
+    return float(special.stdtrit(freedom, p))
+
+
+def chi_square_tail(x: float, freedom: float) -> float:
+    """Probability of chi-square with `freedom` degrees of freedom above x."""
+    return float(special.chdtrc(freedom, x))
+
+
+def fisher_tail(f: float, freedom: float, rest: float) -> float:
+    """Probability of Fisher's F(freedom, rest) above f."""
+    return float(special.fdtrc(freedom, rest, f))
+
+
+def fisher_limit(p: float, freedom: float, rest: float) -> float:
+    """Quantile 1 - p of Fisher's F(freedom, rest)."""
+    return float(special.fdtri(freedom, rest, 1.0 - p))

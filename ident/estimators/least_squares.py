@@ -4,8 +4,7 @@ Ordinary least squares, equation (11), has one variance for all rows; weighted l
 (14), one for each joint and side. Iteratively reweighted least squares gives less weight to rows with large
 residuals (Huber 1964; Beaton and Tukey 1974).
 
-`estimate_from` makes the results object of any estimator: residuals, variances with the right degrees of freedom,
-covariances.
+`estimate_from` makes the results object of any estimator: residuals, variances with their freedom, covariances.
 """
 
 from __future__ import annotations
@@ -192,13 +191,7 @@ def _robust(
         found["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
     elif settings.kind == "jackknife" and scores is None:
         found["jackknife"] = jackknife(
-            problem,
-            bread,
-            coefficients,
-            row_weights,
-            block,
-            matrices=matrices,
-            correlation=robust.matrix,
+            problem, bread, coefficients, row_weights, block, matrices=matrices, correlation=robust.matrix
         )
     return found
 

@@ -41,8 +41,7 @@ class BodyPrior:
     """Prior knowledge of the standard parameters.
 
     projection : K (p, n), base parameters = K standard parameters.
-    bodies : (k, 10) int, positions of the ten inertial parameters of each rigid body, in the order of
-        `parameters.INERTIAL`.
+    bodies : (k, 10) int, positions of the inertial parameters of each rigid body, in the order of `INERTIAL`.
     nonnegative : positions of parameters without negative values (drive inertia, friction).
     inertial : (k, 10) consistent prior of the bodies, if need be from `nearest_consistent`.
     absent : positions of parameters left out of the model; they stay zero.
@@ -118,8 +117,7 @@ class PhysicallyConsistent:
     metric : distance of a body from its prior: "pullback" (quadratic, invariant), "entropic"
         (log-determinant divergence, keeps away from the boundary), "euclidean".
     strength : s; 1 takes the prior as stated, "evidence" and "cross_validation" let the data choose, see
-        `MaximumAPosteriori`. Data with model errors choose too loose a prior, at the cost of accuracy on other
-        motions.
+        `MaximumAPosteriori`. Data with model errors choose too loose a prior for other motions.
     margin : smallest eigenvalue of a pseudo-inertia relative to the prior's smallest. The result's
         `standard` holds the standard parameters (n,).
     """

@@ -21,7 +21,6 @@ from ident.dynamics.parameters import Floats
 
 __all__ = ["Floats", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
 
-
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
 
@@ -198,6 +197,9 @@ class Problem:
     def rows(self) -> int:
         """Number r of rows."""
         return sum(len(group.target) for group in self.groups)
+
+    def __repr__(self) -> str:
+        return f"Problem: {self.rows} rows of {len(self.groups)} groups, {len(self.names)} parameters"
 
     @cached_property
     def classes(self) -> tuple[RowClass, ...]:

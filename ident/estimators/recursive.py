@@ -137,8 +137,7 @@ class RecursiveLeastSquares:
 
     memory_s : time constant of the forgetting [s], None keeps all, with the result of WLS.
     prior : initial information; None begins without any (a standard deviation of `initial_std`).
-    sigma : standard deviation of the rows by class label ("A1 motor"); None takes those of a WLS over the
-        problem.
+    sigma : standard deviation of the rows by class label ("A1 motor"); None takes those of a WLS.
     """
 
     memory_s: float | None = None
@@ -221,8 +220,7 @@ class RecursiveLeastSquares:
 class RegressorExtensionMixing:
     """Element-wise estimates without persistent excitation.
 
-    memory_s : time constant of the extension [s]; it runs on from one session to the next. every : instants
-        between two mixings.
+    memory_s : time constant of the extension over all sessions [s]. every : instants between two mixings.
     initial, initial_std : initial values (p,) and their standard deviation (a number or (p,)), kept by
         parameters never excited. sigma : standard deviation of the rows by class; None takes the root mean
         square of the torque by class as a scale, without a solution of the whole problem.

@@ -24,8 +24,7 @@ _LONGEST_INLINE = 3
 class Program:
     """The inverse dynamics of a model as a graph: outputs by name, and their operations.
 
-    outputs : "tau_joint", "tau_motor" (or "tau_difference"), n expressions each, and "gravity" (joint side,
-        at rest).
+    outputs : n expressions of "tau_joint", "tau_motor" (or "tau_difference") and "gravity" (joint side).
     """
 
     model: StandardModel
@@ -53,11 +52,7 @@ class Program:
         flat = [expression for outputs in self.outputs.values() for expression in outputs]
         kinds = Counter(str(self.graph.nodes[index][0]) for index in self.graph.needed(flat))
         calls = sum(kinds[name] for name in ("sin", "cos", "sign", "tanh", "deadband"))
-        return {
-            "multiplications": kinds["mul"],
-            "additions": kinds["add"] + kinds["sub"],
-            "functions": calls,
-        }
+        return {"multiplications": kinds["mul"], "additions": kinds["add"] + kinds["sub"], "functions": calls}
 
 
 def to_c(model: StandardModel, name: str = "arm") -> str:

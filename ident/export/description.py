@@ -80,8 +80,7 @@ _SNAP_RAD = 1e-5
 
 
 def to_urdf(model: StandardModel, *, name: str | None = None) -> str:
-    """URDF text of a consistent model: the arm's own URDF with new inertials, or a new one for a chain from a
-    table.
+    """URDF text of a consistent model: the arm's own with new inertials, or a new one for a chain from a table.
 
     Bodies fixed to a moving link are part of that link's parameters and lose their own inertial. Angles of joint
     origins within 1e-5 of a multiple of pi/2 are written as that multiple, as in the chain.

@@ -1,7 +1,6 @@
 """The input of all exports: an arm with one payload and numbers for every standard parameter.
 
-`standard_model` makes it from an identified model, with the base parameters as they are or with physically
-consistent bodies.
+`standard_model` makes it from an identified model, with or without physically consistent bodies.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ class CoupledDrives:
 class StandardModel:
     """Numbers for every standard parameter of a chain, with the payload (if any) as part of the last link.
 
-    inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia Fvl Fcl offl Fvm Fcm
-        offm.
+    inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia ... offm.
     sides : torques of the model: joint torque, motor torque, or only their difference.
     coulomb_kind, coulomb_width : the function for sign(qd).
     consistent : whether every link is physically consistent (needed for URDF and MJCF, not for code).
@@ -79,8 +77,7 @@ class ConsistentParameters:
     """Physically consistent standard parameters (n_columns,), and the change of torque.
 
     projection : the cone program's result, its base parameters in the order of `names`.
-    torque_change_nm : (n,) root mean square change of the joint torque at random states [Nm]; zero when
-        exact.
+    torque_change_nm : (n,) RMS change of the joint torque at random states [Nm]; zero when exact.
     """
 
     vector: Floats
@@ -161,8 +158,7 @@ def standard_model(
 def consistent_parameters(model: DynamicModel, reference: Floats | None = None) -> ConsistentParameters:
     """Standard parameters of the model as physically consistent bodies, see `ident.dynamics.physical`.
 
-    reference : (links + payloads, 10) bodies for the combinations not identified; default those of the URDF,
-        made consistent.
+    reference : (links + payloads, 10) bodies for the free combinations; default the URDF's, made consistent.
 
     Base parameters eliminated as not essential (value 0) may move by the median standard deviation of the others
     of their unit. Raises ConfigurationError for a model of torque differences, without bodies.

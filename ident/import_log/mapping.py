@@ -30,6 +30,12 @@ __all__ = ["Coupling", "LogMapping", "Signal", "TimeBase", "Transmission"]
 
 Floats = NDArray[np.float64]
 
+# fmt: off
+_QUANTITIES = {
+    "position": "angle", "velocity": "rate", "joint_torque": "torque", "motor_torque": "torque",
+    "motor_position": "angle", "command": "angle",
+}
+# fmt: on
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _UNITS = {
     "rad": ("angle", 1.0),
@@ -209,16 +215,8 @@ class LogMapping:
             raise ConfigurationError(
                 f"`offset_rad` has {len(self.offset_rad)} entries for {len(self.joints)} joints"
             )
-        kinds = {
-            "position": "angle",
-            "motor_position": "angle",
-            "command": "angle",
-            "velocity": "rate",
-            "joint_torque": "torque",
-            "motor_torque": "torque",
-        }
         for name, signal in self.signals.items():
-            if signal.quantity != kinds[name]:
+            if signal.quantity != _QUANTITIES[name]:
                 raise ConfigurationError(f"`{name}` cannot have the unit `{signal.unit}`")
             if signal.columns is not None and len(signal.columns) != len(self.joints):
                 raise ConfigurationError(
@@ -248,8 +246,7 @@ class LogMapping:
     @property
     def signals(self) -> dict[str, Signal]:
         """The signals of the mapping, by name."""
-        names = ("position", "velocity", "joint_torque", "motor_torque", "motor_position", "command")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return {name: getattr(self, name) for name in _QUANTITIES if getattr(self, name) is not None}
 
     @property
     def matrix(self) -> Floats:

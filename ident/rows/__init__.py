@@ -11,9 +11,9 @@ from ident.rows.filters import (
     low_pass,
     optimal_cutoff,
 )
-from ident.rows.observation import observe
+from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
 from ident.rows.timebase import Delay, DelayData, estimate_delay
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "TorqueChannel",
     "advice",
     "as_sessions",
+    "commanded",
     "differentiate",
     "estimate_delay",
     "excitation_frequency",
@@ -35,4 +36,7 @@ __all__ = [
     "optimal_cutoff",
     "payload_name",
     "prepare",
+    "require",
+    "stack",
+    "stated_mass",
 ]

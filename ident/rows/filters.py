@@ -47,8 +47,7 @@ class SignalSettings:
     average_periods : average the rows of all periods; their scatter gives the noise variance.
     edge_s : time lost at each end of an uninterrupted stretch to the transients of the Butterworth filter,
         None takes 2 / `cutoff_hz`.
-    longest_bridge_s : lost samples up to this long are bridged by interpolation, a longer gap splits the
-        record.
+    longest_bridge_s : longest gap bridged by interpolation; a longer one splits the record.
     bridged_share : largest share of the filter's weight on bridged samples; rows beyond it are dropped.
     standstill_rad_s, standstill_share : below this speed the Coulomb torque of a joint is unknown; its rows
         with more than this share of the filter's weight on such samples are dropped. Share 1 keeps all.
@@ -107,8 +106,7 @@ _OUTPUTS = 8
 def low_pass(values: Floats, dt: float, cutoff_hz: float, order: int = 4) -> Floats:
     """Butterworth low-pass of `order` run forward and back over (n, k) values sampled every `dt` seconds.
 
-    Zero phase. The gain is the square of the single pass: -6 dB at the cut-off, roll-off of order 2 x
-    `order`.
+    Zero phase. The gain is that of the single pass squared: -6 dB at the cut-off, roll-off of order 2 x `order`.
     """
     nyquist = 0.5 / dt
     if cutoff_hz >= nyquist:
@@ -181,13 +179,11 @@ def block_means(values: NDArray[np.generic], factor: int) -> Floats:
 
 @dataclass(frozen=True)
 class ParallelFilter:
-    """Weighted mean around output times: a Kaiser-windowed sinc, applied alike to torque and regressor
-    columns.
+    """Weighted mean around output times: a Kaiser-windowed sinc, the same for torque and regressor columns.
 
     times : (m,) sample times [s], need not be equidistant; outputs : (K,) times of the rows [s]. A row is
         sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time represented by sample i. Any
-        such mean of Y = Omega chi holds for the same chi, so irregular or slow sampling does not bias the
-        estimate.
+        such mean of Y = Omega chi holds for the same chi, so irregular or slow sampling adds no bias.
     """
 
     times: Floats
@@ -295,8 +291,7 @@ def _kaiser(position: Floats, attenuation_db: float) -> Floats:
 def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> float:
     """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
 
-    velocity : (n, J) low-passed, equidistant. For a Fourier excitation this is about n_f w0, its highest
-        harmonic.
+    velocity : (n, J) low-passed, equidistant. About the highest harmonic n_f w0 of a Fourier excitation.
     """
     highest = 0.0
     power_of_joint = np.var(velocity, axis=0)

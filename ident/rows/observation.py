@@ -30,14 +30,13 @@ from ident.rows.filters import (
     low_pass,
     thinning,
 )
-from ident.rows.prepare import Passage, PreparedSession, TorqueChannel
+from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, clock_ns
 from ident.rows.timebase import Stretch, sample_period, stretches
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
 __all__ = ["commanded", "observe", "stack"]
-
 
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
@@ -242,12 +241,7 @@ def _groups(
 
 
 def _averaged(
-    matrix: Floats,
-    target: Floats,
-    slope: Floats,
-    index: NDArray[np.int64],
-    period_rows: int,
-    periods: int,
+    matrix: Floats, target: Floats, slope: Floats, index: NDArray[np.int64], period_rows: int, periods: int
 ) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
     """Mean of the rows of equal phase over all periods; phases missing in a period are left out."""
     phase = index % period_rows
@@ -266,9 +260,7 @@ def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | 
     if session.command is None or not session.command.position.shape[1]:
         return None
     joint, command = session.joint, session.command.select(prepared.joint_names)
-    own = command.publish_time if np.ptp(command.publish_time) > 0 else command.log_time
-    reference = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
-    times = np.asarray((own - int(reference[0])) * 1e-9, dtype=np.float64)
+    times = np.asarray((clock_ns(command) - int(clock_ns(joint)[0])) * 1e-9, dtype=np.float64)
     where = f"{prepared.name}: /joint_command"
     dt = sample_period(times, command.sequence if command.numbered else None, where)
     bad: NDArray[np.bool_] = np.asarray(~np.isfinite(command.position).all(axis=1))

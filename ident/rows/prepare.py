@@ -44,7 +44,7 @@ from ident.rows.timebase import (
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["Passage", "PreparedSession", "TorqueChannel", "prepare"]
+__all__ = ["Passage", "PreparedSession", "TorqueChannel", "clock_ns", "prepare"]
 
 BoolArray = NDArray[np.bool_]
 
@@ -57,8 +57,7 @@ _DISAGREEMENT = 2.0
 class TorqueChannel:
     """Torque of one side as measured, and the filtered motion at its sample times.
 
-    times : (m,) [s], delay removed; q, qd, qdd, torque : (m, J); flagged : (m, J), bridged or outlying
-        samples.
+    times : (m,) [s], delay removed. q, qd, qdd, torque : (m, J). flagged : (m, J), bridged or outliers.
     """
 
     side: str
@@ -90,10 +89,8 @@ class Passage:
 class PreparedSession:
     """A session ready for any regressor.
 
-    row_time_s : time between rows; period_rows : rows in one period of the excitation, None if it has no
-        periods.
-    delay : of the motor channel, None without one. counts : lost, bridged and outlying samples and dropped
-        rows.
+    row_time_s : time between rows. period_rows : rows in a period of the excitation, None without periods.
+    delay : of the motor channel, None without one. counts : lost samples, outliers, dropped rows.
     moving : moving joints. warnings : sentences for the report. uid : of the session, from its metadata.
     mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
     """
@@ -113,6 +110,12 @@ class PreparedSession:
     warnings: tuple[str, ...]
     uid: str = ""
     mean_torque: tuple[float, ...] = ()
+
+    def __repr__(self) -> str:
+        return (
+            f"Prepared session {self.name}: {self.counts['rows']} rows, cut-off {self.cutoff_hz:.3g} Hz, "
+            f"excitation up to {self.excitation_hz:.3g} Hz"
+        )
 
     def without_samples(self) -> PreparedSession:
         """The same without its passages, to save memory; enough for the report."""
@@ -138,8 +141,8 @@ def prepare(
     settings = settings or SignalSettings()
     name = session.path.name
     _check_finite(session.joint, name)
-    origin = int(_clock(session.joint)[0])
-    times = np.asarray((_clock(session.joint) - origin) * 1e-9, dtype=np.float64)
+    origin = int(clock_ns(session.joint)[0])
+    times = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
     position, effort = session.joint.position, session.joint.effort
     sensed = bool(effort.shape[1])
     if not sensed:
@@ -362,7 +365,7 @@ def _motor(
     _check_finite(session.motor, name)
     if not session.motor.effort.shape[1]:
         raise DataError(f"{name}: /motor_states has no effort; record motor torques or choose Model 1")
-    clock, reference = _clock(session.motor), _clock(session.joint)
+    clock, reference = clock_ns(session.motor), clock_ns(session.joint)
     times = np.asarray((clock - origin) * 1e-9, dtype=np.float64)
     span = (reference[-1] - reference[0]) * 1e-9
     overlap = min(times[-1], span) - max(times[0], 0.0)
@@ -414,7 +417,7 @@ def _delay(
     )
 
 
-def _clock(columns: JointColumns) -> NDArray[np.int64]:
+def clock_ns(columns: JointColumns) -> NDArray[np.int64]:
     """The source's times [ns], or the host's without them."""
     return columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
 

@@ -44,7 +44,7 @@ def _kind(value: Any) -> str:
 def require(value: Any, kind: type, name: str, advice: str) -> None:
     """Raise ConfigurationError, with advice, when the argument `name` is not of the type `kind`."""
     if not isinstance(value, kind):
-        raise ConfigurationError(f"`{name}` must be a {kind.__name__}, not {_kind(value)}; {advice}")
+        raise ConfigurationError(f"`{name}` must be of type {kind.__name__}, not {_kind(value)}; {advice}")
 
 
 def payload_name(session: Session) -> str | None:

@@ -43,8 +43,7 @@ _BLOCK = 50
 class Stretch:
     """Equidistant samples without a long gap.
 
-    start : time of the first sample [s]; dt : sample time [s]; values : (n, k), bridged where `bridged`
-        (n,);
+    start : time of the first sample [s]. dt : sample time [s]. values : (n, k). bridged : (n,) interpolated ones.
     resampled : whether all values are interpolated because of irregular times.
     """
 
@@ -81,11 +80,7 @@ def sample_period(times: Floats, sequence: NDArray[np.int64] | None, where: str)
 
 
 def stretches(
-    times: Floats,
-    values: Floats,
-    bad: BoolArray,
-    dt: float,
-    longest_bridge_s: float,
+    times: Floats, values: Floats, bad: BoolArray, dt: float, longest_bridge_s: float
 ) -> tuple[list[Stretch], int]:
     """Equidistant stretches of (n, k) values at (n,) times, and the number of samples lost.
 

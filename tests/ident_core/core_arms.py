@@ -1,4 +1,4 @@
-"""Arms that several tests use."""
+"""Arms of several tests."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def bodies(n: int, seed: int = 0) -> np.ndarray:
 
 
 def shared(path: str) -> Path:
-    """A file of the measured data that may lie beside the project."""
+    """A file of the measured data beside the project."""
     file = DATA / path
     if not file.is_file():
         pytest.skip(f"{file} is absent: the recordings of other people's robots are not part of the project")

@@ -1,4 +1,4 @@
-"""Chains from tables and from URDFs whose frames are, or are not, modified-DH frames."""
+"""Chains from tables and from URDFs, with modified-DH frames or others."""
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +16,7 @@ INERTIAL = (
 
 
 def urdf(joints: list[dict[str, str]], extra: str = "") -> str:
-    """A URDF of a chain whose moving links all have a body."""
+    """A URDF of a chain with a body for each moving link."""
     links = ['<link name="l0"/>']
     for number, joint in enumerate(joints, start=1):
         body = INERTIAL.format(m=1.0 + 0.3 * number, x=0.01 * number)

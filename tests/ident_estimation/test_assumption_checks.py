@@ -1,4 +1,4 @@
-"""Each assumption is found to hold where it does and violated where it is."""
+"""Each assumption is found to hold or to be violated, as it is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Elimination of parameters that the data do not support."""
+"""Elimination of parameters not supported by the data."""
 
 from __future__ import annotations
 

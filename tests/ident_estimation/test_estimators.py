@@ -1,4 +1,4 @@
-"""Estimators on regressions whose truth is known."""
+"""Estimators on regressions with known truth."""
 
 from __future__ import annotations
 

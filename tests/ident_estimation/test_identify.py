@@ -1,6 +1,4 @@
-"""From sessions to a model, end to end on a simulated arm, and what happens to sessions that
-cannot be used.
-"""
+"""From sessions to a model, end to end on a simulated arm, and the refusal of unusable sessions."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Three recordings of a real LWR4+ by FloBaRoID's authors (github kjyv/FloBaRoID, LGPL-3), as sessions.
 
-Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast. The score is the one that others use on
-these files: the file's own q, qd, qdd, all of its 25 s, every ninth sample, ||e|| / ||tau|| over all joints.
+Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast. The score is the usual one for these files:
+the file's own q, qd, qdd, all of its 25 s, every ninth sample, ||e|| / ||tau|| over all joints.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def recorded(gravity: np.ndarray, *, seed: int, seconds: float = 30.0) -> Sessio
 
 
 def leaning(about_x: float, about_y: float) -> np.ndarray:
-    """Gravity in the axes of a base that was rotated by small angles about x and then y."""
+    """Gravity in the axes of a base rotated by small angles about x and then y."""
     cx, sx, cy, sy = np.cos(about_x), np.sin(about_x), np.cos(about_y), np.sin(about_y)
     rotation = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]) @ np.array(
         [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]

@@ -187,7 +187,7 @@ def test_a_name_that_is_no_identifier_is_refused() -> None:
 
 
 def consistent_lwr() -> StandardModel:
-    """Bodies that differ from the URDF's, with the base parameters of Table 2."""
+    """Bodies other than the URDF's, with the base parameters of Table 2."""
     chain, rows = table2()
     structure = ModelStructure(chain)
     base = numeric_base(structure)

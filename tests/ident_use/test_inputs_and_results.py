@@ -56,7 +56,10 @@ def results(truth_model: Any, bench: Any, unloaded: Any, loaded: Any, found: Any
     other = identify([second], bench.chain, MODEL_1)
     validation = validate(found.model, second, settings=PLAIN)
     return {
+        "chain": bench.chain,
         "estimate": found.estimate,
+        "assumptions": found.assumptions,
+        "essential": found.essential,
         "identification": found,
         "model": found.model,
         "validation": validation,
@@ -99,22 +102,25 @@ def test_a_missing_log_is_an_error_of_the_data(bench: Any, found: Any, tmp_path:
 
 
 def test_a_model_or_chain_of_another_type_is_refused(bench: Any, unloaded: Any, found: Any) -> None:
-    with pytest.raises(ConfigurationError, match=r"`chain` must be a Chain, not str 'arm\.urdf'; read one"):
+    with pytest.raises(
+        ConfigurationError, match=r"`chain` must be of type Chain, not str 'arm\.urdf'; read one"
+    ):
         identify(unloaded, "arm.urdf")  # type: ignore[arg-type]
-    with pytest.raises(ConfigurationError, match=r"`settings` must be a IdentificationSettings"):
+    with pytest.raises(ConfigurationError, match=r"`settings` must be of type IdentificationSettings"):
         identify(unloaded, bench.chain, {"model": 1})  # type: ignore[arg-type]
     for call in (
         lambda: validate("model.yaml", unloaded),  # type: ignore[arg-type]
         lambda: identify_payload("model.yaml", unloaded),  # type: ignore[arg-type]
     ):
-        with pytest.raises(ConfigurationError, match=r"`model` must be a DynamicModel"):
+        with pytest.raises(ConfigurationError, match=r"`model` must be of type DynamicModel"):
             call()
-    with pytest.raises(ConfigurationError, match=r"`second` must be a DynamicModel"):
+    with pytest.raises(ConfigurationError, match=r"`second` must be of type DynamicModel"):
         compare(found.model, found)
 
 
-def test_results_have_a_short_form(results: dict[str, Any], bench: Any) -> None:
-    for name, result in {**results, "chain": bench.chain}.items():
+def test_results_have_a_short_form(results: dict[str, Any], bench: Any, found: Any) -> None:
+    inside = {"problem": found.problem, "base": found.base, "prepared": found.prepared[0]}
+    for name, result in {**results, **inside}.items():
         text = repr(result)
         assert len(text.splitlines()) <= 10, name
         assert max(map(len, text.splitlines())) < 200, name

@@ -60,7 +60,7 @@ def test_payload_of_a_perfectly_known_arm(truth_model: Any, loaded: Any) -> None
 def test_uncertainty_of_the_arm_is_part_of_the_payloads(
     estimated: Callable[..., DynamicModel], loaded: Any
 ) -> None:
-    """Over many arm models that scatter as they say, the payload scatters as it says."""
+    """Over many arm models with the stated scatter, the payload has its stated scatter."""
     z = []
     for seed in range(12):
         found = identify_payload(

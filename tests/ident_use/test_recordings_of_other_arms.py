@@ -1,4 +1,4 @@
-"""Recordings that other people published: imported, and held against what they found."""
+"""Recordings published by others: import, and comparison with their results."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def folder(name: str) -> Path:
 def tx40(tmp_path_factory: pytest.TempPathFactory) -> Identification:
     """As its source did it: 100 Hz position filter, speeds below 1 % of the limit left out (0.05 rad/s).
 
-    A row stays while its filter rests to one half on samples that move.
+    A row stays while half of its filter is on moving samples.
     """
     source = folder("tx40")
     path = tmp_path_factory.mktemp("tx40") / "tx40.mcap"

@@ -176,7 +176,7 @@ def test_forward_simulation_feels_a_wrong_payload(truth_model: Any, loaded: Any)
 
 
 def test_simulated_pendulum_keeps_its_energy_balance(truth_model: Any) -> None:
-    """The work of the controller is what the energy gains and friction takes."""
+    """The work of the controller is the gain of energy plus the loss in friction."""
     times = np.arange(0, 2.0, 5e-4)
     target = 0.3 * np.sin(2 * np.pi * 0.5 * times)[:, None] * np.ones(7)
     q, qd, torque = simulate(truth_model, times, target, side="joint")
