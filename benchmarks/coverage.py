@@ -21,9 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ident.identify import ESTIMATORS, Identification, IdentificationSettings, identify
-from ident.kinematics import Chain
-from ident.parameters import split_name
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import split_name
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimators import ESTIMATORS
 from lwr_driver.configuration import find
 from runner.published import TABLE_2
 from tests.ident.estimation.emulated_sessions import record_pair

@@ -6,7 +6,6 @@ into a temporary environment (`--figaroh-python PATH` takes one that has it). Th
 on two 60 s sessions and on two 600 s sessions, 1 kHz, one of each pair with a payload: CPU and peak memory.
 
 Rigid arm: 70 columns, 43 base parameters, 7 rows a sample, all made and held as a matrix, as the others do.
-"Streamed" is the same result from blocks of 4096 samples that are never put together.
 """
 
 from __future__ import annotations
@@ -30,14 +29,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ident.accumulation import Accumulation, solve_normal
-from ident.base import numeric_base
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import DRIVE
+from ident.dynamics.regressor import rigid_regressor, torque
+from ident.dynamics.structure import ModelStructure
 from ident.estimators import CovarianceSettings, Problem, RowGroup, WeightedLeastSquares
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.parameters import DRIVE
-from ident.regressor import rigid_regressor, torque
-from ident.structure import ModelStructure, Samples
 from lwr_driver.configuration import find
 
 NOISE = np.array([0.4, 0.4, 0.25, 0.25, 0.2, 0.1, 0.1])
@@ -153,16 +151,6 @@ def stages(samples: int, with_figaroh: bool, python: Path | None) -> None:
         )
         return Problem(base.names, groups, 1e-3)
 
-    def streamed() -> None:
-        accumulation = Accumulation(structure, numeric_base(structure).columns)
-        accumulation.add(Samples(q, qd, qdd, joint=tau))
-        parts = [accumulation.normal("joint", j) for j in range(7)]
-        weights = [1.0] * 7
-        for _ in range(4):
-            values, covariance = solve_normal(parts, weights)
-            weights = [part.rows / part.sum_of_squares(values) for part in parts]
-        np.sqrt(np.diag(covariance)) / np.abs(values)
-
     loop = cpu_s(lambda: pinocchio_loop(model, q, qd, qdd), repeats=2)
     out, block = np.zeros((70, 7, samples)), np.zeros((70, 7, 4096))
     parts = [tuple(x[end - 4096 : end] for x in states) for end in range(4096, samples + 1, 4096)]
@@ -175,7 +163,7 @@ def stages(samples: int, with_figaroh: bool, python: Path | None) -> None:
         ours["blocks"] *= samples / (4096 * len(parts))
     ours["base"] = cpu_s(lambda: numeric_base(structure), repeats=5)
     ours["wls"], ours["robust"] = fitting(CovarianceSettings("textbook")), fitting(CovarianceSettings())
-    ours["held"], ours["streamed"] = cpu_s(held, repeats=2), cpu_s(streamed)
+    ours["held"] = cpu_s(held, repeats=2)
     theirs = figaroh(states, tau, python) if with_figaroh else None
     whole = None if theirs is None else theirs["regressor"] + theirs["base"] + theirs["wls"]
 
@@ -195,7 +183,6 @@ def stages(samples: int, with_figaroh: bool, python: Path | None) -> None:
     row("WLS with RSD, equation (14)", ours["wls"], None, None if theirs is None else theirs["wls"])
     row("WLS with jackknife and HAC covariance", ours["robust"], None, None)
     row("all together, matrix held", ours["held"], None, whole)
-    row("all together, streamed", ours["streamed"], None, whole)
     if theirs is not None:
         print(f"FIGAROH: {theirs['count']:.0f} base parameters; the base step solves least squares, too")
 

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from ident.diagnosis import diagnose
-from ident.kinematics import Chain
-from ident.regressor import torque
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
 

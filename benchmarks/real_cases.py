@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from ident.diagnosis import ArmData, Diagnosis, diagnose
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.structure import Coupling
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 

@@ -17,6 +17,8 @@ import argparse
 import dataclasses
 import os
 
+from benchmarks.real_cases import iiwa14, lwr4, tx40
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import sys
@@ -29,14 +31,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real_cases import iiwa14, lwr4, tx40
-from ident.cad_prior import cad_prior
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.mounting import Mounting, find_mounting
 from ident.estimators import Estimate
-from ident.identify import Identification, IdentificationSettings, identify
+from ident.estimators.physical import cad_prior
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.mounting import Mounting, find_mounting
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import CONFIGS, find
 from lwr_driver.session import Session, read_session
 

@@ -1,32 +1,29 @@
-"""Regressor, base parameters and accumulation against plain pinocchio (and FIGAROH, where it is installed).
+"""Regressor and base parameters against plain pinocchio (and FIGAROH, where it is installed).
 
-Run `python -m benchmarks.regressor [--samples 100000]`. It prints CPU seconds on one core (best of the runs),
-ratios to pinocchio's loop, and the peak memory of a long two-payload record. A busy machine changes the
-seconds by half, the ratios little.
+Run `python -m benchmarks.regressor [--samples 100000]`. It prints CPU seconds on one core (best of the runs)
+and ratios to pinocchio's loop. A busy machine changes the seconds by half, the ratios little.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
-import multiprocessing
 import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from ident.accumulation import Accumulation, solve_normal
-from ident.base import closed_form_base, numeric_base
-from ident.kinematics import Chain
-from ident.parameters import from_pinocchio
-from ident.regressor import rigid_regressor, torque
-from ident.structure import ModelStructure, Samples
+from ident.dynamics.base_closed_form import closed_form_base
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import from_pinocchio
+from ident.dynamics.regressor import rigid_regressor, torque
+from ident.dynamics.structure import ModelStructure
 from lwr_driver.configuration import find
 
 ROW = "{:<62}{:>10}{:>9}{:>10}"
@@ -41,12 +38,6 @@ def cpu_s(run: Callable[[], Any], repeats: int = 3) -> float:
         run()
         best = min(best, time.process_time() - start)
     return best
-
-
-def peak_mb() -> float:
-    """Largest resident size of this process (getrusage would count the parent's as well)."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024.0
 
 
 def pinocchio_loop(model: Any, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
@@ -72,16 +63,12 @@ def main() -> None:
     parser.add_argument(
         "--samples", type=int, default=100_000, help="samples of the regressor (default 100000)"
     )
-    parser.add_argument(
-        "--record-s", type=float, default=600.0, help="length of the long record (default 600 s)"
-    )
     options = parser.parse_args()
     n = options.samples
     urdf = find("lwr4plus.urdf")
     chain, model = Chain.from_urdf(urdf), pin.buildModelFromUrdf(str(urdf))
     q, qd, qdd = np.random.default_rng(0).uniform(-2.0, 2.0, (3, n, 7))
     structure = ModelStructure(chain, 2, payloads=("load",))
-    base = numeric_base(structure)
     loop = cpu_s(lambda: pinocchio_loop(model, q, qd, qdd), repeats=2)
 
     print(f"LWR4+, {n} samples, one core; ratio: pinocchio's loop / this")
@@ -113,51 +100,12 @@ def main() -> None:
     inertial = np.ones((7, 10))
     report("torque (inverse dynamics)", cpu_s(lambda: torque(chain, q, qd, qdd, inertial)))
 
-    motor = joint = np.ones((n, 7))
-    bare, loaded = Samples(q, qd, qdd, motor, joint), Samples(q, qd, qdd, motor, joint, "load")
-
-    def accumulate(factor: str) -> Accumulation:
-        accumulation = Accumulation(structure, base.columns, factor=factor)  # type: ignore[arg-type]
-        accumulation.add(bare, session=0)
-        return accumulation
-
-    report("Model 2, 102 columns, 14 rows: Gram accumulation", cpu_s(lambda: accumulate("gram")))
-    report("Model 2, 102 columns, 14 rows: triangular factors", cpu_s(lambda: accumulate("qr"), repeats=1))
-    accumulation = accumulate("gram")
-    accumulation.add(loaded, session=1)
-
-    def solve() -> None:
-        parts = [accumulation.normal(side, j) for side in structure.sides for j in range(7)]
-        solve_normal(parts, [1.0] * len(parts))
-
     print(ROW.format("", "CPU ms", "", ""))
     for label, run in (
-        ("WLS step from accumulated data (102 parameters)", solve),
         ("base parameters, numeric (136 columns, two sessions)", lambda: numeric_base(structure)),
         ("base parameters, closed form", lambda: closed_form_base(structure)),
     ):
         print(ROW.format(label, f"{1e3 * cpu_s(run, repeats=5):.2f}", "", ""))
-
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(1) as pool:
-        before, after = pool.apply(long_record, (options.record_s,))
-    whole = 2 * options.record_s * 1e3 * 14 * len(base) * 8 / 1e9
-    print(
-        f"{options.record_s:g} s at 1 kHz, two payloads, Model 2, streamed: peak {after:.0f} MB, of which "
-        f"{before:.0f} MB before the first sample; the whole matrix would take {whole:.1f} GB"
-    )
-
-
-def long_record(length_s: float) -> tuple[float, float]:
-    """Accumulate two sessions that arrive second by second; peak memory before and after [MB]."""
-    structure = ModelStructure(Chain.from_urdf(find("lwr4plus.urdf")), 2, payloads=("load",))
-    accumulation = Accumulation(structure, numeric_base(structure).columns)
-    before, rng = peak_mb(), np.random.default_rng(1)
-    for session, payload in enumerate((None, "load")):
-        for _ in range(int(length_s)):
-            q, qd, qdd, motor, joint = rng.uniform(-2.0, 2.0, (5, 1000, 7))
-            accumulation.add(Samples(q, qd, qdd, motor, joint, payload), session=session)
-    return before, peak_mb()
 
 
 if __name__ == "__main__":

@@ -20,8 +20,10 @@ def row(name: str, effect: Effect) -> str:
     """One cause as a row of its table."""
     shown = [p for p in effect.parameters if p.name not in effect.hidden]
     parameters = ", ".join(f"{p.name} [{p.unit}]" if p.unit != "1" else p.name for p in shown)
+    forms = f"; form: {', '.join(form.value for form in effect.known_forms)}" if effect.known_forms else ""
+    alike = ", ".join(f"`{cause}`" for cause in effect.confused_with)
     decides = effect.tell_apart.replace("joint {joint}", "the joint").replace("{joint}", "the joint")
-    return f"| `{name}` | {effect.physics} | {parameters} | {decides} |"
+    return f"| `{name}` | {effect.physics} | {parameters}{forms} | {alike} | {decides} |"
 
 
 def tables() -> str:
@@ -29,7 +31,8 @@ def tables() -> str:
     parts = []
     for side, title in SIDES.items():
         rows = [row(name, effect) for name, effect in EFFECTS.items() if effect.side == side]
-        head = "| cause | physics | parameters | told apart by |\n| --- | --- | --- | --- |"
+        titles = ("cause", "physics", "parameters", "looks like", "discriminating experiment")
+        head = f"| {' | '.join(titles)} |\n|{' --- |' * len(titles)}"
         parts.append(f"### {title}\n\n{head}\n" + "\n".join(rows) + "\n")
     return "\n".join(parts)
 

@@ -1,10 +1,10 @@
-"""What is commanded in a cycle: hold, a row of the motion, or a stop; guarded, and without any socket.
+"""The command of a cycle: hold, a row of the motion, or a stop; guarded, and without any socket.
 
-Every value passes the guard. What does not pass is not sent: the arm is stopped instead, and if even the stop
-would break a limit nothing is sent any more, which makes the controller brake by itself.
+Every value passes the guard. A refused value is not sent: the arm is stopped instead. If even the stop would
+break a limit, no more answers are sent, and the controller brakes by itself.
 
 The rows of a motion are counted by the controller's packets, not by answers: after a lost packet the motion
-is where it would have been. In between the controller extrapolates.
+continues as if it had come. In between the controller extrapolates.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ from numpy.typing import NDArray
 
 from lwr_driver.arm import JOINTS, Limits
 from lwr_driver.control import Control, Mode, Result, Text, Word
-from lwr_driver.guard import Guard, Violation
+from lwr_driver.guard import Guard, Stop, Violation
 from lwr_driver.ring import NO_PHASE
-from lwr_driver.stop import Stop
 
 __all__ = ["BRAKE", "HOLD", "Commander", "Foreseen"]
 
 HOLD, BRAKE = 0, 1
-"""Numbers of the phases that the loop itself gives to rows: holding, and stopping before the end of a
-motion.
-"""
+"""Phase numbers given by the loop itself: holding, and stopping before the end of a motion."""
 
-
-# Values that are foreseen anew in a cycle: one is used up, and it must not take long.
+# New values foreseen in a cycle: one is used up, and it must not take long.
 _MORE = 3
 
 
 class Foreseen(NamedTuple):
-    """values : (7,) float32 each [rad], the last `new` of them not told before; room : how far arm and set point
-    may be from the value sent before for it to hold [rad]."""
+    """Values of the next packets.
+
+    values : (7,) float32 each [rad], the last `new` of them new since the last call
+    room : largest distance of arm and set point from the value sent before, for the values to hold [rad]
+    """
 
     values: list[NDArray[np.float32]]
     new: int
@@ -42,10 +41,10 @@ class Foreseen(NamedTuple):
 
 
 class _Ahead:
-    """Values of the packets from `sequence` on, passed by a guard that has seen those before.
+    """Values of the packets from `sequence` on, each checked by a guard after the values before it.
 
-    sent : how many values have been sent altogether. state : in which they hold. cycles : from the last value
-    sent to the first of these
+    sent : number of values sent so far; state : the values hold in this state only; cycles : from the last
+    value sent to the first of these
     """
 
     def __init__(self, sequence: int, sent: int, state: object, guard: Guard, cycles: int) -> None:
@@ -54,7 +53,7 @@ class _Ahead:
         self.values: list[NDArray[np.float32]] = []
 
     def advance(self, sequence: int, sent: int, state: object) -> bool:
-        """Drop what has been sent; False if anything else has happened than that each packet got its value."""
+        """Drop the sent values; False unless each packet got its value and nothing else happened."""
         used = sent - self._sent
         if state != self._state or used != sequence - self._sequence or used > len(self.values):
             return False
@@ -63,7 +62,7 @@ class _Ahead:
         return True
 
     def add(self, value: NDArray[np.float32]) -> bool:
-        """Append a value if the guard lets it pass."""
+        """Append a value if it passes the guard."""
         if self._guard.check(value, self._cycles) is not None:
             return False
         self._cycles = 1
@@ -74,12 +73,12 @@ class _Ahead:
 class Commander:
     """Chooses the position of each cycle in command mode.
 
-    limits : of every value sent. control : shared memory with the motion. joint_names : for reasons.
-    tracking_limit : distance of the arm, or of the controller's set point, from the last value sent at which
-    a motion is stopped [rad].
+    limits : of every value sent; control : shared memory with the motion; joint_names : for reasons
+    tracking_limit : largest distance of the arm, or of the controller's set point, from the last value sent;
+        beyond it a motion is stopped [rad]
 
-    mode : what is answered; index : row of the motion, -1 outside one; phase : number of the phase;
-    target : last value sent (7,) float32, not a number before the first
+    mode : kind of answer; index : row of the motion, -1 outside one; phase : number of the phase
+    target : last value sent (7,) float32, NaN before the first
     ended : result and reason of the motion, (NONE, "") before its end
     """
 
@@ -118,16 +117,14 @@ class Commander:
         return self.mode in (Mode.MOTION, Mode.STOP)
 
     def enter(
-        self,
-        setpoint: NDArray[np.float32],
-        safety_limits: float,
-        step: NDArray[np.float64] | None = None,
+        self, setpoint: NDArray[np.float32], safety_limits: float, step: NDArray[np.float64] | None = None
     ) -> NDArray[np.float32] | None:
-        """Begin to command with the controller's own set point; the value to send.
+        """Begin to command with the controller's own set point; returns the value to send.
 
-        step : of the set point per cycle (7,) [rad], None at rest. A set point that moves is one that was lost
-        in command mode and is brought to rest within the limits: from the rows of the motion where it is the
-        value sent last, else from its present velocity.
+        step : of the set point per cycle (7,) [rad], None at rest
+
+        A moving set point means a loss of command mode in motion. It is brought to rest within the limits:
+        from the rows of the motion if it equals the value sent last, else from its present velocity.
         """
         moves = step is not None and bool(step.any())
         self._guard.scale_velocity(safety_limits)
@@ -156,11 +153,11 @@ class Commander:
         return self.command(0)
 
     def follows(self, setpoint: NDArray[np.float32]) -> bool:
-        """Whether the set point is the value sent last: the controller has missed nothing since."""
+        """Whether the set point is the value sent last: the controller has missed nothing."""
         return bool(np.array_equal(setpoint, self.target))
 
     def watch(self, elapsed: int, setpoint: NDArray[np.float32], q: NDArray[np.float32]) -> None:
-        """Count `elapsed` cycles, and stop if arm or set point are not where they were sent."""
+        """Count `elapsed` cycles, and stop if arm or set point are too far from the value sent."""
         self._since_sent += elapsed
         error = np.abs(q - self.target)
         np.maximum(self._control.tracking, error, out=self._control.tracking)
@@ -180,11 +177,12 @@ class Commander:
             )
 
     def foresee(self, sequence: int, rows: int, most: int = 1) -> Foreseen | None:
-        """What `command` will give for packet number `sequence`, the next one, and up to `most` from there on, if
-        each of them comes and nothing new is asked for; without any effect.
+        """Values of `command` for the next packet, number `sequence`, and up to `most` from there on.
 
-        rows : of a motion that is to begin with that packet, 0 for none. None where the value is not known
-        beforehand, or does not pass the guard.
+        They hold if each packet comes and nothing new is requested; the call has no effect. None if the value
+        is not known beforehand or does not pass the guard.
+
+        rows : of a motion to begin with that packet, 0 for none
         """
         room, begins = np.inf, False
         if self.mode is Mode.MOTION:
@@ -214,7 +212,7 @@ class Commander:
         return Foreseen(ahead.values, new, room) if ahead.values else None
 
     def begin(self, rows: int, sequence: int) -> None:
-        """Begin the motion of `rows` rows that lies in the shared memory with packet number `sequence`."""
+        """Begin the motion in the shared memory, `rows` rows, with packet number `sequence`."""
         self.ended = (Result.NONE, "")
         if self.mode is not Mode.HOLD:
             self.ended = (Result.REFUSED, f"a motion cannot begin {self.place()}")
@@ -225,7 +223,7 @@ class Commander:
             self.phase, self._next_phase = NO_PHASE, 0
 
     def command(self, sequence: int) -> NDArray[np.float32] | None:
-        """The value of packet number `sequence`, (7,); None if nothing may be sent any more."""
+        """The value for packet number `sequence`, (7,); None if no value may be sent any more."""
         target = self._next(sequence)
         violation = self._guard.check(target, self._since_sent)
         if violation is not None and self.mode is not Mode.STOP:
@@ -240,7 +238,7 @@ class Commander:
         return target
 
     def stop(self, result: Result, reason: str) -> None:
-        """Begin a stop within the limits; `ended` tells `result` and `reason` once the arm holds."""
+        """Begin a stop within the limits; `ended` is (`result`, `reason`) once the arm holds."""
         if self.mode not in (Mode.MOTION, Mode.HOLD):
             return
         self._pending = (result, reason)
@@ -252,9 +250,7 @@ class Commander:
         self.mode = Mode.STOP
 
     def lose(self, result: Result, reason: str) -> None:
-        """The controller follows no longer: back to the mirror, and the motion, if there is one, ends for
-        good.
-        """
+        """Return to the mirror when the controller no longer follows; a motion ends for good."""
         if self.mode in (Mode.MIRROR, Mode.SILENT):
             return
         reason = f"{reason}, {self.place()}"
@@ -267,7 +263,7 @@ class Commander:
         self.mode, self.index, self.phase = Mode.MIRROR, -1, NO_PHASE
 
     def fall_silent(self, result: Result, reason: str) -> None:
-        """Send nothing any more: the controller brakes the arm by itself."""
+        """Stop answering for good: the controller brakes the arm by itself."""
         if self.mode is Mode.SILENT:
             return
         if self.moving:
@@ -276,7 +272,7 @@ class Commander:
         self.mode, self.index, self.phase = Mode.SILENT, -1, NO_PHASE
 
     def place(self) -> str:
-        """Where in the motion the loop is, for a reason."""
+        """Place in the motion, for a reason."""
         if self.mode is not Mode.MOTION:
             return f"in mode {self.mode.name.lower()}"
         row = max(self.index, 0)
@@ -287,7 +283,7 @@ class Commander:
         return np.array_equal(self._plan[0].astype(np.float32), self.target)
 
     def _next(self, sequence: int) -> NDArray[np.float32]:
-        """Row of this cycle, as the mode wants it."""
+        """Row of this cycle in the present mode."""
         if self.mode is Mode.MOTION:
             self.index = min(sequence - self._base, self._rows - 1)
             self._find_phase()
@@ -300,9 +296,7 @@ class Commander:
         return self._hold.astype(np.float32)
 
     def _commit(self, target: NDArray[np.float32]) -> None:
-        """Remember what is sent, from which a stop would begin, and see whether a motion or a stop is
-        over.
-        """
+        """Remember the rows before a possible stop, and end a finished motion or stop."""
         past = self._past
         if self.mode is Mode.MOTION:
             for back in range(3):
@@ -320,7 +314,7 @@ class Commander:
         self._sent += 1
 
     def _end(self, result: Result, reason: str) -> None:
-        """A motion or a stop is over and the arm holds."""
+        """End a motion or a stop: the arm holds."""
         self._hold = self._past[0].copy()
         self.mode = Mode.HOLD
         self.ended = (result, reason)

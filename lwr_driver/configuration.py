@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import os
 import types
 import typing
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ import yaml
 
 from fri.errors import ConfigurationError
 
-__all__ = ["CONFIGS", "find", "parse", "read_mapping", "read_yaml"]
+__all__ = ["CONFIGS", "as_path", "expect", "find", "parse", "read_mapping", "read_yaml"]
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
@@ -24,14 +25,30 @@ _LONGEST_SHOWN = 80
 T = TypeVar("T")
 
 
+def expect(value: Any, kind: type, subject: str, advice: str) -> None:
+    """Raise ConfigurationError, with the advice, unless `value` is of the type `kind`."""
+    if not isinstance(value, kind):
+        raise ConfigurationError(f"{subject}: expected {_called(kind)}, found {_found(value)}; {advice}")
+
+
+def as_path(value: Any, subject: str) -> Path:
+    """`value` as a path; ConfigurationError unless it is a text or a path."""
+    path = os.fspath(value) if isinstance(value, (str, os.PathLike)) else None
+    if not isinstance(path, str):
+        raise ConfigurationError(
+            f"{subject}: expected a path, found {_found(value)}; give it as text or pathlib.Path"
+        )
+    return Path(path)
+
+
 def find(name: str | Path, *, beside: Path | None = None) -> Path:
     """Path of the configuration file `name`.
 
-    Looked for as given (relative to the working directory), then in the folder of the file that names it
-    (`beside`), then in the project's `configs/`. Raises ConfigurationError with the places tried.
+    Tried in order: the working directory, the folder `beside` of the file naming it, the project's
+    `configs/`. Raises ConfigurationError with the places tried.
     """
     try:
-        wanted = Path(name).expanduser()
+        wanted = as_path(name, "configuration file").expanduser()
     except RuntimeError as error:
         raise ConfigurationError(f"file {_shown(name)!r} cannot be looked for: {error}") from error
     places = [wanted] if wanted.is_absolute() else [Path.cwd() / wanted]
@@ -52,7 +69,7 @@ def find(name: str | Path, *, beside: Path | None = None) -> Path:
 
 
 def _shown(name: str | Path) -> str:
-    """The name as far as it fits into a message."""
+    """The beginning of a long name, for a message."""
     text = str(name)
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
@@ -70,7 +87,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Parsed content of a YAML file whose top level must be a mapping."""
+    """Parsed content of a YAML file with a mapping at its top level."""
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise ConfigurationError(f"{path}: the top level must be a mapping of keys, found {_kind(content)}")
@@ -78,11 +95,11 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def parse(cls: type[T], content: Any, where: str) -> T:
-    """Build the dataclass `cls` from `content`, strictly: unknown or missing keys and wrong types are errors.
+    """Build the dataclass `cls` from `content`; unknown or missing keys and wrong types are errors.
 
     Understood: nested dataclasses, `tuple[X, ...]`, fixed tuples, `dict[str, X]`, `X | None`, `Literal`,
-    bool, int, float, str and Path. `where` names the file. Non-finite numbers are refused.
-    A ConfigurationError raised by the dataclass's `__post_init__` gets the place put before it.
+    bool, int, float, str and Path; numbers must be finite. `where` names the file, also in front of an error
+    of the dataclass's own `__post_init__`.
     """
     if not isinstance(content, Mapping):
         raise ConfigurationError(f"{where}: expected a mapping of keys, found {_kind(content)}")
@@ -170,6 +187,14 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
         Path: "a path",
     }
     raise ConfigurationError(f"{where}: expected {expected.get(hint, hint)}, found {_kind(value)} {value!r}")
+
+
+def _found(value: Any) -> str:
+    return f"{_kind(value)} {_shown(repr(value))}"
+
+
+def _called(kind: type) -> str:
+    return f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}"
 
 
 def _kind(value: Any) -> str:

@@ -1,8 +1,8 @@
-"""The memory that the driver and its loop process share: requests one way, state and results the other.
+"""The memory shared by the driver and its loop process: requests one way, state and results the other.
 
-Every word is 8 bytes, aligned, and written by one side only; data is written before the word that announces
-it, an order that x86-64 keeps for the reader. The memory has no name (`memfd_create`): it is gone with its
-last process.
+Every word is 8 bytes, aligned, and written by one side only. Data are written before the word announcing
+them, and x86-64 keeps this order for the reader. The memory has no name (`memfd_create`): it is gone with
+its last process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ HISTORY = 128
 """Rows kept for an exception or a snapshot, newest last."""
 
 BIN_NS = 2_000
-"""Width of a bin of the reply latency histogram; the last bin holds all that is longer."""
+"""Width of a bin of the reply latency histogram; the last bin holds all longer latencies."""
 
 _BINS = 1001
 _PHASES = 4096
@@ -34,7 +34,7 @@ _TEXT_BYTES = 1024
 
 
 class Mode(IntEnum):
-    """What the loop answers: the mirror, the last position, a motion, a stop, or nothing."""
+    """Answer of the loop: the mirror, the last position, a motion, a stop, or nothing."""
 
     MIRROR = 0
     HOLD = 1
@@ -44,14 +44,14 @@ class Mode(IntEnum):
 
 
 class Job(IntEnum):
-    """What the loop is asked to bring about; meanwhile and afterwards it goes on answering."""
+    """Request to the loop; it goes on answering during and after a job."""
 
     NONE = 0
     CYCLES = 1  # A: cycles to take the mean of
     QUALITY = 2  # A: cycles on end, B: least quality
     START = 3  # command mode
     LEAVE = 4  # monitor mode
-    MOTION = 5  # A: rows, B: count of stop requests that are over
+    MOTION = 5  # A: rows, B: count of past stop requests
     HALT = 6  # no motion
     LOAD = 7  # load data in the first row of `plan`: kg, mm from the flange, kg m2
 
@@ -63,7 +63,7 @@ class Result(IntEnum):
     DONE = 1
     ABORTED = 2  # somebody asked for a stop
     REFUSED = 3  # a condition was not met; nothing moved
-    ROBOT = 4  # the arm or its controller ended it
+    ROBOT = 4  # ended by the arm or its controller
     NETWORK = 5  # packets were missing
     GUARD = 6  # a row would have broken a limit
     TIMEOUT = 7
@@ -77,13 +77,13 @@ class Word(IntEnum):
     JOB = 1
     A = 2
     B = 3
-    LIMIT = 4  # cycles after which a job that waits gives up
+    LIMIT = 4  # cycles after which a waiting job gives up
     PHASES = 5
     STOP = 8  # count of stop requests
     DROP = 9
     QUIT = 10
     # written by the loop
-    DONE = 16  # number of the request that is done, written after its result
+    DONE = 16  # number of the last finished request, written after its result
     RESULT = 17
     CYCLES = 18  # packets received, written after the row in the history
     MODE = 19
@@ -100,7 +100,7 @@ class Word(IntEnum):
     RECEIVED = 30
     NOTES = 31  # count of notes; the last is in the text NOTE
     SUSPECT = 32
-    ROW = 33  # last row of a motion that was sent, -1 if none since the motion was asked for
+    ROW = 33  # last row sent of a motion, -1 if none since its request
 
 
 class Text(IntEnum):
@@ -112,13 +112,11 @@ class Text(IntEnum):
 
 
 class Control:
-    """View of the shared memory. Made by `create`; the loop process attaches to the inherited file
-    descriptor.
+    """View of the shared memory, made by `create`, or from the file descriptor inherited by the loop process.
 
     words : (64,) int64 by `Word`
     history : (HISTORY,) of `ROW`; row number n is at n % HISTORY
-    plan : (rows, 7) float64, the motion [rad]; phase_rows, phase_ids : where its phases begin, and their
-        numbers
+    plan : (rows, 7) float64, the motion [rad]; phase_rows, phase_ids : first rows and numbers of its phases
     measured : (6, 7) float64: mean q, std q, mean tau, std tau, mean external tau, mean command
     tracking : (7,) worst tracking error since command mode began [rad]
     latency : histogram of the reply latency in bins of `BIN_NS`
@@ -159,7 +157,7 @@ class Control:
 
     @property
     def done(self) -> bool:
-        """Whether the loop has done what it was asked for last."""
+        """Whether the last request is finished."""
         return int(self.words[Word.DONE]) == int(self.words[Word.REQUEST])
 
     @property
@@ -168,7 +166,7 @@ class Control:
         return Result(int(self.words[Word.RESULT]))
 
     def write_text(self, place: Text, text: str) -> None:
-        """Put a text, cut to what fits."""
+        """Put a text, truncated to its place."""
         content = text.encode()[: _TEXT_BYTES - 1]
         line = self._texts[place]
         line[: len(content)] = np.frombuffer(content, dtype=np.uint8)
@@ -179,14 +177,14 @@ class Control:
         return self._texts[place].tobytes().split(b"\0", 1)[0].decode(errors="replace")
 
     def put_motion(self, q: NDArray[np.float64], phases: Sequence[tuple[int, int]]) -> None:
-        """Lay down the rows of a motion and its phases as (first row, number); no motion may be running."""
+        """Store the rows of a motion and its phases as (first row, number); no motion may be running."""
         if len(q) > self.plan_rows:
             raise ConfigurationError(
                 f"motion of {len(q)} rows; the driver was set up for {self.plan_rows}. Raise "
                 "`longest_motion_s`"
             )
         if len(phases) > _PHASES:
-            raise ConfigurationError(f"motion of {len(phases)} phases; {_PHASES} can be told apart")
+            raise ConfigurationError(f"motion of {len(phases)} phases; {_PHASES} is the limit")
         self.plan[: len(q)] = q
         for place, (row, number) in enumerate(phases):
             self.phase_rows[place], self.phase_ids[place] = row, number
@@ -198,8 +196,7 @@ class Control:
             cycles = int(self.words[Word.CYCLES])
             wanted = min(count, cycles, HISTORY // 2)
             rows = self.history[np.arange(cycles - wanted, cycles) % HISTORY]
-            # Rows are overwritten after HISTORY cycles; only a reader that was held up for so long reads
-            # again.
+            # Rows are overwritten after HISTORY cycles; only a reader delayed for so long reads again.
             if int(self.words[Word.CYCLES]) - (cycles - wanted) < HISTORY:
                 return rows
 
@@ -211,7 +208,7 @@ class Control:
         for name, value in list(vars(self).items()):
             if isinstance(value, np.ndarray):
                 delattr(self, name)
-        # A view that someone still holds keeps the memory mapped until it is dropped too.
+        # Another view keeps the memory mapped until it is dropped too.
         self._map = None  # type: ignore[assignment]
         os.close(self.descriptor)
         self.descriptor = -1

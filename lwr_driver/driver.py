@@ -1,4 +1,4 @@
-"""The driver: the connection to the arm as a lifecycle, on top of a real-time process and a recorder process.
+"""The driver: the connection to the arm, on top of a real-time process and a recorder process.
 
 ::
 
@@ -13,7 +13,7 @@
         driver.end_record(outcome.status, outcome.reason)
         outcome.check()
 
-A motion that ended, for whatever reason, is never taken up again.
+A motion is never resumed after its end.
 """
 
 from __future__ import annotations
@@ -23,27 +23,25 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import (
-    ConfigurationError,
-    LwrError,
-    NetworkError,
-    OperatorError,
-    RefusedError,
-    RobotError,
-)
+from fri.errors import ConfigurationError, LwrError, NetworkError, OperatorError, RefusedError, RobotError
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
 from lwr_driver.commander import BRAKE, HOLD
+from lwr_driver.configuration import as_path, expect
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
 from lwr_driver.link import (
     LinkSettings,
+    LinkState,
+    Measured,
+    Outcome,
+    Progress,
+    Waiting,
     advise_command,
     advise_connect,
     advise_leave,
@@ -52,17 +50,16 @@ from lwr_driver.link import (
     advise_quality,
     advise_rest,
     silence_in_lock_step,
+    snapshot,
 )
 from lwr_driver.loop import LoopSettings
 from lwr_driver.loop_process import LoopProcess, Scheduling
 from lwr_driver.motion import Motion, check_motion, check_start
-from lwr_driver.motor_torque import KrlMotorTorque
-from lwr_driver.realtime import Rights
+from lwr_driver.realtime import Rights, undisturbed
 from lwr_driver.recorder import Recorded, Recorder, SessionRequest
 from lwr_driver.ring import Ring
+from lwr_driver.session.motor_torque import KrlMotorTorque
 from lwr_driver.session.writer import ExitStatus
-from lwr_driver.state import LinkState, Measured, Outcome, Progress, Waiting, snapshot
-from lwr_driver.undisturbed import undisturbed
 
 __all__ = ["Driver", "LinkSettings", "LinkState", "Measured", "Outcome", "Progress", "Waiting"]
 
@@ -72,7 +69,7 @@ LOCK_STEP_EPOCH_NS = 1_577_836_800 * 10**9
 """Log time of packet 0 in lock step: the first of January 2020."""
 
 ROWS_KEPT = 50
-"""Cycles that an error or an outcome carries."""
+"""Cycles attached to an error or an outcome."""
 
 _POLL_S = 0.002
 _NOTIFY_S = 0.5
@@ -92,14 +89,14 @@ _PHASES = {HOLD: "hold", BRAKE: "brake"}
 class Driver:
     """Connection to one arm. A context manager: leaving it always stops the arm and ends both processes.
 
-    arm : limits that guard every cycle
-    link : how the arm is reached
+    arm : limits for the guard of every cycle
+    link : settings of the connection
     notify : called with a Waiting about twice a second while a step waits
-    motor_torque : where the motor torques stand in the KRL variables; None records none
+    motor_torque : places of the motor torques in the KRL variables; None records none
 
-    Steps that wait raise OperatorError if `request_stop` or `drop_link` is called meanwhile, NetworkError if
-    the link or a process is gone, RobotError if the controller does not do what is asked. Errors carry the
-    last cycles as `.rows`.
+    A waiting step raises OperatorError after `request_stop` or `drop_link`, NetworkError if the link or a
+    process is gone, RobotError if the controller does not follow a request. Errors carry the last cycles as
+    `.rows`.
     """
 
     def __init__(
@@ -110,6 +107,8 @@ class Driver:
         notify: Callable[[Waiting], None] | None = None,
         motor_torque: KrlMotorTorque | None = None,
     ) -> None:
+        expect(arm, Arm, "arm of the driver", "give `Arm.load()`")
+        expect(link, LinkSettings, "link of the driver", 'give `LinkSettings(address="192.168.0.100")`')
         self.arm, self.link, self.motor_torque = arm, link, motor_torque
         self.rights: Rights | None = None
         self._notify = notify
@@ -121,18 +120,20 @@ class Driver:
         self._stops_seen = 0
         self._notes_seen = 0
 
+    def __repr__(self) -> str:
+        link, seen = self.link, "not connected" if self._loop is None else self.state().summary
+        return f"Driver of {self.arm.name}\n  link   {link.address}:{link.port}, {link.handshake}\n  state  {seen}"
+
     def __enter__(self) -> Driver:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # -- lifecycle -------------------------------------------------------------------------------------------
 
     def connect(self, *, timeout_s: float = 60.0) -> LinkState:
-        """Start loop and recorder and wait for the first packet; everything is ended again if that fails."""
+        """Start loop and recorder and wait for the first packet; on failure both are ended again."""
         if self._loop is not None:
             return self.state()
         link = self.link
@@ -161,14 +162,8 @@ class Driver:
             self.rights = self._loop.rights
             for shortage in (*self.rights.missing, *self.rights.advice):
                 log.warning("%s", shortage)
-            self._wait(
-                Job.CYCLES,
-                a=1,
-                timeout_s=timeout_s,
-                awaited=f"the first packet on UDP {link.address}:{self._loop.port}",
-                advice=advise_connect,
-                failure=NetworkError,
-            )
+            awaited = f"the first packet on UDP {link.address}:{self._loop.port}"
+            self._wait(Job.CYCLES, awaited, advise_connect, timeout_s, a=1, failure=NetworkError)
         except BaseException:
             self.close()
             raise
@@ -176,12 +171,12 @@ class Driver:
 
     @property
     def port(self) -> int:
-        """UDP port on which the loop listens."""
+        """UDP port of the loop."""
         return self._need(self._loop).port
 
     @property
     def ring_name(self) -> str:
-        """Name of the shared memory with every cycle, for onlookers (`Ring.attach`, `Ring.peek`)."""
+        """Name of the shared memory with every cycle, for observers (`Ring.attach`, `Ring.peek`)."""
         name: str = self._need(self._ring).name
         return name
 
@@ -215,38 +210,31 @@ class Driver:
         if words[Word.DROP] or Mode(int(words[Word.MODE])) not in (Mode.HOLD, Mode.MOTION, Mode.STOP):
             return
         for job in (Job.HALT, Job.LEAVE):
-            self._wait(
-                job,
-                timeout_s=_CLOSE_PATIENCE_S,
-                patience_s=_CLOSE_PATIENCE_S,
-                awaited="rest",
-                advice=advise_rest,
-                stoppable=False,
-            )
+            self._wait_for_rest(job, patience_s=_CLOSE_PATIENCE_S)
+
+    def _wait_for_rest(
+        self, job: Job, timeout_s: float = _CLOSE_PATIENCE_S, patience_s: float | None = None
+    ) -> None:
+        self._wait(job, "rest", advise_rest, timeout_s, stoppable=False, patience_s=patience_s)
 
     # -- steps -----------------------------------------------------------------------------------------------
 
     def wait_quality(self, quality: str = "OK", *, cycles: int = 100, timeout_s: float = 60.0) -> LinkState:
-        """Wait until the controller has rated the link `quality` or better for `cycles` cycles on end."""
+        """Wait until the controller rates the link `quality` or better for `cycles` successive cycles."""
         try:
             least = Quality[quality.upper()]
         except KeyError:
             known = ", ".join(item.name for item in Quality)
             raise ConfigurationError(f"quality {quality!r} is unknown; choose one of {known}") from None
+        awaited = f"quality {least.name} for {cycles} cycles"
         self._wait(
-            Job.QUALITY,
-            a=cycles,
-            b=int(least),
-            timeout_s=timeout_s,
-            awaited=f"quality {least.name} for {cycles} cycles",
-            advice=advise_quality,
-            failure=NetworkError,
+            Job.QUALITY, awaited, advise_quality, timeout_s, a=cycles, b=int(least), failure=NetworkError
         )
         return self.state()
 
     @property
     def sets_load(self) -> bool:
-        """Whether the KRL program takes load data over the link, see `set_load`."""
+        """Whether the KRL program accepts load data over the link, see `set_load`."""
         return isinstance(find_handshake(self.link.handshake), IdentificationHandshake)
 
     def set_load(
@@ -257,10 +245,12 @@ class Driver:
         *,
         timeout_s: float = 10.0,
     ) -> LinkState:
-        """Put load data in force on the controller, which compensates gravity with them; in monitor mode.
+        """Set load data for the gravity compensation of the controller; in monitor mode.
 
-        mass : [kg]. com : centre of mass in the flange frame [m]. inertia : JX JY JZ about it, along the axes
-        of the flange frame [kg m2]. Raises ConfigurationError where the KRL program takes none.
+        mass : [kg]; com : centre of mass in the flange frame [m]
+        inertia : JX JY JZ about it, along the axes of the flange frame [kg m2]
+
+        Raises ConfigurationError if the KRL program accepts none.
         """
         if not self.sets_load:
             raise ConfigurationError(
@@ -271,12 +261,7 @@ class Driver:
         if mode != "mirror":
             raise RobotError(f"load data cannot change in mode {mode}; leave command mode first")
         control.plan[0] = (mass, *(1000.0 * value for value in com), *inertia)
-        self._wait(
-            Job.LOAD,
-            timeout_s=timeout_s,
-            awaited=f"load data of {mass:g} kg in force",
-            advice=advise_load,
-        )
+        self._wait(Job.LOAD, f"load data of {mass:g} kg in force", advise_load, timeout_s)
         return self.state()
 
     def enter_command(self, *, timeout_s: float = 120.0) -> LinkState:
@@ -285,23 +270,12 @@ class Driver:
         From then on the arm holds where the controller has it.
         """
         try:
-            self._wait(
-                Job.START,
-                timeout_s=timeout_s,
-                awaited="command mode with drives on",
-                advice=advise_command,
-            )
+            self._wait(Job.START, "command mode with drives on", advise_command, timeout_s)
         except BaseException:
-            # The request must not be granted after nobody waits for it any more.
+            # The request must not be granted later, with nobody waiting for it.
             if self._loop is not None:
                 with contextlib.suppress(LwrError):
-                    self._wait(
-                        Job.LEAVE,
-                        timeout_s=_CLOSE_PATIENCE_S,
-                        awaited="rest",
-                        advice=advise_rest,
-                        stoppable=False,
-                    )
+                    self._wait_for_rest(Job.LEAVE)
             raise
         return self.state()
 
@@ -312,9 +286,9 @@ class Driver:
         `progress` is called about ten times a second; an exception from it stops the arm and is passed on.
 
         Raises RefusedError, before anything moves, if the motion breaks a limit or begins elsewhere, and
-        RobotError if command mode is not on. What happens once it moves is in the outcome, not in an
-        exception.
+        RobotError outside command mode. Failures after the beginning are in the outcome, not raised.
         """
+        expect(motion, Motion, "motion to execute", "give a `Motion`, such as from `move_to`")
         control, state = self._need(self._control), self.state()
         if int(control.words[Word.STOP]) != self._stops_seen:
             self._stops_seen = int(control.words[Word.STOP])
@@ -350,20 +324,14 @@ class Driver:
         """Means over `cycles` cycles, in monitor mode or while holding in command mode."""
         if cycles < 1:
             raise ConfigurationError(f"mean over {cycles} cycles; take one at least")
-        self._wait(
-            Job.CYCLES,
-            a=cycles,
-            timeout_s=max(10.0, 20.0 * cycles * self.state().period_s),
-            awaited=f"{cycles} cycles",
-            advice=advise_monitor,
-            failure=NetworkError,
-        )
+        limit_s = max(10.0, 20.0 * cycles * self.state().period_s)
+        self._wait(Job.CYCLES, f"{cycles} cycles", advise_monitor, limit_s, a=cycles, failure=NetworkError)
         q, q_std, tau, tau_std, external, command = self._need(self._control).measured.copy()
         return Measured(cycles, q, q_std, tau, tau_std, external, command)
 
     def stop(self) -> LinkState:
         """Stop within the limits and wait until the commanded position rests."""
-        self._wait(Job.HALT, timeout_s=10.0, awaited="rest", advice=advise_rest, stoppable=False)
+        self._wait_for_rest(Job.HALT, 10.0)
         words = self._need(self._control).words
         self._stops_seen = int(words[Word.STOP])
         return self.state()
@@ -371,14 +339,14 @@ class Driver:
     def request_stop(self) -> None:
         """Ask for a jerk-limited stop and return at once; from any thread or signal handler.
 
-        It holds until a step notices it: a motion is stopped, a waiting step raises OperatorError, and a
-        motion that has not begun does not begin.
+        It holds until a step notices it: a motion is stopped or does not begin, a waiting step raises
+        OperatorError.
         """
         if self._control is not None:
             self._control.words[Word.STOP] += 1
 
     def drop_link(self) -> None:
-        """Answer no more, for good: the controller brakes by itself. From any thread or signal handler."""
+        """Stop answering for good: the controller brakes by itself. From any thread or signal handler."""
         if self._control is not None:
             self._control.words[Word.DROP] = 1
 
@@ -386,13 +354,7 @@ class Driver:
         """Ask the KRL program to stop commanding and wait for monitor mode; no effect after `drop_link`."""
         if Mode(int(self._need(self._control).words[Word.MODE])) is Mode.SILENT:
             return self.state()
-        self._wait(
-            Job.LEAVE,
-            timeout_s=timeout_s,
-            awaited="monitor mode",
-            advice=advise_leave,
-            stoppable=False,
-        )
+        self._wait(Job.LEAVE, "monitor mode", advise_leave, timeout_s, stoppable=False)
         return self.state()
 
     def state(self) -> LinkState:
@@ -405,9 +367,7 @@ class Driver:
         return self._rows(count)
 
     def latency_histogram(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Reply latencies since the connection began: upper edges of the bins [s] and counts; the last bin
-        holds all that is longer.
-        """
+        """Reply latencies since `connect`: upper edges of the bins [s] and counts; the last bin is open."""
         counts = self._need(self._control).latency.copy()
         edges = np.arange(1, len(counts) + 1, dtype=np.float64) * (BIN_NS * 1e-9)
         return edges, counts
@@ -417,7 +377,8 @@ class Driver:
     def record(
         self, path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes] | None = None
     ) -> None:
-        """Begin a session log at `path` with the next cycle; `metadata` as from `session_metadata`."""
+        """Begin a session log at `path` with the next cycle; `metadata` from `session_metadata`."""
+        path = as_path(path, "session log")
         self._need(self._recorder).open(
             SessionRequest(
                 path=path,
@@ -447,19 +408,19 @@ class Driver:
     def _wait(
         self,
         job: Job,
-        *,
-        timeout_s: float,
         awaited: str,
         advice: Callable[[LinkState], str],
+        timeout_s: float,
+        *,
         a: int = 0,
         b: int = 0,
         failure: type[LwrError] = RobotError,
         stoppable: bool = True,
         patience_s: float | None = None,
     ) -> None:
-        """Post a job and wait for its end; the error says what was awaited, what is seen, and what to do.
+        """Post a job and wait for its end; an error names the aim, the present state and the remedy.
 
-        The time limit counts cycles where there is a cycle, so that it means the same in lock step.
+        The time limit counts cycles as soon as there are any, so it has the same meaning in lock step.
         """
         state = self.state()
         limit = round(timeout_s / state.period_s) if state.period_s > 0.0 else 0
@@ -546,7 +507,7 @@ class Driver:
         return _PHASES.get(number) or names.get(number, "")
 
     def _recorder_trouble(self) -> LwrError | None:
-        """What is wrong with the recording; then the motion is stopped, for without data it is in vain."""
+        """A failure of the recording; it stops the motion, useless without data."""
         if not self._recording:
             return None
         try:
@@ -557,17 +518,10 @@ class Driver:
         return None
 
     def _give_up(self, error: BaseException) -> None:
-        """Stop what still moves before an exception leaves."""
+        """Stop a moving arm before an exception is passed on."""
         log.info("motion given up: %s", error)
         with contextlib.suppress(LwrError):
-            self._wait(
-                Job.HALT,
-                timeout_s=_CLOSE_PATIENCE_S,
-                awaited="rest",
-                advice=advise_rest,
-                stoppable=False,
-                patience_s=1.0,
-            )
+            self._wait_for_rest(Job.HALT, patience_s=1.0)
 
     def _failed(self, motion: Motion, error: LwrError) -> Outcome:
         row = int(self._need(self._control).words[Word.ROW])
@@ -607,7 +561,7 @@ class Driver:
 
 
 class _Watch:
-    """Notices that the loop process has ended, or in lock step that the other side has gone."""
+    """Notices the end of the loop process and, in lock step, of the other side."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -627,7 +581,7 @@ class _Watch:
             return
         cycles = int(driver._need(driver._control).words[Word.CYCLES])
         now = time.monotonic()
-        # A pause of this process itself tells nothing of the others, which may have stood still as well.
+        # A pause of this process is no silence of the others: they may have paused as well.
         self._silence_s += min(now - self._looked, _LONGEST_LOOK_S)
         self._looked = now
         if cycles != self._cycles:

@@ -1,17 +1,31 @@
-"""The guard of every cycle: position, velocity, acceleration and jerk of the float32 value that is about to
-be sent.
+"""The guard of every cycle, and the jerk-limited stop.
 
-With the rows x0..x3 sent at the cycles t0 < t1 < t2 < t3, the derivatives are divided differences,
+The guard checks position, velocity, acceleration and jerk of the float32 value about to be sent. With the
+rows x0..x3 sent at the cycles t0 < t1 < t2 < t3, the derivatives are divided differences,
 
-    v = (x3 - x2) / h3,   a = 2 (v - v') / (h3 + h2),   j = 3 (a - a') / (h3 + h2 + h1),
+    v = (x3 - x2) / h3,   a = 2 (v - v') / (h3 + h2),   j = 3 (a - a') / (h3 + h2 + h1).
 
-which for lost packets (h of several periods) stay within the bounds that hold on the full grid: a divided
-difference over some points of a grid is a weighted mean, with weights above zero, of those over neighbouring
-points.
+After lost packets (h of several periods) they keep the bounds of the full grid: a divided difference over
+some points of a grid is a mean, with positive weights, of those over neighbouring points.
 
-A float32 of magnitude 2 to 4 rad is rounded by up to 1.2e-7 rad. At 1 ms that alone makes 2.4e-4 rad/s, 0.48
-rad/s² and 950 rad/s³ of apparent motion, so each limit is widened by the largest amount that rounding can
-account for, and by nothing else.
+A float32 of magnitude 2 to 4 rad is rounded by up to 1.2e-7 rad. At 1 ms that alone makes 2.4e-4 rad/s,
+0.48 rad/s² and 950 rad/s³ of apparent motion. Each limit is widened by the largest such rounding, and by
+nothing else.
+
+The stop is exact in discrete time. From the last three commanded rows follow the discrete velocity
+v0 = (q0 - q1)/T and acceleration a0 = (q0 - 2 q1 + q2)/T². Ruckig's velocity interface brings (v0, a0) to
+rest in the shortest time with |a| <= A and |j| <= J (Berscheid and Kroeger 2021), each joint by itself. The
+rows are q(k) = q(k-1) + T v(kT). Then
+
+- first differences are v(kT), and second differences (v(kT) - v(kT - T))/T are means of a, so at most A;
+- third differences are at most J: within the profile as second differences of v, and across the beginning
+  because v(T) - v0 - T a0 is at most J T²/2. This leaves room to begin the profile at a0 + d with
+  |d| <= J T/2, half a period of jerk earlier; without it a stop at the peak of an acceleration would
+  overshoot by a0 T/2.
+
+So the stop keeps the limits in the discrete sense of guard and controller. The distance of a stop has a
+closed form, used to check a motion beforehand: wherever it is stopped, the arm stays inside its position
+limits.
 """
 
 from __future__ import annotations
@@ -21,10 +35,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from lwr_driver.arm import JOINTS, Limits
 
-__all__ = ["ROUNDING", "Guard", "Violation"]
+__all__ = ["ROUNDING", "Guard", "Stop", "Violation", "stop_extent"]
 
 # Half the spacing of float32 numbers between 2 and 4 rad; joint positions of the arm are below 3 rad.
 ROUNDING = 2.0**-23
@@ -35,7 +50,7 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True)
 class Violation:
-    """One limit that a row would break: joint index from 0, value and limit in SI units."""
+    """One limit broken by a row: joint index from 0, value and limit in SI units."""
 
     quantity: str
     joint: int
@@ -50,10 +65,10 @@ class Violation:
 
 
 class Guard:
-    """Watches the values that are sent, cycle by cycle.
+    """Checks the values to be sent, cycle by cycle.
 
-    limits : of the arm; where the controller has the arm outside the position limits already, it may rest
-        there and come back, but go no further
+    limits : of the arm; an arm already outside the position limits may rest there and come back, but go no
+        further
     period_s : time of one cycle [s]
     """
 
@@ -70,7 +85,7 @@ class Guard:
         self.reset(np.zeros(JOINTS, dtype=np.float32))
 
     def reset(self, q: NDArray[np.float32], v: NDArray[np.float64] | None = None) -> None:
-        """Begin at the value q that was sent in this cycle, at rest or with the velocity v [rad/s]."""
+        """Begin at the value q sent in this cycle, at rest or with the velocity v [rad/s]."""
         self._q = q.astype(np.float64)
         self._v, self._a = np.zeros(JOINTS) if v is None else v, np.zeros(JOINTS)
         self._v_error = 0.0 if v is None else 2.0 * ROUNDING / self._period
@@ -80,17 +95,17 @@ class Guard:
         self._outside = bool(np.any(self._bounds[0] > self._half))
 
     def copy(self) -> Guard:
-        """Another guard that has seen the same values."""
+        """Another guard in the same state."""
         twin = copy(self)
         twin._bounds = self._bounds.copy()
         return twin
 
     def scale_velocity(self, factor: float) -> None:
-        """Shrink the velocity limit by the controller's `safety_limits`, where that is below 1."""
+        """Reduce the velocity limit by the controller's `safety_limits` below 1."""
         self._bounds[1] = self._limits.v_max * (factor if 0.0 < factor < 1.0 else 1.0)
 
     def check(self, q: NDArray[np.float32], cycles: int, *, remember: bool = True) -> Violation | None:
-        """Why q must not be sent `cycles` cycles after the last value, or None; then it is remembered."""
+        """The limit broken by sending q `cycles` cycles after the last value, or None; then q is remembered."""
         h3 = cycles * self._period
         two, three = h3 + self._h2, h3 + self._h2 + self._h1
         x = q.astype(np.float64)
@@ -106,7 +121,7 @@ class Guard:
         excess = np.abs(values, out=self._excess)
         excess -= self._bounds
         excess -= errors
-        # Also false for values that are no numbers.
+        # Also false for NaN.
         if not excess.max() <= _SLACK:
             return self._violation(x)
         if not remember:
@@ -130,3 +145,112 @@ class Guard:
             return Violation("position", joint, float(x[joint]), float(edge[joint]))
         value, bound = abs(self._values[kind, joint]), self._bounds[kind, joint]
         return Violation(tuple(_UNITS)[kind], joint, float(value), float(bound))
+
+
+Rows = NDArray[np.float64]
+
+
+class Stop:
+    """Plans and executes jerk-limited stops, one at a time; all memory is allocated on construction.
+
+    limits : acceleration and jerk of the stop; period_s : time of one cycle [s]
+    """
+
+    def __init__(self, limits: Limits, period_s: float) -> None:
+        self._period, self._limits = period_s, limits
+        self._otg = Ruckig(JOINTS, period_s)
+        self._trajectory = Trajectory(JOINTS)
+        start = InputParameter(JOINTS)
+        start.control_interface = ControlInterface.Velocity
+        start.synchronization = Synchronization.No
+        start.current_position = [0.0] * JOINTS
+        start.target_velocity = [0.0] * JOINTS
+        start.target_acceleration = [0.0] * JOINTS
+        start.max_velocity = limits.v_max.tolist()
+        start.max_acceleration = limits.a_max.tolist()
+        start.max_jerk = limits.j_max.tolist()
+        self._start = start
+        self._q = np.zeros(JOINTS)
+        self._cycle = 0
+        self._cycles = 0
+
+    def begin(self, q0: Rows, q1: Rows, q2: Rows) -> None:
+        """Plan the stop from the rows commanded now, one and two cycles ago, each (7,) [rad].
+
+        Raises ValueError if no stop can be computed (rows not finite).
+        """
+        velocity = (q0 - q1) / self._period
+        acceleration = (q0 - 2.0 * q1 + q2) / self._period**2
+        if not (np.all(np.isfinite(velocity)) and np.all(np.isfinite(acceleration))):
+            raise ValueError("the last commanded rows are not finite")
+        acceleration = _let_go(self._limits, self._period, velocity, acceleration)
+        self._start.current_velocity = velocity.tolist()
+        self._start.current_acceleration = acceleration.tolist()
+        try:
+            result = self._otg.calculate(self._start, self._trajectory)
+        except RuntimeError as error:
+            raise ValueError(f"no stop from {velocity} rad/s, {acceleration} rad/s²: {error}") from error
+        if int(result) < 0:
+            raise ValueError(f"no stop from {velocity} rad/s, {acceleration} rad/s²: {result}")
+        self._q = q0.astype(np.float64)
+        self._cycle = 0
+        self._cycles = int(np.ceil(self._trajectory.duration / self._period - 1e-9))
+
+    def advance(self, cycles: int) -> Rows:
+        """Row `cycles` cycles further on, (7,) [rad]."""
+        for _ in range(min(cycles, self._cycles - self._cycle)):
+            self._cycle += 1
+            velocity = self._trajectory.at_time(self._cycle * self._period)[1]
+            self._q = self._q + self._period * np.array(velocity)
+        return self._q
+
+    @property
+    def finished(self) -> bool:
+        """Whether the commanded position rests."""
+        return self._cycle >= self._cycles
+
+
+def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, Rows]:
+    """Lowest and highest position and highest speed of a stop begun at any row of q.
+
+    q : (n, 7) [rad]; rows before the first equal the first
+
+    Returns three (n, 7): lowest position [rad], highest position [rad], highest speed [rad/s]. The positions
+    are bounds, too wide by about one period at the highest speed at most.
+    """
+    padded = np.vstack([q[:1], q[:1], q])
+    v = (padded[2:] - padded[1:-1]) / period_s
+    a = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) / period_s**2
+    a_max, j_max = limits.a_max, limits.j_max
+    a = _let_go(limits, period_s, v, a)
+    # Mirror each case so that the velocity is positive after a is brought to zero at full jerk. Then the stop
+    # has three phases: jerk downwards, acceleration at -peak, jerk back to zero.
+    sign = np.where(v + a * np.abs(a) / (2.0 * j_max) >= 0.0, 1.0, -1.0)
+    v, a = sign * v, sign * a
+    peak = np.minimum(np.sqrt(np.maximum(j_max * v + 0.5 * a**2, 0.0)), np.maximum(a_max, -a))
+    t1, t3 = (a + peak) / j_max, peak / j_max
+    v1 = v + a * t1 - 0.5 * j_max * t1**2
+    v2 = 0.5 * peak**2 / j_max
+    t2 = np.where(peak > 0.0, np.maximum(v1 - v2, 0.0) / np.where(peak > 0.0, peak, 1.0), 0.0)
+    x1 = v * t1 + 0.5 * a * t1**2 - j_max * t1**3 / 6.0
+    x2 = x1 + v1 * t2 - 0.5 * peak * t2**2
+    end = x2 + v2 * t3 - 0.5 * peak * t3**2 + j_max * t3**3 / 6.0
+    # A negative initial velocity changes sign once, in the first phase.
+    root = (a - np.sqrt(np.maximum(a**2 + 2.0 * j_max * v, 0.0))) / j_max
+    turn = np.where(v < 0.0, np.clip(root, 0.0, t1), 0.0)
+    back = v * turn + 0.5 * a * turn**2 - j_max * turn**3 / 6.0
+    peak_speed = np.where(a > 0.0, v + a**2 / (2.0 * j_max), v)
+    # T times the sum of v(kT) exceeds the integral only while v rises, by the height of the rise at most.
+    above = np.maximum(np.maximum(end, back), 0.0) + period_s * (peak_speed - v)
+    below = np.minimum(np.minimum(end, back), 0.0)
+    lowest = q + np.where(sign > 0.0, below, -above)
+    highest = q + np.where(sign > 0.0, above, -below)
+    return lowest, highest, np.maximum(np.abs(v), peak_speed)
+
+
+def _let_go(limits: Limits, period_s: float, v: Rows, a: Rows) -> Rows:
+    """First acceleration of the profile: a, shifted by up to half a period of jerk against the motion."""
+    excess = v + a * np.abs(a) / (2.0 * limits.j_max)
+    half = 0.5 * period_s * limits.j_max
+    moved = np.clip(a - excess / period_s, -limits.a_max, limits.a_max)
+    return np.clip(moved, a - half, a + half)

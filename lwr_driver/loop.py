@@ -1,11 +1,10 @@
 """The FRI loop: receive, judge, answer at once, write a row; nothing else.
 
-Outside command mode the answer is the mirror of the controller's own set point, in command mode what
-`lwr_driver.commander` says. Leaving command mode ends a motion for good; what was lost is never taken up
-again.
+Outside command mode the answer is the mirror of the controller's own set point, in command mode the value of
+`lwr_driver.commander`. Leaving command mode ends a motion for good; it is never resumed.
 
-Requests come through shared memory and are looked at once a cycle. In lock step the loop stands still between
-them, so that no virtual time passes while nobody asks for it.
+Requests come through shared memory and are read once a cycle. In lock step the loop stands still between
+requests, so no virtual time passes without one.
 """
 
 from __future__ import annotations
@@ -25,52 +24,40 @@ from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS, Limits
 from lwr_driver.commander import Commander
 from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
-from lwr_driver.rest import Rest
 from lwr_driver.ring import ROW, Ring
 
 if TYPE_CHECKING:
     from lwr_driver.turnaround import Turnaround
 
-__all__ = ["Loop", "LoopSettings"]
+__all__ = ["Loop", "LoopSettings", "Rest"]
 
-_IDLE_S = 0.0005  # pause of a loop in lock step that has nothing to do
-_SLICE_S = 0.02  # longest wait for a packet before requests and silence are looked at
+_IDLE_S = 0.0005  # pause of an idle loop in lock step
+_SLICE_S = 0.02  # longest wait for a packet between checks of requests and silence
 _FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated
 _RING_PATIENCE_S = 5.0
-# A loop that looks out for the packet does not sleep so long before it is due, at most this share of a cycle,
-# and so long after. Waking up can take a millisecond where the kernel works for another program and is not
-# PREEMPT_RT; that must be over when the packet comes.
+# Active waiting begins so long before a packet is due, at most this share of a cycle, and ends so long after.
+# On a kernel without PREEMPT_RT waking up can take a millisecond; it must be over when the packet comes.
 _LOOKOUT_S, _LOOKOUT_SHARE = 1.2e-3, 0.4
 _OVERDUE_S = 0.15e-3
-# Jobs that write nothing to the controller's program.
+# Jobs without a message to the KRL program.
 _LEAVE_ALONE = (Job.NONE, Job.MOTION, Job.CYCLES)
-_REMIND_S = 1.0  # silence in lock step after which the other side is told that nothing came
-_STILL_RAD = 1e-5  # a set point that moves by no more in a cycle rests
-# What a reason tells of the link: counter and word for it.
-_TOLD = (
+_REMIND_S = 1.0  # silence in lock step before a reminder to the other side
+_STILL_RAD = 1e-5  # largest step per cycle of a set point at rest
+# Counters of the link in a reason, with their words.
+_REPORTED = (
     ("lost", "lost"),
     ("reordered", "late"),
     ("suspect", "held back"),
     ("malformed", "malformed"),
     ("foreign", "foreign"),
 )
-_COUNTERS = (
-    (Word.LOST, "lost"),
-    (Word.REPEATED, "repeated"),
-    (Word.REORDERED, "reordered"),
-    (Word.SUSPECT, "suspect"),
-    (Word.MALFORMED, "malformed"),
-    (Word.FOREIGN, "foreign"),
-    (Word.RESTARTS, "restarts"),
-    (Word.UNREFLECTED, "unreflected"),
-    (Word.ANSWERED, "answered"),
-    (Word.RECEIVED, "received"),
-)
+_COUNTED = ("lost", "repeated", "reordered", "suspect", "malformed", "foreign", "restarts", "unreflected")
+_COUNTERS = tuple((Word[name.upper()], name) for name in (*_COUNTED, "answered", "received"))
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What the loop must know; see `lwr_driver.driver.LinkSettings` for the meaning."""
+    """Settings of the loop, as in `lwr_driver.link.LinkSettings`."""
 
     address: str
     port: int
@@ -82,16 +69,52 @@ class LoopSettings:
     joint_names: tuple[str, ...]
 
 
+class Rest:
+    """Means over some cycles; sums of deviations from the first one, against rounding."""
+
+    def __init__(self, remote: RemoteEnd) -> None:
+        msr = remote.msr
+        self._values = (
+            msr["msr_jnt_pos"],
+            msr["msr_jnt_trq"],
+            msr["est_ext_jnt_trq"],
+            remote.command["jnt_pos"],
+        )
+        self._count = 0
+        self._first = np.zeros((4, JOINTS))
+        self._sum, self._squares = np.zeros((4, JOINTS)), np.zeros((4, JOINTS))
+
+    def add(self, *, first: bool) -> int:
+        """Include the present cycle, restarting with the `first`; returns the number of cycles."""
+        if first:
+            self._count = 0
+            self._sum[:] = self._squares[:] = 0.0
+            for place, value in enumerate(self._values):
+                self._first[place] = value
+        for place, value in enumerate(self._values):
+            deviation = value - self._first[place]
+            self._sum[place] += deviation
+            self._squares[place] += deviation * deviation
+        self._count += 1
+        return self._count
+
+    def write(self, measured: NDArray[np.float64]) -> None:
+        """Fill (6, 7): mean q, std q, mean tau, std tau, mean external tau, mean command."""
+        mean = self._sum / self._count
+        std = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
+        mean += self._first
+        measured[0], measured[1], measured[2], measured[3] = mean[0], std[0], mean[1], std[1]
+        measured[4], measured[5] = mean[2], mean[3]
+
+
 class Loop:
     """One link to a controller, driven by requests in shared memory.
 
-    Usable in any process: `cycle` handles one packet, `run` goes on until it is told to quit.
+    Usable in any process: `cycle` handles one packet, `run` goes on until the request to quit.
 
-    settings, limits : see there. control : the shared memory. ring : rows for the recorder, None keeps none.
-
-    turnaround : looks out for the packet that is due, with its answer ready and those to the packets after it,
-    instead of sleeping until it comes, for the price of up to 1.35 ms of a processor in each cycle, 0.55 ms at
-    1 kHz; None without
+    control : the shared memory; ring : rows for the recorder, None keeps none
+    turnaround : waits actively for the next packet, with its answer and those to the following packets ready;
+        it costs up to 1.35 ms of a processor in each cycle, 0.55 ms at 1 kHz; None to sleep instead
     """
 
     def __init__(
@@ -99,7 +122,7 @@ class Loop:
     ) -> None:
         self._settings, self._control, self._ring = settings, control, ring
         self.turnaround: Turnaround | None = None
-        self._ready_in = Mode.MIRROR  # mode in which the answers that are ready hold
+        self._ready_in = Mode.MIRROR  # mode of the prepared answers
         self._handshake = find_handshake(settings.handshake)
         self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
         self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
@@ -114,7 +137,7 @@ class Loop:
         self._past_setpoints = [(unknown, 1)] * 3  # newest first, and the cycles to the one before
         self._limits, self._fastest = limits, limits.v_max
         self._doubted = self._held_back = False
-        self._let_brake = 0  # cycles in which a set point in motion was left to the controller
+        self._let_brake = 0  # cycles of a moving set point left to the controller
         self._misses, self._misses_before, self._missed_at = 0, 0, -_FEWEST_CYCLES
         self._counted_before = self.remote.counters()
         self._heard_s = self._reminded_s = time.monotonic()
@@ -136,13 +159,11 @@ class Loop:
 
     @property
     def mode(self) -> Mode:
-        """What the loop answers at present."""
+        """Present kind of answer."""
         return self._commander.mode
 
     def run(self, parent: int | None = None) -> None:
-        """Serve packets and requests until `QUIT` is set or the parent process is gone; stops a motion
-        first.
-        """
+        """Serve packets and requests until `QUIT` is set or the parent is gone; stops a motion first."""
         parent = os.getppid() if parent is None else parent
         commander = self._commander
         if self._ring is not None:
@@ -186,7 +207,7 @@ class Loop:
         return True
 
     def _up_to_date(self) -> bool:
-        """Whether every packet that was answered has been taken in."""
+        """Whether every answered packet has been processed."""
         return self.turnaround is None or not self.turnaround.waiting
 
     def _serve(self) -> None:
@@ -206,7 +227,7 @@ class Loop:
             self._ring.beat(time.monotonic_ns())
 
     def _look_out(self, turnaround: Turnaround, timeout_s: float) -> bool:
-        """Wait for a packet with the answer ready; False if none came. A new request is taken up at once."""
+        """Wait for a packet with the answer ready; False if none came. A new request is taken at once."""
         remote = self.remote
         again = not turnaround.next(more=self._commander.mode is self._ready_in)
         while again:
@@ -220,7 +241,7 @@ class Loop:
         return remote.receive(0.0, (turnaround.length, turnaround.source, turnaround.received_ns)) is not None
 
     def _make_ready(self, turnaround: Turnaround) -> None:
-        """Have the answers ready that the next packets get if they are regular ones, as far as they are known now."""
+        """Prepare the answers to the next packets, if these are regular, as far as known now."""
         seen, remote, commander = turnaround.disarm(), self.remote, self._commander
         self._take_request()
         asked = self._job is Job.MOTION
@@ -234,7 +255,7 @@ class Loop:
             or (stops and (begins or commander.mode is Mode.MOTION))
         ):
             return
-        # Other jobs may write to the controller's program with any answer. In lock step no packet waits.
+        # Other jobs may write to the KRL program with any answer. In lock step no packet waits.
         several = self._job in _LEAVE_ALONE and not self._settings.lock_step
         most = turnaround.most if several else 1
         foreseen = commander.foresee(self._sequence + 1, self._a if begins else 0, most)
@@ -249,14 +270,14 @@ class Loop:
         turnaround.arm(remote.controller, counter, ready, self._sample_time, commander.target, foreseen.room)
 
     def _disagree(self) -> None:
-        """What was sent is not what the loop decides: cannot be, and if it is, nothing is certain any more."""
+        """Fall silent after an answer sent against the loop's decision; this cannot happen."""
         self._commander.fall_silent(Result.GUARD, "an answer was sent that the loop would not have given")
 
     def remind(self) -> None:
-        """Lock step: after a while without a packet, say that all that came has been answered.
+        """Lock step: after some silence, repeat that all packets have been answered.
 
-        One datagram lost on either way would else make both sides wait for ever, and in command mode a driver
-        that thinks for long would seem to be gone. What is held back on purpose is no reason to remind.
+        Otherwise both sides would wait for ever after one lost datagram, and in command mode a slow driver
+        would seem to be gone. An answer held back on purpose is no reason to remind.
         """
         now = time.monotonic()
         answering = self._answered and self._commander.mode is not Mode.SILENT
@@ -275,11 +296,11 @@ class Loop:
     # -- what to answer --------------------------------------------------------------------------------------
 
     def _decide(self, sequence: int, elapsed: int, sent: bool) -> NDArray[np.float32] | None:
-        """The position to send, or None for the mirror, or for nothing where the answer is held back.
+        """The position to send, or None for the mirror, or for no answer at all if it is held back.
 
-        sent : the answer has left already; what is asked for since then is for the next packet
+        sent : the answer has left already; new requests are for the next packet
 
-        In command mode the mirror of a set point in motion would stop the arm at once. Without an answer the
+        In command mode the mirror of a moving set point would stop the arm at once. Without an answer the
         controller brakes it.
         """
         remote, commander = self.remote, self._commander
@@ -296,7 +317,7 @@ class Loop:
         past[2], past[1], past[0] = past[1], past[0], (setpoint, elapsed)
         if remote.restarts != self._restarts:
             self._restarts = remote.restarts
-            # The request to start was made to the program before and is cleared; it is made anew.
+            # The restart has cleared the request to start; it is made anew.
             self._begun = self._begun and self._job is not Job.START
             self._lose("the controller was started again")
         elif elapsed > self._silence_cycles:
@@ -341,11 +362,10 @@ class Loop:
         return commander.command(sequence)
 
     def _step(self) -> NDArray[np.float64] | None:
-        """Step of the controller's set point per cycle (7,) [rad], zero at rest; None where it cannot be
-        told.
+        """Step of the controller's set point per cycle (7,) [rad], zero at rest; None if unknown.
 
-        It cannot where the packet or the one before is the first, or one of them may be damaged: the steps
-        must agree as far as the acceleration limits go.
+        It is unknown at the first two packets, and if one of the last may be damaged: the steps must agree
+        within the acceleration limits.
         """
         (now, cycles), (before, cycles_before), (first, _) = self._past_setpoints
         step = (now - before).astype(np.float64) / cycles
@@ -353,29 +373,28 @@ class Loop:
             return np.zeros(JOINTS)
         change = np.abs(step - (before - first) / cycles_before)
         room = self._limits.a_max * self._period**2 * (cycles + cycles_before) / 2.0 + _STILL_RAD
-        # Also false for what is no number.
+        # Also false for NaN.
         return step if np.all(change <= room) and np.all(np.abs(step) <= self._fastest) else None
 
     def _may_stop(self, setpoint: NDArray[np.float32], elapsed: int) -> bool:
-        """Whether a set point that moves after command mode was lost is to be stopped by commands.
+        """Whether commands shall stop a set point still moving after a loss of command mode.
 
-        It is if it does what was sent last. What a controller does after missing answers, no command can take
-        up within the limits of the motion before; it is left to brake, unless it goes on as if nobody had to
-        answer.
+        They shall if it follows the value sent last. No command can continue the braking of a controller
+        after missing answers within the limits; it is left to brake, unless it goes on without answers.
         """
         self._let_brake += elapsed
         return self._commander.follows(setpoint) or self._let_brake > _FEWEST_CYCLES
 
     def _doubtful(self) -> bool:
-        """Whether a packet that would end command mode is the first of its kind and was not asked for.
+        """Whether this is the first, unrequested packet to end command mode.
 
-        One packet alone may be damaged: what is commanded goes on, the next packet tells.
+        One packet alone may be damaged: commands go on, and the next packet decides.
         """
         in_command = self._commander.mode not in (Mode.MIRROR, Mode.SILENT)
         return in_command and not self._doubted and self._job is not Job.LEAVE
 
     def _set_period(self, sample_time_s: float) -> None:
-        """Take the controller's sample time: float32 on the wire, a whole number of milliseconds in truth."""
+        """Take the controller's sample time: float32 on the wire, in truth whole milliseconds."""
         if self._sample_time:
             self._lose(f"the controller changed its sample time to {sample_time_s:.4g} s")
         self._sample_time = sample_time_s
@@ -386,7 +405,7 @@ class Loop:
         self._commander.set_period(self._period)
 
     def _leave(self) -> None:
-        """The controller does not follow, or no longer: say why if it did before."""
+        """End command mode, with the reason, if the controller no longer follows."""
         if self._commander.mode is Mode.MIRROR:
             return
         remote = self.remote
@@ -411,15 +430,15 @@ class Loop:
             return
         reason += self._meanwhile()
         self._commander.lose(result, reason)
-        # The KRL program must not start command mode again before it is asked to.
+        # The KRL program must not start command mode again without a request.
         self._handshake.request_stop(self.remote.command, self.remote.msr)
         if self._job is Job.START:
             self._finish(result, reason)
 
     def _meanwhile(self) -> str:
-        """What else the link has seen in command mode, for a reason."""
+        """Irregular packets in command mode, for a reason."""
         now, before = self.remote.counters(), self._counted_before
-        seen = [f"{now[name] - before[name]} {word}" for name, word in _TOLD if now[name] > before[name]]
+        seen = [f"{now[name] - before[name]} {word}" for name, word in _REPORTED if now[name] > before[name]]
         if now["malformed"] > before["malformed"]:
             by = self.remote.malformed_by
             seen.append(f"most for its {max(by, key=lambda fault: by[fault]).value}")
@@ -430,7 +449,7 @@ class Loop:
         if self._ring is not None:
             self._ring.beat(round(now * 1e9))
         self._take_request()
-        self._tell()
+        self._publish_counters()
         self._words[Word.MODE] = int(self._commander.mode)
         if self._commander.mode is Mode.SILENT and self._job in (Job.MOTION, Job.HALT):
             self._finish(
@@ -466,7 +485,7 @@ class Loop:
                 words[Word.ROW] = -1
 
     def _advance_job(self, elapsed: int) -> None:
-        """See whether what was asked for has come about."""
+        """Finish the job if its aim is reached or its limit exceeded."""
         job, remote = self._job, self.remote
         if job is Job.NONE:
             return
@@ -480,7 +499,7 @@ class Loop:
             self._run_length = self._run_length + 1 if remote.quality >= self._b else 0
             done = self._run_length >= self._a
         elif job is Job.START:
-            # After a fallback, seen or not, the program wants its stop acknowledged before it takes a start.
+            # After a fallback, seen or not, the program needs its stop acknowledged before a start.
             self._begun = self._begun and not handshake.fallen(remote.msr)
             self._begun = self._begun or handshake.stopped(remote.msr) or remote.state == State.CMD
             if self._begun:
@@ -529,7 +548,7 @@ class Loop:
         if answered:
             control.latency[min((sent_ns - received_ns) // BIN_NS, len(control.latency) - 1)] += 1
         if self._settings.lock_step:
-            # The clock of a log in lock step is the controller's: the same run gives the same log.
+            # In lock step the log uses the controller's clock: the same run gives the same log.
             received_ns = sent_ns = remote.sequence * round(self._period * 1e9)
         fields["t_recv"][0] = received_ns
         fields["t_send"][0] = sent_ns if answered else 0
@@ -550,10 +569,10 @@ class Loop:
         words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), index
         if index >= 0:
             words[Word.ROW] = index
-        self._tell()
+        self._publish_counters()
 
-    def _tell(self) -> None:
-        """Counters and the last note of the link into the shared memory."""
+    def _publish_counters(self) -> None:
+        """Write counters and the last note of the link into the shared memory."""
         remote, words = self.remote, self._words
         for word, name in _COUNTERS:
             words[word] = getattr(remote, name)

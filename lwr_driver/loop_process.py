@@ -1,8 +1,8 @@
 """The FRI loop in a process of its own: the handle that starts and ends it, and its entry.
 
-The process is a fresh interpreter that imports numpy, ruckig and `fri` only, and with real-time rights the
-compiled `lwr_driver.turnaround`. It inherits the shared memory and a pipe for one line, in which it says that
-it is ready or why not. It ignores Ctrl-C, and ends when its parent is gone.
+The process is a fresh interpreter. It imports numpy, ruckig and `fri` only, and with real-time rights the
+compiled `lwr_driver.turnaround`. It inherits the shared memory and a pipe, and writes one line to the pipe:
+ready, or the reason why not. It ignores Ctrl-C, and ends when its parent is gone.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ _END_TIMEOUT_S = 3.0
 
 @dataclass(frozen=True)
 class Scheduling:
-    """How the process runs. required : refuse to start without the rights; apply : ask for them at all."""
+    """Scheduling of the process.
+
+    apply : ask for real-time rights; required : refuse to start without them
+    """
 
     apply: bool
     required: bool
@@ -56,16 +59,11 @@ class LoopProcess:
     Raises NetworkError if the address cannot be bound or required rights are missing, ConfigurationError if
     the process cannot be started.
 
-    rights : what the process was granted; port : UDP port it listens on; pid : of the process
+    rights : rights of the process; port : its UDP port; pid : its process id
     """
 
     def __init__(
-        self,
-        settings: LoopSettings,
-        limits: Limits,
-        control: Control,
-        ring: Ring,
-        scheduling: Scheduling,
+        self, settings: LoopSettings, limits: Limits, control: Control, ring: Ring, scheduling: Scheduling
     ) -> None:
         self._control = control
         order = {
@@ -119,7 +117,7 @@ class LoopProcess:
             )
 
     def stop(self) -> None:
-        """Tell the process to end, which it does after stopping a motion; kill it if it does not."""
+        """Ask the process to stop a motion and end; kill it if it does not."""
         if self._process.poll() is None:
             self._control.words[Word.QUIT] = 1
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -191,15 +189,15 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> Rights:
-    """Take the rights that are granted; with all of them, and a processor of its own, the loop looks out."""
+    """Take the granted rights; with all of them and a processor of its own, the loop waits actively."""
     turnaround, advice = None, []
     if realtime.assess(scheduling.priority).ok:
-        # Before the rights: a compiler wants the processor for long, and all that it touches would be locked.
+        # Before the rights: the compiler needs much time, and all its memory would be locked.
         try:
             from lwr_driver.turnaround import Turnaround
 
             turnaround = Turnaround(loop.remote.descriptor, loop.remote.buffer, control.words)
-        except Exception as error:  # whatever keeps a compiler from working, the loop does without
+        except Exception as error:  # the loop works without a compiler
             remedy = f"answers take longer; see that numba works and may write its cache ({error})"
             advice.append(Shortage("the code that answers at once cannot be compiled", remedy))
     rights = realtime.set_up(scheduling.priority, scheduling.cpu)

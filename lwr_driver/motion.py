@@ -1,4 +1,4 @@
-"""A motion: the joint positions to command, one row per FRI cycle, and the checks that it must pass first."""
+"""A motion: the joint positions to command, one row per FRI cycle, and the checks before it may run."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from ruckig import (
 
 from fri.errors import ConfigurationError, RefusedError
 from lwr_driver.arm import JOINTS, Arm
-from lwr_driver.guard import ROUNDING
-from lwr_driver.stop import stop_extent
+from lwr_driver.configuration import expect
+from lwr_driver.guard import ROUNDING, stop_extent
 
 __all__ = ["Extreme", "Motion", "check_motion", "check_start", "extremes", "move_to"]
+
+Rows = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Rows of joint positions, one per FRI cycle, sent as float32.
 
-    q : (n, 7) float64, joint positions [rad]; row 0 is sent in the cycle in which the motion begins
+    q : (n, 7) float64, joint positions [rad]; row 0 is sent in the first cycle of the motion
     period_s : time between rows [s]
     phases : (first row, name) in rising order of rows; rows before the first phase have no name
     """
@@ -37,7 +39,10 @@ class Motion:
     phases: tuple[tuple[int, str], ...] = ()
 
     def __post_init__(self) -> None:
-        q = np.array(self.q, dtype=np.float64)
+        try:
+            q = np.array(self.q, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ConfigurationError(f"motion: q is no array of numbers ({error}); give (rows, 7)") from error
         if q.ndim != 2 or q.shape[1] != JOINTS or q.shape[0] < 1:
             raise ConfigurationError(
                 f"motion of shape {q.shape}; it must be (rows, {JOINTS}) with a row at least"
@@ -67,7 +72,7 @@ class Motion:
         return (len(self.q) - 1) * self.period_s
 
     def join(self, other: Motion) -> Motion:
-        """This motion followed at once by `other`, whose first row repeats our last and is dropped."""
+        """This motion followed at once by `other`; its first row must repeat our last row and is dropped."""
         if other.period_s != self.period_s:
             raise ConfigurationError(
                 f"motions of periods {self.period_s} s and {other.period_s} s cannot be joined"
@@ -87,10 +92,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Extreme:
-    """The moment of a motion that comes closest to one kind of limit, or exceeds it most.
+    """The closest approach of a motion to one kind of limit, or its largest excess.
 
-    quantity : `position`, `velocity`, `acceleration`, `jerk` of the rows as they are sent, or `stop
-        position`, `stop velocity`: where a stop begun at that row would lead
+    quantity : `position`, `velocity`, `acceleration`, `jerk` of the rows as sent; `stop position`,
+        `stop velocity` of a stop begun at that row
     joint : name; row, time_s : place in the motion; value, limit : in `unit`; ok : whether the limit is kept
     """
 
@@ -112,18 +117,16 @@ class Extreme:
 
 
 def extremes(arm: Arm, motion: Motion) -> tuple[Extreme, ...]:
-    """For each kind of limit the worst moment of the motion, judged on the float32 values that are really
-    sent.
+    """The worst moment of the motion for each kind of limit, on the float32 values as sent.
 
     The arm rests at the first row before the motion and at the last row after it. Derivatives are differences
-    of rows, as in `lwr_driver.guard`; each limit is widened by what rounding to float32 can account for. A
-    motion that passes can be stopped at any row without leaving the limits (`lwr_driver.stop`).
+    of rows; each limit is widened by the rounding to float32. A motion within the limits can be stopped at
+    any row without leaving them (`lwr_driver.guard`).
     """
     limits, period = arm.limits, motion.period_s
     sent = motion.q.astype(np.float32).astype(np.float64)
     planned, rounded = _at_rest_around(motion.q), _at_rest_around(sent)
-    # Rows that were float32 already carry their rounding; of all others the plan itself must keep the limits
-    # too.
+    # Rows in float32 carry their rounding already; otherwise the plan itself must keep the limits too.
     exact = not np.array_equal(sent, motion.q)
     found = [_nearest(arm, motion, "position", sent, sent, ROUNDING)]
     for order, (quantity, unit, bound) in enumerate(
@@ -139,7 +142,7 @@ def extremes(arm: Arm, motion: Motion) -> tuple[Extreme, ...]:
         slack = 2.0**order * ROUNDING / period**order
         ok = bool(np.all(np.abs(rounded) <= bound + slack + 1e-9))
         ok &= not exact or bool(np.all(np.abs(planned) <= bound * (1.0 + 1e-6) + 1e-9))
-        # Entry i ends at row i + order of the padded rows, which is row i + order - 3 of the motion.
+        # Entry i ends at row i + order of the padded rows, row i + order - 3 of the motion.
         found.append(_largest(arm, motion, quantity, unit, np.abs(planned), bound, order - 3, ok))
     lowest, highest, speed = stop_extent(limits, period, motion.q)
     found.append(_nearest(arm, motion, "stop position", lowest, highest, ROUNDING))
@@ -158,9 +161,7 @@ def check_motion(arm: Arm, motion: Motion) -> None:
 
 
 def check_start(arm: Arm, motion: Motion, q_command: NDArray[np.float64]) -> None:
-    """Raise RefusedError unless row 0, rounded to float32, is the value `q_command` that is being sent, (7,)
-    [rad].
-    """
+    """Raise RefusedError unless row 0, rounded to float32, is the commanded position `q_command`, (7,) [rad]."""
     gap = np.abs(motion.q[0].astype(np.float32).astype(np.float64) - q_command)
     joint = int(np.argmax(gap))
     if gap[joint] > 0.0:
@@ -179,17 +180,23 @@ def move_to(
     speed_scale: float = 0.2,
     phase: str = "move_to_start",
 ) -> Motion:
-    """Jerk-limited straight line in joint space, at rest at both ends, in the shortest whole number of
-    periods.
+    """Jerk-limited straight line in joint space, from rest to rest in the fewest whole periods.
 
-    start, goal : (7,) [rad]. speed_scale : of the velocity limits, above 0 to 1; acceleration is scaled by
-    its square root, jerk not at all. The line is straight (phase synchronisation), so checking it is checking
-    what is executed. Raises RefusedError if start or goal is outside the position limits.
+    start, goal : (7,) [rad]
+    speed_scale : share of the velocity limits, above 0 to 1; acceleration scales with its square root, jerk
+        does not
+
+    All joints keep to the line (phase synchronisation), so a check of the line covers the motion.
+    Raises RefusedError if start or goal is outside the position limits.
     """
+    expect(arm, Arm, "arm of a motion", "give `Arm.load()`")
     if not 0.0 < speed_scale <= 1.0:
         raise ConfigurationError(f"speed_scale {speed_scale} is not above 0 and at most 1")
     limits = arm.limits
-    ends = np.array([start, goal], dtype=np.float64)
+    try:
+        ends = np.array([start, goal], dtype=np.float64)
+    except (TypeError, ValueError):
+        ends = np.empty(0)
     if ends.shape != (2, JOINTS) or not np.all(np.isfinite(ends)):
         raise ConfigurationError(f"start and goal must be {JOINTS} finite joint positions each")
     for name, q in zip(("start", "goal"), ends, strict=True):
@@ -207,8 +214,8 @@ def move_to(
     request.synchronization = Synchronization.Phase
     request.duration_discretization = DurationDiscretization.Discrete
     request.current_position, request.target_position = ends[0].tolist(), ends[1].tolist()
-    # A little below the limits: rounding uses them up to the last digit, and a stop begun while accelerating
-    # towards full speed passes it by J T²/8 (`lwr_driver.stop`).
+    # A little below the limits: rounding uses up the last digit, and a stop begun while accelerating towards
+    # full speed exceeds it by J T²/8 (`lwr_driver.guard`).
     keep = 1.0 - 1e-6
     full = keep * limits.v_max - 0.13 * limits.j_max * period_s**2
     request.max_velocity = (speed_scale * np.maximum(full, 0.1 * limits.v_max)).tolist()
@@ -233,14 +240,7 @@ def _at_rest_around(q: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.vstack([q[:1], q[:1], q[:1], q, q[-1:], q[-1:], q[-1:]])
 
 
-def _nearest(
-    arm: Arm,
-    motion: Motion,
-    quantity: str,
-    lowest: NDArray[np.float64],
-    highest: NDArray[np.float64],
-    slack: float,
-) -> Extreme:
+def _nearest(arm: Arm, motion: Motion, quantity: str, lowest: Rows, highest: Rows, slack: float) -> Extreme:
     """The row and joint with the least room to a position limit."""
     limits = arm.limits
     below, above = lowest - limits.q_low, limits.q_high - highest
@@ -248,40 +248,20 @@ def _nearest(
     upper = above[row, joint] <= below[row, joint]
     value, limit = (highest, limits.q_high) if upper else (lowest, limits.q_low)
     ok = min(below[row, joint], above[row, joint]) >= -slack
-    return _extreme(arm, motion, quantity, "rad", row, joint, value[row, joint], limit[joint], bool(ok))
+    found = float(value[row, joint]), float(limit[joint]), "rad", bool(ok)
+    return Extreme(quantity, arm.joint_names[joint], row, row * motion.period_s, *found)
 
 
 def _largest(
-    arm: Arm,
-    motion: Motion,
-    quantity: str,
-    unit: str,
-    value: NDArray[np.float64],
-    limit: NDArray[np.float64],
-    shift: int,
-    ok: bool,
+    arm: Arm, motion: Motion, quantity: str, unit: str, value: Rows, limit: Rows, shift: int, ok: bool
 ) -> Extreme:
     """The row and joint with the largest share of a limit; entry i of `value` belongs to row i + shift."""
     index, joint = _place((value / limit).argmax(), value.shape)
     row = min(max(index + shift, 0), len(motion) - 1)
-    return _extreme(arm, motion, quantity, unit, row, joint, value[index, joint], limit[joint], ok)
+    found = float(value[index, joint]), float(limit[joint]), unit, ok
+    return Extreme(quantity, arm.joint_names[joint], row, row * motion.period_s, *found)
 
 
 def _place(flat: np.intp, shape: tuple[int, ...]) -> tuple[int, int]:
     row, joint = np.unravel_index(flat, shape)
     return int(row), int(joint)
-
-
-def _extreme(
-    arm: Arm,
-    motion: Motion,
-    quantity: str,
-    unit: str,
-    row: int,
-    joint: int,
-    value: float,
-    limit: float,
-    ok: bool,
-) -> Extreme:
-    name, time_s = arm.joint_names[joint], row * motion.period_s
-    return Extreme(quantity, name, row, time_s, float(value), float(limit), unit, ok)

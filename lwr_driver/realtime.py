@@ -1,7 +1,7 @@
-"""Real-time set-up of a process on Linux: what is needed, what is missing, and how to get it.
+"""Real-time set-up of a process on Linux, with the remedy for each missing right; work without Ctrl-C.
 
-Measured on a busy computer, it is the scheduler and not the language that decides whether an answer leaves
-within a millisecond: SCHED_FIFO, a processor of its own and locked memory.
+Measured on a busy computer, the scheduler and not the language decides whether an answer leaves within a
+millisecond: SCHED_FIFO, a processor of its own and locked memory.
 """
 
 from __future__ import annotations
@@ -12,20 +12,24 @@ import gc
 import os
 import platform
 import resource
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from fri.errors import NetworkError
 
-__all__ = ["Rights", "Shortage", "assess", "set_up"]
+__all__ = ["Rights", "Shortage", "assess", "set_up", "undisturbed"]
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _PREFAULT_BYTES = 16 * 2**20
 _LIMITS_FILE = "/etc/security/limits.d/realtime.conf"
-_LOCK_BYTES = 768 * 2**20  # a loop that has loaded the compiler takes some 500 MiB
+_LOCK_BYTES = 768 * 2**20  # a loop with the compiler loaded takes some 500 MiB
 
 # Held open for the life of the process: closing it lets the processor sleep deeply again.
 _awake: list[int] = []
@@ -33,7 +37,7 @@ _awake: list[int] = []
 
 @dataclass(frozen=True)
 class Shortage:
-    """A right that is missing: what it is, why it counts, and how to get it."""
+    """A missing right and its remedy."""
 
     what: str
     remedy: str
@@ -44,10 +48,10 @@ class Shortage:
 
 @dataclass(frozen=True)
 class Rights:
-    """What the process has and lacks.
+    """Rights of a process.
 
-    missing : without these no cycle is safe; advice : would make the timing better
-    processor : that the loop is bound to, None for any
+    missing : without these no cycle is safe; advice : improvements of the timing
+    processor : of the loop, None for any
     """
 
     missing: tuple[Shortage, ...] = ()
@@ -70,7 +74,7 @@ class Rights:
 
 
 def assess(priority: int = 80) -> Rights:
-    """What a real-time process started by this user would have and lack; changes nothing."""
+    """Rights of a real-time process started by this user; changes nothing."""
     missing, advice = [], []
     capabilities = _capabilities()
     ceiling = resource.getrlimit(resource.RLIMIT_RTPRIO)[1]
@@ -90,9 +94,9 @@ def assess(priority: int = 80) -> Rights:
 
 
 def set_up(priority: int = 80, processor: int | None = None) -> Rights:
-    """Make this process a real-time one as far as it may; returns what was not granted.
+    """Make this process a real-time one as far as allowed; returns its rights.
 
-    priority : of SCHED_FIFO, 1 to 99. processor : to be bound to; None takes an isolated one, else the last.
+    priority : of SCHED_FIFO, 1 to 99; processor : to bind to, None for an isolated one, else the last
     """
     missing, advice = [], []
     kernel = _kernel_advice()
@@ -182,7 +186,7 @@ def _choose(processor: int | None) -> int | None:
 
 
 def _prefault() -> None:
-    """Have the heap grown and its pages present, and keep it so: no page faults later."""
+    """Grow the heap, touch its pages and keep them: no page faults later."""
     library = ctypes.CDLL(None, use_errno=True)
     with contextlib.suppress(AttributeError):
         library.mallopt(_M_TRIM_THRESHOLD, -1)
@@ -190,3 +194,28 @@ def _prefault() -> None:
     block = bytearray(_PREFAULT_BYTES)
     block[:: resource.getpagesize()] = b"\1" * len(block[:: resource.getpagesize()])
     del block
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold back a KeyboardInterrupt until the block is left: acquiring or giving back is not interrupted.
+
+    Only in the main thread with Python's own handler; elsewhere Ctrl-C raises none.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    interrupted = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal interrupted
+        interrupted = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if interrupted:
+        raise KeyboardInterrupt

@@ -1,10 +1,9 @@
-"""The recorder: a process of its own that turns the ring of the FRI loop into session logs.
+"""The recorder: a process of its own, from the ring of the FRI loop to session logs.
 
-`Recorder` is the handle in the process that drives the experiment. It starts the other process as a fresh
-interpreter (nothing inherited but one socket), which attaches to the ring and drains it all the time; rows
-that arrive while no session is open are dropped. Requests and answers go over the socket. The recorder
-outlives Ctrl-C, and when the process that started it vanishes, or the FRI loop does, it ends the open session
-with exit status `fail` and a reason.
+`Recorder` is the handle in the driving process. It starts the recorder as a fresh interpreter with one
+inherited socket for requests and answers. The recorder attaches to the ring and drains it all the time; rows
+outside a session are dropped. It outlives Ctrl-C. When the driving process or the FRI loop vanishes, it ends
+the open session with exit status `fail` and a reason.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError, LwrError
-from lwr_driver.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.ring import Ring
+from lwr_driver.session.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.session.writer import ExitStatus
 
 __all__ = ["Recorded", "Recorder", "SessionRequest"]
@@ -79,7 +78,7 @@ class _Failure:
 
 @dataclass(frozen=True)
 class _Event:
-    """Something that went wrong between requests: the failure, and how the session ended through it."""
+    """A failure between requests, and how it ended the session."""
 
     failure: _Failure
     recorded: Recorded | None
@@ -89,11 +88,10 @@ class Recorder:
     """Handle of the recorder process. A context manager; leaving it ends an open session with `fail`.
 
     ring : made by this process
-    heartbeat_timeout_s : silence of the loop after which it counts as dead; None watches its process only
-    nice : how far the recorder steps back behind other processes
+    heartbeat_timeout_s : after so much silence the loop counts as dead; None watches its process only
+    nice : nice value of the recorder
 
-    Every call may raise DataError if the recorder process died; what it wrote before can be read and
-    recovered.
+    Every call may raise DataError if the recorder process died; its file can be read and recovered.
     """
 
     def __init__(self, ring: Ring, *, heartbeat_timeout_s: float | None = 2.0, nice: int = _NICE) -> None:
@@ -132,13 +130,8 @@ class Recorder:
         return self._process.pid
 
     @property
-    def path(self) -> Path | None:
-        """File of the open session."""
-        return self._path
-
-    @property
     def lag(self) -> int:
-        """Rows that the loop has published and the recorder has not yet taken."""
+        """Rows published by the loop and not yet taken."""
         return self.ring.head - self.ring.tail
 
     def open(self, request: SessionRequest) -> None:
@@ -153,7 +146,7 @@ class Recorder:
     def add_phases(self, names: Sequence[str]) -> int:
         """Add phase names to the open session; returns the number of the first, for the rows' `phase`.
 
-        Raises what has ended the session, if something has.
+        Raises the failure that ended the session, if any.
         """
         try:
             first: int = self._ask(_Phases(tuple(names)))
@@ -167,14 +160,14 @@ class Recorder:
     ) -> Recorded:
         """End the session with all rows published until now, or until row number `upto`.
 
-        A session that has ended already by a failure (disk full, loop dead) is returned as it ended then.
+        For a session already ended by a failure (disk full, loop dead), that end is returned.
         """
         answer: Recorded = self._ask(_Close(exit_status, reason, self.ring.head if upto is None else upto))
         self._path = None
         return answer
 
     def check(self) -> None:
-        """Raise what went wrong since the session was opened, such as a full disk; never waits."""
+        """Raise a failure since the session was opened, such as a full disk; never waits."""
         self._drain()
         if self._events:
             raise self._events[0].failure.error()
@@ -197,9 +190,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _ask(self, message: object) -> Any:
@@ -264,15 +255,15 @@ class _Server:
         self._recording: Recording | None = None
         self._ended: Recorded | None = None
         self._overruns = 0
-        self.told_to_end = ""
+        self.end_reason = ""
 
     def run(self) -> None:
-        """Serve until told to stop or until nobody is left to serve."""
+        """Serve until a request to stop, or until the driving process is gone."""
         self._connection.send("ready")
         busy = False
         while True:
-            if self.told_to_end:
-                self._end_by_failure(self.told_to_end)
+            if self.end_reason:
+                self._end_by_failure(self.end_reason)
                 return
             try:
                 if self._connection.poll(0 if busy else _PAUSE_S) and not self._answer(
@@ -300,7 +291,7 @@ class _Server:
                 self._drain(None)
                 self._end_by_failure("the recorder was stopped before the session was closed")
                 return False
-        except Exception as error:  # whatever a request brings about, the recorder goes on
+        except Exception as error:  # the recorder goes on after any failed request
             self._connection.send(_Failure.of(error))
         return True
 
@@ -329,12 +320,12 @@ class _Server:
         return self._ring.overruns - self._overruns
 
     def _drain(self, upto: int | None) -> int:
-        """Record all rows there are, or those before row number `upto`; returns how many."""
+        """Record all rows, or those before row number `upto`; returns their number."""
         rows = self._ring.take(upto)
         if len(rows) and self._recording is not None:
             try:
                 self._recording.write(rows)
-            except Exception as error:  # the session ends in order, whatever the rows hold
+            except Exception as error:  # the session ends in order, also on impossible rows
                 self._ring.release(len(rows))
                 self._end_by_failure(str(error), _Failure.of(error))
                 return len(rows)
@@ -381,7 +372,7 @@ def main(arguments: Sequence[str]) -> None:
     server = _Server(connection, ring, None if timeout == "none" else float(timeout))
 
     def end(number: int, frame: FrameType | None) -> None:
-        server.told_to_end = f"the recorder was ended by {signal.Signals(number).name}"
+        server.end_reason = f"the recorder was ended by {signal.Signals(number).name}"
 
     signal.signal(signal.SIGTERM, end)
     try:
@@ -391,7 +382,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _step_back(nice: int) -> None:
-    """Ordinary scheduling, also if the parent is a real-time process, and behind the others."""
+    """Ordinary scheduling with a nice value, also below a real-time parent."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
@@ -399,7 +390,7 @@ def _step_back(nice: int) -> None:
 
 
 def _alive(pid: int) -> bool:
-    """Whether a process runs; one that waits to be reaped does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,9 +1,8 @@
 """The shared-memory ring between the FRI loop and the recorder: one writer, one reader, rows of fixed size.
 
-The loop fills `Ring.row` and calls `publish`, which copies the row into its slot and then advances the head;
-it never waits, allocates or calls the system. When the ring is full the new row is dropped and counted, so
-that a reader never sees a row that is half overwritten. The reader takes rows with `take` and frees them with
-`release`.
+The loop fills `Ring.row` and calls `publish`: it copies the row into its slot, then advances the head; it
+never waits, allocates or calls the system. If the ring is full, the new row is dropped and counted, so a
+reader never sees a half overwritten row. The reader takes rows with `take` and frees them with `release`.
 
 Each counter is an aligned 8-byte word in a cache line of its own, written by one side only. The order "row
 first, head second" is kept by the total store order of x86-64, the architecture of the controller PCs.
@@ -16,7 +15,6 @@ import sys
 import threading
 import time
 from multiprocessing import resource_tracker, shared_memory
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -28,17 +26,17 @@ from fri.packets import CMD, MSR
 __all__ = ["CAPACITY", "NO_PHASE", "ROW", "Ring"]
 
 CAPACITY = 8192
-"""Rows of a ring unless told otherwise: 8 s at 1 kHz, 11 MB."""
+"""Default number of rows: 8 s at 1 kHz, 11 MB."""
 
 NO_PHASE = -1
-"""Value of `phase` in rows that belong to no phase."""
+"""Value of `phase` in rows without a phase."""
 
 ROW = np.dtype(
     [
         ("t_recv", "<i8"),  # CLOCK_MONOTONIC when the packet was received [ns]
         ("t_send", "<i8"),  # CLOCK_MONOTONIC after the answer was sent [ns], 0 without an answer
         ("sequence", "<i8"),  # packet count of the controller, unwrapped
-        ("plan_index", "<i8"),  # row of the motion that was sent, -1 outside a motion
+        ("plan_index", "<i8"),  # row of the motion, -1 outside one
         ("phase", "<i4"),  # index into the recorder's phase names, NO_PHASE for none
         ("answered", "u1"),  # 1 if `cmd` was sent
         ("flags", "u1"),  # free for the loop, not recorded
@@ -47,10 +45,7 @@ ROW = np.dtype(
         ("cmd", CMD),
     ]
 )
-"""One FRI cycle: what was received, what was answered, and when.
-
-No gaps, so a copy is a copy of all bytes.
-"""
+"""One FRI cycle: packet, answer, and their times. No gaps: a copy holds all bytes."""
 
 _MAGIC = 0x4C57525F52494E47
 _LINE = 8  # words of a cache line
@@ -64,8 +59,7 @@ _attach_lock = threading.Lock()
 class Ring:
     """A ring of `ROW`s in shared memory, made by `create` and opened in the other process by `attach`.
 
-    The process that created it calls `unlink` when both sides are done; `close` only drops this process's
-    view.
+    The creating process calls `unlink` when both sides are done; `close` only drops this process's view.
     """
 
     def __init__(self, memory: shared_memory.SharedMemory, *, owner: bool) -> None:
@@ -97,10 +91,7 @@ class Ring:
 
     @classmethod
     def create(cls, capacity: int = CAPACITY) -> Ring:
-        """A new ring with every page touched, so that the loop takes no page fault.
-
-        Needs `unlink` at the end.
-        """
+        """A new ring with every page touched, against page faults of the loop. Needs `unlink` at the end."""
         if capacity < 2:
             raise ConfigurationError(f"ring of {capacity} rows; it needs 2 at least")
         size = _HEADER_BYTES + capacity * ROW.itemsize
@@ -119,7 +110,7 @@ class Ring:
 
     @classmethod
     def attach(cls, name: str) -> Ring:
-        """The ring that another process created under `name`."""
+        """The ring created by another process under `name`."""
         try:
             memory = _attach(name)
         except (OSError, ValueError) as error:
@@ -134,7 +125,7 @@ class Ring:
 
     @property
     def name(self) -> str:
-        """Name under which the other process attaches."""
+        """Name of the memory, for `attach`."""
         return self._memory.name
 
     # -- the side of the loop --------------------------------------------------------------------------------
@@ -146,7 +137,7 @@ class Ring:
         self._writer[0] = os.getpid()
 
     def stop_writing(self) -> None:
-        """Declare that the writer ends on purpose: its silence is no fault any more."""
+        """Declare an intended end: silence of the writer is no fault any more."""
         self._writer[0] = 0
 
     def publish(self) -> bool:
@@ -187,7 +178,7 @@ class Ring:
     def peek(self, count: int) -> NDArray[Any]:
         """Copy of the newest rows, oldest first, at most `count`, for onlookers: nothing is freed.
 
-        Rows that the writer overtook meanwhile are left out.
+        Rows overwritten meanwhile are left out.
         """
         head = int(self._head[0])
         first = max(head - min(count, self.capacity // 2), 0)
@@ -209,7 +200,7 @@ class Ring:
 
     @property
     def free(self) -> int:
-        """Rows that can be published before the ring is full; a loop in lock step waits for some."""
+        """Rows left before the ring is full; a loop in lock step waits for some."""
         return self.capacity - int(self._head[0] - self._tail[0])
 
     @property
@@ -245,16 +236,14 @@ class Ring:
             self._memory.unlink()
 
     def __del__(self) -> None:
-        # Else the shared memory complains at exit that views of it are still around.
+        # Else the shared memory complains at exit about remaining views.
         if hasattr(self, "_bytes"):
             self.close()
 
     def __enter__(self) -> Ring:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._owner:
             self.unlink()
         else:
@@ -264,8 +253,8 @@ class Ring:
 def _attach(name: str) -> shared_memory.SharedMemory:
     if sys.version_info >= (3, 13):
         return shared_memory.SharedMemory(name=name, track=False)
-    # Before 3.13 attaching registers the memory with this process's resource tracker, which then removes it
-    # under the creator's feet when this process ends.
+    # Before 3.13 attaching registers the memory with this process's resource tracker; at its end the tracker
+    # would remove memory still in use by the creator.
     with _attach_lock:
         register = resource_tracker.register
         resource_tracker.register = lambda *_: None

@@ -1,21 +1,21 @@
-"""Answers that are ready before their packets come, and the compiled wait that sends them.
+"""Answers ready before their packets come, and the compiled wait that sends them.
 
-Between a packet and its answer the loop's own code takes some 50 us, and several times that when a long cycle
-has let the processor's caches go cold. So the loop decides in the quiet part of a cycle what the next packet
-gets if it is a regular one: the next of the controller's packets, in command mode with drives on and nothing
-new in it but measurements. This module waits for that packet in compiled code, looks whether it is regular,
-and sends the answer, which the guard has passed for exactly that cycle. Whatever is not regular, be it a
-packet or a request of the driver, is left to the loop as if this module were not there.
+Between a packet and its answer the loop's own code takes some 50 us, and several times as long with cold
+caches after a long cycle. So in the quiet part of a cycle the loop decides the answer to the next packet, if
+that is a regular one: the next of the controller's packets, in command mode with drives on, with new
+measurements and nothing else. This module waits for the packet in compiled code, checks whether it is
+regular, and sends the answer, already passed by the guard for exactly this cycle. Any other packet, and any
+request of the driver, is left to the loop.
 
-Afterwards the loop takes the packet through its ordinary code, which comes to the same answer from the same
+Afterwards the loop processes the packet in its ordinary code and comes to the same answer from the same
 numbers; it compares the bytes and does not send again.
 
-A computer that stood still for some cycles finds their packets waiting. Where the answers to several packets are
-known beforehand, all that wait and are regular are answered one after the other, each as if it had come alone,
-before the loop's own code takes them in turn; it would stay late for much longer if they had to wait for that.
+After a pause of the computer several packets may wait. As far as their answers are known beforehand, regular
+ones are answered one after the other, as if each had come alone; only then does the loop's own code process
+them in turn. In the other order it would stay late for much longer.
 
-Importing this module compiles it, or takes the compiled code from the cache, and loads the compiler's 300 MB;
-only a loop with real-time rights does.
+Importing this module compiles it, or loads the compiled code from the cache, and loads the compiler's
+300 MB; only a loop with real-time rights does.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = ["Turnaround"]
 _MOST = 16
 
 _NOTHING, _ARRIVED, _ASKED = 0, 1, 2
-# Asleep it looks at the requests so often: a motion that is asked for shortly before a packet is begun by it.
+# Longest sleep between two checks of the requests: a motion requested shortly before a packet begins with it.
 _NAP_NS = 250_000
 _CLOCK_MONOTONIC, _DONTWAIT, _POLLIN = 1, int(socket.MSG_DONTWAIT), int(select.POLLIN)
 _SOCKADDR = struct.Struct("!2s H 4s 8x")
@@ -68,9 +68,9 @@ _COMMANDING, _BEST, _DRIVES, _POSITION = (
     ALL_DRIVES,
     int(Control.POSITION),
 )
-# Each value within these keeps the norms within those that `fri.packets` allows.
+# Values within these keep the norms within the limits of `fri.packets`.
 _TURN, _TORQUE = 2.0 * pi, 1000.0
-# An argument of the compiled code and no constant in it, since the cache would not notice that they moved.
+# An argument of the compiled code, not a constant: the cache would not notice a change.
 _WATCHED = np.array([Word.REQUEST, Word.STOP, Word.DROP, Word.QUIT], np.int64)
 
 _recvfrom: Any = types.ExternalFunction(
@@ -99,9 +99,7 @@ def _asked(words: Any, seen: Any, watched: Any) -> Any:
 
 @njit("boolean(uint16[::1], float32[::1], int64, float32, float32[::1], float32)", cache=True)
 def _regular(shorts: Any, floats: Any, sequence: Any, sample_time: Any, sent: Any, room: Any) -> Any:
-    """Whether the measurement is the one that the answer is for; comparisons are false for what is no
-    number.
-    """
+    """Whether the prepared answer belongs to this measurement; comparisons are false for NaN."""
     good = (
         shorts[_AT_SIZE] == MSR_SIZE
         and shorts[_AT_ID] == MSR_ID
@@ -126,7 +124,7 @@ def _regular(shorts: Any, floats: Any, sequence: Any, sample_time: Any, sent: An
             and abs(q - sent[joint]) <= room
             and abs((krl + offset) - sent[joint]) <= room
         )
-    # Last, so that all of it is at hand when the packet comes: it is looked at before, too.
+    # Last, so that calls before the packet load the code and data of all the rest.
     return good and shorts[_AT_SEQ] == sequence
 
 
@@ -181,14 +179,14 @@ def _turn(
     asleep: Any,
     patience: Any,
 ) -> Any:
-    """Wait, and answer regular packets; see `Turnaround.wait`. How it ended, and how many datagrams are taken.
+    """Wait, and answer regular packets; see `Turnaround.wait`. Returns the status and the number of datagrams.
 
-    The first `taken` of them have their answers. After the one that is waited for come those that wait, as long as
+    The first `taken` datagrams have their answers. After the awaited one, waiting ones are answered as long as
     they are regular and an answer is ready.
 
-    ends : sockaddr_in of the senders. answers, targets : by counter modulo their number, `ready` of them from
-    `sequence` on. sent : value sent before them. found : length, instants of arrival and of the answer [ns], for
-    each datagram. scratch : pollfd, time, length of an address. awake, asleep, patience : from now [ns]
+    ends : sockaddr_in of the senders; answers, targets : by counter modulo their number, `ready` of them from
+    `sequence` on; sent : value sent before them; found : length, instants of arrival and of the answer [ns] of
+    each datagram; scratch : pollfd, time, length of an address; awake, asleep, patience : from now [ns]
     """
     time = scratch[1:3]
     start = _now(time)
@@ -199,7 +197,7 @@ def _turn(
         if passed >= patience:
             return _NOTHING, taken
         if awake <= passed < asleep:
-            # Of the packet before: what is found does not matter, only that the code and the data are at hand.
+            # On the packet before, to keep code and data in the caches; the result does not matter.
             scratch[4] = _regular(shorts[0], floats[0], sequence, sample_time, sent, room)
             continue
         nap = min(_NAP_NS, patience - passed)
@@ -232,13 +230,12 @@ def _turn(
 
 
 class Turnaround:
-    """Waits for a packet on the socket `descriptor`, and answers regular ones; what comes is put into `buffer`
-    [bytes], one datagram after the other.
+    """Waits for packets on the socket `descriptor`, answers regular ones, and puts them into `buffer` in turn.
 
-    words : shared words of `Control`; a request that is new keeps a packet from being answered here
+    words : shared words of `Control`; after a new request no packet is answered here
 
-    most : packets that answers may be ready for
-    arrived : whether there is a datagram in the buffer; sent : and it has been answered
+    most : largest number of prepared answers
+    arrived : whether there is a datagram in the buffer; sent : whether it has been answered
     length, source : of the datagram; received_ns, sent_ns : CLOCK_MONOTONIC
     """
 
@@ -255,19 +252,19 @@ class Turnaround:
         self._last = np.zeros(JOINTS, np.float32)
         self._ready, self._sequence, self._sample_time, self._room = 0, 0, 0.0, 0.0
         self._place, self._taken = 0, 0
-        # By their counter modulo their number.
+        # Indexed by counter modulo `most`.
         self._answers = np.zeros((self.most, CMD_SIZE), np.uint8)
         self._targets = np.zeros((self.most, JOINTS), np.float32)
         self.arrived = self.sent = False
 
     def disarm(self) -> NDArray[np.int64]:
-        """Have nothing ready; the words (64,) as they are now, to which requests are compared."""
+        """Discard all answers; returns the present words (64,), the reference for new requests."""
         self._ready = 0
         self._seen[:] = self._words
         return self._seen
 
     def slot(self, counter: int, target: NDArray[np.float32]) -> memoryview:
-        """Where the answer to the packet with that counter, with the value `target` (7,) [rad], is to be written."""
+        """Memory for the answer to the packet with this counter, of the value `target` (7,) [rad]."""
         place = counter % self.most
         self._targets[place] = target
         return self._answers[place].data
@@ -281,10 +278,10 @@ class Turnaround:
         last: NDArray[np.float32],
         room: float,
     ) -> None:
-        """Have answers ready for `ready` packets with the counters from `sequence` on, from `controller`.
+        """Declare the answers ready for `ready` packets from `controller`, with counters from `sequence` on.
 
-        sample_time_s : that the packets must name. last, room : value sent last (7,) [rad], and how far the
-        measured position and the set point may be from the value sent before them
+        sample_time_s : required in the packets; last : value sent last (7,) [rad]; room : largest distance of
+        measured position and set point from the value sent before [rad]
         """
         host, port = controller
         family = socket.AF_INET.to_bytes(2, "little")
@@ -292,13 +289,14 @@ class Turnaround:
         self._controller[:] = np.frombuffer(address, np.int64)
         self._sequence, self._sample_time = sequence, sample_time_s
         self._last[:] = last
-        # As float32, and no wider.
+        # As float32, never wider.
         self._room = float(np.nextafter(np.float32(room), np.float32(0.0)))
         self._ready = ready
 
     def wait(self, awake_ns: int, asleep_ns: int, patience_ns: int) -> bool:
-        """Wait for a datagram for `patience_ns`, from `awake_ns` until `asleep_ns` without sleeping, all from
-        now on; what came is in the attributes. True if a new request ended the waiting.
+        """Wait for a datagram for `patience_ns`, without sleep from `awake_ns` until `asleep_ns`, all from now.
+
+        The result is in the attributes; returns True if a new request ended the wait.
         """
         self._taken, self._place = 0, -1
         asked = self._run(awake_ns, asleep_ns, patience_ns)
@@ -334,13 +332,13 @@ class Turnaround:
 
     @property
     def waiting(self) -> int:
-        """Datagrams that were taken and are still to be put into the buffer."""
+        """Datagrams taken and not yet put into the buffer."""
         return max(self._taken - self._place - 1, 0)
 
     def next(self, *, more: bool) -> bool:
-        """Put the next of the datagrams that were taken into the buffer; False if there is none.
+        """Put the next taken datagram into the buffer; False if there is none.
 
-        more : whether those that came meanwhile get the answers that are left; these must still hold
+        more : answer datagrams of the meantime with the remaining answers; these must still hold
         """
         if more and 0 < self._taken < self._ready and self._found[self._taken - 1, 2] > 0:
             self._run(0, 0, 0)
@@ -353,7 +351,7 @@ class Turnaround:
 
     @property
     def answer_bytes(self) -> memoryview:
-        """The 376 bytes that the datagram in the buffer was answered with, if it was."""
+        """The 376 bytes of the answer to the datagram in the buffer, if it was sent."""
         return self._answers[(self._sequence + self._place) % self.most].data
 
     @property
@@ -363,16 +361,16 @@ class Turnaround:
 
     @property
     def source(self) -> tuple[str, int]:
-        """Host and port that it came from."""
+        """Host and port of its sender."""
         _, port, host = _SOCKADDR.unpack(self._ends[self._place].tobytes())
         return socket.inet_ntoa(host), port
 
     @property
     def received_ns(self) -> int:
-        """When it came."""
+        """Time of its arrival [ns]."""
         return int(self._found[self._place, 1])
 
     @property
     def sent_ns(self) -> int:
-        """When the answer had been sent, 0 for not at all."""
+        """Time after its answer was sent, 0 without one [ns]."""
         return int(self._found[self._place, 2])

@@ -1,1 +1,1 @@
-"""What a person drives: `lwr-run` and the experiment sequence."""
+"""The user's programs: command line, experiment, doctor, preflight, preview, report."""

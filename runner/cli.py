@@ -1,4 +1,4 @@
-"""`lwr-run`: the commands a person types; each verb is a module of its own, imported when it is used."""
+"""`lwr-run`: the command line. Modules of commands are imported on use."""
 
 from __future__ import annotations
 
@@ -12,33 +12,38 @@ import click
 
 from fri.errors import LwrError, OperatorError
 
-# Before numpy is imported: the matrices are small, and a second BLAS thread costs more than it gives.
+# Before the import of numpy: for small matrices a second BLAS thread costs time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __all__ = ["main"]
 
 VERBS = {
-    "doctor": "is this computer ready, and the link, and the controller?",
-    "experiment": "plan, drive, log, swap the payload, estimate: the whole chain",
-    "plan": "an optimal exciting motion inside all limits",
-    "check": "dry run of an experiment file: every check, no motion",
-    "preview": "the planned motion in 3D in the browser, before anything moves",
+    "doctor": "examine this computer, the link and the controller",
+    "experiment": "the whole chain: plan, drive, log, swap the payload, estimate",
+    "plan": "an optimal exciting motion within all limits",
+    "check": "every check of an experiment file, without motion",
+    "preview": "the planned motion in 3D in the browser",
     "report": "report.html of a finished experiment, figures as SVG",
     "emulator": "run the emulated controller and arm until interrupted",
     "identify": "estimate a model from session logs",
-    "validate": "hold a model against sessions that it has not seen",
-    "commission": "learn the healthy arm, for later diagnoses to be held against",
-    "diagnose": "what the simulation gets wrong, by cause and joint; extends the model",
-    "compare": "two models, parameter by parameter, with significance",
+    "validate": "test a model on sessions it was not fitted to",
+    "commission": "record a healthy-arm baseline",
+    "diagnose": "model errors by cause and joint, and an extended model",
+    "compare": "significant differences between two models",
     "payload": "the payload's ten parameters from a known arm and one session",
     "export": "a model as URDF, MJCF, or stand-alone C and numpy code",
-    "info": "what a session log contains",
-    "recover": "make a session log whole whose recorder was killed",
+    "info": "summary of a session log",
+    "recover": "repair the log of a killed recorder",
     "attach": "add a controller's trace file to a session log",
-    "import": "turn other people's CSV and NPZ files into a session log",
-    "completion": "what bash, zsh or fish need to complete commands and options",
+    "import": "convert CSV and NPZ recordings to a session log",
+    "completion": "completion script for bash, zsh or fish",
 }
-MODULES = {"import": "import_log"}
+FAMILIES = {
+    "setup": ("doctor", "emulator", "completion"),
+    "motions": ("plan", "check", "preview"),
+    "models": ("validate", "compare", "payload", "export"),
+    "logs": ("report", "info", "recover", "attach", "import"),
+}
 
 EXIT_CODES = """\b
 Exit codes:
@@ -49,18 +54,19 @@ Exit codes:
 
 
 class Verbs(click.Group):
-    """A group whose commands are imported only when they are called, so that help is instant."""
+    """A group with commands imported on use, for instant help."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in the order in which a person meets them."""
+        """Names in the order of use."""
         return list(VERBS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The command of that name, imported now."""
         if cmd_name not in VERBS:
             return None
-        module = importlib.import_module(f"runner.commands.{MODULES.get(cmd_name, cmd_name)}")
-        command: click.Command = module.command
+        family = next((family for family, verbs in FAMILIES.items() if cmd_name in verbs), cmd_name)
+        module = importlib.import_module(f"runner.commands.{family}")
+        command: click.Command = getattr(module, "command" if family == cmd_name else f"{cmd_name}_command")
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -69,7 +75,7 @@ class Verbs(click.Group):
             formatter.write_dl(list(VERBS.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; an error of ours becomes one message and its exit code."""
+        """Run the command; an `LwrError` becomes one message and an exit code."""
         try:
             return super().invoke(ctx)
         except LwrError as error:
@@ -81,7 +87,7 @@ class Verbs(click.Group):
 
 
 @click.group(cls=Verbs, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-v", "--verbose", count=True, help="Say more: -v for what happens, -vv for every detail.")
+@click.option("-v", "--verbose", count=True, help="Log more: -v progress, -vv every detail.")
 @click.version_option(package_name="lwr-identification", prog_name="lwr-run")
 def main(verbose: int) -> None:
     """Identify the dynamics of a KUKA LWR4+: drive the arm, log the motion, estimate the model.

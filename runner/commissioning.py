@@ -6,13 +6,12 @@ from pathlib import Path
 
 from fri.errors import OperatorError, RobotError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from runner.experiment import Run
+from lwr_driver.arm.cell import Cell
+from runner.experiment import Progress, Run
 from runner.experiment_file import Experiment
 from runner.laboratory import Laboratory
 from runner.planning import Excitations
-from runner.progress import Progress
-from runner.status import StatusLine
+from runner.terminal import StatusLine
 
 __all__ = ["record_sets"]
 

@@ -1,25 +1,69 @@
-"""What this computer brings to the link: address, port, real-time rights, kernel, clock, disk, versions."""
+"""This computer: address, port, real-time rights, kernel, clock, disk, versions."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import fcntl
+import functools
 import os
 import platform
 import shutil
 import socket
 import struct
+import subprocess
 import textwrap
 from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
 from fri.errors import LwrError, NetworkError, RefusedError
 from lwr_driver.realtime import assess
-from runner.versions import versions
 
-__all__ = ["Finding", "Interface", "Verdict", "examine_computer", "find_interface"]
+__all__ = [
+    "Finding", "Interface", "Verdict", "examine_computer", "find_interface", "git_commit", "software",
+    "versions",
+]  # fmt: skip
+
+_PACKAGES = ("numpy", "scipy", "pin", "ruckig", "numba", "mcap")
+_DISTRIBUTION = "lwr-identification"
+
+
+def software() -> str:
+    """Name and version of this software."""
+    return f"{_DISTRIBUTION} {metadata.version(_DISTRIBUTION)}"
+
+
+@functools.cache
+def git_commit() -> str:
+    """Commit of the running checkout, with `+` after local changes; empty outside of a checkout."""
+    root = Path(__file__).resolve().parents[1]
+    try:
+        commit = _git(root, "rev-parse", "HEAD")
+        return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def versions() -> dict[str, str]:
+    """Versions by package, with Python, the platform and the commit of this software."""
+    found = {name: metadata.version(name) for name in _PACKAGES}
+    return {
+        "software": software(),
+        "git_commit": git_commit(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **found,
+    }
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["git", *arguments], cwd=root, capture_output=True, text=True, timeout=10, check=True
+    )
+    return done.stdout.strip()
+
 
 Verdict = Literal["ok", "advice", "fail"]
 
@@ -34,9 +78,9 @@ _MARKS = {"ok": "ok  ", "advice": "note", "fail": "FAIL"}
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at: what was found, what is wanted, and what to do.
+    """One item: value, limit, verdict and advice.
 
-    who : the error that a failure stands for, by who must act; it gives the exit code
+    who : error class of a failure, by the person who must act; it gives the exit code.
     """
 
     subject: str
@@ -62,7 +106,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Interface:
-    """A network interface by name, and the counters that the kernel keeps of it."""
+    """A network interface by name, with the kernel's counters."""
 
     name: str
 
@@ -79,7 +123,7 @@ class Interface:
 
 
 def find_interface(address: str) -> Interface | None:
-    """The interface that carries the IPv4 address, None if none does."""
+    """The interface with this IPv4 address, or None."""
     wanted = socket.inet_aton(address)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
@@ -91,10 +135,9 @@ def find_interface(address: str) -> Interface | None:
 
 
 def examine_computer(address: str, port: int, folder: Path, *, realtime: bool) -> list[Finding]:
-    """Look at everything that needs no controller.
+    """Every finding without a controller.
 
-    address, port : where the PC's end listens. folder : where the logs go
-    realtime : whether real-time rights are needed, as they are for a real arm
+    address, port : of the PC's end. folder : of the logs. realtime : real-time rights are needed (a real arm).
     """
     return [
         _interface(address),
@@ -172,7 +215,7 @@ def _processors() -> Finding:
             governors.add(path.read_text().strip())
     value = f"{count}" + (f", governor {'/'.join(sorted(governors))}" if governors else "")
     if count < 2:
-        return Finding("processors", value, "2", "advice", "the loop shares one with everything else")
+        return Finding("processors", value, "2", "advice", "the loop shares it with all other processes")
     if governors - {"performance"}:
         return Finding(
             "processors", value, "performance", "advice", "sudo cpupower frequency-set -g performance"
@@ -187,13 +230,13 @@ def _clock_source() -> Finding:
     except OSError:
         return Finding("clock source", "unknown", "a fast one", "advice", f"{path} cannot be read")
     if source not in _GOOD_CLOCKS:
-        advice = "reading it takes microseconds; see the kernel's messages for why tsc was given up"
+        advice = "reading it takes microseconds; the kernel's messages explain why tsc was given up"
         return Finding("clock source", source, "tsc", "advice", advice)
     return Finding("clock source", source, "tsc or as good", "ok")
 
 
 def _clock_time() -> Finding:
-    """Whether the clock is kept right; the logs carry its time. Measurements do not depend on it."""
+    """Synchronisation of the clock; only the dates in the logs depend on it."""
     status = -1
     with contextlib.suppress(OSError, AttributeError):
         status = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))

@@ -1,13 +1,21 @@
-"""The doctor: is this computer ready, and the link, and the controller? Each item with limit and advice."""
+"""The doctor: examination of this computer, the link and the controller, each item with limit and advice.
+
+For the link, the port is first observed without an answer, to recognise any sender. Then the driver's own loop
+answers for some seconds in monitor mode, without motion.
+"""
 
 from __future__ import annotations
 
+import socket
+import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import LwrError, NetworkError, RobotError
 from fri.handshake import IdentificationHandshake, find_handshake
@@ -17,13 +25,19 @@ from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings, LinkState
 from lwr_driver.link import advise_quality
 from runner.computer import Finding, Verdict, examine_computer, find_interface
-from runner.link_test import Heard, LinkTest, exercise, listen
 
-__all__ = ["Examination", "Patient", "examine", "judge_heard", "judge_link"]
+__all__ = [
+    "Examination", "Heard", "LinkTest", "Patient", "examine", "exercise", "judge_heard", "judge_link",
+    "listen",
+]  # fmt: skip
 
-GOOD_SHARE = 0.99
-POOR_SHARE = 0.95
-WARM = 60.0
+_HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
+_LARGEST = 65535
+_SLICE_S = 0.2
+_REPORT_S = 0.5
+_GOOD_SHARE = 0.99
+_POOR_SHARE = 0.95
+_WARM = 60.0
 # Upper edges of the printed histogram [us].
 _STEPS = (20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
 _BAR = 40
@@ -32,11 +46,156 @@ _RANKS = ("UNACCEPTABLE", "BAD", "OK", "PERFECT")
 
 
 @dataclass(frozen=True)
-class Patient:
-    """What is examined: this computer's end of the link, and what is expected at the other.
+class Heard:
+    """Datagrams received without an answer.
 
-    counter_int : number of `$FRI_TO_INT` that counts fresh motor torques, None where none are expected
-    realtime : whether real-time rights are needed
+    kinds : counts by (source address, bytes, datagram id); the id is -1 for datagrams too short for one.
+    """
+
+    waited_s: float
+    kinds: Counter[tuple[str, int, int]] = field(default_factory=Counter)
+
+    @property
+    def fri(self) -> tuple[str, ...]:
+        """Senders of FRI 1.0."""
+        return tuple(sorted({k[0] for k in self.kinds if k[1:] == (MSR_SIZE, MSR_ID)}))
+
+    def __str__(self) -> str:
+        if not self.kinds:
+            return "nothing"
+        parts = []
+        for (source, size, number), count in self.kinds.most_common(4):
+            name = f"id 0x{number:04x}" if number >= 0 else "no id"
+            parts.append(f"{count} datagrams of {size} bytes with {name} from {source}")
+        return ", ".join(parts)
+
+
+def listen(
+    address: str,
+    port: int,
+    controller: str | None,
+    wait_s: float,
+    report: Callable[[float, Heard], None] | None = None,
+) -> Heard:
+    """Wait for an FRI packet of the controller, at most `wait_s`, without an answer.
+
+    report : called about twice a second with the elapsed time and the datagrams so far.
+    """
+    kinds: Counter[tuple[str, int, int]] = Counter()
+    began = time.monotonic()
+    reported = began
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind((address, port))
+        while True:
+            waited = time.monotonic() - began
+            heard = Heard(waited, kinds)
+            if waited >= wait_s or (heard.fri and (controller is None or controller in heard.fri)):
+                return heard
+            if report is not None and time.monotonic() - reported >= _REPORT_S:
+                reported = time.monotonic()
+                report(waited, heard)
+            end.settimeout(max(1e-3, min(_SLICE_S, wait_s - waited)))
+            try:
+                datagram, source = end.recvfrom(_LARGEST)
+            except TimeoutError:
+                continue
+            number = -1
+            if len(datagram) >= _HEADER.itemsize:
+                number = int(np.frombuffer(datagram, _HEADER, 1)[0]["datagram_id"])
+            kinds[(source[0], len(datagram), number)] += 1
+
+
+@dataclass(frozen=True, eq=False)
+class LinkTest:
+    """The link over `seconds`, with every packet answered by its mirror.
+
+    start, end : states before and after. worst_quality : lowest quality. edges, counts : histogram of the reply
+    latency, upper edges [s]. msr : the last packet, dtype `fri.packets.MSR`, shape (). fresh : increments of the
+    motor torques' counter, None without one. trouble : error at an early end.
+    """
+
+    seconds: float
+    start: LinkState
+    end: LinkState
+    worst_quality: str
+    edges: NDArray[np.float64]
+    counts: NDArray[np.int64]
+    msr: Any
+    fresh: int | None = None
+    trouble: LwrError | None = None
+
+    @property
+    def packets(self) -> int:
+        """Packets received in the time."""
+        return self.end.received - self.start.received
+
+    @property
+    def rate_hz(self) -> float:
+        """Packets a second."""
+        return self.packets / self.seconds if self.seconds > 0.0 else 0.0
+
+    def between(self, name: str) -> int:
+        """Growth of a counter of the link, such as `lost`."""
+        return int(getattr(self.end, name) - getattr(self.start, name))
+
+    @property
+    def in_time(self) -> float:
+        """Share of the cycles answered before the controller's next packet."""
+        cycles = self.packets + self.between("lost")
+        return 1.0 - min(1.0, (self.between("late") + self.between("lost")) / cycles) if cycles else 0.0
+
+
+def exercise(
+    driver: Driver,
+    seconds: float,
+    *,
+    counter_int: int | None = None,
+    report: Callable[[float, LinkState], None] | None = None,
+) -> LinkTest:
+    """Test the link of a connected driver for `seconds`. Nothing is commanded."""
+    first = driver.state()
+    # The controller rates the last hundred packets, so the beginning is left out.
+    settle = max(100, round(0.5 / first.period_s))
+    trouble: LwrError | None = None
+    worst, count_before = len(_RANKS) - 1, 0
+    start = first
+    _, counts_before = driver.latency_histogram()
+    began = time.monotonic()
+    try:
+        driver.monitor(settle)
+        start = driver.state()
+        _, counts_before = driver.latency_histogram()
+        count_before = _count(driver, counter_int)
+        began = time.monotonic()
+        while time.monotonic() - began < seconds:
+            driver.monitor(max(1, round(_REPORT_S / start.period_s)))
+            state = driver.state()
+            worst = min(worst, _RANKS.index(state.quality))
+            if report is not None:
+                report(time.monotonic() - began, state)
+    except LwrError as error:
+        trouble = error
+    elapsed = time.monotonic() - began
+    end = driver.state()
+    edges, counts = driver.latency_histogram()
+    fresh = None if counter_int is None else _count(driver, counter_int) - count_before
+    rows = driver.last_rows(1)
+    return LinkTest(
+        elapsed, start, end, _RANKS[worst], edges, counts - counts_before, rows[0]["msr"], fresh, trouble
+    )
+
+
+def _count(driver: Driver, counter_int: int | None) -> int:
+    rows = driver.last_rows(1)
+    return 0 if counter_int is None or not len(rows) else int(rows[0]["msr"]["krl_int"][counter_int - 1])
+
+
+@dataclass(frozen=True)
+class Patient:
+    """This computer's end of the link, and the expected controller.
+
+    counter_int : index of the motor torques' counter in `$FRI_TO_INT`, None without motor torques.
+    realtime : real-time rights are needed.
     """
 
     arm: Arm
@@ -51,14 +210,14 @@ class Patient:
 
 @dataclass(frozen=True)
 class Examination:
-    """All findings, and the link test if there was one."""
+    """All findings, and the link test if requested."""
 
     findings: tuple[Finding, ...]
     link: LinkTest | None = None
 
     @property
     def exit_code(self) -> int:
-        """0 if nothing failed, else that of the first failure."""
+        """Exit code of the first failure, else 0."""
         return next((f.who.exit_code for f in self.findings if f.verdict == "fail"), 0)
 
     @property
@@ -110,9 +269,9 @@ def examine(
     wait_s: float = 20.0,
     report: Callable[[str, float, str], None] | None = None,
 ) -> Examination:
-    """Examine the computer, and with `link_s` the link for so long.
+    """Examine the computer and, for `link_s` seconds, the link.
 
-    wait_s : longest wait for the first packet. report : told what goes on: heading, share done, detail
+    wait_s : longest wait for the first packet. report : called with heading, share done and detail.
     """
     findings = examine_computer(patient.address, patient.port, patient.folder, realtime=patient.realtime)
     if link_s is None or any(f.verdict == "fail" and f.subject in ("interface", "port") for f in findings):
@@ -152,7 +311,7 @@ def examine(
 
 
 def judge_heard(patient: Patient, heard: Heard, traffic: int) -> list[Finding]:
-    """What came to the port. traffic : packets that the interface received meanwhile, for whatever port."""
+    """The datagrams at the port. traffic : packets received by the interface meanwhile, for any port."""
     place = f"UDP {patient.address}:{patient.port}"
     wanted = f"{MSR_SIZE} bytes, id 0x{MSR_ID:04x}"
     if not heard.kinds:
@@ -160,16 +319,16 @@ def judge_heard(patient: Patient, heard: Heard, traffic: int) -> list[Finding]:
         return [Finding("packets", seen, wanted, "fail", _start_advice(patient, traffic), NetworkError)]
     if not heard.fri:
         advice = (
-            "what sends there is not FRI 1.0 of a KR C2 lr (an LBR iiwa speaks another protocol); check "
-            "which software runs on the controller, and that nothing else uses the port"
+            "the sender does not speak FRI 1.0 of a KR C2 lr (an LBR iiwa has another protocol); check the "
+            "controller's software, and for other programs at the port"
         )
         return [Finding("packets", str(heard), wanted, "fail", advice, NetworkError)]
     if patient.controller is not None and patient.controller not in heard.fri:
-        advice = f"set `link.controller` to {heard.fri[0]}, or find out who that is"
+        advice = f"set `link.controller` to {heard.fri[0]}, or stop that sender"
         value = f"FRI from {', '.join(heard.fri)}"
         return [Finding("packets", value, f"from {patient.controller}", "fail", advice, NetworkError)]
     if patient.controller is None and len(heard.fri) > 1:
-        advice = "name the one that is meant in `link.controller`"
+        advice = "name the controller in `link.controller`"
         return [Finding("packets", f"FRI from {', '.join(heard.fri)}", "one", "fail", advice, NetworkError)]
     return [Finding("packets", f"{MSR_SIZE} bytes, id 0x{MSR_ID:04x} from {heard.fri[0]}", wanted, "ok")]
 
@@ -219,7 +378,7 @@ def _losses(link: LinkTest) -> Finding:
     counts = {name: link.between(name) for name in names}
     value = ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "none"
     limit = "none lost or damaged"
-    if counts["lost"] > (1.0 - GOOD_SHARE) * link.packets or counts["malformed"]:
+    if counts["lost"] > (1.0 - _GOOD_SHARE) * link.packets or counts["malformed"]:
         advice = "change the cable, use a network card of its own and no switch in between"
         return Finding("losses", value, limit, "fail", advice, NetworkError)
     if any(counts.values()):
@@ -258,11 +417,11 @@ def _replies(link: LinkTest) -> Finding:
 
 def _in_time(link: LinkTest) -> Finding:
     value = f"{100 * link.in_time:.3f} % of {link.packets} cycles"
-    limit = f"{100 * GOOD_SHARE:g} %"
-    if link.in_time < POOR_SHARE:
+    limit = f"{100 * _GOOD_SHARE:g} %"
+    if link.in_time < _POOR_SHARE:
         advice = "this set-up is not sufficient for command mode; see reply and losses"
         return Finding("answered in time", value, limit, "fail", advice, NetworkError)
-    if link.in_time < GOOD_SHARE:
+    if link.in_time < _GOOD_SHARE:
         advice = "command mode would be lost now and then; take a longer cycle or a real-time kernel"
         return Finding("answered in time", value, limit, "advice", advice)
     return Finding("answered in time", value, limit, "ok")
@@ -298,14 +457,14 @@ def _robot(state: LinkState) -> list[Finding]:
     else:
         found.append(Finding("drives", bits, "0x7f to move", "ok"))
     hottest = float(np.max(state.temperature))
-    verdict: Verdict = "advice" if hottest > WARM else "ok"
+    verdict: Verdict = "advice" if hottest > _WARM else "ok"
     advice = "friction changes with temperature; let the arm rest, or warm it up to the same point each time"
-    found.append(Finding("temperature", f"at most {hottest:.0f} °C", f"{WARM:.0f} °C", verdict, advice))
+    found.append(Finding("temperature", f"at most {hottest:.0f} °C", f"{_WARM:.0f} °C", verdict, advice))
     return found
 
 
 def _program(patient: Patient, link: LinkTest) -> list[Finding]:
-    """Whether the KRL program that is expected runs, what load it compensates, what it publishes."""
+    """The KRL program: its name, its load data, its motor torques."""
     handshake = find_handshake(patient.handshake)
     found = [Finding("KRL program", f"{handshake.name} takes requests", handshake.name, "ok")]
     if not handshake.opened(link.msr):

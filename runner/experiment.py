@@ -5,51 +5,127 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from fri.errors import LwrError, RefusedError, RobotError
+from fri.errors import DataError, LwrError, RefusedError, RobotError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, Outcome
 from lwr_driver.driver import Progress as MotionProgress
 from lwr_driver.motion import Motion
-from lwr_driver.motor_torque import match_torques
 from lwr_driver.realtime import Rights
 from lwr_driver.session import read_session, session_metadata
-from lwr_driver.trace import import_trace
+from lwr_driver.session.motor_torque import match_torques
+from lwr_driver.session.trace import import_trace
+from runner.computer import git_commit, software
 from runner.experiment_file import Experiment, Payload, SessionPlan
-from runner.interrupt import Interrupts
-from runner.operator import Operator
-from runner.payload import Rest, check_payload, load_data
-from runner.preflight import Preflight, check_gravity, check_link, check_rights
-from runner.preparation import session_motion
-from runner.progress import Progress
-from runner.status import StatusLine
-from runner.versions import git_commit, software
+from runner.planning import session_motion
+from runner.preflight import (
+    Preflight,
+    Rest,
+    check_gravity,
+    check_link,
+    check_payload,
+    check_rights,
+    load_data,
+)
+from runner.terminal import Interrupts, StatusLine
 
-__all__ = ["Bench", "LinkReport", "Record", "Run"]
+__all__ = ["Bench", "LinkReport", "Operator", "Progress", "Record", "Run"]
 
 Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]
 
-REST_CYCLES_S = 0.5
-LEAST_MOTION_RAD = 0.02
+_REST_S = 0.5
+_LEAST_MOTION_RAD = 0.02
+_PROGRESS = "progress.json"
+
+
+@dataclass
+class Progress:
+    """Progress of an experiment, stored beside its logs for a resumption.
+
+    finished : the arm's state at rest after each finished session. attempts : uids of all attempts by session.
+    """
+
+    path: Path
+    origin: Path | None = None
+    finished: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    attempts: dict[str, list[str]] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, folder: Path) -> Progress:
+        """Read the progress in `folder`, or begin anew. DataError for a broken file."""
+        path = folder / _PROGRESS
+        if not path.exists():
+            return cls(path)
+        try:
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            origin = Path(content["origin"]) if content["origin"] else None
+            return cls(path, origin, dict(content["finished"]), dict(content["attempts"]))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"{path}: cannot be read: {error}; delete it to start the experiment anew"
+            ) from error
+
+    @classmethod
+    def create(cls, folder: Path, origin: Path) -> Progress:
+        """Begin the progress of an experiment. origin : folder of its file."""
+        progress = cls(folder / _PROGRESS, origin)
+        progress._save()
+        return progress
+
+    def rest(self, session: str, payload: Payload | None) -> Rest:
+        """The arm at rest after a finished session."""
+        entry = self.finished[session]
+        return Rest(np.asarray(entry["q"]), np.asarray(entry["tau"]), payload)
+
+    def begin(self, session: str, log: Path, uid: str) -> tuple[str, str]:
+        """Count an attempt at a session; an earlier unfinished log is renamed.
+
+        Returns the uid of this attempt, `uid` with a number, and the uid of the previous attempt or "".
+        """
+        earlier = self.attempts.setdefault(session, [])
+        if log.exists():
+            number = max(len(earlier), 1)
+            while (kept := log.with_name(f"{log.stem}.attempt-{number}{log.suffix}")).exists():
+                number += 1
+            log.rename(kept)
+        parent = earlier[-1] if earlier else ""
+        earlier.append(f"{uid}-{len(earlier) + 1}")
+        self._save()
+        return earlier[-1], parent
+
+    def finish(self, session: str, rest: Rest) -> None:
+        """Mark a session as finished."""
+        self.finished[session] = {"q": rest.q.tolist(), "tau": rest.tau.tolist()}
+        self._save()
+
+    def _save(self) -> None:
+        content = {"origin": str(self.origin or ""), "finished": self.finished, "attempts": self.attempts}
+        draft = self.path.with_suffix(".json.new")
+        with draft.open("w", encoding="utf-8") as stream:
+            json.dump(content, stream, indent=1)
+            stream.flush()
+            os.fsync(stream.fileno())
+        draft.replace(self.path)
 
 
 @dataclass(frozen=True)
 class LinkReport:
-    """How the link was during a session: counts of cycles, reply latency of the loop, tracking.
+    """The link during a session: counts of cycles, reply latency of the loop, tracking.
 
-    missed : answers that the controller did not get in time.
-    latency_s : quantiles since the connection began.
-    worst_tracking_error : (n,) [rad]
+    missed : late answers by the controller's count. latency_s : quantiles since the connection.
+    worst_tracking_error : (n,) [rad].
     """
 
     cycles: int
@@ -76,7 +152,7 @@ class LinkReport:
 
 @dataclass(frozen=True)
 class Record:
-    """How one session ended: its file, status, reason, how the link was, and what is odd about its data."""
+    """The end of a session: file, status, reason, link, and warnings about the data."""
 
     name: str
     path: Path
@@ -87,8 +163,21 @@ class Record:
     warnings: tuple[str, ...] = ()
 
 
+class Operator(Protocol):
+    """The requests of an experiment to the person at the arm."""
+
+    def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
+        """Swap the payload `mounted` for `wanted`, and enter its load data in the controller."""
+
+    def start_trace(self) -> None:
+        """Start the controller's own recording."""
+
+    def save_trace(self, path: Path) -> bool:
+        """Save the controller's recording to `path`; False without a file."""
+
+
 class Onlooker(Protocol):
-    """Somebody who watches the motions, such as the live view."""
+    """An observer of the motions, such as the live view."""
 
     def begin(self, session: str, payload: Payload | None, motion: Motion) -> None:
         """A motion begins."""
@@ -96,7 +185,7 @@ class Onlooker(Protocol):
 
 @dataclass(frozen=True)
 class Bench:
-    """What the sequence needs from outside: the arm's description, a driver, a person, who watches."""
+    """The surroundings of the sequence: the arm's description, a driver, a person, an observer."""
 
     arm: Arm
     cell: Cell
@@ -109,8 +198,8 @@ class Bench:
 class Run:
     """One run of an experiment into one folder.
 
-    experiment : what to do. folder : where the logs go; sessions that are finished there are not repeated.
-    excite : gives the exciting motion of a session, planned beforehand, at the controller's period [s].
+    folder : of the logs; its finished sessions are not repeated.
+    excite : planned exciting motion of a session at the controller's period [s].
     """
 
     def __init__(
@@ -129,15 +218,15 @@ class Run:
         self._rest: Rest | None = None
 
     def followed_by(self, experiment: Experiment, excite: Callable[[SessionPlan, float], Motion]) -> Run:
-        """A run of further sessions, which begins with the arm and its payload as this one left them."""
+        """A run of further sessions, from the present state of the arm and its payload."""
         run = Run(experiment, self.folder, self.bench, excite)
         run._mounted, run._rest = self._mounted, self._rest
         return run
 
     def sessions(self) -> list[Record]:
-        """Run every session that is not finished yet; returns the record of each, finished earlier or now.
+        """Run every unfinished session; returns the records of all, finished earlier or now.
 
-        A session that aborts or fails ends the sequence: its record is the last one.
+        An aborted or failed session ends the sequence and has the last record.
         """
         records: list[Record] = []
         for plan in self.experiment.sessions:
@@ -167,7 +256,7 @@ class Run:
             driver.enter_command()
             try:
                 if not np.array_equal(motion.q[0], driver.state().q_command):
-                    # The controller took up its set point anew as command mode began.
+                    # The controller moved its set point at the start of command mode.
                     motion, preflight = self._prepare(plan, here)
                 uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
                 driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
@@ -191,7 +280,7 @@ class Run:
         return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error, warnings)
 
     def _still_loaded(self, plan: SessionPlan, before: Rest, outcome: Outcome) -> Outcome:
-        """The outcome; a failure if the payload is not what it was before the motion."""
+        """The outcome; a failure if the payload changed during the motion."""
         if outcome.status != "success":
             return outcome
         check = check_payload(self.bench.arm, before, self._at_rest(plan.payload))
@@ -201,7 +290,7 @@ class Run:
         return dataclasses.replace(outcome, status="fail", reason=reason, error=RobotError(reason))
 
     def _torque_warnings(self, path: Path) -> tuple[str, ...]:
-        """Motor torques of a KRL program that follow another joint, or are of another size."""
+        """Warnings about motor torques of the wrong joint, size or sign."""
         if self.experiment.motor_torque.source != "krl_reals":
             return ()
         session = read_session(path)
@@ -210,8 +299,8 @@ class Run:
                 f"{path.name} has no motor torques: the counter `counter_int` in the KRL variables stands "
                 "still. It serves Model 1",
             )
-        # A joint that stands still shows what the others do to it.
-        moves = np.ptp(session.joint.position, axis=0) > LEAST_MOTION_RAD
+        # At a resting joint only reactions of the other joints are visible.
+        moves = np.ptp(session.joint.position, axis=0) > _LEAST_MOTION_RAD
         moving = {name for name, moved in zip(session.joint.names, moves, strict=True) if moved}
         return tuple(
             f"{path.name}: {match}; check `reals`, `scale` and `sign` of motor_torque.krl"
@@ -220,7 +309,7 @@ class Run:
         )
 
     def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
-        """The motion of a session from where the arm is; RefusedError unless every check of it holds."""
+        """The motion of a session from the present posture. RefusedError after a failed check."""
         bench, state = self.bench, self.bench.driver.state()
         motion, preflight = session_motion(
             self.experiment,
@@ -240,7 +329,7 @@ class Run:
         return motion, preflight
 
     def _swap(self, plan: SessionPlan) -> None:
-        """Have the payload of the session on the flange, and make sure that it is the announced one."""
+        """Have the payload of the session mounted, and check it by the torques at rest."""
         bench = self.bench
         before = self._rest
         if plan.payload != self._mounted or before is None:
@@ -258,11 +347,11 @@ class Run:
         bench.status.say(check.summary())
 
     def _at_rest(self, payload: Payload | None) -> Rest:
-        measured = self.bench.driver.monitor(self._cycles(REST_CYCLES_S))
+        measured = self.bench.driver.monitor(self._cycles(_REST_S))
         return Rest(measured.q, measured.tau, payload)
 
     def _drive(self, plan: SessionPlan, motion: Motion) -> Outcome:
-        """Execute the motion with the status line; Ctrl-C is in the hands of the caller."""
+        """Execute the motion with the status line. The caller handles Ctrl-C."""
 
         def progress(now: MotionProgress) -> None:
             error = 1000 * float(np.max(now.state.tracking_error))
@@ -278,7 +367,7 @@ class Run:
         return self.bench.driver.execute(motion, progress)
 
     def _import_trace(self, path: Path) -> None:
-        """Give the log the motor torques of the controller's trace, where there is one."""
+        """Add the motor torques of the controller's trace, if present, to the log."""
         trace = path.with_suffix(".trace.csv")
         if self.bench.operator.save_trace(trace):
             self.bench.status.say(str(import_trace(path, trace)))

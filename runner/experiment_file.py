@@ -1,4 +1,4 @@
-"""The experiment file: what is to be done, with which arm, at which controller, under which payloads."""
+"""The experiment file: arm, controller, payloads, motions, and the steps of an experiment."""
 
 from __future__ import annotations
 
@@ -14,33 +14,25 @@ import pinocchio as pin
 
 from fri.errors import ConfigurationError
 from fri.handshake import find_handshake
-from lwr_driver.cell import PayloadShape
+from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
-from lwr_driver.motor_torque import KrlMotorTorque
+from lwr_driver.session.motor_torque import KrlMotorTorque
 
 __all__ = [
-    "DiagnosisPlan",
-    "Excitation",
-    "Experiment",
-    "Identification",
-    "Link",
-    "MotorTorque",
-    "Moves",
-    "Payload",
-    "Replan",
-    "SessionPlan",
-]
+    "DiagnosisPlan", "Excitation", "Experiment", "Identification", "Link", "MotorTorque", "Moves",
+    "Payload", "Replan", "SessionPlan",
+]  # fmt: skip
 
 DEFAULT = "experiments/default.yaml"
 
 
 @dataclass(frozen=True)
 class Payload:
-    """What hangs on the flange, as announced: from the scale and the drawing, not from identification.
+    """The payload on the flange as announced: from scale and drawing, not from identification.
 
     mass : kg. com : centre of mass in the frame of link 7 [m].
-    inertia : XX XY XZ YY YZ ZZ about the centre of mass [kg m²], zero where unknown.
-    shape : outer shape for the collision check; None leaves the payload out of it.
+    inertia : XX XY XZ YY YZ ZZ about the centre of mass [kg m²], zero if unknown.
+    shape : outer shape for the collision check; None omits the payload there.
     """
 
     name: str
@@ -69,9 +61,9 @@ class Payload:
 
 @dataclass(frozen=True)
 class SessionPlan:
-    """One motion of the arm with one payload; it becomes `NAME.mcap`.
+    """One motion of the arm with one payload, logged as `NAME.mcap`.
 
-    validation : another motion, which the estimate does not see and is held against.
+    validation : held-out session with another motion.
     """
 
     name: str
@@ -110,7 +102,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Moves:
-    """Approach and return: where the arm rests [rad], and how gently it goes there."""
+    """Approach and return: resting position `home` [rad] and speed."""
 
     home: tuple[float, ...] = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
     speed_scale: float = 0.2
@@ -146,11 +138,11 @@ class Link:
 
 @dataclass(frozen=True)
 class MotorTorque:
-    """Where motor torques come from; the FRI packet has none.
+    """Source of the motor torques; the FRI packet has none.
 
-    krl_reals : the KRL program publishes them in `$FRI_TO_REA` with a counter in `$FRI_TO_INT`, see `krl`.
+    krl_reals : `$FRI_TO_REA`, written by the KRL program, with a counter in `$FRI_TO_INT`; see `krl`.
     trace_file : the controller's own recording, imported after each motion and aligned by the data.
-    none : a valid session for Model 1.
+    none : for Model 1.
     """
 
     source: Literal["krl_reals", "trace_file", "none"] = "krl_reals"
@@ -159,7 +151,7 @@ class MotorTorque:
 
 @dataclass(frozen=True)
 class Identification:
-    """Which model is estimated from the sessions, and how the signals are prepared."""
+    """Model, estimator and filters of the estimate."""
 
     model: Literal[1, 2, 3] = 2
     estimator: str = "wls"
@@ -169,10 +161,10 @@ class Identification:
 
 @dataclass(frozen=True)
 class DiagnosisPlan:
-    """What the experiment ends with.
+    """The diagnosis at the end of an experiment.
 
-    run : look for what the model lacks. reference : model file of `lwr-run commission`, the healthy arm.
-    sure : confidence below which a finding with look-alikes asks for a motion that decides.
+    run : diagnose model errors. reference : healthy-arm baseline, a model file of `lwr-run commission`.
+    sure : least confidence of a finding with look-alikes; below it a discriminating experiment is offered.
     """
 
     run: bool = True
@@ -186,10 +178,10 @@ class DiagnosisPlan:
 
 @dataclass(frozen=True)
 class Replan:
-    """Further rounds, each with a motion planned from what the rounds before have taught.
+    """Further rounds, each with a motion planned with the estimate so far.
 
-    rounds : how many. problem : the planning problem, whose arm, cell, sessions, knowledge and prior are the
-    experiment's own.
+    rounds : their number. problem : file of the planning problem; arm, cell, sessions, knowledge and prior come
+    from the experiment.
     """
 
     rounds: int = 0
@@ -236,22 +228,22 @@ class Experiment:
                     f"session name {name!r} is used {names.count(name)} times; names must differ"
                 )
         if all(session.validation for session in self.sessions):
-            raise ConfigurationError("every session is for validation; an estimate needs one that is not")
+            raise ConfigurationError("every session is for validation; an estimate needs another one")
         known = {session.payload for session in self.sessions if not session.validation}
         for session in self.sessions:
             if session.validation and session.payload is not None and session.payload not in known:
                 raise ConfigurationError(
-                    f"session {session.name!r} validates with the payload {session.payload.name!r}, which no "
-                    "session before it identifies; give the payload a session without `validation`"
+                    f"session {session.name!r} validates with the payload {session.payload.name!r}, not "
+                    "identified by another session; give the payload a session without `validation`"
                 )
         if self.lock_step and self.backend == "fri":
             raise ConfigurationError("lock_step is for the emulator; set `lock_step: false` with backend fri")
 
     @classmethod
     def load(cls, name: str | Path = DEFAULT, *, beside: Path | None = None) -> Experiment:
-        """Read and check an experiment file; raises ConfigurationError with file, key, value and advice.
+        """Read and check an experiment file. ConfigurationError with file, key, value and advice.
 
-        Files that it names are looked for in the folder `beside`, by default the file's own.
+        beside : folder for the files named in it, by default its own.
         """
         path = find(name)
         experiment = parse(cls, read_mapping(path), str(path))
@@ -261,7 +253,7 @@ class Experiment:
         return experiment
 
     def changed(self, **values: Any) -> Experiment:
-        """The same experiment with other values of some keys; it keeps its file."""
+        """The same experiment and file with other values of some keys."""
         other = dataclasses.replace(self, **values)
         for name in ("source", "folder", "text"):
             object.__setattr__(other, name, getattr(self, name))
@@ -274,7 +266,7 @@ class Experiment:
 
     @property
     def uid(self) -> str:
-        """Twelve hexadecimal digits that stand for the content of the file."""
+        """Hash of the file, twelve hexadecimal digits."""
         return hashlib.sha256(self.text.encode()).hexdigest()[:12]
 
     def home(self, joints: int) -> npt.NDArray[np.float64]:
@@ -288,6 +280,12 @@ class Experiment:
     def payloads(self) -> dict[str, Payload]:
         """The announced payloads by name."""
         return {plan.payload.name: plan.payload for plan in self.sessions if plan.payload is not None}
+
+    @property
+    def heaviest(self) -> Payload | None:
+        """The announced payload with the largest mass, or None."""
+        payloads = sorted(self.payloads().values(), key=lambda payload: payload.mass)
+        return payloads[-1] if payloads else None
 
 
 def _positive(name: str, value: float, unit: str) -> None:

@@ -1,35 +1,117 @@
-"""The set-up of an experiment: the arm or its emulator, the driver connected to it, and who stands there."""
+"""The set-up of an experiment: the arm or its emulator, the connected driver, and the person at the arm."""
 
 from __future__ import annotations
 
-import logging
 import socket
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 
+import click
+
+from fri.errors import OperatorError
 from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.driver import Driver, LinkSettings, Waiting
-from lwr_driver.motor_torque import KrlMotorTorque
-from runner.experiment import Bench
-from runner.experiment_file import Experiment
-from runner.operator import EmulatedOperator, Operator, Person
-from runner.status import StatusLine
+from lwr_driver.session.motor_torque import KrlMotorTorque
+from runner.experiment import Bench, Operator
+from runner.experiment_file import Experiment, Payload
+from runner.terminal import StatusLine
 from sim_backend.configuration import load_configuration
+from sim_backend.pendant import Pendant
 from sim_backend.process import EmulatorProcess
 from sim_backend.robot import robot_file
 
-__all__ = ["Laboratory"]
+__all__ = ["EmulatedOperator", "Laboratory", "Operator", "Person"]
 
-log = logging.getLogger(__name__)
+
+class Person:
+    """The person at the arm, asked on the terminal: mounts payloads, enters load data, confirms.
+
+    assume_yes : confirm without a question, for automation.
+    enters_load : load data are entered at the pendant, not sent over the link.
+    """
+
+    def __init__(self, assume_yes: bool, *, enters_load: bool = True) -> None:
+        self._assume_yes = assume_yes
+        self._enters_load = enters_load
+
+    def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
+        """Ask for the swap and wait for the confirmation."""
+        if wanted is None:
+            work = f"Take the payload {mounted.name!r} off" if mounted else "Leave the flange empty"
+            load = "set the load data on the controller to the empty flange"
+        else:
+            work = f"Mount the payload {wanted.name!r}, {wanted.mass:g} kg"
+            x, y, z = (1000 * value for value in wanted.com)
+            load = (
+                f"enter its load data on the controller: {wanted.mass:g} kg, centre of mass "
+                f"({x:.0f}, {y:.0f}, {z:.0f}) mm in the frame of link 7"
+            )
+        if self._enters_load:
+            work = f"{work}, then {load}"
+        self._confirm(f"{work}. Stay clear of the arm. Ready?")
+
+    def start_trace(self) -> None:
+        """Ask for the controller's recording to be started."""
+        self._confirm("Start the controller's trace (motor torques and axis positions). Running?")
+
+    def save_trace(self, path: Path) -> bool:
+        """Ask for the trace file."""
+        if self._assume_yes:
+            return path.exists()
+        self._confirm(f"Stop the trace and copy its file to {path}. Done?")
+        return path.exists()
+
+    def _confirm(self, question: str) -> None:
+        if self._assume_yes:
+            return
+        if not click.confirm(question, default=False, err=True):
+            raise OperatorError(f"not confirmed: {question.rsplit('. ', 1)[0]}; nothing moved")
+
+
+class EmulatedOperator:
+    """The person at the arm, emulated at the emulator's pendant.
+
+    known : payloads with properties in the emulator; others are mounted as announced.
+    enters_load : load data are entered at the pendant, not sent over the link.
+    """
+
+    def __init__(self, pendant: Pendant, known: frozenset[str], *, enters_load: bool = True) -> None:
+        self._pendant = pendant
+        self._known = known
+        self._enters_load = enters_load
+
+    def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
+        """Mount or unmount, and enter the announced load data."""
+        if wanted is None:
+            self._pendant.unmount()
+            if self._enters_load:
+                self._pendant.set_load(0.0)
+            return
+        if wanted.name in self._known:
+            self._pendant.mount(wanted.name)
+        else:
+            self._pendant.mount(mass=wanted.mass, com=wanted.com, inertia=wanted.inertia)
+        if self._enters_load:
+            self._pendant.set_load(wanted.mass, wanted.com, wanted.inertia)
+
+    def start_trace(self) -> None:
+        """Begin the controller's trace."""
+        self._pendant.start_trace()
+
+    def save_trace(self, path: Path) -> bool:
+        """Save the controller's trace."""
+        self._pendant.save_trace(path)
+        return True
 
 
 class Laboratory:
-    """Starts what an experiment needs and ends it again; a context manager that gives the `Bench`.
+    """A context manager: starts emulator and driver, gives the `Bench`, and ends them.
 
-    assume_yes : confirm questions to the operator by itself
-    allow_non_realtime : command a real arm without real-time rights; the emulator never needs them
+    assume_yes : confirm all questions to the operator.
+    allow_non_realtime : command a real arm without real-time rights; the emulator needs none.
     """
 
     def __init__(
@@ -98,7 +180,7 @@ class Laboratory:
             lock_step=emulated and self.experiment.lock_step,
             handshake=link.handshake,
             realtime="allow" if emulated or self._allow_non_realtime else "require",
-            # On a busy computer the emulator may be held up for long, and in lock step that harms nothing.
+            # On a busy computer the emulator may pause for long; in lock step a pause is harmless.
             lock_step_patience_s=60.0,
         )
 
@@ -115,7 +197,7 @@ class Laboratory:
 
 
 def free_port(address: str) -> int:
-    """A UDP port of `address` that nobody uses now."""
+    """An unused UDP port of `address`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((address, 0))
         port: int = probe.getsockname()[1]

@@ -1,7 +1,7 @@
-"""The live view: a page with the arm, its torques, the link and the progress, from a process of its own.
+"""The live view: a page with the arm, its torques, the link and the progress, from its own process.
 
-The process looks into the ring that the loop writes for the recorder and takes nothing out of it, so neither
-notices that somebody watches. It ends with the process that started it.
+The process reads the loop's ring without taking rows from the recorder, so neither is disturbed. It ends with its
+parent process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from fri.states import Quality, State
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell, PayloadShape
 from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
 from runner.experiment_file import Experiment, Payload
@@ -48,9 +48,9 @@ _COLOURS = ("#000000", "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#
 
 
 class LiveView:
-    """Handle of the live view's process; a context manager. `url` is where the page is.
+    """Handle of the live view's process; a context manager. url : address of the page.
 
-    ring_name : of the driver (`Driver.ring_name`). Raises ConfigurationError without the extra `view`.
+    ring_name : of the driver (`Driver.ring_name`). ConfigurationError without the extra `view`.
     """
 
     def __init__(self, experiment: Experiment, ring_name: str, *, port: int = 8080) -> None:
@@ -78,7 +78,7 @@ class LiveView:
         self.url = self._first_line()
 
     def begin(self, session: str, payload: Payload | None, motion: Motion) -> None:
-        """Announce a session's motion, so that the page shows its payload, phases and time left."""
+        """Announce a session's motion: payload, phases and duration."""
         self._send(
             {
                 "session": session,
@@ -111,7 +111,7 @@ class LiveView:
         self.close()
 
     def _send(self, message: Mapping[str, Any]) -> None:
-        # A page that died must not stop an arm that moves.
+        # A dead page must not stop a moving arm.
         if self._process.stdin is not None:
             with contextlib.suppress(OSError, ValueError):
                 self._process.stdin.write(json.dumps(message) + "\n")
@@ -135,7 +135,7 @@ class LiveView:
 
 
 class Sample:
-    """What the page shows of the newest cycles: rows of the ring, newest last, (n,) of `ROW`, n > 0."""
+    """Content of the page from the newest cycles. rows : of the ring, newest last, (n,) of `ROW`, n > 0."""
 
     def __init__(self, rows: NDArray[Any]) -> None:
         row = rows[-1]
@@ -151,7 +151,7 @@ class Sample:
         commanded = np.where(answered[:, None], rows["cmd"]["jnt_pos"].astype(np.float64), setpoint)
         self.commanded = commanded[-1]
         gap = rows["msr"]["msr_jnt_pos"].astype(np.float64) - commanded
-        # Of all cycles since the last look the worst, so that no spike is missed.
+        # The worst of all cycles since the last update, to show every spike.
         self.error = gap[np.argmax(np.abs(gap), axis=0), np.arange(gap.shape[1])]
         self.answer_rate = float(msr["answer_rate"])
         self.latency_s, self.jitter_s = float(msr["latency"]), float(msr["jitter"])
@@ -262,7 +262,7 @@ class Dashboard:
 
 
 def phase_at(session: Mapping[str, Any], row: int) -> str:
-    """Name of the phase in which a row of the announced motion lies."""
+    """Name of the phase at a row of the announced motion."""
     name = ""
     for first, phase in session.get("phases", []):
         if first <= row:

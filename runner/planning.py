@@ -1,32 +1,49 @@
-"""The exciting motions of an experiment: from a plan file, or simple feasible ones planned now."""
+"""The motions of an experiment: the exciting ones, from a plan file or planned now, and whole checked sessions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
 
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan, feasible_fourier
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find
-from lwr_driver.motion import Motion
+from lwr_driver.motion import Motion, move_to
 from runner.experiment_file import Experiment, Payload, SessionPlan
+from runner.preflight import (
+    Item,
+    Preflight,
+    check_disk,
+    check_motion_limits,
+    check_path,
+    check_start,
+    check_torque,
+)
 
-__all__ = ["PLAN", "VALIDATION_PLAN", "Excitations", "checker", "excitation_rows", "plan_excitation"]
+__all__ = [
+    "PLAN", "VALIDATION_PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation",
+    "route", "session_motion", "way",
+]  # fmt: skip
 
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"
+Vector = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Excitations:
     """The motions of an experiment's sessions.
 
-    exciting : what the estimate is made from, `periods` times. unseen : what it is held against, once; None
-    where no session is for validation.
+    exciting : motion of the estimate, `periods` times. unseen : held-out motion, once; None without a session
+    for validation.
     """
 
     exciting: ExcitationPlan
@@ -35,7 +52,7 @@ class Excitations:
 
     @classmethod
     def of(cls, experiment: Experiment, arm: Arm, cell: Cell, folder: Path | None = None) -> Excitations:
-        """The motions stored in `folder`, the results of the experiment; what is not there is planned now."""
+        """The motions stored in `folder`, the results of the experiment; missing ones are planned now."""
 
         def stored(name: str, make: Callable[[Experiment, Arm, Cell], ExcitationPlan]) -> ExcitationPlan:
             path = None if folder is None else folder / name
@@ -51,28 +68,28 @@ class Excitations:
         )
 
     def save(self, folder: Path) -> None:
-        """Write the plans that are not there yet into the folder of the results."""
+        """Write missing plan files into the folder of the results."""
         for name, plan in ((PLAN, self.exciting), (VALIDATION_PLAN, self.unseen)):
             if plan is not None and not (folder / name).is_file():
                 plan.save(folder / name)
 
     def rows(self, session: SessionPlan, period_s: float) -> Motion:
-        """The motion of a session for a controller's period [s], each period of it a phase of its own."""
+        """The motion of a session for a controller's period [s], with one phase per period of the motion."""
         if session.validation and self.unseen is not None:
             return excitation_rows(self.unseen, 1)(period_s)
         return excitation_rows(self.exciting, self.periods)(period_s)
 
 
 def checker(arm: Arm, cell: Cell, payload: Payload | None) -> CollisionChecker:
-    """Collision check of the arm in its cell with the shape of a payload, where it has one."""
+    """Collision check of the arm in its cell, with the shape of the payload if it is known."""
     return CollisionChecker(arm, cell, None if payload is None else payload.shape)
 
 
 def plan_excitation(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationPlan:
-    """The experiment's exciting motion, one period of which serves all of its sessions.
+    """The experiment's exciting motion, the same period for all sessions.
 
-    With `excitation.plan` the file is read; what it holds is checked again before each motion. Without it a
-    feasible random Fourier motion is planned with the payload that is largest in mass.
+    With `excitation.plan` the file is read; its motion is checked again before each session. Without it a
+    feasible random Fourier motion is planned with the heaviest payload.
     """
     settings = experiment.excitation
     if settings.plan is not None:
@@ -87,16 +104,15 @@ def plan_excitation(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationP
 
 
 def _plan_unseen(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationPlan:
-    """Another motion than the exciting one: a simple feasible one from the next seed."""
+    """Another motion than the exciting one, from the next seed."""
     return _simple(experiment, arm, cell, experiment.excitation.seed + 1, 1)
 
 
 def _simple(experiment: Experiment, arm: Arm, cell: Cell, seed: int, periods: int) -> ExcitationPlan:
     settings = experiment.excitation
-    payloads = sorted(experiment.payloads().values(), key=lambda payload: payload.mass)
     return feasible_fourier(
         arm,
-        checker(arm, cell, payloads[-1] if payloads else None),
+        checker(arm, cell, experiment.heaviest),
         period_s=settings.period_s,
         harmonics=settings.harmonics,
         periods=periods,
@@ -107,7 +123,7 @@ def _simple(experiment: Experiment, arm: Arm, cell: Cell, seed: int, periods: in
 
 
 def excitation_rows(plan: ExcitationPlan, periods: int) -> Callable[[float], Motion]:
-    """The plan as rows for a controller's period, each period of the motion marked as a phase of its own."""
+    """The plan as rows for a controller's period, with one phase per period of the motion."""
 
     def rows(period_s: float) -> Motion:
         q = plan.rows(period_s, periods)
@@ -116,3 +132,88 @@ def excitation_rows(plan: ExcitationPlan, periods: int) -> Callable[[float], Mot
         return Motion(q, period_s, phases)
 
     return rows
+
+
+def dwell(q: Vector, duration_s: float, period_s: float, phase: str) -> Motion:
+    """Rest at q, (n,) [rad], for `duration_s` [s]."""
+    rows = max(2, round(duration_s / period_s) + 1)
+    return Motion(np.tile(q, (rows, 1)), period_s, ((0, phase),))
+
+
+def way(arm: Arm, points: Sequence[Vector], period_s: float, speed_scale: float, phase: str) -> Motion:
+    """Straight jerk-limited moves in joint space from point to point, at rest in each, (n,) [rad]."""
+    motion = dwell(points[0], 0.0, period_s, phase)
+    for start, goal in itertools.pairwise(points):
+        motion = motion.join(move_to(arm, start, goal, period_s, speed_scale=speed_scale, phase=phase))
+    return motion
+
+
+def route(
+    arm: Arm,
+    approach: Sequence[Vector],
+    excitation: Motion,
+    retreat: Sequence[Vector],
+    *,
+    speed_scale: float,
+    settle_s: float,
+    brake_s: float,
+) -> Motion:
+    """One session as one motion: approach, settle, excite, brake and return.
+
+    approach : points from the present posture to the first row of the excitation. retreat : points from its last
+    row to the resting posture. speed_scale : of the velocity limits, for both. settle_s, brake_s : rest before
+    and after the excitation [s].
+    """
+    period = excitation.period_s
+    first, last = excitation.q[0], excitation.q[-1]
+    motion = way(arm, [*approach, first], period, speed_scale, "move_to_start")
+    motion = motion.join(dwell(first, settle_s, period, "settle"))
+    motion = motion.join(excitation)
+    motion = motion.join(dwell(last, brake_s, period, "brake"))
+    return motion.join(way(arm, [last, *retreat], period, speed_scale, "return"))
+
+
+def session_motion(
+    experiment: Experiment,
+    arm: Arm,
+    cell: Cell,
+    plan: SessionPlan,
+    excitation: Motion,
+    start: npt.NDArray[np.float64],
+    folder: Path | None = None,
+) -> tuple[Motion, Preflight]:
+    """One session as one motion from `start`, (n,) [rad], with its preflight.
+
+    The straight way to the first row of the excitation is tried first, then the way over the home position. The
+    arm returns home, or stays at the last row if the way home is not free. If every way fails a check, the first
+    one is returned with its failures. folder : of the log.
+    """
+    moves = experiment.moves
+    home = experiment.home(len(start))
+    collision = checker(arm, cell, plan.payload)
+    margin = max(moves.clearance_m, cell.margin_m)
+    first: tuple[Motion, Preflight] | None = None
+    for approach, retreat in itertools.product(([start], [start, home]), ([home], [])):
+        motion = route(
+            arm,
+            approach,
+            excitation,
+            retreat,
+            speed_scale=moves.speed_scale,
+            settle_s=moves.settle_s,
+            brake_s=moves.brake_s,
+        )
+        items: list[Item] = [
+            check_start(arm, start, excitation.q[0], moves.max_start_distance_rad),
+            *check_motion_limits(arm, motion),
+            check_torque(arm, motion, plan.payload),
+            check_path(collision, motion, margin),
+        ]
+        if folder is not None:
+            items.append(check_disk(folder, len(motion)))
+        preflight = Preflight(tuple(items))
+        if preflight.ok:
+            return motion, preflight
+        first = first or (motion, preflight)
+    assert first is not None
+    return first

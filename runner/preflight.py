@@ -1,4 +1,13 @@
-"""Preflight: every condition that must hold before the arm moves, each with its value and its limit."""
+"""Preflight: every condition of a motion, with its value and its limit, and the check of a swapped payload.
+
+At rest, equation (1) is gravity plus friction and offset. Between two measurements the offset cancels, the arm's
+own gravity follows from the nominal model, and the rest is the payload's weight:
+
+    Δτ = G(q₂; payload₂) − G(q₁; payload₁) + Δfriction.
+
+After approaches from opposite sides the friction of a joint may differ by twice its Coulomb torque, so the
+tolerance has a constant part per joint.
+"""
 
 from __future__ import annotations
 
@@ -15,37 +24,140 @@ import pinocchio as pin
 
 from fri.errors import RefusedError
 from lwr_driver.arm import Arm
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.collision import CollisionChecker
+from lwr_driver.link import LinkState
 from lwr_driver.motion import Motion, extremes
 from lwr_driver.realtime import Rights
-from lwr_driver.state import LinkState
 from runner.experiment_file import Payload
-from runner.payload import Rest, gravity_torque
 
 __all__ = [
-    "Item",
-    "Preflight",
-    "check_disk",
-    "check_gravity",
-    "check_link",
-    "check_motion_limits",
-    "check_path",
-    "check_rights",
-    "check_start",
-    "check_torque",
-]
+    "Item", "PayloadCheck", "Preflight", "Rest", "check_disk", "check_gravity", "check_link",
+    "check_motion_limits", "check_path", "check_payload", "check_rights", "check_start", "check_torque",
+    "gravity_torque", "load_data",
+]  # fmt: skip
 
 Vector = npt.NDArray[np.float64]
+Triple = tuple[float, float, float]
 
-BYTES_PER_CYCLE = 600.0
-TORQUE_SHARE = 0.8
-GRAVITY_SHARE = 0.3
-GRAVITY_FLOOR = 0.03
+_RELATIVE_TOLERANCE = 0.15
+_FRICTION_SHARE = 0.02
+_BYTES_PER_CYCLE = 600.0
+_TORQUE_SHARE = 0.8
+_GRAVITY_SHARE = 0.3
+_GRAVITY_FLOOR = 0.03
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The arm at rest: mean joint position q [rad] and joint torque tau [Nm], (n,) each, and its payload."""
+
+    q: Vector
+    tau: Vector
+    payload: Payload | None
+
+
+@dataclass(frozen=True)
+class PayloadCheck:
+    """Result of the static check.
+
+    measured, predicted, tolerance : (n,) torque change per joint [Nm].
+    mass : best fit of the change at the announced centre of mass [kg]; nan in an insensitive pose.
+    """
+
+    measured: Vector
+    predicted: Vector
+    tolerance: Vector
+    mass: float
+    announced: Payload | None
+
+    @property
+    def ok(self) -> bool:
+        """Every joint agrees within its tolerance."""
+        return bool(np.all(np.abs(self.measured - self.predicted) <= self.tolerance))
+
+    def summary(self) -> str:
+        """The result in one line."""
+        error = float(np.max(np.abs(self.measured - self.predicted)))
+        weighs = (
+            "" if not np.isfinite(self.mass) else f", like {self.mass:.2f} kg at the announced centre of mass"
+        )
+        return f"static check of the payload: torques changed as announced within {error:.2f} Nm{weighs}"
+
+    def reason(self, joint_names: tuple[str, ...]) -> str:
+        """The worst joint, in one sentence with value, limit and advice."""
+        excess = np.abs(self.measured - self.predicted) / self.tolerance
+        worst = int(np.argmax(excess))
+        name = "no payload" if self.announced is None else f"payload {self.announced.name!r}"
+        weighs = "" if not np.isfinite(self.mass) else f"; the change corresponds to {self.mass:.2f} kg"
+        return (
+            f"{name} announced, but the torque of {joint_names[worst]} changed by "
+            f"{self.measured[worst]:+.2f} Nm, expected {self.predicted[worst]:+.2f} ± "
+            f"{self.tolerance[worst]:.2f} Nm{weighs}. "
+            "Check the mounted payload, and its mass and com in the experiment file."
+        )
+
+
+def gravity_torque(arm: Arm, q: Vector, payload: Payload | None) -> Vector:
+    """Gravity torque G(q) of the nominal arm with a payload welded to the last link, (n,) [Nm]."""
+    model = _loaded(arm, payload)
+    return np.asarray(pin.computeGeneralizedGravity(model, model.createData(), q))
+
+
+def _loaded(arm: Arm, payload: Payload | None) -> pin.Model:
+    model = pin.buildModelFromXML(arm.urdf)
+    if payload is not None:
+        model.appendBodyToJoint(model.njoints - 1, payload.body(), pin.SE3.Identity())
+    return model
+
+
+def check_payload(arm: Arm, before: Rest, after: Rest) -> PayloadCheck:
+    """Compare the change of the joint torques at rest with the prediction for the announced payloads.
+
+    before, after : measurements at rest. Two per cent of the torque limit are allowed for the sensor and for
+    friction on the link side, of unknown sign at rest.
+    """
+    measured = after.tau - before.tau
+    predicted = gravity_torque(arm, after.q, after.payload) - gravity_torque(arm, before.q, before.payload)
+    arm_moved = np.abs(gravity_torque(arm, after.q, None) - gravity_torque(arm, before.q, None))
+    tolerance = _FRICTION_SHARE * arm.tau_max + _RELATIVE_TOLERANCE * (np.abs(predicted) + arm_moved)
+    return PayloadCheck(measured, predicted, tolerance, _mass(arm, before, after), after.payload)
+
+
+def _mass(arm: Arm, before: Rest, after: Rest) -> float:
+    """Least-squares mass at the announced centre of mass [kg]."""
+    payload = after.payload if after.payload is not None else before.payload
+    if payload is None:
+        return float("nan")
+    unit = Payload("unit", 1.0, payload.com)
+    per_kg = gravity_torque(arm, after.q, unit) - gravity_torque(arm, after.q, None)
+    if float(np.linalg.norm(per_kg)) < 0.5:
+        return float("nan")
+    carried = gravity_torque(arm, before.q, before.payload)
+    change = after.tau - before.tau - gravity_torque(arm, after.q, None) + carried
+    return float(per_kg @ change / (per_kg @ per_kg))
+
+
+def load_data(arm: Arm, payload: Payload | None) -> tuple[float, Triple, Triple]:
+    """Load data of the controller: mass [kg], centre of mass in the flange frame [m] and inertia about it along
+    its axes [kg m2]; zeros for the empty flange.
+    """
+    if payload is None:
+        return 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    model = pin.buildModelFromXML(arm.urdf)
+    flange = model.frames[model.getFrameId("flange")].placement
+    com = flange.actInv(np.asarray(payload.com))
+    tensor = flange.rotation.T @ payload.body().inertia @ flange.rotation
+    return payload.mass, _triple(com), _triple(np.diag(tensor))
+
+
+def _triple(values: Vector) -> Triple:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 @dataclass(frozen=True)
 class Item:
-    """One condition: what was looked at, what was found, what is allowed, and what to do if it fails."""
+    """One condition: subject, value, limit, and advice for a failure."""
 
     subject: str
     value: str
@@ -61,13 +173,13 @@ class Item:
 
 @dataclass(frozen=True)
 class Preflight:
-    """The list of conditions, in the order in which they were checked."""
+    """The conditions in the order of their checks."""
 
     items: tuple[Item, ...]
 
     @property
     def ok(self) -> bool:
-        """True where every condition holds."""
+        """Every condition holds."""
         return all(item.ok for item in self.items)
 
     def __str__(self) -> str:
@@ -77,7 +189,7 @@ class Preflight:
         return Preflight((*self.items, *other))
 
     def enforce(self) -> None:
-        """Raise RefusedError that names every failed condition; nothing may move then."""
+        """Raise RefusedError with every failed condition; nothing may move then."""
         failed = [item for item in self.items if not item.ok]
         if failed:
             lines = "; ".join(
@@ -91,7 +203,7 @@ class Preflight:
 
 
 def check_motion_limits(arm: Arm, motion: Motion) -> list[Item]:
-    """Position, velocity, acceleration and jerk of every row as it is sent, against the arm's limits."""
+    """Position, velocity, acceleration and jerk of every row as sent, against the arm's limits."""
     items = []
     for worst in extremes(arm, motion):
         items.append(
@@ -119,10 +231,8 @@ def check_path(checker: CollisionChecker, motion: Motion, margin: float) -> Item
 
 
 def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
-    """Largest share of the joint torque limit that the nominal model predicts along the motion."""
-    model = pin.buildModelFromXML(arm.urdf)
-    if payload is not None:
-        model.appendBodyToJoint(model.njoints - 1, payload.body(), pin.SE3.Identity())
+    """Largest predicted share of a joint torque limit along the motion, by the nominal model."""
+    model = _loaded(arm, payload)
     data = model.createData()
     step = max(1, math.ceil(0.01 / motion.period_s))
     time = motion.period_s * step
@@ -137,14 +247,14 @@ def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
     return Item(
         "joint torque estimate",
         f"{arm.joint_names[joint]} {abs(tau[row, joint]):.1f} Nm at t = {row * time:.2f} s",
-        f"{TORQUE_SHARE * arm.tau_max[joint]:.1f} Nm",
-        bool(share[row, joint] <= TORQUE_SHARE),
+        f"{_TORQUE_SHARE * arm.tau_max[joint]:.1f} Nm",
+        bool(share[row, joint] <= _TORQUE_SHARE),
         "slow the motion down or take a lighter payload",
     )
 
 
 def check_start(arm: Arm, q: Vector, first: Vector, limit: float) -> Item:
-    """Distance of the arm from the first row of the excitation, which the approach must bridge."""
+    """Distance of the arm from the first row of the excitation, the length of the approach."""
     distance = np.abs(first - q)
     joint = int(np.argmax(distance))
     return Item(
@@ -168,7 +278,7 @@ def check_rights(rights: Rights, *, needed: bool) -> Item:
 
 
 def check_link(state: LinkState) -> Item:
-    """The controller's own rating of the link, drives and errors."""
+    """The controller's rating of the link, drives and errors."""
     good = state.quality in ("OK", "PERFECT") and not state.error
     return Item(
         "link",
@@ -182,10 +292,10 @@ def check_link(state: LinkState) -> Item:
 def check_gravity(arm: Arm, rest: Rest) -> Item:
     """Joint torques at rest against gravity of the nominal arm with its payload: signs, order, gross load.
 
-    The sign of the sensors is not documented; a joint whose torque opposes gravity gives itself away here.
+    The sign of the sensors is not documented; a wrong sign fails here.
     """
     expected = gravity_torque(arm, rest.q, rest.payload)
-    allowed = GRAVITY_SHARE * np.abs(expected) + GRAVITY_FLOOR * arm.tau_max
+    allowed = _GRAVITY_SHARE * np.abs(expected) + _GRAVITY_FLOOR * arm.tau_max
     excess = np.abs(rest.tau - expected) / allowed
     joint = int(np.argmax(excess))
     return Item(
@@ -193,13 +303,13 @@ def check_gravity(arm: Arm, rest: Rest) -> Item:
         f"{arm.joint_names[joint]} {rest.tau[joint]:+.2f} Nm",
         f"{expected[joint]:+.2f} ± {allowed[joint]:.2f} Nm",
         bool(excess[joint] <= 1.0),
-        "check sign, order and zero of the torque sensors, and what is mounted",
+        "check sign, order and zero of the torque sensors, and the mounted payload",
     )
 
 
 def check_disk(folder: Path, cycles: int) -> Item:
-    """Free space where the logs go, against what the motion will write."""
-    needed = 2.0 * BYTES_PER_CYCLE * cycles + 50e6
+    """Free disk space against the size of the log."""
+    needed = 2.0 * _BYTES_PER_CYCLE * cycles + 50e6
     place = folder
     while not place.exists():
         place = place.parent

@@ -1,4 +1,4 @@
-"""The planned motion to look at before anything moves: in 3D, with limits and the tightest moment."""
+"""Preview of a planned motion in 3D, with limits and the tightest moment."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import Clearance
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import Clearance
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.motion import Motion
+from runner.experiment import Progress
 from runner.experiment_file import Experiment, Payload
-from runner.planning import Excitations, checker, excitation_rows
+from runner.planning import Excitations, checker, excitation_rows, session_motion
 from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
-from runner.preparation import session_motion
-from runner.progress import Progress
-from runner.report.markup import table
+from runner.report.markup import conditions_table
 from runner.report.plot import STYLES, Line, Panel, Points
 from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
@@ -44,9 +43,9 @@ _NEAR: Colour = (230, 159, 0)
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A motion with everything that is known of it beforehand.
+    """A planned motion with its checks.
 
-    title : what it is. tightest : nearest moment to anything; margin : distance that must be kept [m].
+    tightest : moment of the smallest clearance. margin : least clearance allowed [m].
     time (k,) [s], distance (k,) [m] : clearance along the motion.
     """
 
@@ -62,7 +61,7 @@ class Planned:
     distance: Floats
 
     def facts(self) -> dict[str, Any]:
-        """What is known of the motion, as plain content."""
+        """Plain content for JSON."""
         tight = self.tightest
         return {
             "title": self.title,
@@ -79,7 +78,7 @@ class Planned:
         }
 
     def at(self, row: int) -> str:
-        """What is near at a row of the motion: distance to anything, and the joint closest to its limit."""
+        """Clearance at a row of the motion, and the joint closest to its limit."""
         limits, q = self.arm.limits, self.motion.q[row]
         room = np.minimum(limits.q_high - q, q - limits.q_low)
         joint = int(np.argmin(room))
@@ -94,7 +93,7 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     """The motion of an experiment file, of the folder of an experiment with its plan, or of a plan file.
 
     session : of the experiment; by default the one with the heaviest payload. A plan alone is shown with the
-    default arm and cell. Raises ConfigurationError for a file that is neither.
+    default arm and cell. ConfigurationError for any other file.
     """
     folder = Path(file)
     results = folder if folder.is_dir() else None
@@ -126,9 +125,8 @@ def _of_plan(path: Path, period_s: float) -> Planned:
     plan = ExcitationPlan.load(path)
     if plan.joint_names != arm.joint_names:
         raise ConfigurationError(
-            f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}; preview an "
-            "experiment "
-            "file that names the arm"
+            f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}; preview an experiment "
+            "file with that arm"
         )
     motion = excitation_rows(plan, 1)(period_s)
     items = [
@@ -196,7 +194,7 @@ def build_scene(server: Any, planned: Planned) -> ArmShape:
 
 
 def preview_html(planned: Planned) -> str:
-    """One self-contained page: the motion in 3D with a time slider, the limits, and what is nearest when."""
+    """One self-contained page: the motion in 3D with a time slider, the limits, and the clearance over time."""
     server = start_server()
     try:
         arm = build_scene(server, planned)
@@ -214,6 +212,7 @@ def preview_html(planned: Planned) -> str:
     mark = "\N{CHECK MARK}" if ok else "\N{MULTIPLICATION X}"
     tight = planned.tightest
     joints = "".join(map(panel_svg, _joint_panels(planned)))
+    conditions = conditions_table(map(vars, planned.preflight.items), "Conditions before the motion")
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
@@ -228,16 +227,16 @@ def preview_html(planned: Planned) -> str:
         f"<p>{planned.motion.duration_s:.1f} s. Tightest moment: <b>{1000 * tight.distance:.0f} mm</b>, "
         f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; "
         f"{1000 * planned.margin:.0f} mm must be "
-        f"kept.</p>{_conditions(planned)}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
+        f"kept.</p>{conditions}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
         f"<h2>Joints within their limits</h2><div class=joints>{joints}</div>"
         "</section></main></body></html>\n"
     )
 
 
 def serve(planned: Planned, port: int, tell: Callable[[str], None]) -> None:
-    """Show the motion in a viser server with play and time slider until Ctrl-C, which ends it quietly.
+    """Show the motion in a viser server with play and time slider until Ctrl-C.
 
-    tell : called with the address once the page is there. Raises ConfigurationError for a port in use.
+    tell : called with the address of the ready page. ConfigurationError for a port in use.
     """
     server = start_server(port)
     try:
@@ -312,14 +311,6 @@ def _colour(distance: float, margin: float) -> Colour:
     if distance < margin:
         return ALARM
     return _NEAR if distance < 3.0 * margin else _FREE
-
-
-def _conditions(planned: Planned) -> str:
-    rows = [
-        [item.subject, item.value, item.limit, "held" if item.ok else "NOT HELD"]
-        for item in planned.preflight.items
-    ]
-    return table(("condition", "found", "limit", ""), rows, "Conditions before the motion")
 
 
 def _clearance_panel(planned: Planned) -> Panel:

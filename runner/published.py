@@ -1,17 +1,20 @@
-"""The published results that a run is held against.
+"""The published results, and the same characteristics of a run.
 
-Kolyubin, Paramonov and Shiriaev, "Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+",
+Kolyubin, Shiriaev and Jubien, "Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+",
 IFAC-PapersOnLine 50-1 (2017): Table 1 (excitation trajectories) and Table 2 (essential base parameters).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["SOURCE", "TABLE_1", "TABLE_2", "PublishedMotion", "PublishedParameter"]
+from ident.estimation.identify import Identification
+
+__all__ = ["SOURCE", "TABLE_1", "TABLE_2", "PublishedMotion", "PublishedParameter", "characteristics"]
 
 SOURCE = (
-    "Kolyubin, Paramonov, Shiriaev: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
+    "Kolyubin, Shiriaev, Jubien: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
     "IFAC-PapersOnLine 50-1 (2017)"
 )
 
@@ -64,3 +67,29 @@ def _entries(text: str) -> tuple[PublishedParameter, ...]:
 
 TABLE_2 = _entries(_TABLE_2)
 """The 49 essential base parameters of Model 2, in the order of the paper."""
+
+
+def characteristics(found: Identification) -> dict[str, Any]:
+    """Condition numbers and mean torques of the sessions of an identification, as in Table 1.
+
+    condition : of the unscaled, unweighted observation matrix, over all base parameters (`base`), the essential
+        parameters of this run (`essential`) and the 49 of Table 2 (`paper`). The last one is the definition in
+        agreement with Table 1. None if the run lacks any of the parameters.
+    mean_torque_nm : by session file and joint, mean |joint torque sensor| over the excitation [Nm].
+    """
+    names = list(found.problem.names)
+    wanted = [entry.name for entry in TABLE_2]
+    condition: dict[str, float | None] = {"base": found.condition, "essential": None, "paper": None}
+    if found.essential is not None and len(found.essential.names):
+        condition["essential"] = found.problem.select(found.essential.columns).condition
+    if set(wanted) <= set(names):
+        condition["paper"] = found.problem.select([names.index(name) for name in wanted]).condition
+    return {"condition": condition, "mean_torque_nm": _mean_torque(found)}
+
+
+def _mean_torque(found: Identification) -> dict[str, dict[str, float]]:
+    return {
+        session.name: dict(zip(session.joint_names, session.mean_torque, strict=True))
+        for session in found.prepared
+        if session.mean_torque
+    }

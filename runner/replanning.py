@@ -1,8 +1,8 @@
-"""Further rounds of an experiment: plan again with what the rounds before have taught, drive, estimate jointly.
+"""Further rounds of an experiment: plan with the estimate so far, drive, estimate from all rounds.
 
-The motion of a round is planned with the present estimate of the parameters (torque limits hold for their
-uncertainty), the noise that the identification found, and the information of every session so far: it adds
-what those lack. It passes the same checks as any other motion before the arm moves.
+The motion of a round is planned with the present estimate (torque limits hold within its uncertainty), the noise of
+the residuals, and the information of every session so far, so it adds the missing information. It passes the same
+checks as any other motion.
 """
 
 from __future__ import annotations
@@ -14,34 +14,34 @@ from typing import Literal
 
 import numpy as np
 
+from ident.estimation.identify import Identification
 from ident.excitation import ExcitationPlan
 from ident.excitation.arm_model import split_name
 from ident.excitation.planner import Progress as SearchProgress
 from ident.excitation.planner import plan
 from ident.excitation.problem import Knowledge, PlanProblem, Prior
-from ident.identify import Identification
-from ident.model_file import write_model
+from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from runner.experiment import Record, Run
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import excitation_rows
 from runner.preflight import check_start
-from runner.results import estimate, identified_model, summarise, write_results
-from runner.status import StatusLine
+from runner.results import estimate, named_model, summarise, write_results
+from runner.terminal import StatusLine
 
 __all__ = ["Rounds", "next_problem", "planned_near_home", "rounds_begun", "show_search"]
 
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"
-# Searches for a motion that begins near enough to home, and the distance of rows of which the first is looked at [s].
+# Searches for a motion with a start near home, and its row period for that check [s].
 _SEARCHES, _ROW_S = 4, 0.01
 
 
 def rounds_begun(folder: Path) -> int:
-    """Further rounds that the experiment in `folder` has a plan of."""
+    """Number of further rounds with a plan in `folder`."""
     count = 0
     while (folder / PLAN.format(count + 2)).is_file():
         count += 1
@@ -65,10 +65,10 @@ class Rounds:
     status: StatusLine
 
     def run(self, first: Run, records: Sequence[Record], rounds: int) -> list[Record]:
-        """Run `rounds` further rounds after the `first` one, which left `records`; all records.
+        """Run `rounds` further rounds after the `first` one with its `records`; returns all records.
 
-        The results of the rounds so far are written before each new one, so that they stand whatever happens.
-        A session that aborts or fails ends the sequence: its record is the last one.
+        The results so far are written before each new round. An aborted or failed session ends the sequence and
+        has the last record.
         """
         found, run = list(records), first
         for number in range(2, rounds + 2):
@@ -86,7 +86,7 @@ class Rounds:
         return found
 
     def _motion(self, number: int, records: Sequence[Record]) -> ExcitationPlan:
-        """The motion of a round: the one already in the folder, or planned now and stored there."""
+        """The motion of a round, read from the folder, or planned now and stored there."""
         path = self.folder / PLAN.format(number)
         if path.is_file():
             return ExcitationPlan.load(path)
@@ -96,7 +96,7 @@ class Rounds:
         summary = summarise(self.experiment, records, found)
         write_results(self.folder, self.experiment, self.arm, summary, found)
         model = self.folder / MODEL.format(number - 1)
-        write_model(identified_model(found, self.arm.name), model)
+        write_model(named_model(found.model, self.arm.name), model)
         problem = next_problem(self.experiment, self.cell, records, found, model)
         status.show(
             f"planning round {number}", 0.0, "Ctrl-C ends the search and keeps the best motion so far"
@@ -117,9 +117,9 @@ class Rounds:
 def planned_near_home(
     experiment: Experiment, arm: Arm, problem: PlanProblem, show: Callable[[SearchProgress], None]
 ) -> ExcitationPlan:
-    """The motion of a search, of one with the next seed where it begins farther from home than the approach may go.
+    """The motion of a search. If its start is too far from home for the approach, the next seed is searched.
 
-    The last of a few searches is given as it is; the preflight refuses it and says why.
+    The motion of the last search is returned in any case; the preflight then refuses it with the reason.
     """
     search = problem.search
     for seed in range(search.seed, search.seed + _SEARCHES):
@@ -135,18 +135,16 @@ def next_problem(
 ) -> PlanProblem:
     """The planning problem of the next round.
 
-    The problem file that the experiment names says what is wanted (motion, objective, workspace, search); arm,
-    cell, sessions, payload, present estimate (`model`, with its covariance), noise, and the sessions recorded
-    so far as prior come from the experiment.
+    Motion, objective, workspace and search come from the experiment's problem file. Arm, cell, sessions, payload,
+    noise, present estimate (`model`, with its covariance) and the recorded sessions, as prior, come from the
+    experiment.
     """
     wanted = PlanProblem.load(find(experiment.replan.problem, beside=experiment.folder))
-    payload = _heaviest(experiment)
+    payload = experiment.heaviest
     sessions = [session for session in experiment.sessions if not session.validation]
-    loads: list[Literal["unloaded", "loaded"]] = []
-    for session in sessions:
-        load: Literal["unloaded", "loaded"] = "unloaded" if session.payload is None else "loaded"
-        if load not in loads:
-            loads.append(load)
+    loads: list[Literal["unloaded", "loaded"]] = [
+        "unloaded" if session.payload is None else "loaded" for session in sessions
+    ]
     unseen = {session.name for session in experiment.sessions if session.validation}
     prior = tuple(Prior(session=str(r.path.resolve())) for r in records if r.name not in unseen)
     clearance = 0.0 if wanted.clearance_m is None else wanted.clearance_m
@@ -158,7 +156,7 @@ def next_problem(
         motion=replace(wanted.motion, periods=experiment.excitation.periods),
         knowledge=_knowledge(wanted.knowledge, payload, found, model),
         parameters=_names(found, payload),
-        sessions=tuple(loads),
+        sessions=tuple(dict.fromkeys(loads)),
         model=experiment.identification.model,
         clearance_m=max(clearance, experiment.moves.clearance_m, cell.margin_m),
         prior=prior,
@@ -171,13 +169,8 @@ def _always(motion: ExcitationPlan, periods: int) -> Callable[[SessionPlan, floa
     return lambda session, period_s: rows(period_s)
 
 
-def _heaviest(experiment: Experiment) -> Payload | None:
-    payloads = sorted(experiment.payloads().values(), key=lambda payload: payload.mass)
-    return payloads[-1] if payloads else None
-
-
 def _knowledge(wanted: Knowledge, payload: Payload | None, found: Identification, model: Path) -> Knowledge:
-    """What is known now: the estimate with its covariance, and the noise that its residuals show."""
+    """Present knowledge: the estimate with its covariance, and the noise of its residuals."""
     joints = found.structure.chain.joint_names
     fits = {(fit.side, fit.joint): fit for fit in found.estimate.classes}
     # rows of the difference of both sides are weighted as motor rows
@@ -198,7 +191,7 @@ def _knowledge(wanted: Knowledge, payload: Payload | None, found: Identification
 
 
 def _names(found: Identification, payload: Payload | None) -> tuple[str, ...]:
-    """The essential parameters of the arm and of the payload that is planned with."""
+    """The essential parameters of the arm and of the planned payload."""
     names = found.base.names if found.essential is None else found.essential.names
     joints = found.structure.chain.n
     link = None if payload is None else found.structure.payload_link(payload.name)

@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
 from ident.model import DynamicModel
-from ident.signals.filters import low_pass
+from ident.rows.filters import low_pass
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import find, parse
 from lwr_driver.session import Session

@@ -1,32 +1,38 @@
-"""What an experiment leaves behind: model.yaml, summary.json and a short text report."""
+"""Results of an experiment, or of logs alone: model.yaml, summary.json and a short text report."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.validate import validate
 from ident.estimators.estimate import Estimate
-from ident.identify import Identification, IdentificationSettings, identify
-from ident.kinematics import Chain
 from ident.model import DynamicModel
-from ident.model_file import write_model
-from ident.signals.settings import SignalSettings
-from ident.validation import validate
+from ident.model.model_file import write_model
+from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
-from runner.characteristics import characteristics
+from runner.computer import software, versions
 from runner.experiment import LinkReport, Record
 from runner.experiment_file import Experiment
-from runner.versions import software, versions
+from runner.published import characteristics
+from runner.terminal import plain
 from sim_backend.robot import truth
 
-__all__ = ["agreement", "estimate", "identified_model", "summarise", "true_base", "write_results"]
+__all__ = [
+    "agreement", "estimate", "named_model", "new_folder", "summarise", "true_base",
+    "write_log_results", "write_results",
+]  # fmt: skip
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
@@ -48,12 +54,12 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
 
 
 def unseen_sessions(experiment: Experiment) -> frozenset[str]:
-    """Names of the sessions that the estimate is held against."""
+    """Names of the held-out sessions."""
     return frozenset(plan.name for plan in experiment.sessions if plan.validation)
 
 
 def true_base(experiment: Experiment, found: Identification) -> dict[str, float]:
-    """The emulated arm's true base parameters by name; empty where the arm is real."""
+    """The emulated arm's true base parameters by name; empty for a real arm."""
     if experiment.backend != "emulator":
         return {}
     structure = found.structure
@@ -63,7 +69,7 @@ def true_base(experiment: Experiment, found: Identification) -> dict[str, float]
 
 
 def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> float:
-    """Share of the parameters whose estimate lies within `sigmas` standard deviations of the truth."""
+    """Share of the estimates within `sigmas` standard deviations of the truth."""
     known = [entry for entry in parameters if "truth" in entry]
     if not known:
         return math.nan
@@ -74,7 +80,7 @@ def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> floa
 def summarise(
     experiment: Experiment, records: Sequence[Record], found: Identification | None
 ) -> dict[str, Any]:
-    """Content of summary.json: how the experiment ended, what was estimated, how the link was."""
+    """Content of summary.json: end of the experiment, estimate, link."""
     last = records[-1]
     unseen = unseen_sessions(experiment)
     summary: dict[str, Any] = {
@@ -110,7 +116,7 @@ def summarise(
 
 
 def estimated(found: Identification, tested: Sequence[Session]) -> dict[str, Any]:
-    """What an estimate adds to a summary. tested : sessions that it has not seen and is held against."""
+    """Content of a summary from an estimate. tested : held-out sessions."""
     content = found.to_dict()
     content["signals"] = content.pop("sessions")
     content["excitation"] = characteristics(found)
@@ -128,20 +134,19 @@ def write_results(
 ) -> str:
     """Write model.yaml, report.txt and summary.json into `folder`; returns the report.
 
-    How the link was in sessions that an earlier run has finished stays in the summary.
+    Link statistics of sessions finished in an earlier run stay in the summary.
     """
     summary["link"] = {**_earlier_link(folder, summary), **summary["link"]}
     report = _report(experiment, summary, found)
     if found is not None:
-        model = identified_model(found, arm.name)
-        write_model(model, folder / "model.yaml")
+        write_model(named_model(found.model, arm.name), folder / "model.yaml")
     (folder / "report.txt").write_text(report, encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     return report
 
 
 def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
-    """The link of the sessions that the last summary in the folder and this one both call finished."""
+    """Link statistics of the previous summary, for sessions finished there and here."""
     try:
         earlier = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         kept = {entry["name"] for entry in earlier["sessions"] if entry["exit_status"] == "success"}
@@ -152,10 +157,9 @@ def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     return {name: link[name] for name in names if name in kept and name in link}
 
 
-def identified_model(found: Identification, robot: str) -> DynamicModel:
-    """The identified model with its covariance and where it comes from."""
-    provenance = {**found.model.provenance, "software": software()}
-    return dataclasses.replace(found.model, robot=robot, provenance=provenance)
+def named_model(model: DynamicModel, robot: str) -> DynamicModel:
+    """The identified model with the name of the robot, and this software in its provenance."""
+    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, "software": software()})
 
 
 def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
@@ -207,5 +211,80 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
         )
     for score in summary.get("validation", ()):
         errors = ", ".join(f"{side} {100 * value:.2f} %" for side, value in score["relative"].items())
-        lines.append(f"  torque of {score['session']}, unseen by the estimate, is computed to: {errors}")
+        lines.append(f"  torque error of {score['session']}, held out: {errors}")
     return "\n".join([*lines, "", found.summary()]) + "\n"
+
+
+_ANNOUNCED = ("payload", "payload_mass")
+
+
+def new_folder(folder: Path) -> Path:
+    """Make an empty folder for results. ConfigurationError if this is impossible."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigurationError(f"{folder} is not an empty folder; choose another --results")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(
+            f"{folder} cannot be made: {error.strerror}; choose another --results"
+        ) from error
+    return folder
+
+
+def write_log_results(
+    folder: Path,
+    found: Identification,
+    sessions: Sequence[Session],
+    tested: Sequence[Session],
+    model: DynamicModel,
+    *,
+    text: str,
+) -> Path:
+    """Write summary.json, model.yaml, report.txt and report.html into `folder`; returns the path of the page.
+
+    sessions : of the estimate. tested : held-out sessions. The logs are not copied; the summary has their paths.
+    """
+    names = _names([*sessions, *tested])
+    entries = [
+        _entry(session, name, folder, index >= len(sessions))
+        for index, (session, name) in enumerate(zip([*sessions, *tested], names, strict=True))
+    ]
+    summary = {
+        "schema_version": 1,
+        "experiment": folder.resolve().name,
+        "from_logs": True,
+        "exit_status": "success",
+        "reason": "",
+        "sessions": entries,
+        "link": {},
+        "versions": versions(),
+        **estimated(found, tested),
+    }
+    write_model(model, folder / "model.yaml")
+    (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps(plain(summary), indent=1) + "\n", encoding="utf-8")
+    from runner.report.page import write_report
+
+    return write_report(folder)
+
+
+def _entry(session: Session, name: str, folder: Path, unseen: bool) -> Mapping[str, Any]:
+    return {
+        "name": name,
+        "file": os.path.relpath(session.path.resolve(), folder.resolve()),
+        "exit_status": "success",
+        "reason": "",
+        "validation": unseen,
+        "warnings": [],
+        # The command line may correct the payload of the log.
+        "metadata": {key: session.metadata[key] for key in _ANNOUNCED if key in session.metadata},
+    }
+
+
+def _names(sessions: Sequence[Session]) -> list[str]:
+    """Names of the sessions: their file names, with the folder for equal names."""
+    stems = [session.path.stem for session in sessions]
+    return [
+        stem if stems.count(stem) == 1 else f"{session.path.resolve().parent.name}-{stem}"
+        for session, stem in zip(sessions, stems, strict=True)
+    ]

@@ -1,6 +1,6 @@
 """The arm and its cell as primitive shapes in a viser scene, for preview and live view.
 
-viser is part of the extra `view`; nothing else imports this module.
+viser is part of the extra `view`; only preview and live view import this module.
 """
 
 from __future__ import annotations
@@ -18,20 +18,13 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell, PayloadShape
 from runner.experiment_file import Payload
 
 __all__ = [
-    "ALARM",
-    "BODY",
-    "GHOST",
-    "ArmShape",
-    "Colour",
-    "add_cell",
-    "line_colour",
-    "start_server",
+    "ALARM", "BODY", "GHOST", "ArmShape", "Colour", "add_cell", "line_colour", "start_server",
     "stop_server",
-]
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -41,13 +34,13 @@ JOINT: Colour = (0, 114, 178)
 GHOST: Colour = (0, 158, 115)
 ALARM: Colour = (213, 94, 0)
 CARRIED: Colour = (86, 86, 86)
-_DENSITY = 2700.0  # of a payload whose shape is not given, drawn as an aluminium ball [kg/m³]
+_DENSITY = 2700.0  # of a payload without shape, drawn as an aluminium ball [kg/m³]
 
 
 def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
-    """A viser server that only this computer reaches.
+    """A viser server for this computer only.
 
-    port : 0 takes any that is free. ConfigurationError without the extra `view` and for a port in use.
+    port : 0 for any free one. ConfigurationError without the extra `view` and for a port in use.
     """
     try:
         import viser
@@ -55,9 +48,9 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
         from runner.report.interactive import INSTALL
 
         raise ConfigurationError(f"3D view: {INSTALL}") from error
-    # The package announces connections on its own loggers and on standard output.
+    # viser reports connections on its own loggers and on standard output.
     logging.getLogger("websockets").setLevel(logging.ERROR)
-    # It would take the next free port without a word.
+    # viser would silently take the next free port.
     _check_free(host, port)
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port or _free_port(host), verbose=False)
@@ -75,7 +68,7 @@ def stop_server(server: Any) -> None:
 
 
 def line_colour(colour: Colour) -> Colour:
-    """The value that viser shows as this colour where lines have a colour each, taken as linear light."""
+    """The colour as linear light, expected by viser for lines with individual colours."""
     red, green, blue = (round(255 * (value / 255) ** 2.2) for value in colour)
     return red, green, blue
 

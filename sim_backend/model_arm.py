@@ -16,13 +16,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident import regressor
-from ident.cad_prior import cad_prior
+from ident.dynamics import regressor
+from ident.dynamics.parameters import INERTIAL, PER_LINK
 from ident.effects import Parameters, Simulated, find_effect
 from ident.effects.model_torque import parameter_values
+from ident.estimators.physical import cad_prior
 from ident.export import consistent_parameters
 from ident.model import DynamicModel
-from ident.parameters import INERTIAL, PER_LINK
 from sim_backend.plant import Effect
 from sim_backend.robot import Drive, with_inertias
 

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from fri.errors import ConfigurationError, LwrError, NetworkError, RobotError
 from lwr_driver.configuration import find
-from lwr_driver.undisturbed import undisturbed
+from lwr_driver.realtime import undisturbed
 from sim_backend.pendant import Pendant
 
 __all__ = ["Emulator", "EmulatorProcess"]

@@ -228,7 +228,7 @@ def robot_model(config: EmulatorConfig) -> DynamicModel | None:
     if "chain" not in content:
         return None
     # Imported only here: the start without the estimation takes half the time.
-    from ident.model_file import read_model
+    from ident.model.model_file import read_model
 
     model = read_model(content)
     if model.structure.chain.n != JOINTS:

@@ -14,7 +14,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings
 from lwr_driver.motion import Motion, move_to
 from runner.laboratory import free_port
-from runner.route import dwell
+from runner.planning import dwell
 from sim_backend.process import EmulatorProcess
 
 __all__ = ["Lab", "descendants", "gone"]

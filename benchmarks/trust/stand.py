@@ -31,11 +31,11 @@ from lwr_driver.arm import Arm
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion, check_motion, move_to
-from lwr_driver.recording import Recorded, Recording, SessionRequest
 from lwr_driver.ring import Ring
 from lwr_driver.session import session_metadata
+from lwr_driver.session.recording import Recorded, Recording, SessionRequest
 from lwr_driver.turnaround import Turnaround
-from runner.route import dwell
+from runner.planning import dwell
 from sim_backend.configuration import krl_program
 from sim_backend.faults import FaultyWire, Parcel, WireFault
 from sim_backend.monitor import CommandMonitor

@@ -20,7 +20,7 @@ from fri.packets import CMD_SIZE, MSR_SIZE, MsrBuffer
 from fri.policy import KrcLimits, KrcPolicy
 from fri.sequence import SequenceTracker
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session, recover
 
 __all__ = ["TARGETS", "check", "corpus"]
@@ -117,7 +117,7 @@ def emulator(data: bytes) -> None:
 
 def urdf(data: bytes) -> None:
     """A robot description."""
-    from ident.kinematics import Chain
+    from ident.dynamics.kinematics import Chain
 
     try:
         text = data.decode()

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.trust.gathered import gather
 from benchmarks.trust.table import Ledger
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 
 __all__ = ["campaign"]
 

@@ -19,10 +19,9 @@ from benchmarks.trust.table import Ledger
 from benchmarks.trust.wire_faults import FAULTS, NAMED, PERIODS_MS, SEEN, Fault
 from fri.states import State
 from lwr_driver.control import Job, Mode, Result, Text, Word
-from lwr_driver.link import advise_command, silence_in_lock_step
+from lwr_driver.link import advise_command, silence_in_lock_step, snapshot
 from lwr_driver.ring import Ring
 from lwr_driver.session import read_session
-from lwr_driver.state import snapshot
 
 __all__ = ["FAULTS", "PHASES", "WireRun", "campaign", "plan", "run"]
 

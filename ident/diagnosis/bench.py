@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fri.errors import DataError
-from ident.base import BaseSet
-from ident.cad_prior import cad_prior
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.noise import noise_floor, repeatability
@@ -18,9 +16,11 @@ from ident.diagnosis.recording import Recording
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import Selection
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
 from ident.effects import DELAYS, ELASTICITY, Shape
-from ident.kinematics import Chain
-from ident.structure import Coupling
+from ident.estimators.physical import cad_prior
 
 __all__ = [
     "ArmData",

@@ -10,9 +10,9 @@ import numpy as np
 
 from ident.diagnosis.bench import Bench
 from ident.diagnosis.candidates import Trial
+from ident.diagnosis.data_quality import SampleLoss
 from ident.diagnosis.evidence import Floats, Key, Rows
-from ident.diagnosis.gain import HeldOut, fall, held_out, interval
-from ident.diagnosis.hygiene import SampleLoss
+from ident.diagnosis.held_out import HeldOut, fall, held_out, interval
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions, model_form_error
 from ident.diagnosis.nominal import TRAVEL_RAD, Arm, Nominal

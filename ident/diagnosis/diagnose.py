@@ -21,16 +21,16 @@ from ident.diagnosis.bench import (
 )
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import Baseline, Simulate, conclude, timing_finding
+from ident.diagnosis.data_quality import sample_loss
 from ident.diagnosis.evidence import Rows, Score
-from ident.diagnosis.hygiene import sample_loss
 from ident.diagnosis.nominal import Arm
 from ident.diagnosis.recording import Recording, record
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis, Finding
 from ident.diagnosis.selection import Claim, Null, Selection, best_candidate, select
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
-from ident.kinematics import Chain
 from ident.model import DynamicModel
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.distributions import chi_square_tail, fisher_tail
+from ident.estimators.estimate import chi_square_tail, fisher_tail
 
 __all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
 

@@ -22,17 +22,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
 
-from ident import regressor
-from ident.base import BaseSet, numeric_base
 from ident.diagnosis.recording import Recording, Stretch
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics import regressor
+from ident.dynamics.base_set import BaseSet, numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import split_name
+from ident.dynamics.structure import Condition, Coupling, ModelStructure, Side
 from ident.effects.motion import Motion, dahl
 from ident.effects.springs import Springs
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.parameters import split_name
-from ident.signals.filters import differentiate, low_pass
-from ident.structure import Condition, Coupling, ModelStructure, Side
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import differentiate, low_pass
 
 __all__ = ["TRAVEL_RAD", "Arm", "Nominal", "SideRows", "structure_of"]
 

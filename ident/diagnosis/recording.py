@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from ident.diagnosis.bandwidth import passed_band
-from ident.diagnosis.hygiene import Stuck, clipped_at, held_times, stuck_at
+from ident.diagnosis.data_quality import Stuck, clipped_at, held_times, passed_band, stuck_at
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.kinematics import Chain
-from ident.signals.prepare import PreparedSession, prepare
-from ident.signals.settings import SignalSettings
-from ident.structure import Side
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Side
+from ident.rows.filters import SignalSettings
+from ident.rows.prepare import PreparedSession, prepare
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

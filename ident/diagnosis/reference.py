@@ -15,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.base import BaseSet
 from ident.diagnosis.evidence import Floats
-from ident.distributions import fisher_limit
+from ident.dynamics.base_set import BaseSet
+from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel
 
 __all__ = ["DELAY_STD_S", "Reference"]

@@ -18,8 +18,8 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.distributions import normal_tail
 from ident.effects import DELAYS, ELASTICITY, Shape
+from ident.estimators.estimate import normal_tail
 
 __all__ = ["Claim", "Null", "Selection", "best_candidate", "confidence", "gains", "margin", "select"]
 

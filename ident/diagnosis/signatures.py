@@ -23,8 +23,8 @@ from ident.diagnosis.recording import record
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import select
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
 from ident.effects import Form, Shape, find_effect
-from ident.kinematics import Chain
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session

@@ -26,9 +26,17 @@ from ident.effects.effect import (
 from ident.effects.motion import Floats, Motion, dahl
 from ident.effects.springs import Springs
 from ident.effects.words import Values, quantity, quantity_text, times, wave
-from ident.signals.filters import differentiate, low_pass
+from ident.rows.filters import differentiate, low_pass
 
-__all__ = ["Backlash", "BaseTilt", "CableSpring", "EncoderEccentricity", "JointElasticity", "JointZeroOffset"]
+__all__ = [
+    "Backlash",
+    "BaseTilt",
+    "CableSpring",
+    "EncoderEccentricity",
+    "JointElasticity",
+    "JointZeroOffset",
+    "sideways_gravity",
+]
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
 _LINK_HZ, _MOTOR_HZ = 8.0, 30.0
@@ -367,6 +375,12 @@ def _pulls(angle: Any, shape: Shape) -> tuple[Any, ...]:
     return (np.maximum(away, 0.0) if shape.form is _Spring.TAUT_ABOVE else np.minimum(away, 0.0),)
 
 
+def sideways_gravity(gravity: Floats, axes: Floats) -> Floats:
+    """Derivatives (k, 3) of gravity (3,) in the base's axes, for rotations of the base about `axes` (k, 3)."""
+    # The base turned by +angle sees gravity turned by -angle.
+    return np.array([-np.cross(axis, gravity) for axis in axes])
+
+
 class BaseTilt(Effect):
     """Gravity is turned by `tilt_x` about x and `tilt_y` about y of the base frame (small angles)."""
 
@@ -388,8 +402,7 @@ class BaseTilt(Effect):
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Gravity torques of the sideways parts of gravity, in all rows."""
         down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
-        # The base turned by +angle sees gravity turned by -angle.
-        return tuple(both_sides(motion.gravity_along(-np.cross(axis, down))) for axis in np.eye(3)[:2])
+        return tuple(both_sides(motion.gravity_along(side)) for side in sideways_gravity(down, np.eye(3)[:2]))
 
     def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
         """Gravity of the simulated arm turned."""

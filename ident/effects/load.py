@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ident import regressor
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 from ident.effects.effect import (
     Column,
     Effect,
@@ -25,7 +26,6 @@ from ident.effects.effect import (
 )
 from ident.effects.motion import Floats, Motion
 from ident.effects.words import Values, quantity, quantity_text
-from ident.kinematics import Chain
 
 __all__ = ["Contact", "PayloadChange", "PayloadError", "force_torque", "leaning", "slide"]
 

@@ -1,19 +1,16 @@
-"""Torque of a model's effects, and the motion as the effects see it."""
+"""Entries of a model's effects: their check, their parameter values and the torque they add."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident import regressor
+from ident.dynamics.structure import Side
+from ident.effects import find_effect
 from ident.effects.motion import Floats, Motion
-
-if TYPE_CHECKING:
-    from ident.model import DynamicModel
-    from ident.structure import Side
 
 __all__ = ["check_entry", "effects_torque", "parameter_values"]
 
@@ -25,8 +22,6 @@ def check_entry(entry: Mapping[str, Any], joints: int) -> None:
 
     Raises ConfigurationError with the entry, the value and what is allowed.
     """
-    from ident.effects import find_effect
-
     unknown = set(entry) - _ENTRY
     if unknown or not {"cause", "joints", "parameters"} <= set(entry):
         raise ConfigurationError(
@@ -52,28 +47,15 @@ def parameter_values(entry: Mapping[str, Any]) -> dict[str, float]:
 
 
 def effects_torque(
-    model: DynamicModel,
-    q: Floats,
-    qd: Floats,
-    qdd: Floats,
-    linear: Mapping[str, Floats],
-    *,
-    side: Side,
-    payload: str | None = None,
-    time: Floats | None = None,
-    measured: bool = False,
+    entries: Iterable[Mapping[str, Any]], motion: Motion, *, side: Side, measured: bool = False
 ) -> Floats:
-    """Torque (N, n) [Nm] that the model's effects add to one side.
+    """Torque (N, n) [Nm] added to one side by the entries of a model's effects.
 
-    linear : torque (N, n) of the linear model by side, at least the joint's. time : (N,) [s], evenly spaced;
-    default 1 ms steps. measured : what sensors add to the physics counts too. Effects of a moment (a contact,
-    a payload that came loose) and late channels are properties of a session, not of the arm, and left out.
+    measured : add the errors of the sensors to the physics. Effects of an event (a contact, a payload that came
+    loose) and delayed channels are properties of a session, not of the arm, and are left out.
     """
-    from ident.effects import find_effect
-
-    total = np.zeros_like(q)
-    motion = _motion(model, q, qd, qdd, linear, payload, time)
-    for entry in model.effects:
+    total = np.zeros_like(motion.q)
+    for entry in entries:
         effect = find_effect(str(entry["cause"]))
         if effect.event or effect.side == "timing" or (effect.side == "sensor" and not measured):
             continue
@@ -82,45 +64,3 @@ def effects_torque(
             motor, link = effect.torque(motion, int(joint) - 1, values, entry.get("form"))
             total += motor if side == "motor" else link if side == "joint" else motor - link
     return total
-
-
-def _motion(
-    model: DynamicModel,
-    q: Floats,
-    qd: Floats,
-    qdd: Floats,
-    linear: Mapping[str, Floats],
-    payload: str | None,
-    time: Floats | None,
-) -> Motion:
-    chain, drive = model.structure.chain, model.drive()
-    bodies = model.inertial(payload)
-    joint = linear.get("joint")
-    if joint is None:
-        joint = regressor.torque(chain, q, qd, qdd, bodies)
-    stamps: Floats = np.arange(len(q), dtype=np.float64) * 1e-3
-    if time is not None:
-        stamps = time - time[0]
-
-    def friction(speed: Floats) -> Floats:
-        return drive["Fvm"] * speed + drive["Fcm"] * np.sign(speed)
-
-    return Motion(
-        chain=chain,
-        bodies=bodies,
-        session=1,
-        time=stamps,
-        duration_s=float(stamps[-1]) if len(stamps) else 0.0,
-        q=q,
-        qd=qd,
-        qdd=qdd,
-        motor_speed=qd,
-        motor_acceleration=qdd,
-        joint_torque=joint,
-        motor_torque=linear.get("motor", joint),
-        gear_ratio=np.ones(chain.n),
-        inertia=drive["Ia"],
-        link_coulomb=drive["Fcl"],
-        motor_coulomb=drive["Fcm"],
-        friction=friction,
-    )

@@ -9,9 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ident import regressor
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 from ident.effects.springs import Springs
-from ident.kinematics import Chain
 
 __all__ = ["Floats", "Motion", "dahl", "first_order", "play"]
 

@@ -1,19 +1,18 @@
-"""Covariances that hold for what the residuals really are.
+"""Covariances valid for serially correlated residuals.
 
-The textbook covariance of equation (14) takes the rows for serially uncorrelated. Residuals of a real arm are
-not: unmodelled physics repeats with the motion, so neighbouring rows err alike and the textbook standard
-deviation can be several times too small. Here the scores of all rows of one instant are summed first, so
-correlation between joints and sides is covered too, and then
+The textbook covariance of equation (14) assumes serially uncorrelated rows. Residuals of a real arm are
+correlated: unmodelled physics repeats with the motion, so neighbouring rows have similar errors, and the
+textbook standard deviation can be several times too small. Here the scores of all rows of one instant are
+summed first, so correlation between joints and sides is covered too, and then
 
 * `hac`: Bartlett-weighted autocovariances of the scores (Newey and West 1987), bandwidth after Andrews (1991)
   or stated, critical values after Kiefer and Vogelsang (2005). With a hundred parameters on a minute of
-  motion it is still 10 to 20 % too small, since the residuals at the very frequencies that matter were fitted
-  away;
+  motion it is still 10 to 20 % too small, because the fit removes residuals at the frequencies of the motion;
 * `jackknife` (the default): blocks of time, twice the bandwidth long, are left out one after the other. It
-  undoes that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard
-  deviations are the jackknife's, correlations the HAC's, which have full rank. Where the motion is periodic a
-  block is a part of the period, left out of all periods together: what the model lacks repeats with the
-  motion, so the periods are no independent witnesses of it;
+  corrects that effect (Quenouille 1956; the CR3 estimator of MacKinnon and White 1985 for blocks). Standard
+  deviations are the jackknife's; correlations are the HAC's, of full rank. For a periodic motion a block is a
+  part of the period, left out of all periods together: unmodelled physics repeats with the motion, so the
+  periods are not independent;
 * `bootstrap`: blocks of time drawn with replacement (Kunsch 1989), the parameters solved again each time.
 """
 
@@ -27,18 +26,11 @@ from typing import Literal
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
+from ident.dynamics.parameters import Floats
 from ident.estimators.estimate import Covariance
-from ident.estimators.problem import FloatArray, Problem, RowGroup
+from ident.estimators.problem import Problem, RowGroup
 
-__all__ = [
-    "CovarianceSettings",
-    "Scores",
-    "bootstrap",
-    "effective_rows",
-    "hac",
-    "jackknife",
-    "textbook",
-]
+__all__ = ["CovarianceSettings", "Scores", "bootstrap", "effective_rows", "hac", "jackknife", "textbook"]
 
 _LONGEST = 4000
 _CHUNK = 8192
@@ -46,7 +38,7 @@ _CHUNK = 8192
 
 @dataclass(frozen=True)
 class CovarianceSettings:
-    """Which covariance an estimate states.
+    """The stated covariance of an estimate.
 
     kind : "jackknife" (blocks of time left out, default), "hac" (Newey-West) and "bootstrap" (blocks drawn)
         are robust to serial correlation; "textbook" is equation (14).
@@ -65,18 +57,13 @@ class CovarianceSettings:
 class Scores:
     """Sum over all rows of one instant of row times weighted residual: one (T, p) array a record."""
 
-    records: tuple[FloatArray, ...]
+    records: tuple[Floats, ...]
 
     @classmethod
     def of(
-        cls,
-        problem: Problem,
-        coefficients: Sequence[FloatArray],
-        matrices: Sequence[FloatArray] | None = None,
+        cls, problem: Problem, coefficients: Sequence[Floats], matrices: Sequence[Floats] | None = None
     ) -> Scores:
-        """Scores with a coefficient for each row (weight times
-        residual); `matrices` replace the regressors.
-        """
+        """Scores with a coefficient for each row (weight times residual); `matrices` replace the regressors."""
         spans: dict[int, tuple[int, int]] = {}
         for group in problem.groups:
             if len(group.time_index):
@@ -107,10 +94,8 @@ class Scores:
         """Number of instants."""
         return sum(len(record) for record in self.records)
 
-    def bartlett(self, length: int) -> FloatArray:
-        """Sum over lags |l| < length of (1 - |l| / length) S_l: the sum of squares of all windows of
-        `length`.
-        """
+    def bartlett(self, length: int) -> Floats:
+        """Sum over lags |l| < length of (1 - |l| / length) S_l, the sum of squares of all windows of `length`."""
         p = self.records[0].shape[1]
         total = np.zeros((p, p))
         for record in self.records:
@@ -124,10 +109,8 @@ class Scores:
         """Sums over `factor` neighbouring instants: the same long-run variance from fewer rows."""
         return Scores(tuple(_block_sums(record, factor) for record in self.records))
 
-    def bandwidth(self, bread: FloatArray) -> float:
-        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in
-        samples, over the parameters' own scores.
-        """
+    def bandwidth(self, bread: Floats) -> float:
+        """Andrews (1991) AR(1) plug-in for the Bartlett kernel, in samples, over the parameters' own scores."""
         numerator = denominator = 0.0
         directions = bread.T / np.maximum(np.sqrt(np.abs(np.diag(bread))), 1e-300)
         for record in self.records:
@@ -147,13 +130,13 @@ class Scores:
         return 1.1447 * (alpha * self.samples) ** (1.0 / 3.0)
 
 
-def textbook(bread: FloatArray) -> Covariance:
+def textbook(bread: Floats) -> Covariance:
     """(A^T R^-1 A)^-1 of equation (14): right only for serially uncorrelated residuals."""
     return Covariance(bread, "textbook, equation (14): assumes serially uncorrelated residuals")
 
 
 def hac(
-    scores: Scores, bread: FloatArray, sample_time_s: float, bandwidth_s: float | None = None
+    scores: Scores, bread: Floats, sample_time_s: float, bandwidth_s: float | None = None
 ) -> tuple[Covariance, float]:
     """bread x long-run variance of the scores x bread^T, and the bandwidth used [s]."""
     factor = max(1, -(-max(len(record) for record in scores.records) // _LONGEST))
@@ -176,24 +159,23 @@ def hac(
 
 def jackknife(
     problem: Problem,
-    bread: FloatArray,
-    coefficients: Sequence[FloatArray],
-    row_weights: Sequence[FloatArray],
+    bread: Floats,
+    coefficients: Sequence[Floats],
+    row_weights: Sequence[Floats],
     block_s: float,
     *,
-    matrices: Sequence[FloatArray] | None = None,
-    correlation: FloatArray | None = None,
+    matrices: Sequence[Floats] | None = None,
+    correlation: Floats | None = None,
 ) -> Covariance:
     """Delete-a-block jackknife from one Newton step a block, exact for linear estimators.
 
-    coefficients : weight times residual of each row; row_weights : what multiplies a row's a a^T in the
-        inverse of `bread`; matrices : instruments, if they replace one of the regressors; correlation : (p,
-        p) covariance whose correlations are taken over.
+    coefficients : weight times residual of each row. row_weights : factor of a row's a a^T in the inverse of
+        `bread`. matrices : instruments in place of one factor a. correlation : (p, p) for the correlations.
     """
     p = len(problem.names)
     information = np.linalg.inv(bread)
-    normals: dict[tuple[int, int], FloatArray] = {}
-    sums: dict[tuple[int, int], FloatArray] = {}
+    normals: dict[tuple[int, int], Floats] = {}
+    sums: dict[tuple[int, int], Floats] = {}
     cut = _Blocks.of(problem, block_s)
     for number, group in enumerate(problem.groups):
         left = group.matrix if matrices is None else matrices[number]
@@ -205,7 +187,7 @@ def jackknife(
     shifts = []
     for key, normal in normals.items():
         rest = information - normal
-        # Instruments that hardly follow the regressors can make a diagonal entry negative.
+        # Weak instruments can make a diagonal entry negative.
         scale = np.sqrt(np.maximum(np.abs(np.diag(rest)), 1e-12 * np.abs(np.diag(information))))
         scaled = rest / np.outer(scale, scale)
         shifts.append(np.linalg.lstsq(scaled, sums[key] / scale, rcond=1e-10)[0] / scale)
@@ -227,8 +209,7 @@ def jackknife(
 class _Blocks:
     """Blocks of time of all records.
 
-    length : of a block in samples. spans : (first sample, number of samples that do not repeat, number of
-        blocks) by record.
+    length : of a block in samples. spans : (first sample, samples before a repetition, blocks) by record.
     """
 
     length: int
@@ -274,11 +255,11 @@ class _Blocks:
         return [(int(block[a]), slice(int(a), int(b))) for a, b in itertools.pairwise(edges)]
 
 
-def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int, seed: int) -> Covariance:
+def bootstrap(problem: Problem, weights: Floats, block_s: float, draws: int, seed: int) -> Covariance:
     """Covariance of `draws` weighted least-squares solutions over blocks of time drawn with replacement."""
     cut = _Blocks.of(problem, block_s)
     p = len(problem.names)
-    grams: dict[tuple[int, int], FloatArray] = {}
+    grams: dict[tuple[int, int], Floats] = {}
     for group, number in zip(problem.groups, problem.class_of_group, strict=True):
         for block, rows in cut.runs(group):
             augmented = np.column_stack([group.matrix[rows], group.target[rows]])
@@ -307,13 +288,11 @@ def bootstrap(problem: Problem, weights: FloatArray, block_s: float, draws: int,
     )
 
 
-def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatArray:
-    """Number of independent rows of each class: n / (1 + 2 sum of
-    autocorrelations) by Geyer's initial sequence.
-    """
+def effective_rows(problem: Problem, residuals: Sequence[Floats]) -> Floats:
+    """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's sequence."""
     result = []
     for row_class in problem.classes:
-        total: FloatArray = np.zeros(1)
+        total: Floats = np.zeros(1)
         count = 0
         for index in row_class.groups:
             group = problem.groups[index]
@@ -332,7 +311,7 @@ def effective_rows(problem: Problem, residuals: Sequence[FloatArray]) -> FloatAr
     return np.array(result)
 
 
-def correlation_time(autocovariance: FloatArray) -> float:
+def correlation_time(autocovariance: Floats) -> float:
     """1 + 2 sum rho_l, summed over pairs of lags while the pair is positive; at least 1."""
     if autocovariance[0] <= 0:
         return 1.0
@@ -343,7 +322,7 @@ def correlation_time(autocovariance: FloatArray) -> float:
     return max(1.0, 2.0 * float(pairs[:end].sum()) - 1.0)
 
 
-def _block_sums(values: FloatArray, factor: int) -> FloatArray:
+def _block_sums(values: Floats, factor: int) -> Floats:
     whole = -(-len(values) // factor) * factor
     padded = np.pad(values, ((0, whole - len(values)), (0, 0)))
     return padded.reshape(-1, factor, values.shape[1]).sum(axis=1)

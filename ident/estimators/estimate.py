@@ -1,35 +1,53 @@
-"""What an estimator returns, and the one interface of all estimators."""
+"""The result of an estimator, the interface of all estimators, and the distributions of intervals and tests.
+
+Tails and quantiles come from `scipy.special`, without the slow import of `scipy.stats`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from scipy import special
 
-from ident.distributions import normal_quantile, student_quantile
-from ident.estimators.problem import FloatArray, Problem
+from ident.dynamics.parameters import Floats
+from ident.dynamics.tables import Tabular
+from ident.estimators.problem import Problem
 
-__all__ = ["ClassFit", "Covariance", "Estimate", "Estimator"]
+__all__ = [
+    "ClassFit",
+    "Covariance",
+    "Estimate",
+    "Estimator",
+    "chi_square_tail",
+    "fisher_limit",
+    "fisher_tail",
+    "normal_quantile",
+    "normal_tail",
+    "student_quantile",
+    "student_tail",
+]
+
+Value = TypeVar("Value", float, Floats)
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance (p, p) of the estimate, what it assumes (`kind`), and the degrees of freedom of its
-    intervals.
+    """Covariance (p, p) of the estimate, its assumption (`kind`) and the degrees of freedom of its intervals.
 
-    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed those of
-    the normal law because a serial-correlation-robust variance is itself uncertain.
+    `inflation` multiplies the half width of a normal or t interval: fixed-b critical values exceed the normal
+    ones because a variance robust to serial correlation is itself uncertain.
     """
 
-    matrix: FloatArray
+    matrix: Floats
     kind: str
     degrees_of_freedom: float = float("inf")
     inflation: float = 1.0
 
     @property
-    def std(self) -> FloatArray:
+    def std(self) -> Floats:
         """Standard deviations (p,)."""
         return np.sqrt(np.maximum(np.diag(self.matrix), 0.0))
 
@@ -38,10 +56,9 @@ class Covariance:
 class ClassFit:
     """Residual of one joint and side.
 
-    sigma : std of the rows with the correct degrees of freedom [Nm]; rms : plain root mean square [Nm];
-    parameters : share of the p parameters that these rows consumed (the trace of their part of the hat
-        matrix);
-    n_eff : number of independent rows that the serial correlation leaves.
+    sigma : std of the rows with the correct degrees of freedom [Nm]. rms : plain root mean square [Nm].
+    parameters : share of the p parameters consumed by these rows (the trace of their part of the hat matrix).
+    n_eff : effective number of independent rows under serial correlation.
     """
 
     joint: str
@@ -59,47 +76,47 @@ class ClassFit:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Tabular):
     """Result of an estimator.
 
-    values : (p,) estimates; covariance : the stated, honest one; covariances : every one that was computed,
-        by name ("textbook", "hac", "bootstrap"); weights : (classes,) inverse variances used; residuals : y
-        - A chi [Nm] of each row group. standard : standard parameters, where the estimator finds them;
-        prior_scale : factor s on the prior's covariance, where there is a prior.
+    values : (p,) estimates. covariance : the stated one. covariances : all computed ones by name
+        ("textbook", "hac", "bootstrap"). weights : (classes,) inverse variances. residuals : y - A chi [Nm] of
+        each row group. standard : standard parameters, if the estimator finds them. prior_scale : factor s on
+        the prior's covariance, with a prior.
     """
 
     method: str
     names: tuple[str, ...]
-    values: FloatArray
+    values: Floats
     covariance: Covariance
     covariances: Mapping[str, Covariance]
     classes: tuple[ClassFit, ...]
-    weights: FloatArray
-    residuals: tuple[FloatArray, ...]
+    weights: Floats
+    residuals: tuple[Floats, ...]
     iterations: int = 1
     converged: bool = True
     notes: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    standard: FloatArray | None = None
+    standard: Floats | None = None
     prior_scale: float | None = None
 
     @property
-    def std(self) -> FloatArray:
+    def std(self) -> Floats:
         """Stated standard deviations (p,)."""
         return self.covariance.std
 
     @property
-    def rsd_percent(self) -> FloatArray:
+    def rsd_percent(self) -> Floats:
         """Relative standard deviations (p,) of equation (15) [%], from the stated covariance."""
         return rsd_percent(self.values, self.std)
 
     @property
-    def correlation(self) -> FloatArray:
+    def correlation(self) -> Floats:
         """Correlation matrix (p, p) of the stated covariance."""
         std = np.where(self.std > 0, self.std, 1.0)
         return self.covariance.matrix / np.outer(std, std)
 
-    def interval(self, level: float = 0.95, *, covariance: str | None = None) -> FloatArray:
+    def interval(self, level: float = 0.95, *, covariance: str | None = None) -> Floats:
         """Confidence limits (p, 2) at `level`, from the stated covariance or the one named."""
         chosen = self.covariance if covariance is None else self.covariances[covariance]
         tail = 0.5 + level / 2.0
@@ -108,9 +125,42 @@ class Estimate:
         half = chosen.inflation * factor * chosen.std
         return np.column_stack([self.values - half, self.values + half])
 
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each parameter: name, unit, estimate, std, rsd_percent."""
+        columns = (
+            self.names,
+            self._units,
+            self.values.tolist(),
+            self.std.tolist(),
+            self.rsd_percent.tolist(),
+        )
+        keys = ("name", "unit", "estimate", "std", "rsd_percent")
+        return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+
+    @property
+    def _units(self) -> tuple[str, ...]:
+        return self.units or ("",) * len(self.names)
+
+    def __repr__(self) -> str:
+        rms = [fit.rms for fit in self.classes]
+        residual = f"; residual rms {min(rms):.3g} to {max(rms):.3g} Nm" if rms else ""
+        lines = [
+            f"Estimate ({self.method}): {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows"
+            f"{residual}{'' if self.converged else ', NOT converged'}",
+            f"  standard deviations: {self.covariance.kind}",
+            "  least certain parameters:",
+        ]
+        rsd = self.rsd_percent
+        for k in np.argsort(-rsd, kind="stable")[:5]:
+            lines.append(
+                f"  {self.names[k]:<10}{self.values[k]:>11.4g} ± {self.std[k]:<9.2g} {self._units[k]:<9} "
+                f"RSD {rsd[k]:.1f} %"
+            )
+        return "\n".join(lines)
+
     def summary(self) -> str:
         """Table of the parameters and of the residual per joint and side."""
-        units = self.units or ("",) * len(self.names)
+        units = self._units
         lines = [
             f"{self.method}: {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows, "
             f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
@@ -135,14 +185,49 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """Settings in the constructor, work in `fit`."""
+    """Interface of the estimators: settings in the constructor, work in `fit`."""
 
     def fit(self, problem: Problem) -> Estimate:
         """Estimate the parameters of the problem."""
         ...
 
 
-def rsd_percent(values: FloatArray, std: FloatArray) -> FloatArray:
-    """100 std / |value|, equation (15); infinite where the value is zero."""
+def rsd_percent(values: Floats, std: Floats) -> Floats:
+    """100 std / |value|, equation (15); infinite for a value of zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values != 0.0, 100.0 * std / np.abs(values), np.inf)
+
+
+def normal_tail(z: Value) -> Value:
+    """Probability of a standard normal variable above z, for a number or elementwise."""
+    return special.ndtr(-z)  # type: ignore[no-any-return]
+
+
+def normal_quantile(p: float) -> float:
+    """Quantile p of the standard normal distribution."""
+    return float(special.ndtri(p))
+
+
+def student_tail(t: float, freedom: float) -> float:
+    """Probability of Student's t with `freedom` degrees of freedom above t."""
+    return float(special.stdtr(freedom, -t))
+
+
+def student_quantile(p: float, freedom: float) -> float:
+    """Quantile p of Student's t with `freedom` degrees of freedom."""
+    return float(special.stdtrit(freedom, p))
+
+
+def chi_square_tail(x: float, freedom: float) -> float:
+    """Probability of chi-square with `freedom` degrees of freedom above x."""
+    return float(special.chdtrc(freedom, x))
+
+
+def fisher_tail(f: float, freedom: float, rest: float) -> float:
+    """Probability of Fisher's F(freedom, rest) above f."""
+    return float(special.fdtrc(freedom, rest, f))
+
+
+def fisher_limit(p: float, freedom: float, rest: float) -> float:
+    """Quantile 1 - p of Fisher's F(freedom, rest)."""
+    return float(special.fdtri(freedom, rest, 1.0 - p))

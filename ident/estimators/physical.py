@@ -1,13 +1,14 @@
-"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives that only
-dissipate.
+"""Physically consistent estimation: every body's pseudo-inertia positive definite, drives dissipative.
 
 Standard parameters are fitted through their base parameters under linear matrix inequalities (Sousa and
-Cortesao 2014; Wensing, Kim and Slotine 2018) with a distance to a prior model that settles what the data
-cannot say (Lee, Wensing and Park 2020). The convex program goes to clarabel.
+Cortesao 2014; Wensing, Kim and Slotine 2018). A distance to a prior model determines the combinations unseen in
+the data (Lee, Wensing and Park 2020). The convex program is solved by clarabel. `cad_prior` makes the prior from
+the arm's own URDF.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -16,14 +17,15 @@ import numpy as np
 from scipy import sparse
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.base_set import BaseSet
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com, pseudo_inertia, split_name
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate
+from ident.estimators.least_squares import class_variances
 from ident.estimators.prior import MaximumAPosteriori, Prior
-from ident.estimators.problem import FloatArray, Problem
-from ident.estimators.solution import class_variances
-from ident.parameters import pseudo_inertia
+from ident.estimators.problem import Problem
 
-__all__ = ["BodyPrior", "PhysicallyConsistent", "nearest_consistent"]
+__all__ = ["BodyPrior", "PhysicallyConsistent", "cad_prior", "nearest_consistent"]
 
 Metric = Literal["pullback", "entropic", "euclidean"]
 
@@ -36,27 +38,26 @@ _FINEST = 1e10
 
 @dataclass(frozen=True)
 class BodyPrior:
-    """The standard parameters and what is known of them beforehand.
+    """Prior knowledge of the standard parameters.
 
     projection : K (p, n), base parameters = K standard parameters.
-    bodies : (k, 10) int, positions of the ten inertial parameters of each rigid body, in the order of
-        `parameters.INERTIAL`.
-    nonnegative : positions of parameters that cannot be negative (drive inertia, friction).
-    inertial : (k, 10) prior of the bodies; each must be consistent (`nearest_consistent` makes it so).
-    absent : positions of parameters that the model leaves out; they stay zero.
-    relative_std : how far a body may be from its prior, as a share of itself, one for all or (k,). The
-        default is the robot-to-robot variation that the paper reports, up to 20 %.
+    bodies : (k, 10) int, positions of the inertial parameters of each rigid body, in the order of `INERTIAL`.
+    nonnegative : positions of parameters without negative values (drive inertia, friction).
+    inertial : (k, 10) consistent prior of the bodies, if need be from `nearest_consistent`.
+    absent : positions of parameters left out of the model; they stay zero.
+    relative_std : standard deviation of a body from its prior, as a share of itself, one for all or (k,). The
+        default is the robot-to-robot variation in the paper, up to 20 %.
     """
 
-    projection: FloatArray
+    projection: Floats
     bodies: np.ndarray
     nonnegative: np.ndarray
-    inertial: FloatArray
+    inertial: Floats
     absent: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    relative_std: float | FloatArray = 0.2
+    relative_std: float | Floats = 0.2
 
     @property
-    def firmness(self) -> FloatArray:
+    def firmness(self) -> Floats:
         """1 / relative_std^2 of each body (k,)."""
         return (
             1.0 / np.broadcast_to(np.asarray(self.relative_std, dtype=np.float64), (len(self.bodies),)) ** 2
@@ -74,7 +75,7 @@ class BodyPrior:
                     "`nearest_consistent`"
                 )
 
-    def hessian(self, metric: Metric) -> FloatArray:
+    def hessian(self, metric: Metric) -> Floats:
         """(n, n) quadratic form of the distance to the prior at the prior; zero for the drive parameters.
 
         "pullback" (and "entropic", which agrees with it to second order): tr(J0^-1 dJ J0^-1 dJ) / 2,
@@ -94,9 +95,7 @@ class BodyPrior:
         return total
 
     def prior(self, metric: Metric) -> Prior:
-        """The same as a normal prior of the base parameters; those
-        with a drive parameter in them stay free.
-        """
+        """The same as a normal prior of the base parameters; those with a drive parameter stay free."""
         n = self.projection.shape[1]
         inertial = np.zeros(n, dtype=bool)
         inertial[self.bodies.ravel()] = True
@@ -118,8 +117,7 @@ class PhysicallyConsistent:
     metric : distance of a body from its prior: "pullback" (quadratic, invariant), "entropic"
         (log-determinant divergence, keeps away from the boundary), "euclidean".
     strength : s; 1 takes the prior as stated, "evidence" and "cross_validation" let the data choose, see
-        `MaximumAPosteriori`. Data with model errors choose too loose a prior, which costs accuracy on other
-        motions.
+        `MaximumAPosteriori`. Data with model errors choose too loose a prior for other motions.
     margin : smallest eigenvalue of a pseudo-inertia relative to the prior's smallest. The result's
         `standard` holds the standard parameters (n,).
     """
@@ -131,7 +129,7 @@ class PhysicallyConsistent:
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,) and `standard` (n,). Standard deviations are those without the inequalities."""
+        """Estimate (p,) and `standard` (n,), with the standard deviations of the unconstrained problem."""
         linear = MaximumAPosteriori(self.prior.prior(self.metric), self.strength, self.covariance).fit(
             problem
         )
@@ -142,7 +140,7 @@ class PhysicallyConsistent:
         p, projection = len(problem.names), self.prior.projection
         weights = np.minimum(linear.weights, _FINEST / _mean_squares(problem))
         for _ in range(_REWEIGHTINGS):
-            # Where the constraints bind, the residual grows and its weight must fall with it.
+            # With active constraints the residual grows, so its weight must fall.
             factor = problem.weighted(weights * np.minimum(shares, 1.0))
             standard = program.solve(factor.r[:p, :p] @ projection, factor.r[:p, p])
             values = projection @ standard
@@ -168,13 +166,12 @@ class PhysicallyConsistent:
         )
 
 
-def _mean_squares(problem: Problem) -> FloatArray:
+def _mean_squares(problem: Problem) -> Floats:
     """Mean square torque of each class [Nm^2]."""
-    power = [float(c.factor.r[:, -1] @ c.factor.r[:, -1]) / max(c.factor.rows, 1) for c in problem.classes]
-    return np.maximum(np.array(power), np.finfo(float).tiny)
+    return np.maximum([c.factor.mean_square for c in problem.classes], np.finfo(float).tiny)
 
 
-def nearest_consistent(inertial: FloatArray, *, margin: float = 1e-2) -> FloatArray:
+def nearest_consistent(inertial: Floats, *, margin: float = 1e-2) -> Floats:
     """Consistent (k, 10) nearest to `inertial` in size-relative Euclidean distance.
 
     margin : smallest eigenvalue of each pseudo-inertia relative to a compact body of that mass.
@@ -199,7 +196,7 @@ class _Program:
     strength: float
     margin: float
 
-    def solve(self, quadratic: FloatArray, target: FloatArray) -> FloatArray:
+    def solve(self, quadratic: Floats, target: Floats) -> Floats:
         """Standard parameters (n,) for ||quadratic x - target||^2 plus the regularisation."""
         prior, n = self.prior, quadratic.shape[1]
         start = np.zeros(n)
@@ -231,8 +228,7 @@ class _Program:
             if entropic:
                 first = n + number * (_BODY + 4)
                 rows, offset, kinds = _entropic_rows(places, n + extra, first)
-                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4, whose second-order form is
-                # the pullback metric.
+                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4; to second order the pullback metric.
                 slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
                 strength = self.strength * prior.firmness[number]
                 linear[places] += strength * slope
@@ -245,8 +241,7 @@ class _Program:
             cones += kinds
         full = np.zeros((n + extra, n + extra))
         full[:n, :n] = hessian
-        # Parameters without effect and without prior get a trace of curvature, so that the solution
-        # is unique.
+        # A trace of curvature makes the solution unique for parameters without effect and prior.
         full[np.arange(n), np.arange(n)] += 1e-12 * max(float(np.diag(hessian).max()), 1e-12)
         solution = _run(
             sparse.csc_matrix(np.triu(full)), linear, np.vstack(parts), np.concatenate(offsets), cones
@@ -254,9 +249,7 @@ class _Program:
         return solution[:n]
 
 
-def _run(
-    quadratic: sparse.csc_matrix, linear: FloatArray, rows: FloatArray, offset: FloatArray, cones: list
-) -> FloatArray:
+def _run(quadratic: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Floats, cones: list) -> Floats:
     # Columns scaled to the size of the curvature: masses and inertias differ by orders of magnitude.
     diagonal = np.sqrt(np.maximum(np.asarray(quadratic.diagonal()).ravel(), 0.0))
     typical = float(np.median(diagonal[diagonal > 0])) if np.any(diagonal > 0) else 1.0
@@ -285,26 +278,22 @@ def _run(
     return scale * np.array(result.x)
 
 
-def _svec(matrix: FloatArray) -> FloatArray:
-    """Upper triangle (..., k (k + 1) / 2) column by column,
-    off-diagonals times sqrt(2): clarabel's PSD cone.
-    """
+def _svec(matrix: Floats) -> Floats:
+    """Upper triangle (..., k (k + 1) / 2) column by column, off-diagonals times sqrt(2): clarabel's PSD cone."""
     size = matrix.shape[-1]
     entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]
     return np.stack(entries, axis=-1)
 
 
-def _psd_rows(places: np.ndarray, width: int, floor: FloatArray) -> tuple[FloatArray, FloatArray, list]:
+def _psd_rows(places: np.ndarray, width: int, floor: Floats) -> tuple[Floats, Floats, list]:
     """Rows of A x + s = b for J(x) - floor in the PSD cone."""
     rows = np.zeros((_BODY, width))
     rows[:, places] = -_svec(pseudo_inertia(np.eye(_BODY))).T
     return rows, -_svec(floor), [clarabel.PSDTriangleConeT(4)]
 
 
-def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArray, FloatArray, list]:
-    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at
-    column `first`.
-    """
+def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[Floats, Floats, list]:
+    """log det J >= sum u: [[J, L], [L^T, diag L]] PSD and u_i <= log L_ii; L and u start at column `first`."""
     lower = [(i, j) for j in range(4) for i in range(j, 4)]
     psd = np.zeros((36, width))
     big = np.zeros((_BODY, 8, 8))
@@ -326,13 +315,13 @@ def _entropic_rows(places: np.ndarray, width: int, first: int) -> tuple[FloatArr
     return np.vstack([psd, exponential]), np.concatenate([np.zeros(36), offset]), cones
 
 
-def _compact(mass: float) -> FloatArray:
-    """Pseudo-inertia of a ball of that mass and the density of aluminium: the scale of a real body."""
+def _compact(mass: float) -> Floats:
+    """Pseudo-inertia of an aluminium ball of that mass, the scale of a real body."""
     radius = (3.0 * mass / (4.0 * np.pi * 2700.0)) ** (1.0 / 3.0)
     return np.diag([mass * radius**2 / 5.0] * 3 + [mass])
 
 
-def _smallest(matrix: FloatArray) -> FloatArray:
+def _smallest(matrix: Floats) -> Floats:
     """Diagonal floor from a prior's own size, length and mass apart."""
     second = float(
         np.linalg.eigvalsh(matrix[:3, :3] - np.outer(matrix[:3, 3], matrix[:3, 3]) / matrix[3, 3])[0]
@@ -340,15 +329,15 @@ def _smallest(matrix: FloatArray) -> FloatArray:
     return np.diag([second] * 3 + [matrix[3, 3]])
 
 
-def _sizes(body: FloatArray) -> FloatArray:
-    """Natural size (10,) of each parameter of a body: its radius of gyration makes lengths."""
+def _sizes(body: Floats) -> Floats:
+    """Natural size (10,) of each parameter of a body, with its radius of gyration as length."""
     mass = max(abs(float(body[9])), 1e-3)
     inertia = max(float(np.mean(np.abs(body[[0, 3, 5]]))), float(_compact(mass)[0, 0]) * 2.0)
     length = np.sqrt(inertia / mass)
     return np.array([inertia] * 6 + [mass * length] * 3 + [mass])
 
 
-def _touching(prior: BodyPrior, standard: FloatArray, margin: float) -> int:
+def _touching(prior: BodyPrior, standard: Floats, margin: float) -> int:
     count = 0
     for places, body in zip(prior.bodies, prior.inertial, strict=True):
         floor = margin * _smallest(pseudo_inertia(body))
@@ -357,7 +346,7 @@ def _touching(prior: BodyPrior, standard: FloatArray, margin: float) -> int:
     return count
 
 
-def _refit(estimate: Estimate, problem: Problem, values: FloatArray) -> tuple:
+def _refit(estimate: Estimate, problem: Problem, values: Floats) -> tuple:
     """Class table with the residuals of the constrained values."""
     fits = []
     for fit, row_class in zip(estimate.classes, problem.classes, strict=True):
@@ -370,3 +359,52 @@ def _refit(estimate: Estimate, problem: Problem, values: FloatArray) -> tuple:
             )
         )
     return tuple(fits)
+
+
+# Prior of a payload of unknown inertia: mass, radius of gyration and relative standard deviation.
+_PAYLOAD_KG = 3.0
+_PAYLOAD_RADIUS_M = 0.1
+_PAYLOAD_STD = 3.0
+_DISSIPATIVE = ("Ia", "Fvl", "Fcl", "Fvm", "Fcm")
+
+
+def cad_prior(
+    base: BaseSet, *, relative_std: float = 0.2, payload_masses: Mapping[str, float] | None = None
+) -> BodyPrior:
+    """Prior of the base set's arm: the inertials of the URDF, within `relative_std` of themselves.
+
+    payload_masses : stated mass [kg] by payload name; without it a payload is as good as unknown. Inconsistent
+        inertials are replaced by the nearest consistent ones.
+
+    Raises ConfigurationError for a chain without URDF and for a structure without rigid bodies (Model 3).
+    """
+    structure = base.structure
+    if "difference" in structure.sides:
+        raise ConfigurationError("Model 3 has no rigid bodies and so no prior of them; use `wls`")
+    n = structure.chain.n
+    masses = payload_masses or {}
+    spheres = []
+    for payload in structure.payloads:
+        mass = masses.get(payload, _PAYLOAD_KG)
+        inertia = np.eye(3) * mass * _PAYLOAD_RADIUS_M**2
+        spheres.append(from_com(mass, np.zeros(3), inertia))
+    links = nearest_consistent(structure.chain.urdf_inertials())
+    inertial = np.vstack([links, *[sphere[None, :] for sphere in spheres]])
+    bodies = np.array(
+        [[len(PER_LINK) * k + i for i in range(len(INERTIAL))] for k in range(structure.n_links)],
+        dtype=np.int64,
+    )
+    symbols = [split_name(name)[0] for name in structure.names]
+    acts = np.any(base.matrix != 0.0, axis=0)
+    rigid = np.zeros(structure.n_columns, dtype=bool)
+    rigid[bodies.ravel()] = True
+    return BodyPrior(
+        projection=np.asarray(base.matrix),
+        bodies=bodies,
+        nonnegative=np.array(
+            [k for k, s in enumerate(symbols) if s in _DISSIPATIVE and acts[k]], dtype=np.int64
+        ),
+        inertial=inertial,
+        absent=np.flatnonzero((~rigid & ~acts) | ~structure.active),
+        relative_std=np.array([relative_std] * n + [_PAYLOAD_STD] * len(spheres)),
+    )

@@ -1,8 +1,7 @@
 """Maximum a posteriori: least squares with a prior model (CAD, or another arm of the series).
 
-The prior says where the parameters are expected and how far from there they may lie; the data decide how much
-to trust it. Rows count with their effective number, so that thousands of correlated rows do not drown the
-prior.
+The prior has a mean and a covariance; the data decide its weight. Rows count with their effective number, so
+that thousands of correlated rows do not overrule the prior.
 """
 
 from __future__ import annotations
@@ -16,21 +15,26 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Covariance, Estimate
-from ident.estimators.problem import FloatArray, Problem
-from ident.estimators.solution import class_variances, consumed_parameters, estimate_from
-from ident.estimators.weighted import weighted_solution
+from ident.estimators.least_squares import (
+    class_variances,
+    consumed_parameters,
+    estimate_from,
+    weighted_solution,
+)
+from ident.estimators.problem import Problem
 
 __all__ = ["MaximumAPosteriori", "Prior"]
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Normal prior: mean (p,) and precision (p, p), the inverse covariance; zero precision knows nothing."""
+    """Normal prior: mean (p,) and precision (p, p), the inverse covariance, zero for free parameters."""
 
-    mean: FloatArray
-    precision: FloatArray
+    mean: Floats
+    precision: Floats
 
     def __post_init__(self) -> None:
         p = len(self.mean)
@@ -46,27 +50,25 @@ class Prior:
             )
 
     @classmethod
-    def independent(cls, mean: FloatArray, std: FloatArray) -> Prior:
-        """Independent parameters with standard deviations (p,); infinite where nothing is known."""
+    def independent(cls, mean: Floats, std: Floats) -> Prior:
+        """Independent parameters with standard deviations (p,), infinite for free ones."""
         return cls(
             np.where(np.isfinite(std), mean, 0.0), np.diag(1.0 / np.asarray(std, dtype=np.float64) ** 2)
         )
 
     @classmethod
-    def projected(
-        cls, mean: FloatArray, covariance: FloatArray, projection: FloatArray, known: FloatArray
-    ) -> Prior:
+    def projected(cls, mean: Floats, covariance: Floats, projection: Floats, known: Floats) -> Prior:
         """Prior of base parameters chi_B = P chi from one of standard parameters.
 
         mean, covariance : (n,), (n, n) of the standard parameters; projection : P (p, n); known : (p,) bool,
-            base parameters that the prior speaks of, the others stay free.
+            base parameters under the prior, the others stay free.
         """
         chosen = np.flatnonzero(known)
         part = projection[chosen]
         inner = part @ covariance @ part.T
         scale = np.sqrt(np.diag(inner))
         if np.any(scale <= 0):
-            raise ConfigurationError("a base parameter that the prior speaks of has no prior variance")
+            raise ConfigurationError("a base parameter under the prior has no prior variance")
         precision = np.zeros((len(projection),) * 2)
         block = np.linalg.inv(inner / np.outer(scale, scale) + 1e-9 * np.eye(len(chosen))) / np.outer(
             scale, scale
@@ -81,9 +83,9 @@ class Prior:
 class MaximumAPosteriori:
     """Minimises sum of (n_eff / n) ||e_c||^2 / sigma_c^2 + (chi - chi_0)^T Lambda (chi - chi_0) / s.
 
-    strength : how the prior's scale s is chosen: "evidence" maximises the marginal likelihood of the data
-        (MacKay 1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the
-        prior's own standard deviations, smaller is firmer).
+    strength : choice of the prior's scale s: "evidence" maximises the marginal likelihood of the data (MacKay
+        1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the prior's own
+        standard deviations, a smaller one trusts it more).
     blocks : number of blocks of the cross-validation.
     """
 
@@ -94,7 +96,7 @@ class MaximumAPosteriori:
     iterations: int = 20
 
     def fit(self, problem: Problem) -> Estimate:
-        """Estimate (p,); the stated covariance is the posterior's, which counts the effective rows."""
+        """Estimate (p,), with the posterior covariance of the effective rows."""
         if len(self.prior.mean) != len(problem.names):
             raise DataError(
                 f"the prior has {len(self.prior.mean)} parameters, the problem {len(problem.names)}"
@@ -150,7 +152,7 @@ class MaximumAPosteriori:
     def _how(self) -> str:
         return "stated" if isinstance(self.strength, (int, float)) else self.strength.replace("_", "-")
 
-    def _scale(self, problem: Problem, tempered: FloatArray) -> float:
+    def _scale(self, problem: Problem, tempered: Floats) -> float:
         if isinstance(self.strength, (int, float)):
             return float(self.strength)
         if self.strength == "evidence":
@@ -165,7 +167,7 @@ class MaximumAPosteriori:
         return float(np.exp(found.x))
 
 
-def _start(problem: Problem, prior: Prior) -> tuple[FloatArray, FloatArray]:
+def _start(problem: Problem, prior: Prior) -> tuple[Floats, Floats]:
     """First values and weights; the data alone need not determine the parameters."""
     if not np.any(prior.precision):
         values, weights, *_ = weighted_solution(problem)
@@ -179,21 +181,19 @@ def _start(problem: Problem, prior: Prior) -> tuple[FloatArray, FloatArray]:
     return values, 1.0 / class_variances(problem, values, consumed)
 
 
-def _shares(problem: Problem, values: FloatArray) -> FloatArray:
+def _shares(problem: Problem, values: Floats) -> Floats:
     """n_eff / n of each class."""
     rows = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
     return np.minimum(effective_rows(problem, problem.residuals(values)) / rows, 1.0)
 
 
-def _root_of(precision: FloatArray) -> FloatArray:
+def _root_of(precision: Floats) -> Floats:
     values, vectors = np.linalg.eigh(precision)
     keep = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
     return np.sqrt(values[keep])[:, None] * vectors[:, keep].T
 
 
-def _posterior(
-    problem: Problem, prior: Prior, weights: FloatArray, scale: float
-) -> tuple[FloatArray, FloatArray]:
+def _posterior(problem: Problem, prior: Prior, weights: Floats, scale: float) -> tuple[Floats, Floats]:
     """Values (p,) and root (p, p) with root root^T the posterior covariance."""
     r = problem.weighted(weights).r
     penalty = _root_of(prior.precision) / np.sqrt(scale)
@@ -207,7 +207,7 @@ def _posterior(
     return root @ factor[:p, p], root
 
 
-def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray) -> Callable[[float], float]:
+def _evidence_cost(problem: Problem, prior: Prior, weights: Floats) -> Callable[[float], float]:
     """Minus the log marginal likelihood as a function of log s."""
     r = problem.weighted(weights).r
     p = len(prior.mean)
@@ -226,7 +226,7 @@ def _evidence_cost(problem: Problem, prior: Prior, weights: FloatArray) -> Calla
 
 
 def _cross_validation_cost(
-    problem: Problem, prior: Prior, weights: FloatArray, blocks: int
+    problem: Problem, prior: Prior, weights: Floats, blocks: int
 ) -> Callable[[float], float]:
     """Weighted squared error on blocks of time left out, as a function of log s."""
     p = len(prior.mean)

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
 from fri.errors import DataError
+from ident.dynamics.parameters import Floats
 
-__all__ = ["FloatArray", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
-
-FloatArray = NDArray[np.float64]
+__all__ = ["Floats", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
 
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
@@ -40,8 +39,8 @@ class RowGroup:
     joint: str
     side: str
     record: int
-    matrix: FloatArray
-    target: FloatArray
+    matrix: Floats
+    target: Floats
     time_index: NDArray[np.int64]
 
     def __post_init__(self) -> None:
@@ -68,16 +67,14 @@ class RowGroup:
 
 @dataclass(frozen=True)
 class TriangularFactor:
-    """Upper triangular R (p + 1, p + 1) with R^T R = [A y]^T [A y], and the number of rows it stands for."""
+    """Upper triangular R (p + 1, p + 1) with R^T R = [A y]^T [A y], and its number of rows."""
 
-    r: FloatArray
+    r: Floats
     rows: int
 
     @classmethod
-    def of(cls, matrix: FloatArray, target: FloatArray) -> TriangularFactor:
-        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky
-        where that is safe, blocked QR otherwise.
-        """
+    def of(cls, matrix: Floats, target: Floats) -> TriangularFactor:
+        """Factor of (m, p) rows and (m,) targets: Gram and Cholesky if safe, else blocked QR."""
         if not len(target):
             return cls(np.zeros((matrix.shape[1] + 1,) * 2), 0)
         p = matrix.shape[1]
@@ -87,7 +84,7 @@ class TriangularFactor:
         if r is None:
             r = _blocked_qr(part, target)
         if len(acting) < p:
-            # Upper triangular still, since the order of the columns stays.
+            # Still upper triangular: the order of the columns stays.
             places, whole = np.append(acting, p), np.zeros((p + 1, p + 1))
             whole[np.ix_(places, places)] = r
             r = whole
@@ -95,7 +92,7 @@ class TriangularFactor:
 
     @classmethod
     def combine(cls, factors: Iterable[TriangularFactor], weights: Iterable[float]) -> TriangularFactor:
-        """Factor of the stack in which each part's rows are multiplied by sqrt(weight)."""
+        """Factor of the stack of all parts, their rows multiplied by sqrt(weight)."""
         parts = [(factor, weight) for factor, weight in zip(factors, weights, strict=True) if factor.rows]
         stack = np.vstack([np.sqrt(weight) * factor.r for factor, weight in parts])
         return cls(_triangle(stack), sum(factor.rows for factor, _ in parts))
@@ -106,21 +103,26 @@ class TriangularFactor:
         return self.r.shape[1] - 1
 
     @property
-    def normal(self) -> FloatArray:
+    def mean_square(self) -> float:
+        """Mean square of the targets."""
+        return float(self.r[:, -1] @ self.r[:, -1]) / max(self.rows, 1)
+
+    @property
+    def normal(self) -> Floats:
         """A^T A, (p, p)."""
         r = self.r[:, :-1]
         return r.T @ r
 
-    def sum_of_squares(self, values: FloatArray) -> float:
+    def sum_of_squares(self, values: Floats) -> float:
         """||y - A chi||^2 for values (p,)."""
         return float(np.sum((self.r @ np.append(-values, 1.0)) ** 2))
 
-    def solve(self) -> FloatArray:
+    def solve(self) -> Floats:
         """Least-squares solution (p,). The matrix must have full rank: see `Problem.require_rank`."""
         p = self.parameters
         return solve_triangular(self.r[:p, :p], self.r[:p, p])
 
-    def inverse_root(self) -> FloatArray:
+    def inverse_root(self) -> Floats:
         """R^-1 (p, p) of the matrix part, so that (A^T A)^-1 = R^-1 R^-T."""
         p = self.parameters
         return solve_triangular(self.r[:p, :p], np.eye(p))
@@ -133,7 +135,7 @@ class TriangularFactor:
 
 @dataclass(frozen=True)
 class Nuisance:
-    """A quantity that was estimated before and acts on the rows, such as the delay of a channel.
+    """A quantity estimated before with an effect on the rows, such as the delay of a channel.
 
     std : its standard deviation. columns : by number of the row group, d(target) / d(quantity), (m,). Its
         uncertainty is added to the covariance of every estimate.
@@ -141,7 +143,7 @@ class Nuisance:
 
     name: str
     std: float
-    columns: Mapping[int, FloatArray]
+    columns: Mapping[int, Floats]
 
 
 @dataclass(frozen=True)
@@ -165,9 +167,9 @@ class Problem:
 
     names : p parameter names. groups : the rows. sample_time_s : time between neighbouring time indices [s].
     units : p units, for tables; may be empty. record_names : one name a record, for messages.
-    nuisances : quantities known with an uncertainty that the covariance must carry.
-    periods : for each record the number of time indices after which its motion repeats, None where it does
-        not; may be empty. What the model lacks repeats with the motion, so rows of equal phase err alike.
+    nuisances : quantities with an uncertainty, added to the covariance.
+    periods : for each record the period of its motion in time indices, None without; may be empty. Unmodelled
+        physics repeats with the motion, so rows of equal phase have similar errors.
     """
 
     names: tuple[str, ...]
@@ -195,6 +197,9 @@ class Problem:
     def rows(self) -> int:
         """Number r of rows."""
         return sum(len(group.target) for group in self.groups)
+
+    def __repr__(self) -> str:
+        return f"Problem: {self.rows} rows of {len(self.groups)} groups, {len(self.names)} parameters"
 
     @cached_property
     def classes(self) -> tuple[RowClass, ...]:
@@ -224,11 +229,11 @@ class Problem:
         found = {index: number for number, row_class in enumerate(self.classes) for index in row_class.groups}
         return tuple(found[index] for index in range(len(self.groups)))
 
-    def weighted(self, weights: Sequence[float] | FloatArray) -> TriangularFactor:
+    def weighted(self, weights: Sequence[float] | Floats) -> TriangularFactor:
         """Factor of the whole stack with a weight (inverse variance) for each class."""
         return TriangularFactor.combine([c.factor for c in self.classes], [float(w) for w in weights])
 
-    def residuals(self, values: FloatArray) -> tuple[FloatArray, ...]:
+    def residuals(self, values: Floats) -> tuple[Floats, ...]:
         """y - A chi [Nm] of each group, each (m,)."""
         return tuple(group.target - group.matrix @ values for group in self.groups)
 
@@ -246,17 +251,15 @@ class Problem:
         )
 
     def require_rank(self) -> float:
-        """Condition number of the column-normalised stack; DataError
-        that names the parameters if rank is lost.
-        """
+        """Condition number of the column-normalised stack. DataError names the parameters at a loss of rank."""
         factor = self.weighted(np.ones(len(self.classes)))
         p = factor.parameters
         norms = np.linalg.norm(factor.r[:, :p], axis=0)
         empty = [self.names[i] for i in np.flatnonzero(norms == 0.0)]
         if empty:
             raise DataError(
-                f"no row says anything about {_listed(empty)}; move these joints, add the session that "
-                "excites them, or leave the parameters out of the model"
+                f"no row depends on {_listed(empty)}; move these joints, add a session with them excited, or "
+                "leave the parameters out of the model"
             )
         if self.rows < p:
             raise DataError(f"{self.rows} rows cannot determine {p} parameters; record a longer motion")
@@ -272,9 +275,7 @@ class Problem:
 
     @property
     def condition(self) -> float:
-        """Condition number of the unscaled, unweighted observation matrix: the figure of the paper's Table
-        1.
-        """
+        """Condition number of the unscaled, unweighted observation matrix, as in Table 1 of the paper."""
         singular = np.linalg.svd(self.weighted(np.ones(len(self.classes))).r[:, :-1], compute_uv=False)
         return float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf")
 
@@ -284,8 +285,8 @@ def _listed(names: Sequence[str], limit: int = 12) -> str:
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
 
 
-def _acting(matrix: FloatArray) -> NDArray[np.int64]:
-    """Columns with an entry other than zero: a joint's rows have none for the links before it."""
+def _acting(matrix: Floats) -> NDArray[np.int64]:
+    """Columns with a nonzero entry; a joint's rows have none for the links before it."""
     idle = np.flatnonzero(~matrix[:: max(1, len(matrix) // 16)].any(axis=0))
     acting = np.ones(matrix.shape[1], dtype=bool)
     for column in idle:
@@ -293,16 +294,16 @@ def _acting(matrix: FloatArray) -> NDArray[np.int64]:
     return np.flatnonzero(acting)
 
 
-def _columns(matrix: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
-    """Some columns in rising order, without a copy where they are neighbours."""
+def _columns(matrix: Floats, chosen: NDArray[np.int64]) -> Floats:
+    """Some columns in rising order, without a copy if they are neighbours."""
     if not len(chosen) or chosen[-1] - chosen[0] + 1 == len(chosen):
         return matrix[:, chosen[0] : chosen[-1] + 1] if len(chosen) else matrix[:, :0]
     by_column = matrix.strides[0] < matrix.strides[1]
     return matrix.T[chosen].T if by_column else matrix[:, chosen]
 
 
-def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
-    """Cholesky factor of the equilibrated Gram matrix, or None where it would lose digits."""
+def _gram_factor(matrix: Floats, target: Floats) -> Floats | None:
+    """Cholesky factor of the equilibrated Gram matrix, or None if it would lose digits."""
     p = matrix.shape[1]
     gram = np.empty((p + 1, p + 1))
     gram[:p, :p] = matrix.T @ matrix
@@ -325,7 +326,7 @@ def _gram_factor(matrix: FloatArray, target: FloatArray) -> FloatArray | None:
     return r * scale
 
 
-def _blocked_qr(matrix: FloatArray, target: FloatArray) -> FloatArray:
+def _blocked_qr(matrix: Floats, target: Floats) -> Floats:
     p = matrix.shape[1]
     r = np.zeros((0, p + 1))
     for start in range(0, len(target), _QR_ROWS):
@@ -337,8 +338,8 @@ def _blocked_qr(matrix: FloatArray, target: FloatArray) -> FloatArray:
     return r
 
 
-def _triangle(stack: FloatArray) -> FloatArray:
-    """R (k, k) of the QR decomposition of (m, k), with rows of zeros where m < k."""
+def _triangle(stack: Floats) -> Floats:
+    """R (k, k) of the QR decomposition of (m, k), with rows of zeros for m < k."""
     r = np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
     missing = r.shape[1] - r.shape[0]
     return np.vstack([r, np.zeros((missing, r.shape[1]))]) if missing > 0 else r

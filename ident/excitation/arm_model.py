@@ -21,13 +21,13 @@ import numpy as np
 from numba import njit
 
 from fri.errors import ConfigurationError
-from ident import parameters
+from ident.dynamics import parameters
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import DRIVE, INERTIAL
+from ident.dynamics.urdf import read_urdf
 from ident.excitation.motions import Array, Samples
 from ident.excitation.sweep import forward
-from ident.kinematics import Chain
 from ident.model import DynamicModel
-from ident.parameters import DRIVE, INERTIAL
-from ident.urdf import read_urdf
 from lwr_driver.configuration import read_mapping
 
 __all__ = [

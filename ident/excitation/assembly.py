@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.base import closed_form_base
+from ident.dynamics.base_closed_form import closed_form_base
+from ident.dynamics.structure import Condition, ModelStructure
 from ident.excitation.arm_model import BODY, ArmEstimate, Mechanism, Noise, split_name
 from ident.excitation.check import Check, Limits, check_motion
 from ident.excitation.clearance import space_of
@@ -30,12 +31,11 @@ from ident.excitation.motions import Array, Basis, FourierBasis, ParametricMotio
 from ident.excitation.plan import ExcitationPlan
 from ident.excitation.problem import Objective, PlanProblem, Prior
 from ident.excitation.program import Bound, Setup
-from ident.model_file import read_model
-from ident.signals.prepare import prepare
-from ident.structure import Condition, ModelStructure
+from ident.model.model_file import read_model
+from ident.rows.prepare import prepare
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.session import read_session
 

@@ -28,7 +28,7 @@ from ident.excitation.arm_model import (
 )
 from ident.excitation.clearance import space_of
 from ident.excitation.motions import Array, ParametricMotion, Samples
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.collision import CollisionChecker
 
 __all__ = [
     "Check",

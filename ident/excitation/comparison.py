@@ -21,7 +21,7 @@ from ident.excitation.criteria import Criterion
 from ident.excitation.motions import Array, ParametricMotion, PointToPoint
 from ident.excitation.program import Bound, Setup
 from ident.excitation.search import Candidate, begin, hop, judge, polish
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.collision import CollisionChecker
 
 __all__ = [
     "FrontPoint",

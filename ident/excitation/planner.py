@@ -42,7 +42,7 @@ from ident.excitation.search import (
 )
 from ident.excitation.sqp import minimise
 from lwr_driver.arm import Arm
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.collision import CollisionChecker
 
 __all__ = ["Progress", "explain", "feasible_fourier", "plan", "refuse_impossible", "search_candidates"]
 

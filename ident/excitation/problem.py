@@ -8,7 +8,7 @@ from typing import Literal
 
 from fri.errors import ConfigurationError
 from ident.excitation.check import Workspace
-from lwr_driver.cell import PayloadShape
+from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 
 __all__ = ["Knowledge", "MotionForm", "Objective", "PlanProblem", "Prior", "Search"]

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from ident.export.code import Program, to_c, to_numpy
-from ident.export.from_model import ConsistentParameters, consistent_parameters, standard_model
-from ident.export.mjcf import to_mjcf
-from ident.export.standard import CoupledDrives, StandardModel
-from ident.export.urdf import to_urdf
+from ident.export.description import to_mjcf, to_urdf
+from ident.export.standard import (
+    ConsistentParameters,
+    CoupledDrives,
+    StandardModel,
+    consistent_parameters,
+    standard_model,
+)
 
 __all__ = [
     "ConsistentParameters",

@@ -1,7 +1,7 @@
 """Stand-alone inverse dynamics in C and in numpy, generated from the expressions of a model.
 
-The program needs nothing of this project: C99 with <math.h>, or Python with numpy. It computes the same
-torques as the model to rounding, and lists how many operations that takes.
+The program is independent of this project: C99 with <math.h>, or Python with numpy. It computes the torques of
+the model to rounding, and lists its number of operations.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from fri.errors import ConfigurationError
-from ident.export.expressions import Expression, Graph
-from ident.export.newton_euler import torques
+from ident.export.newton_euler import Expression, Graph, torques
 from ident.export.standard import StandardModel
 
 __all__ = ["Program", "to_c", "to_numpy"]
@@ -23,10 +22,9 @@ _LONGEST_INLINE = 3
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """The inverse dynamics of a model as a graph: outputs by name, and what they cost.
+    """The inverse dynamics of a model as a graph: outputs by name, and their operations.
 
-    outputs : "tau_joint", "tau_motor" (or "tau_difference"), n expressions each, and "gravity" (joint side,
-        at rest).
+    outputs : n expressions of "tau_joint", "tau_motor" (or "tau_difference") and "gravity" (joint side).
     """
 
     model: StandardModel
@@ -36,7 +34,7 @@ class Program:
 
     @classmethod
     def of(cls, model: StandardModel) -> Program:
-        """Write down the inverse dynamics of `model`."""
+        """The inverse dynamics of `model`."""
         graph, n = Graph(), model.chain.n
         q, qd, qdd = ([graph.input(name, k) for k in range(n)] for name in ("q", "qd", "qdd"))
         found = torques(graph, model, q, qd, qdd)
@@ -54,17 +52,13 @@ class Program:
         flat = [expression for outputs in self.outputs.values() for expression in outputs]
         kinds = Counter(str(self.graph.nodes[index][0]) for index in self.graph.needed(flat))
         calls = sum(kinds[name] for name in ("sin", "cos", "sign", "tanh", "deadband"))
-        return {
-            "multiplications": kinds["mul"],
-            "additions": kinds["add"] + kinds["sub"],
-            "functions": calls,
-        }
+        return {"multiplications": kinds["mul"], "additions": kinds["add"] + kinds["sub"], "functions": calls}
 
 
 def to_c(model: StandardModel, name: str = "arm") -> str:
     """C99 source with `<name>_inverse_dynamics` and `<name>_gravity`.
 
-    Raises ConfigurationError for a name that no C function can have.
+    Raises ConfigurationError for an invalid name of a C function.
     """
     _require_identifier(name)
     program = Program.of(model)
@@ -80,7 +74,7 @@ def to_c(model: StandardModel, name: str = "arm") -> str:
     if program.gravity:
         lines += [
             "",
-            "/* Torque that holds the arm at rest, without friction and offsets. */",
+            "/* Torque of the arm at rest, without friction and offsets. */",
             f"void {name}_gravity(const double q[{n}], double gravity[{n}])",
             "{",
             *_body(program, {"gravity": program.gravity}, _C),
@@ -127,7 +121,7 @@ def to_numpy(model: StandardModel) -> str:
             "",
             "",
             "def gravity(q):",
-            f'    """Torque (..., {n}) that holds the arm at rest, without friction and offsets."""',
+            f'    """Torque (..., {n}) of the arm at rest, without friction and offsets."""',
             "    q = np.moveaxis(np.asarray(q, dtype=float), -1, 0)",
             *_body(program, {"gravity": program.gravity}, _NUMPY),
             "    return _stack(gravity, q[0])",
@@ -181,7 +175,7 @@ _NUMPY = _Language(
 
 
 def _body(program: Program, outputs: dict[str, list[Expression]], language: _Language) -> list[str]:
-    """Statements that compute the outputs, each shared subexpression once."""
+    """Statements for the outputs, each shared subexpression once."""
     graph = program.graph
     flat = [expression for expressions in outputs.values() for expression in expressions]
     needed = graph.needed(flat)
@@ -194,7 +188,7 @@ def _body(program: Program, outputs: dict[str, list[Expression]], language: _Lan
         named = graph.nodes[index][0] not in ("const", "input") and (
             uses[index] > 1 or depth > _LONGEST_INLINE
         )
-        # A sign costs nothing where it is used, so it never deserves a name.
+        # A sign costs nothing, so it never gets a name.
         if named and graph.nodes[index][0] != "neg":
             name = f"t{number}"
             number += 1
@@ -263,7 +257,7 @@ def _head(program: Program) -> list[str]:
 _MEANING = {
     "tau_joint": "torque behind the gear, as the joint torque sensor measures it.",
     "tau_motor": "motor torque referred to the joint side.",
-    "tau_difference": "motor torque less joint torque.",
+    "tau_difference": "motor torque minus joint torque.",
 }
 
 

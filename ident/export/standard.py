@@ -1,16 +1,28 @@
-"""An arm with numbers for all its parameters and one condition of load: what all exports start from."""
+"""The input of all exports: an arm with one payload and numbers for every standard parameter.
+
+`standard_model` makes it from an identified model, with or without physically consistent bodies.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com
+from ident.dynamics.physical import Projection, project, reference_bodies
+from ident.dynamics.structure import Side
+from ident.model.dynamic_model import DynamicModel
 
-__all__ = ["CoupledDrives", "StandardModel"]
+__all__ = [
+    "ConsistentParameters",
+    "CoupledDrives",
+    "StandardModel",
+    "consistent_parameters",
+    "standard_model",
+]
 
 
 @dataclass(frozen=True)
@@ -25,20 +37,18 @@ class CoupledDrives:
 
 @dataclass(frozen=True, eq=False)
 class StandardModel:
-    """Numbers for every standard parameter of a chain, with the payload (if any) already part of the last
-    link.
+    """Numbers for every standard parameter of a chain, with the payload (if any) as part of the last link.
 
-    inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia Fvl Fcl offl Fvm Fcm
-        offm.
-    sides : what the model describes: joint torque, motor torque, or only their difference.
-    coulomb_kind, coulomb_width : the function that stands for sign(qd).
-    consistent : whether every link is a body that can exist (needed for URDF and MJCF, not for code).
+    inertial : (n, 10) XX ... M of each link in its modified-DH frame. drive : (n, 7) Ia ... offm.
+    sides : torques of the model: joint torque, motor torque, or only their difference.
+    coulomb_kind, coulomb_width : the function for sign(qd).
+    consistent : whether every link is physically consistent (needed for URDF and MJCF, not for code).
     title : one line for the head of a file.
     """
 
     chain: Chain
-    inertial: NDArray[np.float64]
-    drive: NDArray[np.float64]
+    inertial: Floats
+    drive: Floats
     couplings: tuple[CoupledDrives, ...] = ()
     sides: tuple[str, ...] = ("motor", "joint")
     coulomb_kind: str = "sign"
@@ -56,3 +66,195 @@ class StandardModel:
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
+
+
+_LINK, _BODY = len(PER_LINK), len(INERTIAL)
+_STATES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class ConsistentParameters:
+    """Physically consistent standard parameters (n_columns,), and the change of torque.
+
+    projection : the cone program's result, its base parameters in the order of `names`.
+    torque_change_nm : (n,) RMS change of the joint torque at random states [Nm]; zero when exact.
+    """
+
+    vector: Floats
+    names: tuple[str, ...]
+    projection: Projection
+    torque_change_nm: Floats
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the exported file."""
+        if self.projection.exact:
+            return ("Physically consistent bodies with exactly the identified torque.",)
+        order = np.argsort(-np.abs(self.projection.shift))
+        moved = ", ".join(
+            f"{self.names[k]} by {self.projection.shift[k]:+.1f} sigma"
+            for k in order[:3]
+            if abs(self.projection.shift[k]) > 0.05
+        )
+        return (
+            "No real bodies have the identified base parameters; the nearest ones were taken"
+            + (f" ({moved})." if moved else "."),
+            "RMS change of the joint torque at random states [Nm]: "
+            + " ".join(f"{value:.3g}" for value in self.torque_change_nm),
+        )
+
+
+def standard_model(
+    model: DynamicModel,
+    *,
+    payload: str | None = None,
+    consistent: bool = False,
+    reference: Floats | None = None,
+) -> StandardModel:
+    """The model with one payload (or none) mounted, ready for export.
+
+    consistent : physically consistent bodies, see `consistent_parameters`; else the base parameters as they are
+        and zero for the rest, with the same torque in the fewest operations.
+    reference : (bodies, 10) of `consistent_parameters`.
+
+    Raises ConfigurationError for an unknown payload, and for `consistent` with a model of torque differences.
+    """
+    structure, n = model.structure, model.structure.chain.n
+    notes: tuple[str, ...] = ()
+    if consistent:
+        found = consistent_parameters(model, reference)
+        vector, notes = found.vector, found.notes
+    else:
+        vector = np.zeros(structure.n_columns)
+        vector[model.columns] = model.values
+    link = structure.payload_link(payload)
+    table = vector[: _LINK * n].reshape(n, _LINK)
+    inertial = table[:, :_BODY].copy()
+    if link is not None:
+        inertial[-1] += vector[_LINK * link : _LINK * link + _BODY]
+    if model.effects:
+        named = ", ".join(str(effect["cause"]) for effect in model.effects)
+        notes = (
+            *notes,
+            f"Effects of the model missing in this file: {named}.",
+            "The parameters were estimated together with these effects; without them, a model identified "
+            "without effects predicts better.",
+        )
+    title = f"{model.robot}, {'bare arm' if payload is None else f'payload {payload}'}"
+    return StandardModel(
+        chain=structure.chain,
+        inertial=inertial,
+        drive=table[:, _BODY:],
+        couplings=_couplings(model, vector),
+        sides=structure.sides,
+        coulomb_kind=structure.coulomb.kind,
+        coulomb_width=structure.coulomb.width,
+        consistent=consistent,
+        title=title,
+        notes=notes,
+    )
+
+
+def consistent_parameters(model: DynamicModel, reference: Floats | None = None) -> ConsistentParameters:
+    """Standard parameters of the model as physically consistent bodies, see `ident.dynamics.physical`.
+
+    reference : (links + payloads, 10) bodies for the free combinations; default the URDF's, made consistent.
+
+    Base parameters eliminated as not essential (value 0) may move by the median standard deviation of the others
+    of their unit. Raises ConfigurationError for a model of torque differences, without bodies.
+    """
+    structure, n = model.structure, model.structure.chain.n
+    if structure.sides == ("difference",):
+        raise ConfigurationError(
+            f"the model of {model.robot} describes the difference of motor and joint torque and has no "
+            "bodies; export code, or identify Model 1 or 2"
+        )
+    bodies = structure.n_links
+    inertial = np.array([_LINK * link + k for link in range(bodies) for k in range(_BODY)])
+    matrix, chi, covariance, names = _base(model)
+    vector = np.zeros(structure.n_columns)
+    others = np.setdiff1d(np.arange(structure.n_columns), inertial)
+    own = np.intersect1d(others, model.columns)
+    vector[own] = model.values[[int(np.flatnonzero(model.columns == column)[0]) for column in own]]
+    rigid = np.flatnonzero(np.any(matrix[:, inertial] != 0.0, axis=1))
+    chi, rest = chi[rigid], matrix[np.ix_(rigid, others)] @ vector[others]
+    if covariance is not None:
+        covariance = covariance[np.ix_(rigid, rigid)]
+    start = _reference(model, reference)
+    found = project(matrix[np.ix_(rigid, inertial)], chi - rest, start, covariance=covariance)
+    vector[inertial] = found.bodies.ravel()
+    change = np.zeros(n) if found.exact else _torque_change(model, vector)
+    return ConsistentParameters(vector, tuple(names[k] for k in rigid), found, change)
+
+
+def _base(model: DynamicModel) -> tuple[Floats, Floats, Floats | None, tuple[str, ...]]:
+    """K (b, n_columns), chi (b,), covariance (b, b) or None, names of all base parameters."""
+    structure = model.structure
+    if model.base is None:
+        matrix = np.eye(structure.n_columns)[model.positions]
+        return matrix, np.array(model.values), model.covariance, model.names
+    count = len(model.base)
+    chi = np.zeros(count)
+    chi[model.positions] = model.values
+    if model.covariance is None:
+        return np.array(model.base.matrix), chi, None, model.base.names
+    covariance = np.zeros((count, count))
+    covariance[np.ix_(model.positions, model.positions)] = model.covariance
+    std = np.sqrt(np.diag(model.covariance))
+    units = np.array(model.base.units)
+    for k in np.setdiff1d(np.arange(count), model.positions):
+        alike = std[units[model.positions] == units[k]]
+        covariance[k, k] = float(np.median(alike if len(alike) else std)) ** 2
+    return np.array(model.base.matrix), chi, covariance, model.base.names
+
+
+def _reference(model: DynamicModel, reference: Floats | None) -> Floats:
+    structure, chain = model.structure, model.structure.chain
+    if reference is not None:
+        if np.shape(reference) != (structure.n_links, _BODY):
+            raise ConfigurationError(
+                f"reference bodies have shape {np.shape(reference)}; expected ({structure.n_links}, {_BODY})"
+            )
+        return reference_bodies(reference)
+    links = chain.urdf_inertials() if chain.urdf is not None else np.zeros((chain.n, _BODY))
+    links = np.where((links[:, 9] > 0.0)[:, None], links, _rods(chain))
+    payloads = []
+    for number in range(len(structure.payloads)):
+        first = _LINK * (chain.n + number)
+        payloads.append(model.standard[first : first + _BODY])
+    return reference_bodies(np.vstack([links, *payloads]), gyration_m=0.02)
+
+
+def _rods(chain: Chain) -> Floats:
+    """Bodies of 3 kg halfway to the next joint, for links of unknown inertia."""
+    bodies = []
+    for k in range(chain.n):
+        com = 0.5 * chain.placement(k + 1)[:3, 3] if k + 1 < chain.n else np.zeros(3)
+        bodies.append(from_com(3.0, com, 3.0 * 0.08**2 * np.eye(3)))
+    return np.array(bodies)
+
+
+def _torque_change(model: DynamicModel, vector: Floats) -> Floats:
+    """RMS (n,) of the change at random states, all payloads mounted in turn [Nm]."""
+    structure = model.structure
+    rng = np.random.default_rng(0)
+    shape = (_STATES, structure.chain.n)
+    states = rng.uniform(-np.pi, np.pi, shape), rng.uniform(-1, 1, shape), rng.uniform(-3, 3, shape)
+    side: Side = "joint" if "joint" in structure.sides else "motor"
+    total = np.zeros(structure.chain.n)
+    for payload in (None, *structure.payloads):
+        matrix = structure.regressor(*states, payload=payload, sides=(side,))
+        error = (matrix @ (vector - model.standard)).reshape(structure.chain.n, -1)
+        total += np.mean(error**2, axis=1)
+    return np.sqrt(total / (1 + len(structure.payloads)))
+
+
+def _couplings(model: DynamicModel, vector: Floats) -> tuple[CoupledDrives, ...]:
+    structure = model.structure
+    found = []
+    for number, coupling in enumerate(structure.couplings):
+        first = _LINK * structure.n_links + 3 * number
+        a, b = (structure.chain.joint_names.index(name) for name in coupling.joints)
+        inertia, viscous, coulomb = (float(value) for value in vector[first : first + 3])
+        found.append(CoupledDrives((a, b), inertia, viscous, coulomb))
+    return tuple(found)

@@ -1,37 +1,229 @@
-"""From a recording and its mapping to a session log: conversion to SI at the joint, checks, and writing."""
+"""From a recording and its mapping to a session log: reading, conversion to SI at the joint, checks, writing.
+
+Recordings are CSV (any delimiter, with or without header) or NPZ files; incomplete ones are refused.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
 import hashlib
+import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident.import_log.mapping import LogMapping, Signal, TimeBase
-from ident.import_log.table import Recording
+from ident.import_log.mapping import Floats, LogMapping, Signal, TimeBase
 from lwr_driver.configuration import find
 from lwr_driver.session import SessionWriter, session_metadata
 
-__all__ = ["ImportReport", "import_log"]
+__all__ = ["ImportReport", "Recording", "import_log"]
 
-FloatArray = NDArray[np.float64]
+
+@dataclass
+class Recording:
+    """The files of a recording, each read once.
+
+    source : a file, or the folder of the files named in the mapping.
+    """
+
+    source: Path
+    delimiter: str | None = None
+    header: bool = True
+    _tables: dict[Path, tuple[tuple[str, ...], Floats]] = field(default_factory=dict, repr=False)
+    _archives: dict[Path, dict[str, Floats]] = field(default_factory=dict, repr=False)
+    _digests: dict[Path, str] = field(default_factory=dict, repr=False)
+
+    def path(self, file: str | None) -> Path:
+        """The file named by a signal, or the source itself."""
+        if file is None:
+            if self.source.is_dir():
+                raise DataError(
+                    f"{self.source} is a folder and the mapping names no `file`; give the file itself"
+                )
+            path = self.source
+        else:
+            path = (self.source if self.source.is_dir() else self.source.parent) / file
+        if not path.is_file():
+            raise DataError(f"{path}: no such file; the mapping needs it")
+        return path
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of every file read, by name."""
+        return {path.name: digest for path, digest in self._digests.items()}
+
+    def column(self, file: str | None, column: str | int) -> Floats:
+        """One column (n,), or one-dimensional NPZ array."""
+        path = self.path(file)
+        if path.suffix == ".npz":
+            values = self._array(path, str(column))
+            values = values.reshape(-1) if values.ndim == 2 and 1 in values.shape else values
+            if values.ndim != 1:
+                raise DataError(
+                    f"{path}: array {column!r} has shape {values.shape}; times are one-dimensional"
+                )
+            return values
+        names, values = self._table(path)
+        return values[:, _number(path, names, column)]
+
+    def columns(self, signal: Signal, joints: int, what: str) -> Floats:
+        """The columns (n, joints) of a signal, as they stand in the file."""
+        path = self.path(signal.file)
+        if path.suffix == ".npz":
+            if signal.array is None:
+                raise DataError(f"{path}: `{what}` needs `array`, the name of the array in the archive")
+            values = self._array(path, signal.array)
+            label = f"{path}: array {signal.array!r}"
+            names = tuple(str(k + 1) for k in range(values.shape[-1]))
+        else:
+            if signal.array is not None:
+                raise DataError(
+                    f"{path}: `{what}` names the array {signal.array!r}, but the file is no NPZ archive"
+                )
+            names, values = self._table(path)
+            label = str(path)
+        if values.ndim != 2:
+            raise DataError(
+                f"{label} has shape {values.shape}; rows of samples with a column for each joint are needed"
+            )
+        if signal.columns is not None:
+            return values[:, [_number(path, names, column) for column in signal.columns]]
+        if values.shape[1] != joints:
+            raise DataError(
+                f"{label} has {values.shape[1]} columns for {joints} joints; "
+                f"name them in `columns` of `{what}`"
+            )
+        return values
+
+    def _array(self, path: Path, name: str) -> Floats:
+        if path not in self._archives:
+            self._digest(path)
+            try:
+                with np.load(path, allow_pickle=False) as archive:
+                    self._archives[path] = {key: archive[key] for key in archive.files}
+            except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+                raise DataError(f"{path}: not a readable NPZ archive: {error}") from error
+        arrays = self._archives[path]
+        if name not in arrays:
+            raise DataError(f"{path}: no array {name!r}; it has {', '.join(arrays)}")
+        values = arrays[name]
+        if values.dtype.kind not in "fiu":
+            raise DataError(f"{path}: array {name!r} has type {values.dtype}; numbers are needed")
+        return values.astype(np.float64)
+
+    def _table(self, path: Path) -> tuple[tuple[str, ...], Floats]:
+        if path not in self._tables:
+            self._digest(path)
+            self._tables[path] = _read_csv(path, self.delimiter, self.header)
+        return self._tables[path]
+
+    def _digest(self, path: Path) -> None:
+        try:
+            self._digests[path] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _number(path: Path, names: tuple[str, ...], column: str | int) -> int:
+    if isinstance(column, int):
+        if not 1 <= column <= len(names):
+            raise DataError(f"{path}: no column {column}; columns are numbered 1 to {len(names)}")
+        return column - 1
+    if names.count(column) > 1:
+        raise DataError(f"{path}: {names.count(column)} columns are called {column!r}; name them by number")
+    if column not in names:
+        raise DataError(f"{path}: no column {column!r}; it has {', '.join(names)}")
+    return names.index(column)
+
+
+def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[str, ...], Floats]:
+    """Column names (numbers from 1 without a header) and the values (n, m) of a text table."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not readable as text: {error}") from error
+    rows = [
+        (number, line) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"
+    ]
+    if len(rows) < 1 + header:
+        raise DataError(f"{path}: holds no rows of numbers")
+    first = rows[0][1]
+    mark = (
+        delimiter
+        if delimiter is not None
+        else next((m for m in (",", ";", "\t") if m in first.strip()), None)
+    )
+    names: tuple[str, ...] = ()
+    if header:
+        names = tuple(_split(first, mark))
+        rows = rows[1:]
+        if all(_is_number(name) for name in names):
+            raise DataError(
+                f"{path}: the first row {first[:60]!r} holds numbers, no names; set `header: false`"
+            )
+    width = len(names) if header else len(_split(first, mark))
+    values = _fast(path, rows, mark, width)
+    if values is None:
+        values = np.empty((len(rows), width))
+        for index, (number, line) in enumerate(rows):
+            values[index] = _row(path, number, _split(line, mark), width, names)
+    return names or tuple(str(k + 1) for k in range(width)), values
+
+
+def _fast(path: Path, rows: list[tuple[int, str]], mark: str | None, width: int) -> Floats | None:
+    """The table by numpy's own reader; None unless every row is a plain row of numbers."""
+    try:
+        values = np.loadtxt(
+            [line.strip().rstrip(mark or " ") for _, line in rows], delimiter=mark, ndmin=2, comments=None
+        )
+    except ValueError:
+        return None
+    return values if values.shape == (len(rows), width) else None
+
+
+def _split(line: str, mark: str | None) -> list[str]:
+    parts = [part.strip().strip('"') for part in line.strip().split(mark)]
+    return parts[:-1] if len(parts) > 1 and parts[-1] == "" else parts
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _row(path: Path, number: int, parts: list[str], width: int, names: tuple[str, ...]) -> list[float]:
+    if len(parts) != width:
+        raise DataError(
+            f"{path}: line {number} has {len(parts)} columns, the first has {width}; the file is not whole"
+        )
+    values = []
+    for index, part in enumerate(parts):
+        if not _is_number(part):
+            column = names[index] if names else str(index + 1)
+            shown = "is empty" if not part else f"holds {part!r}"
+            raise DataError(f"{path}: line {number}, column {column!r} {shown}; a number is needed")
+        values.append(float(part))
+    return values
+
 
 _ONCE = ("position", "velocity", "joint_torque")
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import did; prints itself.
+    """Result of an import; prints itself.
 
-    rows : samples written of each topic. rows_in_source : samples that the recording holds.
+    rows : samples written of each topic. rows_in_source : samples of the recording.
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
-    holes : intervals longer than 1.75 periods, where the recording seems to have lost samples.
+    holes : intervals longer than 1.75 periods, probably with lost samples.
     """
 
     path: Path
@@ -72,7 +264,7 @@ class ImportReport:
 class _Channel:
     times: NDArray[np.int64]
     published: NDArray[np.int64]
-    values: FloatArray
+    values: Floats
 
 
 def import_log(
@@ -92,14 +284,13 @@ def import_log(
     payload, payload_mass [kg], serial : instead of the mapping's.
     beside : folder of the mapping file, for its URDF.
 
-    The session's uid follows from the content of the files and the rows taken, so the same recording is
-    recognised when it is imported again. Raises DataError naming file, column and row for non-finite values,
-    times that do not increase, files of unequal length or missing columns; ConfigurationError for an output
-    that exists.
+    The session's uid follows from the content of the files and the rows taken, so a second import of the same
+    recording is recognised. Raises DataError with file, column and row for non-finite values, times that do not
+    increase, files of unequal length or missing columns; ConfigurationError for an existing output.
     """
     source = Path(source)
     if not source.exists():
-        raise DataError(f"{source}: no such file or folder; give the recording that the mapping describes")
+        raise DataError(f"{source}: no such file or folder; give the recording of the mapping")
     recording = Recording(source, mapping.delimiter, mapping.header)
     total, channels = _read(mapping, recording, rows)
     joint = channels["position"]
@@ -189,7 +380,7 @@ def _read(
 
 def _clock(
     mapping: LogMapping, base: TimeBase, signal: Signal, recording: Recording, count: int, place: str
-) -> FloatArray:
+) -> Floats:
     """Times of the samples (n,) [s] by the source's clock."""
     if base.column is None:
         assert base.rate_hz is not None
@@ -202,9 +393,9 @@ def _clock(
 
 
 def _log_times(
-    mapping: LogMapping, base: TimeBase, clock: FloatArray, place: str, first: int
+    mapping: LogMapping, base: TimeBase, clock: Floats, place: str, first: int
 ) -> NDArray[np.int64]:
-    """UTC [ns] of each sample; strictly increasing, or an error that names the rows."""
+    """UTC [ns] of each sample, strictly increasing. DataError with the rows otherwise."""
     if not np.isfinite(clock).all():
         row = int(np.flatnonzero(~np.isfinite(clock))[0])
         raise DataError(
@@ -230,7 +421,7 @@ def _log_times(
 
 
 def _published(mapping: LogMapping, base: TimeBase, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The source's own clock [ns]; counted from the first sample where it begins below zero."""
+    """The source's own clock [ns], counted from the first sample if it begins below zero."""
     published = times - _origin_ns(mapping, base)
     return published - min(0, int(published[0]))
 
@@ -253,7 +444,7 @@ def _utc_ns(text: str) -> int:
     return (elapsed.days * 86400 + elapsed.seconds) * 10**9 + elapsed.microseconds * 1000
 
 
-def _cut(values: FloatArray, rows: tuple[int, int] | None, place: str) -> FloatArray:
+def _cut(values: Floats, rows: tuple[int, int] | None, place: str) -> Floats:
     if rows is None:
         return values
     first, last = rows
@@ -262,7 +453,7 @@ def _cut(values: FloatArray, rows: tuple[int, int] | None, place: str) -> FloatA
     return values[first:last]
 
 
-def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, first: int) -> None:
+def _refuse_non_finite(values: Floats, joints: tuple[str, ...], place: str, first: int) -> None:
     bad = ~np.isfinite(values)
     if bad.any():
         row, column = np.argwhere(bad)[0]
@@ -273,7 +464,7 @@ def _refuse_non_finite(values: FloatArray, joints: tuple[str, ...], place: str, 
         )
 
 
-def _convert(mapping: LogMapping, name: str, signal: Signal, raw: FloatArray) -> FloatArray:
+def _convert(mapping: LogMapping, name: str, signal: Signal, raw: Floats) -> Floats:
     """Values (n, joints) at the joint: the formulas at the head of `ident.import_log.mapping`."""
     values = raw * signal.factors(len(mapping.joints), name)
     if signal.side == "motor":
@@ -283,7 +474,7 @@ def _convert(mapping: LogMapping, name: str, signal: Signal, raw: FloatArray) ->
 
 
 def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
-    def values(name: str) -> FloatArray | None:
+    def values(name: str) -> Floats | None:
         return channels[name].values if name in channels else None
 
     joint = channels["position"]

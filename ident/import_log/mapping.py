@@ -1,10 +1,9 @@
-"""The mapping file: which columns of a recording are which channel, in which units, before or behind the
-gear.
+"""The mapping file: columns, units and side of the gear for each channel of a recording.
 
 Conventions of the conversion, with R the matrix of the transmission, q_motor = R q (n x n)::
 
-    R[i, i] = reduction of joint i (negative where motor and joint turn against each other)
-    R[m, j] = further ratios: how far motor m turns when joint j turns (a wrist whose drives are coupled)
+    R[i, i] = reduction of joint i (negative if motor and joint turn against each other)
+    R[m, j] = further ratios: turns of motor m for a turn of joint j (coupled drives of a wrist)
 
     y = sign * scale * unit * x
     position   joint side:  y + offset      motor side:  inv(R) y + offset
@@ -29,6 +28,14 @@ from lwr_driver.configuration import find, parse, read_mapping
 
 __all__ = ["Coupling", "LogMapping", "Signal", "TimeBase", "Transmission"]
 
+Floats = NDArray[np.float64]
+
+# fmt: off
+_QUANTITIES = {
+    "position": "angle", "velocity": "rate", "joint_torque": "torque", "motor_torque": "torque",
+    "motor_position": "angle", "command": "angle",
+}
+# fmt: on
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _UNITS = {
     "rad": ("angle", 1.0),
@@ -50,7 +57,7 @@ Unit = Literal["rad", "deg", "rev", "counts", "m", "rad/s", "deg/s", "rpm", "m/s
 
 @dataclass(frozen=True)
 class TimeBase:
-    """When the samples were taken: a column of the recording, or a fixed rate.
+    """Times of the samples: a column of the recording, or a fixed rate.
 
     file : file of the column, relative to the source; None is the source itself (or the signal's own file).
     column : name or number (from 1) of a CSV column, or name of an NPZ array; kept as it is, jitter included.
@@ -86,7 +93,7 @@ class Signal:
     unit : of the numbers. `counts` and `A` have no size of their own and need `scale` (rad a count, Nm/A).
     side : `motor` before the gear, `joint` after it.
     sign : 1 or -1, one a joint or one for all. scale : factor, one a joint or one for all.
-    time : when the signal has a clock of its own; None takes that of the mapping.
+    time : a clock of its own; None takes that of the mapping.
     """
 
     unit: Unit
@@ -108,14 +115,14 @@ class Signal:
             )
         scales = self.scale if isinstance(self.scale, tuple) else (self.scale,)
         if any(scale is not None and scale == 0.0 for scale in scales):
-            raise ConfigurationError("`scale` is 0, which would wipe out the measurement")
+            raise ConfigurationError("`scale` is 0 and would erase the measurement")
 
     @property
     def quantity(self) -> str:
-        """What the unit measures: angle, rate or torque."""
+        """Quantity of the unit: angle, rate or torque."""
         return _UNITS[self.unit][0]
 
-    def factors(self, joints: int, where: str) -> NDArray[np.float64]:
+    def factors(self, joints: int, where: str) -> Floats:
         """sign x scale x unit for each joint (n,)."""
         size = _UNITS[self.unit][1]
         factors = np.full(joints, 1.0 if size is None else size)
@@ -131,7 +138,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Motor `motor` turns `ratio` times as far as joint `joint`, besides what its own joint makes it turn."""
+    """Motor `motor` turns `ratio` times as far as joint `joint`, besides the turns for its own joint."""
 
     motor: str
     joint: str
@@ -145,7 +152,7 @@ class Transmission:
     reduction: tuple[float, ...]
     coupling: tuple[Coupling, ...] = ()
 
-    def matrix(self, joints: tuple[str, ...]) -> NDArray[np.float64]:
+    def matrix(self, joints: tuple[str, ...]) -> Floats:
         """R (n, n). ConfigurationError if it does not fit the joints or has no inverse."""
         if len(self.reduction) != len(joints):
             raise ConfigurationError(
@@ -162,9 +169,7 @@ class Transmission:
                 )
             matrix[joints.index(entry.motor), joints.index(entry.joint)] = entry.ratio
         if 0.0 in self.reduction or np.linalg.cond(matrix) > 1e9:
-            raise ConfigurationError(
-                "the transmission has no inverse; every joint needs a motor that moves it"
-            )
+            raise ConfigurationError("the transmission has no inverse; every joint needs a motor of its own")
         return matrix
 
 
@@ -173,7 +178,7 @@ class LogMapping:
     """A mapping file, see the head of the module and the files in `configs/imports/`.
 
     robot : model, as in the metadata of the session. joints : names, as in the URDF, base to tip.
-    time : when the samples were taken. position : measured joint position, the one signal that must exist.
+    time : times of the samples. position : measured joint position, the one required signal.
     joint_torque : joint torque sensor. motor_torque : motor torque or current.
     velocity, motor_position, command : measured velocity, motor position, commanded position.
     offset_rad : added to the positions of each joint after the gear, to meet the zero of the URDF.
@@ -210,17 +215,9 @@ class LogMapping:
             raise ConfigurationError(
                 f"`offset_rad` has {len(self.offset_rad)} entries for {len(self.joints)} joints"
             )
-        kinds = {
-            "position": "angle",
-            "motor_position": "angle",
-            "command": "angle",
-            "velocity": "rate",
-            "joint_torque": "torque",
-            "motor_torque": "torque",
-        }
         for name, signal in self.signals.items():
-            if signal.quantity != kinds[name]:
-                raise ConfigurationError(f"`{name}` has unit `{signal.unit}`, which does not measure that")
+            if signal.quantity != _QUANTITIES[name]:
+                raise ConfigurationError(f"`{name}` cannot have the unit `{signal.unit}`")
             if signal.columns is not None and len(signal.columns) != len(self.joints):
                 raise ConfigurationError(
                     f"`{name}`: {len(signal.columns)} `columns` for {len(self.joints)} joints; name one each"
@@ -241,28 +238,25 @@ class LogMapping:
                     f"`{name}` belongs to the samples of `position` and has no `time` of its own"
                 )
         if self.motor_position is not None and self.motor_torque is None:
-            raise ConfigurationError(
-                "`motor_position` goes with `motor_torque`, which the mapping does not have"
-            )
+            raise ConfigurationError("`motor_position` goes with `motor_torque`, missing in the mapping")
         if self.joint_torque is None and self.motor_torque is None:
             raise ConfigurationError("the mapping has no torque; give `joint_torque` or `motor_torque`")
         self.matrix  # noqa: B018 - checked once, here
 
     @property
     def signals(self) -> dict[str, Signal]:
-        """The signals that there are, by name."""
-        names = ("position", "velocity", "joint_torque", "motor_torque", "motor_position", "command")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        """The signals of the mapping, by name."""
+        return {name: getattr(self, name) for name in _QUANTITIES if getattr(self, name) is not None}
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """R (n, n) of q_motor = R q; the identity without a transmission."""
         if self.transmission is None:
             return np.eye(len(self.joints))
         return self.transmission.matrix(self.joints)
 
     @property
-    def offset(self) -> NDArray[np.float64]:
+    def offset(self) -> Floats:
         """Offsets of the positions (n,) [rad]."""
         return np.zeros(len(self.joints)) if self.offset_rad is None else np.array(self.offset_rad)
 
@@ -274,7 +268,7 @@ class LogMapping:
 
 
 def mapping_path(name: str | Path) -> Path:
-    """Where the mapping file `name` is; a bare name such as `tx40` means `configs/imports/tx40.yaml`."""
+    """Path of the mapping file `name`; a bare name such as `tx40` means `configs/imports/tx40.yaml`."""
     try:
         return find(name)
     except ConfigurationError:

@@ -1,17 +1,24 @@
-"""The session log: one MCAP file for one motion of the arm with one payload. Writer and reader side by side.
+"""The session log: one MCAP file for one motion of the arm with one payload.
 
-`SessionWriter` writes; `read_session` reads into columns of numpy arrays; `recover` makes the file of a
-killed recorder whole; `describe` says what a file holds.
+`SessionWriter` writes a log, `read_session` reads it into numpy arrays, `describe` summarises it. `recover`
+repairs the log of a killed recorder. `as_sessions` accepts sessions and paths alike.
 """
 
 from __future__ import annotations
 
-from lwr_driver.session.columns import ControllerModelColumns, Gap, JointColumns, Phase, StatusColumns
-from lwr_driver.session.frames import LinkFrames
-from lwr_driver.session.reader import read_session
+from lwr_driver.arm import LinkFrames
+from lwr_driver.session.reader import as_sessions, describe, read_session
 from lwr_driver.session.recovery import Recovery, recover
-from lwr_driver.session.session import Missing, Session
-from lwr_driver.session.summary import SessionSummary, describe
+from lwr_driver.session.session import (
+    ControllerModelColumns,
+    Gap,
+    JointColumns,
+    Missing,
+    Phase,
+    Session,
+    SessionSummary,
+    StatusColumns,
+)
 from lwr_driver.session.writer import SessionWriter, session_metadata
 
 __all__ = [
@@ -26,6 +33,7 @@ __all__ = [
     "SessionSummary",
     "SessionWriter",
     "StatusColumns",
+    "as_sessions",
     "describe",
     "read_session",
     "recover",

@@ -1,7 +1,7 @@
-"""The writing side of an MCAP file: whole chunks at once, each on the disk before the next begins.
+"""The writing side of an MCAP file (https://mcap.dev/spec): whole chunks at once, each on the disk in turn.
 
-After every call the file ends with a whole record, so a killed process leaves a file that can be read up to
-there. When a write fails (disk full), what was written of the broken record is cut off again.
+After every call the file ends with a whole record, so the file of a killed process is readable up to there.
+After a failed write (disk full) the broken record is cut off again.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,62 @@ import zstandard
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session import mcap_format as mcap
-from lwr_driver.session.mcap_format import Opcode
-from lwr_driver.session.schemas import Schema
+from lwr_driver.session.messages import Layout, Schema
 
-__all__ = ["PROFILE", "Container", "Messages"]
+MAGIC = b"\x89MCAP0\r\n"
+
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""Start of a message record: opcode, length, channel, sequence, log time, publish time; then the message."""
+
+_HEAD_FIELDS = {"channel_sequence": ("<u4", 11), "log_time": ("<u8", 15), "publish_time": ("<u8", 23)}
+
+FOOTER_SIZE = 9 + 20 + len(MAGIC)
+"""Bytes of the footer record and the closing magic."""
+
+
+class Opcode(IntEnum):
+    """Record types."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
+    DATA_END = 0x0F
+
+
+def _record(opcode: Opcode, *parts: bytes) -> bytes:
+    """A record of this content."""
+    content = b"".join(parts)
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def _text(value: str) -> bytes:
+    """A string with its length."""
+    data = value.encode()
+    return struct.pack("<I", len(data)) + data
+
+
+def _texts(values: Mapping[str, str]) -> bytes:
+    """A map of strings with its length in bytes."""
+    data = b"".join(_text(key) + _text(value) for key, value in values.items())
+    return struct.pack("<I", len(data)) + data
+
+
+def record_layout(layout: Layout, channel_number: int) -> Layout:
+    """Layout of the message records of a channel: their head with its fields, then the message."""
+    head = MESSAGE_HEAD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size - 9 + layout.size, channel_number, 0, 0, 0)
+    return layout.relaid(head, _HEAD_FIELDS)
+
 
 PROFILE = "ros2"
 
@@ -71,7 +123,7 @@ class _Channel:
 class Container:
     """An MCAP file being written. Refuses to overwrite a file.
 
-    fsync : force each chunk to the disk itself, so that even a power cut loses the open chunk only
+    fsync : force each chunk to the disk itself: even a power cut loses the open chunk only
     level : zstd compression level
     """
 
@@ -98,7 +150,7 @@ class Container:
                 f"session log {path} cannot be created: {error.strerror}; choose a folder that can be written"
             ) from error
         try:
-            self._write(mcap.MAGIC + mcap.record(Opcode.HEADER, mcap.text(PROFILE), mcap.text(library)))
+            self._write(MAGIC + _record(Opcode.HEADER, _text(PROFILE), _text(library)))
         except BaseException:
             self._file.close()
             path.unlink(missing_ok=True)
@@ -106,19 +158,19 @@ class Container:
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int) -> None:
         """Write an attachment."""
-        content = mcap.attachment(name, media_type, data, time_ns)
-        index = mcap.attachment_index(
-            self.offset, len(content), (time_ns, time_ns), len(data), name, media_type
-        )
+        content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
+        content += struct.pack("<Q", len(data)) + data
+        content = _record(Opcode.ATTACHMENT, content, struct.pack("<I", zlib.crc32(content)))
+        head = struct.pack("<QQQQQ", self.offset, len(content), time_ns, time_ns, len(data))
         self._write(content)
-        self._attachments.append(index)
+        self._attachments.append(_record(Opcode.ATTACHMENT_INDEX, head, _text(name), _text(media_type)))
 
     def describe(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        content = mcap.metadata(name, values)
-        index = mcap.metadata_index(self.offset, len(content), name)
+        content = _record(Opcode.METADATA, _text(name), _texts(values))
+        place = struct.pack("<QQ", self.offset, len(content))
         self._write(content)
-        self._metadata.append(index)
+        self._metadata.append(_record(Opcode.METADATA_INDEX, place, _text(name)))
 
     def channel(
         self,
@@ -129,18 +181,17 @@ class Container:
         encoding: str = "cdr",
         info: Mapping[str, str] | None = None,
     ) -> int:
-        """Number of the channel `topic`; it is announced in the first chunk with one of its messages."""
+        """Number of the channel `topic`; the first chunk with one of its messages announces it."""
         if topic not in self._channels:
             key = f"{schema.name}\0{schema_encoding}\0{schema.text}"
             if key not in self._schemas:
-                number = len(self._schemas) + 1
-                self._schemas[key] = (
-                    number,
-                    mcap.schema(number, schema.name, schema_encoding, schema.text.encode()),
-                )
+                number, data = len(self._schemas) + 1, schema.text.encode()
+                head = struct.pack("<H", number) + _text(schema.name) + _text(schema_encoding)
+                self._schemas[key] = number, _record(Opcode.SCHEMA, head, struct.pack("<I", len(data)), data)
             schema_number, schema_record = self._schemas[key]
             number = len(self._channels) + 1
-            content = mcap.channel(number, schema_number, topic, encoding, info or {})
+            head = struct.pack("<HH", number, schema_number)
+            content = _record(Opcode.CHANNEL, head, _text(topic), _text(encoding), _texts(info or {}))
             self._channels[topic] = _Channel(number, schema, content, schema_record)
         return self._channels[topic].number
 
@@ -167,10 +218,10 @@ class Container:
         plain = b"".join([*head, *messages.records])
         packed = self._compressor.compress(plain)
         times = (int(messages.log_time.min()), int(messages.log_time.max()))
-        chunk = mcap.record(
+        chunk = _record(
             Opcode.CHUNK,
             struct.pack("<QQQI", *times, len(plain), zlib.crc32(plain)),
-            mcap.text("zstd"),
+            _text("zstd"),
             struct.pack("<Q", len(packed)),
             packed,
         )
@@ -181,17 +232,21 @@ class Container:
         for number in used.tolist():
             mine = messages.channel == number
             entries = np.stack([messages.log_time[mine], starts[mine]], axis=1).astype("<u8").tobytes()
-            index = mcap.record(Opcode.MESSAGE_INDEX, struct.pack("<HI", number, len(entries)), entries)
+            index = _record(Opcode.MESSAGE_INDEX, struct.pack("<HI", number, len(entries)), entries)
             index_offsets[number], counts[number] = at, int(mine.sum())
             parts.append(index)
             at += len(index)
-        place = (self.offset, len(chunk))
-        self._write(b"".join(parts))
-        self._chunks.append(
-            mcap.chunk_index(
-                times, place, index_offsets, at - place[0] - place[1], "zstd", (len(packed), len(plain))
-            )
+        offsets = b"".join(struct.pack("<HQ", *item) for item in index_offsets.items())
+        chunk_index = _record(
+            Opcode.CHUNK_INDEX,
+            struct.pack("<QQQQI", *times, self.offset, len(chunk), len(offsets)),
+            offsets,
+            struct.pack("<Q", at - self.offset - len(chunk)),
+            _text("zstd"),
+            struct.pack("<QQ", len(packed), len(plain)),
         )
+        self._write(b"".join(parts))
+        self._chunks.append(chunk_index)
         for channel in fresh:
             channel.written = True
         for number, count in counts.items():
@@ -202,23 +257,23 @@ class Container:
     def finish(self) -> None:
         """Write the end of the data, the summary and the footer, and close."""
         written = [channel for channel in self._channels.values() if channel.written]
+        schemas = list(dict.fromkeys(channel.schema_record for channel in written))
+        numbers = (
+            len(schemas),
+            len(self._counts),
+            len(self._attachments),
+            len(self._metadata),
+            len(self._chunks),
+        )
+        times = self._times or (0, 0)
+        head = struct.pack("<QHIIIIQQ", sum(self._counts.values()), *numbers, *times)
+        counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
+        statistics = _record(Opcode.STATISTICS, head, struct.pack("<I", len(counts)), counts)
         summary_start = self.offset + 9 + 4
         groups: list[tuple[Opcode, list[bytes]]] = [
-            (Opcode.SCHEMA, list(dict.fromkeys(channel.schema_record for channel in written))),
+            (Opcode.SCHEMA, schemas),
             (Opcode.CHANNEL, [channel.record for channel in written]),
-            (
-                Opcode.STATISTICS,
-                [
-                    mcap.statistics(
-                        self._counts,
-                        len({channel.schema_record for channel in written}),
-                        len(self._attachments),
-                        len(self._metadata),
-                        len(self._chunks),
-                        self._times or (0, 0),
-                    )
-                ],
-            ),
+            (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, self._chunks),
             (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),
@@ -229,11 +284,11 @@ class Container:
                 start = summary_start + len(summary)
                 group = b"".join(records)
                 summary += group
-                offsets += mcap.record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(group)))
+                offsets += _record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(group)))
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, summary_start + len(summary))
         body = summary + offsets + footer
-        end = mcap.record(Opcode.DATA_END, struct.pack("<I", 0))
-        self._write(end + body + struct.pack("<I", zlib.crc32(body)) + mcap.MAGIC)
+        end = _record(Opcode.DATA_END, struct.pack("<I", 0))
+        self._write(end + body + struct.pack("<I", zlib.crc32(body)) + MAGIC)
         self._sync()
         self._file.close()
 

@@ -1,23 +1,24 @@
-"""Reading a session log into columns of numpy arrays, whoever wrote it.
+"""Reading a session log, of any writer, into columns of numpy arrays.
 
 The messages of a chunk are compared with the layouts met so far and read as strided columns; only a message
-that fits none of them is looked at field by field. What does not hold together is an error that names the
-file, the topic and the time; what is missing is said in `Session.missing`. Nothing is repaired on the way.
+of a new layout is decoded field by field. Inconsistent data raise an error with file, topic and time; missing
+data are listed in `Session.missing`. Nothing is repaired on the way.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import DataError
-from lwr_driver.session.cdr import (
+from fri.errors import ConfigurationError, DataError
+from lwr_driver.session.messages import (
+    TOPICS,
     CdrError,
     CdrReader,
     Layout,
@@ -25,12 +26,18 @@ from lwr_driver.session.cdr import (
     fri_status_layout,
     read_joint_state_layout,
 )
-from lwr_driver.session.columns import ControllerModelColumns, JointColumns, Phase, StatusColumns, stamp
 from lwr_driver.session.scan import Block, ChannelRecord, Scan
-from lwr_driver.session.schemas import TOPICS
-from lwr_driver.session.session import Missing, Session
-
-__all__ = ["read_session"]
+from lwr_driver.session.session import (
+    ControllerModelColumns,
+    JointColumns,
+    Missing,
+    Phase,
+    Session,
+    SessionSummary,
+    StatusColumns,
+    stamp,
+    summarise,
+)
 
 SCHEMA_VERSION = "1"
 _FIELDS = ("position", "velocity", "effort")
@@ -38,20 +45,20 @@ _NEEDED = {"/joint_states": "position", "/motor_states": "effort", "/joint_comma
 _TEXT_TOPICS = ("/experiment/phase", "/robot_description")
 _FIXED_TOPICS = ("/fri/status", "/fri/controller_model")
 _MANY_LAYOUTS = 8
-"""Layouts of one block and size after which messages are decoded one by one."""
+"""Most layouts of one block and size; further messages are decoded one by one."""
 
 
 def read_session(
-    path: str | Path, joint_names: Sequence[str] | None = None, *, status: bool = True
+    path: str | os.PathLike[str], joint_names: Sequence[str] | None = None, *, status: bool = True
 ) -> Session:
     """The session in the MCAP file `path`.
 
-    joint_names : joints wanted, in this order; None takes those of `/joint_states` as they are
-    status : read `/fri/status` too, which takes as much memory as all torques and positions
+    joint_names : joints wanted, in this order; None takes those of `/joint_states`
+    status : read `/fri/status` too; it needs as much memory as all torques and positions
 
-    A file that was cut is read up to its last whole chunk and `missing` says what is not there. DataError,
-    with file, topic and time, for: no MCAP, no `/joint_states`, a damaged chunk amid others, wrong types,
-    joints that are unknown or change, values that are not finite, log times or counters that do not rise.
+    A truncated file is read up to its last whole chunk; `missing` lists the rest. DataError, with file, topic
+    and time, for: no MCAP, no `/joint_states`, a damaged chunk amid others, wrong types, unknown or changing
+    joints, values not finite, log times or counters not rising. ConfigurationError if `path` is no path.
     """
     scan = Scan(path)
     source = str(scan.path)
@@ -89,6 +96,33 @@ def read_session(
                     f"{channel.topic} holds other messages than its definition says and was not read"
                 )
     return _session(scan, joints, texts, fixed, notes, joint_names)
+
+
+def as_sessions(value: Session | str | os.PathLike[str] | Iterable[Any]) -> list[Session]:
+    """The sessions of `value`: a session, the path of a session log, or an iterable of these.
+
+    ConfigurationError for anything else; DataError as `read_session`.
+    """
+    if isinstance(value, Iterable) and not isinstance(value, (str, bytes, Mapping)):
+        return [_as_session(item) for item in value]
+    return [_as_session(value)]
+
+
+def describe(session: Session | str | os.PathLike[str]) -> SessionSummary:
+    """Summary of a session, or of the session in a file. DataError as `read_session`."""
+    return summarise(_as_session(session))
+
+
+def _as_session(value: Any) -> Session:
+    if isinstance(value, Session):
+        return value
+    if isinstance(value, (str, os.PathLike)):
+        return read_session(value)
+    shown = repr(value)
+    raise ConfigurationError(
+        f"sessions: {shown if len(shown) <= 80 else f'{shown[:80]}...'} is neither a session nor a path; give "
+        "a Session, the path of a session log (.mcap), or a list of these"
+    )
 
 
 def _session(
@@ -146,7 +180,7 @@ def _session(
     described = texts["/robot_description"]
     description = described[0][1] if described else _attached_description(source, attachments)
     if description is not None and not description.lstrip().startswith("<"):
-        # Whoever takes it for the name of a file must not be led to one by a log.
+        # A log must not lead a user of the description to a file of that name.
         raise DataError(f"{source}: /robot_description begins with {description[:20]!r}, which is no XML")
     session = Session(
         path=scan.path,
@@ -167,7 +201,7 @@ def _session(
 
 
 def _attached_description(source: str, attachments: Mapping[str, bytes]) -> str | None:
-    """The URDF among the attachments: imported logs have no transforms, hence no topic with it."""
+    """The URDF among the attachments: imported logs have no topic with it, for lack of transforms."""
     try:
         return attachments["robot.urdf"].decode("utf-8") if "robot.urdf" in attachments else None
     except UnicodeDecodeError as error:
@@ -180,7 +214,7 @@ def _metadata(scan: Scan, name: str) -> dict[str, str] | None:
 
 
 def _check_types(source: str, channel: ChannelRecord, log_time: int, notes: list[str]) -> bool:
-    """Whether a channel can be read. DataError for a channel that matters; a note for one that does not."""
+    """Whether a channel can be read. DataError for an essential channel, a note for another."""
     wanted = TOPICS[channel.topic]
     found = channel.schema.name if channel.schema is not None else "no schema"
     problem = ""
@@ -252,7 +286,7 @@ class _JointTopic:
         values = {name: np.empty((count, len(self.names))) for name in self.fields}
         stamps = np.empty(count, dtype=np.int64)
         alike = (sizes == sizes[0]).all()
-        # The sizes in the order of the file, so that an error names the first message that breaks a rule.
+        # Sizes in the order of the file: an error names the first wrong message.
         for size in sizes[:1].tolist() if alike else dict.fromkeys(sizes.tolist()):
             left = np.flatnonzero(sizes == size)
             layouts = self.layouts.setdefault(size, [])
@@ -297,7 +331,7 @@ class _JointTopic:
             self.parts.setdefault(name, []).append(part)
 
     def _learn(self, block: Block, row: int) -> tuple[Layout, list[int] | None]:
-        """Layout of a message, and which of its columns belong to our joints; None if all in order."""
+        """Layout of a message, and the columns of our joints in it; None if in our order."""
         where = f"{self.source}: {self.topic} at {stamp(int(block.log_time[row]))}"
         try:
             layout, names = read_joint_state_layout(block.message(row))
@@ -327,7 +361,7 @@ class _JointTopic:
         return layout, [names.index(name) for name in self.names]
 
     def columns(self, notes: list[str]) -> JointColumns | None:
-        """All samples, checked."""
+        """All samples, after checks."""
         if not self.parts:
             return None
         count = sum(map(len, self.parts["log_time"]))
@@ -379,7 +413,7 @@ class _JointTopic:
 
 @dataclass
 class _FixedTopic:
-    """Collects messages of a definition of our own, which all have one layout."""
+    """Collects messages of one of our own definitions, all of one layout."""
 
     topic: str
     layout: Layout

@@ -1,4 +1,4 @@
-"""Making the session log of a killed recorder whole again."""
+"""Repair of the session log of a killed recorder."""
 
 from __future__ import annotations
 
@@ -11,23 +11,21 @@ from pathlib import Path
 import numpy as np
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session.columns import stamp
-from lwr_driver.session.container import Container, Messages
-from lwr_driver.session.mcap_format import MESSAGE_HEAD, Opcode
+from lwr_driver.configuration import as_path
+from lwr_driver.session.container import MESSAGE_HEAD, Container, Messages, Opcode
+from lwr_driver.session.messages import Schema
 from lwr_driver.session.scan import Block, ChannelRecord, Scan
-from lwr_driver.session.schemas import Schema
-
-__all__ = ["Recovery", "copy_messages", "recover", "replacing"]
+from lwr_driver.session.session import stamp
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What `recover` did.
+    """Result of `recover`.
 
     needed : whether the file was broken at all
     messages : messages of each topic in the recovered file
-    bytes_unread : bytes at the end of the broken file that were of no use
-    lost : what is gone, one sentence each
+    bytes_unread : unreadable bytes at the end of the broken file
+    lost : one sentence for each loss
     """
 
     path: Path
@@ -45,16 +43,16 @@ class Recovery:
 
 
 def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
-    """Write everything that can be read of the broken session log `path` into the whole file `out`.
+    """Write everything readable in the broken session log `path` into the whole file `out`.
 
     out : default is `NAME.recovered.mcap` beside `path`; an existing file is refused
 
     Damaged chunks are left out and named. A missing `session_end` is added with exit status `fail`. The
-    result is read back and compared message by message count before it gets its name. DataError if nothing
-    can be recovered.
+    result is read back and its message counts compared before it gets its name. DataError if nothing can be
+    recovered.
     """
-    path = Path(path)
-    out = path.with_suffix(".recovered.mcap") if out is None else Path(out)
+    path = as_path(path, "session log")
+    out = path.with_suffix(".recovered.mcap") if out is None else as_path(out, "recovered session log")
     if out.exists():
         raise ConfigurationError(f"{out} exists already; name another file or remove it")
     scan = Scan(path, skip_damage=True)
@@ -91,9 +89,9 @@ def copy_messages(
     """Copy attachments, metadata and messages of `scan` chunk by chunk, by log time within each.
 
     metadata : replaces the record `session`
-    added : further messages, put into the chunks to which their log times belong
+    added : further messages, put into chunks by their log times
 
-    Returns the number of messages copied of each topic.
+    Returns the number of copied messages of each topic.
     """
     counts: dict[str, int] = {}
     described = False
@@ -123,7 +121,7 @@ def copy_messages(
 
 @contextlib.contextmanager
 def replacing(out: Path) -> Iterator[Path]:
-    """A file beside `out` to write to: it takes the name `out` in one step, or vanishes on an error."""
+    """A file to write beside `out`: it takes the name `out` in one step, or vanishes on an error."""
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     partial.unlink(missing_ok=True)
     try:

@@ -1,17 +1,17 @@
-"""The reading side of an MCAP file: its records from front to back, as far as they are whole.
+"""The reading side of an MCAP file: its whole records from front to back.
 
-Nothing relies on the summary at the end, so the file of a killed recorder reads like any other. Of each chunk
-the messages are found through the message indexes that follow it; the indexes are checked against the data
-and replaced by a walk through the records where they are missing or wrong.
+Nothing relies on the summary at the end, so the file of a killed recorder reads like any other. The messages
+of a chunk are found through the message indexes after it. These are checked against the data and replaced by
+a walk through the records if missing or wrong.
 """
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -19,9 +19,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from lwr_driver.session.mcap_format import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opcode
-
-__all__ = ["Block", "ChannelRecord", "Scan", "SchemaRecord"]
+from lwr_driver.configuration import as_path
+from lwr_driver.session.container import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opcode
 
 _LARGEST_CHUNK = 1 << 28
 _LOOSE_BYTES = 4 << 20
@@ -63,7 +62,7 @@ class ChannelRecord:
 class Block:
     """The messages of one chunk, or of a run of messages outside chunks, in the order of the file.
 
-    data : uint8, plain bytes; starts, sizes : (n,) where each message (without its head) stands in them
+    data : uint8, plain bytes; starts, sizes : (n,) place of each message, without its head
     channel, sequence, log_time, publish_time : (n,) int64
     """
 
@@ -83,7 +82,7 @@ class Block:
 
     def gather(self, rows: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
         """The messages `rows`, all of `size` bytes, as (n, size) uint8."""
-        # A plain-bytes item type, so that every byte is copied.
+        # Items of plain bytes, so every byte is copied.
         windows: NDArray[Any] = np.ndarray(
             (len(self.data) - size + 1,), dtype=f"V{size}", buffer=self.data.data, strides=(1,)
         )
@@ -91,25 +90,24 @@ class Block:
 
 
 class _Cut(Exception):
-    """The file ends, or makes no sense, from here on."""
+    """The file ends here, or continues with nonsense."""
 
 
 class _Damage(Exception):
-    """A record is whole but its content is not."""
+    """A whole record with damaged content."""
 
 
 class Scan:
-    """One pass over a file. After `blocks` is exhausted the other attributes are complete.
+    """One pass over a file; the other attributes are complete after the last of `blocks`.
 
     closed : the file ends with a footer; bytes_unread : bytes behind the last whole record
-    lost_from, lost_to : log times of the chunk that was cut, if its head can be read
-    skipped : damaged chunks and records that were left out, in words (only with `skip_damage`)
+    lost_from, lost_to : log times of a truncated chunk, if its head is readable
+    skipped : damaged chunks and records left out, in words (only with `skip_damage`)
     """
 
-    def __init__(self, path: str | Path, *, skip_damage: bool = False) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | os.PathLike[str], *, skip_damage: bool = False) -> None:
+        self.path = as_path(path, "session log")
         self.profile = ""
-        self.library = ""
         self.channels: dict[int, ChannelRecord] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.attachments: dict[str, tuple[str, int, bytes]] = {}
@@ -119,7 +117,6 @@ class Scan:
         self.lost_from: int | None = None
         self.lost_to: int | None = None
         self.skipped: list[str] = []
-        self.chunks = 0
         self._skip_damage = skip_damage
         self._schemas: dict[int, SchemaRecord] = {}
         self._decompressor = zstandard.ZstdDecompressor()
@@ -222,9 +219,8 @@ class Scan:
     def _chunk(
         self, chunk: tuple[int, bytes], index: list[bytes], damage: tuple[int, str] | None
     ) -> Generator[Block, None, tuple[int, str] | None]:
-        """Yields the block of a chunk; returns the damage so far that no good chunk has followed yet."""
+        """Yields the block of a chunk; returns the damage not yet followed by a good chunk."""
         at, content = chunk
-        self.chunks += 1
         try:
             data = self._decompress(content)
             block = self._block(at, data, index)
@@ -297,7 +293,7 @@ class Scan:
         )
 
     def _indexed(self, data: bytes, plain: NDArray[np.uint8], index: list[bytes]) -> NDArray[np.int64] | None:
-        """Starts of the message records by the indexes; None if those do not account for every byte."""
+        """Starts of the message records by the indexes; None unless these account for every byte."""
         parts = []
         for content in index:
             if (
@@ -328,7 +324,7 @@ class Scan:
         return starts
 
     def _walk(self, data: bytes, start: int, stop: int, at: int) -> NDArray[np.int64]:
-        """Starts of the message records between two places, by a walk that takes in schemas and channels."""
+        """Starts of the message records between two places, by a walk; it reads schemas and channels too."""
         starts = []
         while start < stop:
             if start + 9 > stop:
@@ -368,7 +364,7 @@ class Scan:
         try:
             reader = _Fields(content)
             if opcode == Opcode.HEADER:
-                self.profile, self.library = reader.text(), reader.text()
+                self.profile = reader.text()
             elif opcode == Opcode.SCHEMA:
                 number = reader.number("<H")
                 self._schemas[number] = SchemaRecord(reader.text(), reader.text(), reader.bytes("<I"))
@@ -395,7 +391,7 @@ class Scan:
 
 
 class _Fields:
-    """The fields of a record, one after the other."""
+    """Reads the fields of a record in turn."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content

@@ -1,27 +1,190 @@
-"""A session as it was read: metadata, channels as columns, and what of it is missing."""
+"""A session log in memory: metadata, channels as columns of numpy arrays, phases, and missing samples."""
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
+import difflib
+import html
+import importlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from fri.errors import DataError
-from lwr_driver.session.columns import ControllerModelColumns, JointColumns, Phase, StatusColumns
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["Missing", "Session"]
+from fri.errors import ConfigurationError, DataError
+
+_WIDEST = 120
+"""Characters of a line of a `repr`."""
+
+
+class Phase(NamedTuple):
+    """Beginning of a phase of the experiment: log time [ns] and name."""
+
+    log_time: int
+    name: str
+
+
+class Gap(NamedTuple):
+    """Lost samples before row `row`: their number, and the log times of the rows before and after [ns]."""
+
+    row: int
+    lost: int
+    before: int
+    after: int
+
+
+@dataclass(frozen=True, repr=False)
+class JointColumns:
+    """One channel of joint states, n samples of J joints, in the order of the file.
+
+    log_time, publish_time : (n,) int64, host time and the source's time [ns]
+    sequence : (n,) int64, counter of the source; a gap is a lost sample
+    position [rad], velocity [rad/s], effort [Nm] : (n, J) float64, or (n, 0) if the channel has none
+    source : file, for messages
+    """
+
+    topic: str
+    names: tuple[str, ...]
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    sequence: NDArray[np.int64]
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    effort: NDArray[np.float64]
+    source: str = ""
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+    def __repr__(self) -> str:
+        rate, lost = _pace(self.log_time)[0], f", {self.lost} lost" if self.lost else ""
+        return f"{self.topic}: {len(self)} samples at {rate:.1f} Hz{lost} ({', '.join(self.held)})"
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the fields with values."""
+        return tuple(name for name in ("position", "velocity", "effort") if getattr(self, name).shape[1])
+
+    @property
+    def numbered(self) -> bool:
+        """Whether the source counts its samples; a constant zero is no counter."""
+        return bool(self.sequence.any())
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Lost samples by the counter of the source; empty without a counter."""
+        if not self.numbered:
+            return ()
+        steps = np.diff(self.sequence)
+        return tuple(
+            Gap(int(row) + 1, int(steps[row]) - 1, int(self.log_time[row]), int(self.log_time[row + 1]))
+            for row in np.flatnonzero(steps > 1)
+        )
+
+    @property
+    def lost(self) -> int:
+        """Number of lost samples between the first and the last."""
+        return sum(gap.lost for gap in self.gaps)
+
+    @property
+    def period_s(self) -> float:
+        """Median time between samples by the clock of the source, else of the host [s]."""
+        if len(self) < 2:
+            return float("nan")
+        times = self.publish_time if np.ptp(self.publish_time) > 0 else self.log_time
+        return float(np.median(np.diff(times))) * 1e-9
+
+    def select(self, names: Sequence[str]) -> JointColumns:
+        """The same samples with the joints `names` in this order; DataError for an unknown joint."""
+        wanted = tuple(names)
+        if wanted == self.names:
+            return self
+        for name in wanted:
+            if name not in self.names:
+                near = difflib.get_close_matches(name, self.names, n=1)
+                advice = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(self.names)}"
+                raise DataError(
+                    f"{self.source}: {self.topic} at {stamp(self.log_time)} has no joint {name!r}; {advice}"
+                )
+        columns = [self.names.index(name) for name in wanted]
+        picked = {name: getattr(self, name)[:, columns] for name in self.held}
+        return dataclasses.replace(self, names=wanted, **picked)
+
+    def rows(self, start: int, stop: int) -> JointColumns:
+        """The samples with `start` <= log time < `stop` [ns]."""
+        low, high = np.searchsorted(self.log_time, [start, stop], side="left")
+        fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+        return dataclasses.replace(
+            self, **{name: getattr(self, name)[int(low) : int(high)] for name in fields}
+        )
+
+
+@dataclass(frozen=True)
+class StatusColumns:
+    """The channel `/fri/status`, n cycles; names and units as in `lwr_msgs/msg/FriStatus`."""
+
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    state: NDArray[np.uint16]
+    quality: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    sample_time: NDArray[np.float64]
+    answer_rate: NDArray[np.float32]
+    latency: NDArray[np.float32]
+    jitter: NDArray[np.float32]
+    miss_rate: NDArray[np.float32]
+    miss_counter: NDArray[np.uint32]
+    power: NDArray[np.uint16]
+    control: NDArray[np.uint16]
+    error: NDArray[np.uint16]
+    warning: NDArray[np.uint16]
+    temperature: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+
+@dataclass(frozen=True)
+class ControllerModelColumns:
+    """The channel `/fri/controller_model`: n samples of the controller's own model, float64.
+
+    mass_matrix (n, 7, 7) [kg m2], gravity (n, 7) [Nm], jacobian (n, 6, 7), estimated_external_torque (n, 7)
+    [Nm]
+    """
+
+    log_time: NDArray[np.int64]
+    publish_time: NDArray[np.int64]
+    mass_matrix: NDArray[np.float64]
+    gravity: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    estimated_external_torque: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.log_time)
+
+
+def stamp(times: NDArray[np.int64] | int) -> str:
+    """A log time, or the first of an array, in seconds for a message."""
+    if isinstance(times, np.ndarray):
+        if not len(times):
+            return "(empty)"
+        times = int(times[0])
+    return f"t = {times // 10**9}.{times % 10**9:09d} s"
 
 
 @dataclass(frozen=True)
 class Missing:
-    """What a session lacks; false if it is whole.
+    """Missing parts of a session; false if it is whole.
 
     ended : the recorder wrote `session_end`
     closed : the file has its summary and footer
-    bytes_unread : bytes behind the last whole record that could be read
-    lost_from, lost_to : log times of the chunk that was cut, where its head can still be read [ns]
-    samples : lost samples of each topic, as the source's counters tell them
+    bytes_unread : bytes behind the last readable record
+    lost_from, lost_to : log times of a truncated chunk, if its head is readable [ns]
+    samples : lost samples of each topic by the counters of the source
     notes : further remarks, each a sentence
     """
 
@@ -38,7 +201,7 @@ class Missing:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What is missing, one sentence each."""
+        """One sentence for each missing part."""
         lines = []
         if not self.ended:
             lines.append(
@@ -50,7 +213,7 @@ class Missing:
             lines.append(f"{self.bytes_unread} bytes at the end of the file are not whole and were not read")
         if self.lost_from is not None and self.lost_to is not None:
             seconds = (self.lost_to - self.lost_from) * 1e-9
-            lines.append(f"the chunk that was cut spans {seconds:.3f} s of log time")
+            lines.append(f"the truncated chunk spans {seconds:.3f} s of log time")
         lines += [f"{topic}: {count} samples lost" for topic, count in self.samples.items() if count]
         return (*lines, *self.notes)
 
@@ -58,14 +221,14 @@ class Missing:
         return "; ".join(self.lines) or "nothing"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Session:
     """One motion of the arm with one payload.
 
     metadata : the record `session`; end : the record `session_end`, None if the recorder died
-    joint_names : joints of `/joint_states` in its order; the other channels have theirs in the same order
+    joint_names : joints of `/joint_states` in its order; the other channels keep this order
     joint : `/joint_states`; motor, command : `/motor_states` and `/joint_command`, None if absent
-    phases : beginnings of phases; empty if the session is to be used whole
+    phases : beginnings of phases; empty if the whole session is one
     attachments : file name -> content
     """
 
@@ -83,6 +246,56 @@ class Session:
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     missing: Missing = field(default_factory=Missing)
 
+    def __repr__(self) -> str:
+        data = self.metadata
+        duration = f"{self.duration_s:.3f} s" if len(self.joint) else "empty"
+        recorded = f"{_utc(self.start)}, {duration}" if len(self.joint) else duration
+        phases = ", ".join(dict.fromkeys(phase.name.split()[0] for phase in self.phases if phase.name))
+        lines = [
+            f"Session {self.path}",
+            f"  robot     {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
+            f"  payload   {_payload(data)}",
+            f"  recorded  {recorded}",
+            f"  joints    {' '.join(self.joint_names)}",
+            *(f"  channel   {item!r}" for item in (self.joint, self.motor, self.command) if item is not None),
+            f"  phases    {len(self.phases)}{f': {phases}' if phases else ''}",
+            f"  missing   {self.missing}",
+        ]
+        return "\n".join(line if len(line) <= _WIDEST else f"{line[: _WIDEST - 3]}..." for line in lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+    def to_dataframe(self, topic: str = "/joint_states") -> Any:
+        """A channel of joints as a pandas DataFrame, one row per sample.
+
+        topic : `/joint_states`, `/motor_states` or `/joint_command`
+
+        The index is log time since the first joint state [s]; the columns are `position_JOINT` [rad],
+        `velocity_JOINT` [rad/s] and `effort_JOINT` [Nm], as far as the channel holds them.
+        ConfigurationError for an absent channel, or without pandas.
+        """
+        channels = {item.topic: item for item in (self.joint, self.motor, self.command) if item is not None}
+        if topic not in channels:
+            raise ConfigurationError(
+                f"{self.path}: no channel {topic!r}; choose one of {', '.join(channels)}"
+            )
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise ConfigurationError(
+                "data frames need pandas, which is not installed; `pip install pandas`, or use the arrays of "
+                "`session.joint`"
+            ) from error
+        channel = channels[topic]
+        columns = {
+            f"{field}_{name}": getattr(channel, field)[:, column]
+            for field in channel.held
+            for column, name in enumerate(channel.names)
+        }
+        time = pandas.Index((channel.log_time - self.start) * 1e-9, name="time_s")
+        return pandas.DataFrame(columns, index=time)
+
     @property
     def start(self) -> int:
         """Log time of the first joint state [ns]."""
@@ -94,9 +307,9 @@ class Session:
         return float(self.joint.log_time[-1] - self.joint.log_time[0]) * 1e-9
 
     def select(self, joint_names: Sequence[str]) -> Session:
-        """This session with the joints `joint_names` in this order in all channels.
+        """This session with only the joints `joint_names`, in this order, in all channels.
 
-        DataError names a joint that a channel does not have. Joints that are not asked for are left out.
+        DataError for a joint missing in a channel.
         """
         names = tuple(joint_names)
         if not names or len(set(names)) != len(names):
@@ -112,10 +325,163 @@ class Session:
         )
 
     def spans(self, name: str) -> tuple[tuple[int, int], ...]:
-        """[start, stop) log times [ns] of every phase `name`, and of those numbered `name N`."""
+        """[start, stop) log times [ns] of every phase `name` or `name N`."""
         stops = [*(phase.log_time for phase in self.phases[1:]), int(self.joint.log_time[-1]) + 1]
         return tuple(
             (phase.log_time, stop)
             for phase, stop in zip(self.phases, stops, strict=False)
             if phase.name == name or phase.name.startswith(name + " ")
         )
+
+
+@dataclass(frozen=True)
+class ChannelSummary:
+    """Samples of one topic: number, rate [Hz], lost samples, and the longest pause between two [s]."""
+
+    topic: str
+    samples: int
+    rate_hz: float
+    lost: int
+    longest_pause_s: float
+    holds: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PhaseSummary:
+    """A phase: name, beginning after the first joint state, and duration [s]."""
+
+    name: str
+    begin_s: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class SessionSummary:
+    """The content of `lwr-run info`; `str()` is the text, `as_dict()` the data.
+
+    size_bytes : size of the file; position_range, effort_rms : per joint [rad], [Nm]
+    """
+
+    path: Path
+    size_bytes: int
+    utc_first: str
+    duration_s: float
+    joint_names: tuple[str, ...]
+    channels: tuple[ChannelSummary, ...]
+    phases: tuple[PhaseSummary, ...]
+    position_range: tuple[tuple[float, float], ...]
+    effort_rms: tuple[float, ...]
+    motor_effort_rms: tuple[float, ...]
+    attachments: Mapping[str, int]
+    metadata: Mapping[str, str]
+    end: Mapping[str, str] | None
+    missing: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, for JSON."""
+        return {**asdict(self), "path": str(self.path)}
+
+    def __str__(self) -> str:
+        data = self.metadata
+        status = "unknown: the recorder died" if self.end is None else self.end.get("exit_status", "unknown")
+        reason = f" ({self.end['reason']})" if self.end and self.end.get("reason") else ""
+        lines = [
+            f"{self.path}  {self.size_bytes / 1e6:.1f} MB",
+            f"  robot        {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
+            f"  payload      {_payload(data)}",
+            f"  experiment   {data.get('experiment', '') or '-'}",
+            f"  recorded     {self.utc_first}, {self.duration_s:.3f} s",
+            f"  ended        {status}{reason}",
+            f"  motor torque {data.get('motor_torque_source', 'unknown')}",
+            "",
+            f"  {'topic':<24}{'samples':>9}{'Hz':>9}{'lost':>7}{'longest pause':>16}",
+        ]
+        lines += [
+            f"  {item.topic:<24}{item.samples:>9}{item.rate_hz:>9.1f}{item.lost:>7}"
+            f"{item.longest_pause_s * 1e3:>13.1f} ms"
+            for item in self.channels
+        ]
+        lines += ["", f"  {'joint':<12}{'from':>9}{'to':>9} rad{'sensor rms':>13}{'motor rms':>12} Nm"]
+        for index, name in enumerate(self.joint_names):
+            low, high = self.position_range[index]
+            efforts = [
+                f"{rms[index]:.3f}" if rms else "-" for rms in (self.effort_rms, self.motor_effort_rms)
+            ]
+            lines.append(f"  {name:<12}{low:>9.4f}{high:>9.4f}    {efforts[0]:>13}{efforts[1]:>12}")
+        if self.phases:
+            lines += ["", f"  {'phase':<24}{'begins':>9}{'lasts':>9} s"]
+            lines += [f"  {item.name:<24}{item.begin_s:>9.3f}{item.duration_s:>9.3f}" for item in self.phases]
+        if self.attachments:
+            lines += [
+                "",
+                "  attached     " + ", ".join(f"{k} ({v} bytes)" for k, v in self.attachments.items()),
+            ]
+        lines += ["", *(f"  missing      {line}" for line in self.missing or ("nothing",))]
+        return "\n".join(lines)
+
+
+def summarise(session: Session) -> SessionSummary:
+    """Summary of a session whose file is still there."""
+    joint, motor = session.joint, session.motor
+    channels = [
+        _channel(item.topic, item.log_time, item.lost, item.held)
+        for item in (joint, motor, session.command)
+        if item is not None
+    ]
+    for topic, other in (
+        ("/fri/status", session.status),
+        ("/fri/controller_model", session.controller_model),
+    ):
+        if other is not None:
+            channels.append(_channel(topic, other.log_time, 0, ()))
+    stops = [*(phase.log_time for phase in session.phases[1:]), int(joint.log_time[-1])]
+    return SessionSummary(
+        path=session.path,
+        size_bytes=session.path.stat().st_size,
+        utc_first=_utc(session.start),
+        duration_s=session.duration_s,
+        joint_names=session.joint_names,
+        channels=tuple(channels),
+        phases=tuple(
+            PhaseSummary(phase.name, (phase.log_time - session.start) * 1e-9, (stop - phase.log_time) * 1e-9)
+            for phase, stop in zip(session.phases, stops, strict=False)
+        ),
+        position_range=tuple(
+            (float(low), float(high))
+            for low, high in zip(joint.position.min(axis=0), joint.position.max(axis=0), strict=True)
+        ),
+        effort_rms=_rms(joint),
+        motor_effort_rms=() if motor is None or motor.names != joint.names else _rms(motor),
+        attachments={name: len(data) for name, data in session.attachments.items()},
+        metadata=session.metadata,
+        end=session.end,
+        missing=session.missing.lines,
+    )
+
+
+def _rms(columns: JointColumns) -> tuple[float, ...]:
+    if not columns.effort.shape[1]:
+        return ()
+    return tuple(np.sqrt(np.mean(columns.effort**2, axis=0)).tolist())
+
+
+def _payload(metadata: Mapping[str, str]) -> str:
+    mass = f", {metadata['payload_mass']} kg" if metadata.get("payload_mass") else ""
+    return f"{metadata.get('payload', 'unknown')}{mass}"
+
+
+def _utc(log_time: int) -> str:
+    first = datetime.datetime.fromtimestamp(log_time / 1e9, datetime.UTC)
+    return first.strftime("%Y-%m-%d %H:%M:%S.%f UTC")
+
+
+def _channel(topic: str, log_time: NDArray[np.int64], lost: int, held: tuple[str, ...]) -> ChannelSummary:
+    rate, pause = _pace(log_time)
+    return ChannelSummary(topic, len(log_time), rate, lost, pause, held)
+
+
+def _pace(log_time: NDArray[np.int64]) -> tuple[float, float]:
+    """Median rate of the samples [Hz] and longest pause between two of them [s]."""
+    steps = np.diff(log_time) * 1e-9
+    rate = float(1.0 / np.median(steps)) if len(steps) and np.median(steps) > 0 else 0.0
+    return rate, float(steps.max()) if len(steps) else 0.0

@@ -1,15 +1,13 @@
 """Writing a session log from columns of numpy arrays.
 
-Used by the recorder while the arm moves, by the import of a controller's trace, and by the import of
-recordings made elsewhere. Messages are collected by topic and written as chunks of 0.5 s of log time, so the
-bytes of a log depend on the samples alone and not on how they arrived.
+Used by the recorder and by the import of foreign recordings. Messages are collected by topic and written as
+chunks of 0.5 s of log time. So the bytes of a log depend on the samples alone, not on their arrival.
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
-import struct
 import uuid
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -21,8 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session import mcap_format as mcap
-from lwr_driver.session.cdr import (
+from lwr_driver.arm import LinkFrames
+from lwr_driver.configuration import as_path
+from lwr_driver.session.container import Container, Messages, record_layout
+from lwr_driver.session.messages import (
+    TOPICS,
     Layout,
     LayoutBuilder,
     controller_model_layout,
@@ -30,16 +31,11 @@ from lwr_driver.session.cdr import (
     joint_state_layout,
     tf_layout,
 )
-from lwr_driver.session.columns import stamp
-from lwr_driver.session.container import Container, Messages
-from lwr_driver.session.frames import LinkFrames
-from lwr_driver.session.schemas import TOPICS
-
-__all__ = ["CHUNK_PERIOD_S", "SLOW_PERIOD_NS", "ExitStatus", "SessionWriter", "session_metadata"]
+from lwr_driver.session.session import stamp
 
 CHUNK_PERIOD_S = 0.5
 SLOW_PERIOD_NS = 20_000_000
-"""Period of the channels that need not come every cycle: 50 Hz."""
+"""Period of the slow channels: 50 Hz."""
 
 SCHEMA_VERSION = "1"
 LIBRARY = "lwr-identification"
@@ -53,11 +49,6 @@ _MEDIA_TYPES = {
     ".json": "application/json",
 }
 _LATEST_NS = 2**31 * 10**9
-_PREFIX_FIELDS = {
-    "channel_sequence": ("<u4", 11),
-    "log_time": ("<u8", 15),
-    "publish_time": ("<u8", 23),
-}
 
 
 def session_metadata(
@@ -77,8 +68,8 @@ def session_metadata(
 ) -> dict[str, str]:
     """The metadata record `session`, complete.
 
-    uid, utc_start : made from chance and from the clock if None; give both where logs must repeat bit for bit
-    payload_mass : [kg]; more : further keys, such as where imported data came from
+    uid, utc_start : from chance and from the clock if None; give both for logs equal bit for bit
+    payload_mass : [kg]; more : further keys, such as the source of imported data
     """
     values = {
         "schema_version": SCHEMA_VERSION,
@@ -105,16 +96,15 @@ class SessionWriter:
     path : the new file; an existing one is never overwritten
     joint_names : joints of all columns, as in the URDF; any number
     metadata : the record `session`, see `session_metadata`
-    robot_description : URDF text, written to `/robot_description`, attached as `robot.urdf`, and the source
-    of `/tf`
+    robot_description : URDF text for `/robot_description`, the attachment `robot.urdf`, and `/tf`
     attachments : file name -> content, written first
     start_ns : log time of the attachments [ns]
     fsync : force each chunk to the disk
 
     Log times of a topic must be strictly increasing (DataError otherwise). Every `write_...` takes arrays
-    with n rows; `publish_time` defaults to the log time, `sequence` to a running count. Call `advance` when
-    nothing earlier will come any more; whole chunks are written then. Errors: ConfigurationError if the file
-    cannot be created, DataError if it cannot be written on (disk full).
+    with n rows; `publish_time` defaults to the log time, `sequence` to a running count. `advance` writes all
+    whole chunks before a time. ConfigurationError if the file cannot be created, DataError if it cannot be
+    continued (disk full).
     """
 
     def __init__(
@@ -126,10 +116,9 @@ class SessionWriter:
         robot_description: str | None = None,
         attachments: Mapping[str, bytes] | None = None,
         start_ns: int = 0,
-        chunk_period_s: float = CHUNK_PERIOD_S,
         fsync: bool = False,
     ) -> None:
-        self.path = Path(path)
+        self.path = as_path(path, "session log")
         self.joint_names = tuple(joint_names)
         if not self.joint_names or len(set(self.joint_names)) != len(self.joint_names):
             raise ConfigurationError(
@@ -144,7 +133,7 @@ class SessionWriter:
         self.closed = False
         self._failure: DataError | None = None
         self._last_sequence: int | None = None
-        self._period_ns = round(chunk_period_s * 1e9)
+        self._period_ns = round(CHUNK_PERIOD_S * 1e9)
         self._frames = None if robot_description is None else LinkFrames(robot_description)
         self._description = robot_description
         self._layouts: dict[object, Layout] = {}
@@ -154,7 +143,7 @@ class SessionWriter:
         self._slow_bucket: dict[str, int] = {}
         self._container = Container(self.path, library=LIBRARY, fsync=fsync)
         try:
-            # All numbers are given out beforehand: they must not depend on what happens to come first.
+            # All numbers are fixed beforehand, independent of the first message.
             for topic, schema in TOPICS.items():
                 self._container.channel(topic, schema)
             self._container.describe("session", metadata)
@@ -208,7 +197,7 @@ class SessionWriter:
         publish_time: ArrayLike | None = None,
         sequence: ArrayLike | None = None,
     ) -> None:
-        """Commanded joint positions [rad], (n, J), at the times of the cycles in which they were sent."""
+        """Commanded joint positions [rad], (n, J), at the times of their cycles."""
         arrays = {"position": position, "velocity": None, "effort": None}
         self._joint_states("/joint_command", log_time, arrays, publish_time, sequence)
 
@@ -255,38 +244,20 @@ class SessionWriter:
     ) -> None:
         """Link frames at the joint positions (n, J) [rad]; nothing without a robot description.
 
-        All rows given are written; `slow` picks those that belong to 50 Hz.
+        All rows are written; `slow` selects the rows for 50 Hz.
         """
         if self._frames is None:
             return
-        self.write_tf(
-            log_time,
-            self._frames.pairs,
-            self._frames.poses(self.joint_names, np.atleast_2d(np.asarray(position, dtype=np.float64))),
-            publish_time=publish_time,
-        )
-
-    def write_tf(
-        self,
-        log_time: ArrayLike,
-        pairs: Sequence[tuple[str, str]],
-        poses: NDArray[np.float64],
-        *,
-        publish_time: ArrayLike | None = None,
-    ) -> None:
-        """Poses (n, frames, 7), x y z [m] and quaternion x y z w, of child frames in their parents."""
-        frames = tuple(pairs)
+        pairs = self._frames.pairs
+        poses = self._frames.poses(self.joint_names, np.atleast_2d(np.asarray(position, dtype=np.float64)))
         times = np.atleast_1d(np.asarray(log_time, dtype=np.int64))
-        columns: dict[str, Any] = {f"pose_{index}": poses[:, index] for index in range(len(frames))}
-        for index in range(len(frames)):
+        columns: dict[str, Any] = {f"pose_{index}": poses[:, index] for index in range(len(pairs))}
+        for index in range(len(pairs)):
             columns[f"{index}_sec"], columns[f"{index}_nanosec"] = times // 10**9, times % 10**9
-        self._add("/tf", frames, lambda: tf_layout(frames), times, columns, publish_time, None)
+        self._add("/tf", pairs, lambda: tf_layout(pairs), times, columns, publish_time, None)
 
     def slow(self, topic: str, publish_time: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the rows a 50 Hz topic takes: the first of every 20 ms of the source's clock.
-
-        Keeps its place.
-        """
+        """Rows for a 50 Hz topic, as a mask: the first of every 20 ms of the source's clock, across calls."""
         buckets = publish_time // SLOW_PERIOD_NS
         previous = self._slow_bucket.get(topic)
         taken = np.empty(len(buckets), dtype=bool)
@@ -297,16 +268,16 @@ class SessionWriter:
         return taken
 
     def advance(self, log_time: int) -> None:
-        """Write all chunks that end at or before `log_time`: no message before it will come any more."""
+        """Write all chunks ending at or before `log_time`: no earlier message may follow."""
         self._emit(log_time // self._period_ns * self._period_ns)
 
     def close(
         self, exit_status: ExitStatus = "success", reason: str = "", more: Mapping[str, str] | None = None
     ) -> None:
-        """Write what is left, the record `session_end` and the summary. Does nothing if it is closed already.
+        """Write the rest, the record `session_end` and the summary; a second call has no effect.
 
         After a failed write (disk full) the file ends behind its last whole chunk, with exit status `fail`.
-        DataError if what is left, or even the end, cannot be written.
+        DataError if the rest, or even the end, cannot be written.
         """
         if self.closed:
             return
@@ -339,7 +310,7 @@ class SessionWriter:
 
     @property
     def samples(self) -> int:
-        """Joint states in the file, after `close`; before it, those in whole chunks."""
+        """Joint states in the file; before `close` those in whole chunks."""
         return self._container.count("/joint_states")
 
     def __enter__(self) -> SessionWriter:
@@ -426,9 +397,7 @@ class SessionWriter:
         number = self._container.channel(topic, TOPICS[topic])
         layout_key = (topic, key)
         if layout_key not in self._layouts:
-            layout = build()
-            prefix = mcap.message_prefix(number, layout.size)
-            self._layouts[layout_key] = layout.relaid(prefix, _PREFIX_FIELDS)
+            self._layouts[layout_key] = record_layout(build(), number)
         layout = self._layouts[layout_key]
         values = {"channel_sequence": numbers, "log_time": times, "publish_time": published, **columns}
         if "sec" in layout.fields:
@@ -454,7 +423,7 @@ class SessionWriter:
         self._last[topic] = int(times[-1])
 
     def _emit(self, boundary: int | None) -> None:
-        """Write the chunks of all windows that end at or before `boundary`; all of them if None."""
+        """Write the chunks of all windows ending at or before `boundary`; all of them if None."""
         while True:
             heads = [int(queue[0][0][0]) for queue in self._queues.values() if queue]
             if not heads:
@@ -469,7 +438,7 @@ class SessionWriter:
             try:
                 self._container.write_chunk(messages)
             except DataError as error:
-                # What follows would stand behind a hole.
+                # Later chunks would stand behind a gap.
                 self._failure = error
                 self._queues.clear()
                 raise
@@ -495,6 +464,3 @@ class SessionWriter:
         return Messages(
             [records[row] for row in order.tolist()], np.concatenate(channels)[order], log_times[order]
         )
-
-
-assert struct.calcsize("<BQHIQQ") == mcap.MESSAGE_HEAD.size == 31

@@ -1,1 +1,1 @@
-"""One module a verb of `lwr-run`; each holds a click command named `command`."""
+"""The commands of `lwr-run`, one module per family."""

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.options import coupling_option, gear_ratio_option, json_option
-from runner.plain import as_json as to_json
+from runner.terminal import coupling_option, gear_ratio_option, json_option, to_json
 
 if TYPE_CHECKING:
     from ident.diagnosis import Reference
@@ -68,7 +67,7 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
-    from ident.model_file import write_model
+    from ident.model.model_file import write_model
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm
 

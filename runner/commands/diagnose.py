@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from runner.options import GroupedCommand, coupling_option, gear_ratio_option, json_option
+from runner.terminal import GroupedCommand, coupling_option, gear_ratio_option, json_option
 
 __all__ = ["command"]
 
@@ -80,7 +80,7 @@ def command(
     lwr-run diagnose a.mcap --no-simulation --json --out diagnosis    quicker, and for a program
     """
     from fri.errors import ConfigurationError
-    from ident.model_file import read_model
+    from ident.model.model_file import read_model
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm, study
     from runner.diagnosis.deciding import offers_of_sessions

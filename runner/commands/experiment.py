@@ -13,50 +13,38 @@ import click
 
 from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.diagnosis.after_run import conclude_run
-from runner.experiment import Bench, Record, Run
+from runner.experiment import Bench, Progress, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import Laboratory
-from runner.options import json_option
-from runner.plain import as_json as to_json
 from runner.planning import PLAN, Excitations
-from runner.progress import Progress
 from runner.replanning import Rounds, rounds_begun
 from runner.results import estimate, summarise, write_results
-from runner.status import StatusLine
+from runner.terminal import PATH, StatusLine, json_option, to_json
 
 COPY = "experiment.yaml"
 
 
 @click.command("experiment")
 @click.argument("file", required=False)
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Folder of the results; default experiments/NAME-STAMP."
-)
+@click.option("--out", type=PATH, help="Folder of the results; default: experiments/NAME-STAMP.")
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
+@click.option("--resume", type=PATH, metavar="FOLDER", help="Continue the aborted experiment in FOLDER.")
 @click.option(
-    "--resume",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Go on with the aborted experiment in FOLDER at its first unfinished motion.",
+    "--allow-non-realtime", is_flag=True, help="Command a real arm without real-time rights; may stutter."
 )
-@click.option(
-    "--allow-non-realtime", is_flag=True, help="Command the real arm without real-time rights; may stutter."
-)
-@click.option("--live", is_flag=True, help="A page in the browser with the arm, torques, link and time left.")
+@click.option("--live", is_flag=True, help="Show arm, torques, link and remaining time in the browser.")
 @click.option(
     "--live-port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --live."
 )
-@click.option("--no-diagnosis", is_flag=True, help="Leave out the search for what the model lacks.")
-@click.option(
-    "--decide", is_flag=True, help="Run the motions that decide between causes that look alike, and conclude."
-)
+@click.option("--no-diagnosis", is_flag=True, help="Omit the diagnosis of model errors.")
+@click.option("--decide", is_flag=True, help="Run the discriminating experiments for look-alike causes.")
 @click.option(
     "--replan",
     type=click.IntRange(min=0),
     metavar="N",
-    help="N further rounds: plan again with the estimate so far, drive, and estimate from all rounds.",
+    help="N further rounds, planned with the estimate so far.",
 )
 @json_option
 def command(
@@ -74,9 +62,8 @@ def command(
 ) -> None:
     """Run the experiment FILE; without one the default, against the built-in emulator.
 
-    Plans an exciting motion, checks it, drives the arm through it, logs it, has the payload swapped and
-    checked, drives again, estimates the model, and looks for what the model lacks. The last line printed is
-    the folder of the results.
+    Plans and checks an exciting motion, drives the arm and logs it, has the payload swapped and checked, drives
+    again, estimates the model, and diagnoses its errors. The last line of the output is the folder of the results.
 
     Ctrl-C once stops the arm within its limits, twice drops the link.
 
@@ -84,8 +71,8 @@ def command(
     lwr-run experiment                                   the default, on the emulator
     lwr-run experiment my_lab.yaml --out results/monday
     lwr-run experiment --resume results/monday           go on after an abort
-    lwr-run experiment --resume results/monday --decide  run what decides between look-alikes
-    lwr-run experiment my_lab.yaml --replan 1            a second round with a motion planned from the first
+    lwr-run experiment --resume results/monday --decide  discriminate between look-alikes
+    lwr-run experiment my_lab.yaml --replan 1            a second round, planned with the first
     """
     experiment, folder = _begin(file, out, resume)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
@@ -126,7 +113,7 @@ def command(
 
 @contextmanager
 def _watched(bench: Bench, experiment: Experiment, port: int | None) -> Iterator[Bench]:
-    """The bench with the live view on `port` as onlooker, or as it is."""
+    """The bench, with the live view as onlooker if a port is given."""
     if port is None:
         yield bench
         return
@@ -138,16 +125,14 @@ def _watched(bench: Bench, experiment: Experiment, port: int | None) -> Iterator
 
 
 def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Experiment, Path]:
-    """The experiment and the folder of its results, which holds a copy of the experiment file."""
+    """The experiment and the folder of its results, with a copy of the experiment file."""
     if resume is not None:
         if file is not None or out is not None:
             raise ConfigurationError(
                 "--resume takes its experiment file and folder from FOLDER; leave FILE and --out"
             )
         if not (resume / COPY).is_file():
-            raise ConfigurationError(
-                f"{resume} holds no {COPY}; name the folder of an experiment that was begun"
-            )
+            raise ConfigurationError(f"{resume} holds no {COPY}; name the folder of an aborted experiment")
         return Experiment.load((resume / COPY).resolve(), beside=Progress.load(resume).origin), resume
     experiment = Experiment.load(file if file is not None else DEFAULT)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
@@ -166,7 +151,7 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
 
 
 def _motions(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status: StatusLine) -> Excitations:
-    """The motions already in the folder, or planned now and stored there."""
+    """The motions stored in the folder; missing ones are planned and stored."""
     if not (folder / PLAN).is_file():
         status.show("planning the excitation", 0.0, "")
     motions = Excitations.of(experiment, arm, cell, folder)
@@ -176,10 +161,7 @@ def _motions(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status:
 
 
 def _report(folder: Path, *, aside: bool) -> None:
-    """report.html beside the results; a run is not lost because its page cannot be written.
-
-    aside : its path goes to standard error.
-    """
+    """Write report.html; a failure is only a message. aside : its path goes to standard error."""
     from runner.report.page import write_report
 
     try:
@@ -189,7 +171,7 @@ def _report(folder: Path, *, aside: bool) -> None:
 
 
 def _failure(record: Record, folder: Path) -> LwrError:
-    """The error for the exit code of an experiment that did not finish."""
+    """The error of an unfinished experiment, for the exit code."""
     text = f"session {record.name}: {record.reason}. `lwr-run experiment --resume {folder}` goes on from here"
     if record.status == "abort":
         return OperatorError(text)

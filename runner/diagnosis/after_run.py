@@ -15,20 +15,19 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import LwrError
-from ident.kinematics import Chain
-from ident.model_file import read_model
+from ident.dynamics.kinematics import Chain
+from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
 from runner.diagnosis.deciding import SURE, Deciding, offers, open_findings
 from runner.diagnosis.decision import Answer, decision_text, decisions
 from runner.diagnosis.study import DIAGNOSIS, Study, study
-from runner.experiment import Bench, Record, Run
+from runner.experiment import Bench, Progress, Record, Run
 from runner.experiment_file import Experiment, SessionPlan
 from runner.planning import Excitations, excitation_rows
-from runner.progress import Progress
 
 __all__ = ["DECIDING", "DECISION", "FOLDER", "Conclusion", "conclude_run"]
 

@@ -19,14 +19,13 @@ from ident.effects import Experiment as Discriminating
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import ParametricMotion
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import parse
 from lwr_driver.motion import Motion
 from lwr_driver.session import Session
 from runner.diagnosis.deciding_motions import chirp, poses, reversal_ladder, slow_sweep
 from runner.experiment_file import Experiment, Payload, SessionPlan
-from runner.planning import checker, excitation_rows, plan_excitation
-from runner.preparation import session_motion
+from runner.planning import checker, excitation_rows, plan_excitation, session_motion
 
 __all__ = ["SURE", "Deciding", "offers", "offers_of_sessions", "open_findings"]
 

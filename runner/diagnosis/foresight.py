@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.diagnosis import ArmData, Diagnosis, Reference
 from ident.diagnosis.signatures import overlap, signature_bench, signatures
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from ident.model import DynamicModel
 from lwr_driver.session import JointColumns, Phase, Session
 from runner.diagnosis.look_alikes import Foreseen, LookAlikes

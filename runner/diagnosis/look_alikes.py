@@ -24,9 +24,9 @@ from ident.diagnosis.candidates import Candidate
 from ident.diagnosis.evidence import Rows
 from ident.diagnosis.selection import margin
 from ident.diagnosis.signatures import Signature, overlap, signature_bench, signatures
+from ident.dynamics.kinematics import Chain
 from ident.effects import find_effect
 from ident.effects.words import joints_text, named
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 
 __all__ = [

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ident.diagnosis import Diagnosis
-from ident.diagnosis.gain import HeldOut, interval
+from ident.diagnosis.held_out import HeldOut, interval
 
 __all__ = ["Moved", "RowGain", "moved_parameters", "row_gains"]
 

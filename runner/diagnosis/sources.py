@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.diagnosis import ArmData
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session
 from runner.estimation import couplings

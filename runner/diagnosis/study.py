@@ -14,9 +14,9 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from ident.model import DynamicModel
-from ident.model_file import write_model
+from ident.model.model_file import write_model
 from lwr_driver.arm import JOINTS, Arm
 from lwr_driver.session import Session
 from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
@@ -108,8 +108,7 @@ class Study:
     def write(self, folder: Path) -> None:
         """Write everything into `folder`: numbers, model, text, plots, residuals, deciding motions."""
         from runner.report.look_alike_figures import look_alike_figure
-        from runner.report.replay_figures import replay_figures
-        from runner.report.residual_figures import residual_figures
+        from runner.report.residual_figures import replay_figures, residual_figures
 
         folder.mkdir(parents=True, exist_ok=True)
         kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAYED)
@@ -240,7 +239,7 @@ def _unadvised() -> Iterator[None]:
     def wanted(record: logging.LogRecord) -> bool:
         return "raise `" not in record.getMessage()
 
-    logger = logging.getLogger("ident.signals.prepare")
+    logger = logging.getLogger("ident.rows.prepare")
     logger.addFilter(wanted)
     try:
         yield

@@ -14,8 +14,7 @@ from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.look_alike_figures import look_alike_figure
 from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
-from runner.report.replay_figures import replay_figures
-from runner.report.residual_figures import finding_figure, residual_figures
+from runner.report.residual_figures import finding_figure, replay_figures, residual_figures
 from runner.report.verdicts import error_change, extension_gain
 
 __all__ = ["diagnosis_parts", "diagnosis_section"]

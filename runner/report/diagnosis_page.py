@@ -10,12 +10,12 @@ from typing import Any
 
 from ident.effects import described
 from ident.effects.words import joints_text
+from runner.computer import versions
 from runner.report.diagnosis import diagnosis_parts
 from runner.report.diagnosis_folder import DiagnosisFolder, values_of
 from runner.report.markup import section
 from runner.report.page import page_html, write_page
 from runner.report.verdicts import Level, Verdict, error_change, extension_gain, largest_gain
-from runner.versions import versions
 
 __all__ = ["diagnosis_html", "diagnosis_verdicts", "write_diagnosis_report"]
 

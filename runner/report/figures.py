@@ -7,35 +7,32 @@
     torque_figure(folder, session="loaded", side="motor").save("torque.svg")
     residual_figure(folder).plotly()                                      # interactive
 
-Every function takes a folder of results, or a `ResultFolder` where several figures share the work.
+Every function takes a folder of results, or a `ResultFolder` to share the work between figures.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.parameters import PER_LINK
+from ident.dynamics.parameters import PER_LINK
 from runner.published import TABLE_2
-from runner.report.correlation import MatrixFigure, correlation_figure
-from runner.report.curves import Curves
-from runner.report.folder import ResultFolder
-from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
-from runner.report.thinning import thin
+from runner.report.folder import Curves, ResultFolder
+from runner.report.interactive import DIVERGING, heatmap_chart, heatmap_figure
+from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
+from runner.report.svg import Figure
 
 __all__ = [
-    "bin_means",
-    "correlation_figure",
-    "every_figure",
-    "motion_figure",
-    "parameter_figure",
-    "residual_figure",
-    "torque_figure",
-    "velocity_figure",
-]
+    "STRONG", "MatrixFigure", "bin_means", "correlation_figure", "every_figure", "motion_figure",
+    "parameter_figure", "residual_figure", "torque_figure", "velocity_figure",
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 Results = ResultFolder | str | Path
@@ -43,99 +40,80 @@ Results = ResultFolder | str | Path
 _POINTS = 700
 _BINS = 36
 _MOVING = 0.01
+STRONG = 0.7
+"""Correlation of pairs worth a mention."""
+
+_LEVELS = 20
+_FONT = "font-family='Helvetica,Arial,sans-serif'"
+_INK = "#1a1a1a"
+_SCALE_WIDTH = 56.0
 
 
 def velocity_figure(results: Results, session: str | None = None) -> Figure:
     """Figure 2a of the paper: joint velocities as logged and filtered, by joint."""
     one = _choose(results, session, "joint")
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+
+    def panel(k: int, joint: str) -> Panel:
         fastest = float(np.max(np.abs(one.qd[:, k])))
-        panels.append(
-            Panel(
-                joint,
-                "time [s]",
-                "velocity [rad/s]",
-                (
-                    Line(
-                        "logged",
-                        "differences of the logged positions",
-                        *thin(one.time, one.raw_velocity[:, k], _POINTS),
-                    ),
-                    Line("measured", "filtered", *thin(one.time, one.qd[:, k], _POINTS)),
-                ),
-                f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s.",
-                f"at most {fastest:.2f} rad/s",
-            )
+        marks = (
+            _line("logged", "differences of the logged positions", one.time, one.raw_velocity[:, k]),
+            _line("measured", "filtered", one.time, one.qd[:, k]),
         )
-    return Figure(f"velocity-{one.session}", f"Joint velocities, session {one.session}", tuple(panels))
+        alt = f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s."
+        return Panel(joint, "time [s]", "velocity [rad/s]", marks, alt, f"at most {fastest:.2f} rad/s")
+
+    return _by_joint(one, f"velocity-{one.session}", f"Joint velocities, session {one.session}", panel)
 
 
 def motion_figure(results: Results, session: str | None = None, side: str = "joint") -> Figure:
     """Figure 2b of the paper: torque as logged and filtered, by joint."""
     one = _choose(results, session, side)
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+    title = side.capitalize()
+
+    def panel(k: int, joint: str) -> Panel:
         mean = float(np.mean(np.abs(one.torque[:, k])))
-        panels.append(
-            Panel(
-                joint,
-                "time [s]",
-                "torque [Nm]",
-                (
-                    Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
-                    Line(
-                        "measured",
-                        f"low-pass {one.cutoff_hz:g} Hz",
-                        *thin(one.grid, one.measured[:, k], _POINTS),
-                    ),
-                ),
-                f"{side.capitalize()} torque of {joint} over time, session {one.session}: mean magnitude "
-                f"{mean:.2f} Nm.",
-                f"mean |τ| {mean:.2f} Nm",
-            )
+        marks = (
+            _line("logged", "as logged", one.time, one.torque[:, k]),
+            _line("measured", f"low-pass {one.cutoff_hz:g} Hz", one.grid, one.measured[:, k]),
         )
-    return Figure(
-        f"torque-logged-{one.session}-{side}",
-        f"{side.capitalize()} torques, session {one.session}",
-        tuple(panels),
+        alt = f"{title} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm."
+        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, f"mean |τ| {mean:.2f} Nm")
+
+    return _by_joint(
+        one, f"torque-logged-{one.session}-{side}", f"{title} torques, session {one.session}", panel
     )
 
 
 def torque_figure(results: Results, session: str | None = None, side: str | None = None) -> Figure:
     """Figure 3 of the paper: measured and computed torque with the relative error, by joint.
 
-    session : name; by default one that the estimate has not seen, else the loaded one. side : "joint"
-    (default where there is one) or "motor".
+    session : name; by default a held-out one, else the loaded one. side : "joint" (default if present) or
+    "motor".
     The relative error is the residual over the largest measured torque of the joint in the session. Measured
     and computed torque passed the same low-pass; the samples as logged stand behind them.
     """
     one = _choose(results, session, side, unseen_first=True)
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+
+    def panel(k: int, joint: str) -> Panel:
         error = one.relative_error(k)
         score = one.scores[k]
         rms = float(np.sqrt(np.nanmean(error**2)))
-        panels.append(
-            Panel(
-                joint,
-                "time [s]",
-                "torque [Nm]",
-                (
-                    Line("logged", "as logged", *thin(one.time, one.torque[:, k], _POINTS)),
-                    Line("measured", "measured", *thin(one.grid, one.measured[:, k], _POINTS)),
-                    Line("computed", "computed", *thin(one.grid, one.computed[:, k], _POINTS)),
-                    Line("error", "relative error", *thin(one.grid, error, _POINTS), lower=True),
-                ),
-                f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
-                f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms.",
-                f"residual {score.band_rms:.2g} Nm, error {rms:.2f} %",
-                lower_label="error [%]",
-            )
+        marks = (
+            _line("logged", "as logged", one.time, one.torque[:, k]),
+            _line("measured", "measured", one.grid, one.measured[:, k]),
+            _line("computed", "computed", one.grid, one.computed[:, k]),
+            _line("error", "relative error", one.grid, error, lower=True),
         )
-    kind = "unseen session" if one.unseen else "session"
+        alt = (
+            f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
+            f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms."
+        )
+        note = f"residual {score.band_rms:.2g} Nm, error {rms:.2f} %"
+        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, note, lower_label="error [%]")
+
+    kind = "held-out session" if one.unseen else "session"
     caption = f"Measured and computed {one.side} torque with relative error, {kind} {one.session}"
-    return Figure(f"torque-{one.session}-{one.side}", caption, tuple(panels))
+    return _by_joint(one, f"torque-{one.session}-{one.side}", caption, panel)
 
 
 def residual_figure(
@@ -146,37 +124,34 @@ def residual_figure(
     Over time: every extreme as logged, and the residual in the pass band. Against position and velocity: mean
     and spread (5 to 95 %) of the latter in bins, against position for each direction of motion on its own.
     """
-    if against not in ("time", "position", "velocity"):
+    labels = {"time": "time [s]", "position": "position [rad]", "velocity": "velocity [rad/s]"}
+    if against not in labels:
         raise ConfigurationError(f"residuals against {against!r}: choose time, position or velocity")
     one = _choose(results, session, side)
     residual = one.measured - one.computed
-    panels = []
-    for k, joint in enumerate(one.joint_names):
+
+    def panel(k: int, joint: str) -> Panel:
         rms = float(np.sqrt(np.nanmean(residual[:, k] ** 2)))
-        marks: tuple[Mark, ...]
-        if against == "time":
-            label = "time [s]"
-            marks = (
-                Line("logged", "as logged", *thin(one.time, one.error[:, k], _POINTS)),
-                Line("measured", f"low-pass {one.cutoff_hz:g} Hz", *thin(one.grid, residual[:, k], _POINTS)),
-            )
-        else:
-            label = "position [rad]" if against == "position" else "velocity [rad/s]"
-            marks = _binned(one, residual[:, k], k, against)
-        panels.append(
-            Panel(
-                joint,
-                label,
-                "residual [Nm]",
-                marks,
-                f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {rms:.3g} "
-                "Nm "
-                "rms.",
-                f"{rms:.3g} Nm rms",
-            )
+        marks: tuple[Mark, ...] = (
+            _line("logged", "as logged", one.time, one.error[:, k]),
+            _line("measured", f"low-pass {one.cutoff_hz:g} Hz", one.grid, residual[:, k]),
         )
+        if against != "time":
+            marks = _binned(one, residual[:, k], k, against)
+        note = f"{rms:.3g} Nm rms"
+        alt = f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {note}."
+        return Panel(joint, labels[against], "residual [Nm]", marks, alt, note)
+
     caption = f"Residual {one.side} torque against {against}, session {one.session}"
-    return Figure(f"residual-{against}-{one.session}-{one.side}", caption, tuple(panels))
+    return _by_joint(one, f"residual-{against}-{one.session}-{one.side}", caption, panel)
+
+
+def _line(role: Role, label: str, x: Floats, y: Floats, *, lower: bool = False) -> Line:
+    return Line(role, label, *thin(x, y, _POINTS), lower=lower)
+
+
+def _by_joint(one: Curves, name: str, caption: str, panel: Callable[[int, str], Panel]) -> Figure:
+    return Figure(name, caption, tuple(panel(k, joint) for k, joint in enumerate(one.joint_names)))
 
 
 def parameter_figure(results: Results) -> Figure:
@@ -192,58 +167,42 @@ def parameter_figure(results: Results) -> Figure:
         if not mine:
             continue
         x = np.array([1.0 + links.index(_link(e["name"])) for e in mine])
-        values = np.array([e["estimate"] for e in mine])
         marks: list[Mark] = [
             Points(
                 "estimate",
                 "estimate with 95 % interval",
                 x,
-                values,
+                np.array([e["estimate"] for e in mine]),
                 np.array([interval_95(e) for e in mine]),
                 tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine),
             )
         ]
-        known = [(place, e) for place, e in zip(x, mine, strict=True) if "truth" in e]
-        if known:
-            marks.append(
-                Points(
-                    "truth",
-                    "true value of the emulated arm",
-                    np.array([place for place, _ in known]),
-                    np.array([e["truth"] for _, e in known]),
-                    None,
-                    tuple(f"{e['name']} {e['truth']:.4g} {e['unit']}" for _, e in known),
-                )
-            )
-        printed = [(place, e["name"]) for place, e in zip(x, mine, strict=True) if e["name"] in published]
-        if printed:
-            marks.append(
-                Points(
-                    "published",
-                    "published (Table 2)",
-                    np.array([place for place, _ in printed]),
-                    np.array([published[name] for _, name in printed]),
-                    None,
-                    tuple(f"{name} {published[name]:g}" for _, name in printed),
-                )
-            )
+        placed = list(zip(x, mine, strict=True))
+        known = [
+            (p, e["truth"], f"{e['name']} {e['truth']:.4g} {e['unit']}") for p, e in placed if "truth" in e
+        ]
+        printed = [
+            (p, published[e["name"]], f"{e['name']} {published[e['name']]:g}")
+            for p, e in placed
+            if e["name"] in published
+        ]
+        others: tuple[tuple[Role, str, list[Any]], ...] = (
+            ("truth", "true value of the emulated arm", known),
+            ("published", "published (Table 2)", printed),
+        )
+        for role, label, points in others:
+            if points:
+                places, values, texts = zip(*points, strict=True)
+                marks.append(Points(role, label, np.array(places), np.array(values), None, texts))
         unit = pretty_unit(mine[0]["unit"])
         listed = ", ".join(f"{e['name']} {e['estimate']:.3g}" for e in mine)
-        panels.append(
-            Panel(
-                symbol,
-                "link",
-                unit,
-                tuple(marks),
-                f"Estimates of {symbol} by link with their 95 % intervals: {listed} {unit}.",
-                x_names=links,
-            )
-        )
+        alt = f"Estimates of {symbol} by link with their 95 % intervals: {listed} {unit}."
+        panels.append(Panel(symbol, "link", unit, tuple(marks), alt, x_names=links))
     return Figure("parameters", "Base parameters with their 95 % intervals", tuple(panels))
 
 
 def every_figure(results: Results) -> list[Figure | MatrixFigure]:
-    """All figures that a folder allows."""
+    """All figures of a folder."""
     folder = _folder(results)
     figures: list[Figure | MatrixFigure] = []
     for one in folder.curves:
@@ -268,7 +227,7 @@ def pretty_unit(unit: str) -> str:
 
 
 def interval_95(entry: dict[str, float]) -> tuple[float, float]:
-    """95 % interval of a parameter of summary.json; from its standard deviation where none is stated."""
+    """95 % interval of a parameter of summary.json, if necessary from its standard deviation."""
     stated = entry.get("interval_95")
     if isinstance(stated, list):
         return float(stated[0]), float(stated[1])
@@ -299,7 +258,7 @@ def _binned(one: Curves, residual: Floats, joint: int, against: str) -> tuple[Ma
 
 
 def bin_means(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Centres, means, 5 % and 95 % quantiles of y in bins of x that hold three samples or more."""
+    """Centres, means, 5 % and 95 % quantiles of y in bins of x with three samples or more."""
     edges = np.linspace(x.min(), x.max(), _BINS + 1)
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)
     rows = []
@@ -336,3 +295,140 @@ def _symbol(name: str) -> str:
 
 def _link(name: str) -> str:
     return name.removesuffix("R")[len(_symbol(name)) :]
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixFigure:
+    """A symmetric matrix (n, n) of values from -1 to 1 with its n names. A notebook shows it by itself.
+
+    name : for file names. alt : description in a sentence, for screen readers.
+    """
+
+    name: str
+    caption: str
+    names: tuple[str, ...]
+    values: Floats
+    alt: str
+
+    def strongest(self, count: int) -> list[tuple[str, str, float]]:
+        """The `count` pairs of different parameters with the largest magnitude, largest first."""
+        first, second = np.triu_indices(len(self.names), 1)
+        value = self.values[first, second]
+        order = np.argsort(-np.abs(value), kind="stable")[:count]
+        return [(self.names[first[k]], self.names[second[k]], float(value[k])) for k in order]
+
+    def chart(self) -> dict[str, Any]:
+        """As plotly `data` and `layout`."""
+        return heatmap_chart(self.names, self.values)
+
+    def svg(self, *, columns: int = 1, width: float = 720.0) -> str:
+        """The matrix as a stand-alone SVG text, `width` px wide; `columns` has no effect."""
+        return _svg(self, width)
+
+    def save(self, path: str | Path, *, columns: int = 1, width: float = 720.0) -> Path:
+        """Write the SVG to a file."""
+        target = Path(path)
+        target.write_text(self.svg(columns=columns, width=width), encoding="utf-8")
+        return target
+
+    def plotly(self, *, columns: int = 1) -> Any:
+        """The matrix as a plotly `Figure`; needs the extra `view`."""
+        return heatmap_figure(self.chart(), self.caption)
+
+    def _repr_svg_(self) -> str:
+        return self.svg()
+
+
+def correlation_figure(results: ResultFolder | str | Path) -> MatrixFigure:
+    """Correlation of the base parameters of a folder of results, from the covariance of its model.
+
+    ConfigurationError without a model with covariance.
+    """
+    folder = results if isinstance(results, ResultFolder) else ResultFolder.load(results)
+    model = folder.model
+    if model is None or model.covariance is None or model.std is None:
+        raise ConfigurationError(f"{folder.path}: holds no model with a covariance; nothing is correlated")
+    std = np.where(model.std > 0, model.std, 1.0)
+    matrix = np.clip(model.covariance / np.outer(std, std), -1.0, 1.0)
+    strong = int(np.sum(np.abs(np.triu(matrix, 1)) > STRONG))
+    alt = f"Correlation matrix of {len(matrix)} parameters. {strong} pairs are correlated by more than {STRONG}."
+    caption = "Correlation of the base parameters"
+    return MatrixFigure("correlation", caption, tuple(model.names), np.asarray(matrix), alt)
+
+
+def _svg(figure: MatrixFigure, width: float) -> str:
+    count = max(len(figure.names), 1)
+    size = min(9.0, max(2.0, 0.85 * width / (count + 8)))
+    margin = 0.62 * size * max((len(name) for name in figure.names), default=1) + 8.0
+    side = max((width - margin - _SCALE_WIDTH) / count, 0.1)
+    span = side * count
+    height = margin + span + 8.0
+    level = np.rint(_LEVELS * np.clip(figure.values, -1.0, 1.0)).astype(np.int64)
+    cells: dict[int, list[str]] = {}
+    for row, values in enumerate(level):
+        for start, end, value in _runs(values):
+            if value:
+                box = f"M{margin + start * side:.2f} {margin + row * side:.2f}h{(end - start) * side:.2f}"
+                cells.setdefault(value, []).append(f"{box}v{side:.2f}h{-(end - start) * side:.2f}z")
+    parts = [
+        f"<svg xmlns='http://www.w3.org/2000/svg' width='{width:g}' height='{height:.1f}' "
+        f"viewBox='0 0 {width:g} {height:.1f}' role='img'>",
+        f"<title>{escape(figure.caption)}</title><desc>{escape(figure.alt)}</desc>",
+        "<rect width='100%' height='100%' fill='#ffffff'/>",
+        *(
+            f"<path fill='{_colour(v / _LEVELS)}' d='{''.join(boxes)}'/>"
+            for v, boxes in sorted(cells.items())
+        ),
+        f"<rect x='{margin:.2f}' y='{margin:.2f}' width='{span:.2f}' height='{span:.2f}' fill='none' "
+        "stroke='#8c8c8c' stroke-width='0.8'/>",
+    ]
+    for place, name in enumerate(figure.names):
+        at = margin + (place + 0.5) * side
+        text = f"{_FONT} font-size='{size:.2f}' fill='{_INK}'"
+        label = escape(name)
+        parts.append(
+            f"<text x='{margin - 4:.2f}' y='{at + 0.35 * size:.2f}' {text} text-anchor='end'>{label}</text>"
+            f"<text transform='translate({at + 0.35 * size:.2f},{margin - 4:.2f}) rotate(-90)' {text}>"
+            f"{label}</text>"
+        )
+    return "".join([*parts, *_scale(margin + span + 14.0, margin, min(span, 240.0)), "</svg>\n"])
+
+
+def _scale(x: float, y: float, length: float) -> list[str]:
+    """The colours with their values, from 1 at the top to -1."""
+    each = length / (2 * _LEVELS + 1)
+    boxes = [
+        f"<rect x='{x:.2f}' y='{y + k * each:.2f}' width='10' height='{each + 0.3:.2f}' "
+        f"fill='{_colour(1 - k / _LEVELS)}'/>"
+        for k in range(2 * _LEVELS + 1)
+    ]
+    ticks = [
+        f"<text x='{x + 14:.2f}' y='{y + (1 - value) / 2 * length + 3.5:.2f}' {_FONT} font-size='10' "
+        f"fill='{_INK}'>{text}</text>"
+        for value, text in (
+            (1, "1"),
+            (0.5, "0.5"),
+            (0, "0"),
+            (-0.5, "\N{MINUS SIGN}0.5"),
+            (-1, "\N{MINUS SIGN}1"),
+        )
+    ]
+    return [*boxes, *ticks]
+
+
+def _runs(values: Sequence[int] | NDArray[np.int64]) -> list[tuple[int, int, int]]:
+    """Stretches of equal values: begin, end (exclusive), value."""
+    row = np.asarray(values)
+    edges = np.flatnonzero(np.diff(row)) + 1
+    begins = np.concatenate([[0], edges])
+    ends = np.concatenate([edges, [len(row)]])
+    return [(int(a), int(b), int(row[a])) for a, b in zip(begins, ends, strict=True)]
+
+
+def _colour(value: float) -> str:
+    """Colour of a value from -1 to 1, between the stops of the interactive figure."""
+    place = 0.5 * (value + 1.0)
+    stops = np.array([stop for stop, _ in DIVERGING])
+    shades = np.array([[int(text[k : k + 2], 16) for k in (1, 3, 5)] for _, text in DIVERGING])
+    red, green, blue = (round(float(np.interp(place, stops, shade))) for shade in shades.T)
+    return f"#{red:02x}{green:02x}{blue:02x}"

@@ -1,28 +1,176 @@
-"""The folder of an experiment as the report sees it: read once, and honest about what is not there."""
+"""Results of an experiment, read from its folder, with measured and computed torque of each session."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError, LwrError
+from ident.dynamics.structure import Side
+from ident.estimation.validate import Score, mounted, predictor, prepared_session, score_session
 from ident.model import DynamicModel
-from ident.model_file import read_model
+from ident.model.model_file import read_model
+from ident.rows.filters import ParallelFilter, SignalSettings
+from ident.rows.prepare import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
-from runner.report.curves import Curves, curves
 
-__all__ = ["ResultFolder"]
+__all__ = ["Curves", "ResultFolder", "curves"]
+
+Floats = NDArray[np.float64]
+
+_ATTENUATION_DB = 40.0
+_RATE_PER_CUTOFF = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """One session and side (`joint`, `motor`, `difference`), over the span of the estimate.
+
+    joint_names : n joints. payload : name, None for the bare arm.
+    time (m,) [s], torque, error, q, qd (m, n) : every sample as logged [Nm]; error is measured minus computed.
+    raw_velocity : (m, n) differences of the logged positions [rad/s]; empty (m, 0) on the motor side.
+    grid (k,) [s], measured, computed (k, n) : torque and its prediction, both through the same low-pass [Nm].
+    error and computed are NaN for a resting joint.
+    cutoff_hz : of the low-pass. scores : of the computed-torque test by joint. unseen : held-out session.
+    relative : residual over torque of all joints.
+    """
+
+    session: str
+    file: str
+    side: Side
+    payload: str | None
+    joint_names: tuple[str, ...]
+    cutoff_hz: float
+    time: Floats
+    torque: Floats
+    error: Floats
+    q: Floats
+    qd: Floats
+    raw_velocity: Floats
+    grid: Floats
+    measured: Floats
+    computed: Floats
+    scores: tuple[Score, ...]
+    relative: float
+    unseen: bool = False
+
+    @property
+    def label(self) -> str:
+        """Session and side in words."""
+        return f"{self.session}, {self.side} torque{', held out' if self.unseen else ''}"
+
+    def relative_error(self, joint: int) -> Floats:
+        """(k,) error in percent of the largest measured torque of the joint in this session."""
+        largest = float(np.max(np.abs(self.measured[:, joint]))) or 1.0
+        return 100.0 * (self.measured[:, joint] - self.computed[:, joint]) / largest
+
+
+def curves(
+    model: DynamicModel,
+    session: Session,
+    name: str,
+    *,
+    cutoff_hz: float | None = None,
+    unseen: bool = False,
+) -> list[Curves]:
+    """Curves of a session for each side common to model and session.
+
+    cutoff_hz : cut-off of the position filter, as in the estimation; None takes the default. unseen : held out.
+    """
+    payload = mounted(model, session)
+    settings = None if cutoff_hz is None else SignalSettings(cutoff_hz=cutoff_hz)
+    prepared = prepared_session(model, session, settings)
+    predict = predictor(model, payload)
+    scored = score_session(prepared, predict, model.structure.sides, session, "identified model")
+    chosen = session.select(model.structure.chain.joint_names)
+    found = []
+    for side in model.structure.sides:
+        if side not in scored.relative or side == "difference":
+            continue
+        parts = [
+            part for passage in prepared.passages if (part := _part(passage, side, model, payload, prepared))
+        ]
+        if not parts:
+            continue
+        stacked = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        time = stacked[0]
+        found.append(
+            Curves(
+                session=name,
+                file=session.path.name,
+                side=side,
+                payload=payload,
+                joint_names=prepared.joint_names,
+                cutoff_hz=prepared.cutoff_hz,
+                time=time,
+                torque=stacked[1],
+                error=stacked[2],
+                q=stacked[3],
+                qd=stacked[4],
+                raw_velocity=_velocity(chosen, time) if side == "joint" else np.empty((len(time), 0)),
+                grid=stacked[5],
+                measured=stacked[6],
+                computed=stacked[7],
+                scores=tuple(score for score in scored.scores if score.side == side),
+                relative=float(scored.relative[side]),
+                unseen=unseen,
+            )
+        )
+    return found
+
+
+def _part(
+    passage: Passage, side: Side, model: DynamicModel, payload: str | None, prepared: PreparedSession
+) -> Sequence[Floats]:
+    channel = passage.joint if side == "joint" else passage.motor
+    if channel is None or not len(passage.rows) or not channel.torque.shape[1]:
+        return ()
+    computed = predictor(model, payload)(channel, side)
+    # At rest the Coulomb torque is unknown.
+    settings = prepared.settings
+    resting = np.abs(channel.qd) < settings.standstill_rad_s
+    first, last = passage.rows[0], passage.rows[-1]
+    inside = (channel.times >= first) & (channel.times <= last)
+    step = float(np.median(np.diff(channel.times)))
+    cutoff = min(prepared.cutoff_hz, 0.2 / step)
+    grid = np.arange(first, last, 1.0 / (_RATE_PER_CUTOFF * cutoff))
+    low_pass = ParallelFilter(channel.times, grid, cutoff, _ATTENUATION_DB)
+    filtered = low_pass.apply(computed)
+    filtered[low_pass.share(resting) > settings.standstill_share] = np.nan
+    return (
+        channel.times[inside],
+        channel.torque[inside],
+        np.where(resting, np.nan, channel.torque - computed)[inside],
+        channel.q[inside],
+        channel.qd[inside],
+        grid,
+        low_pass.apply(channel.torque),
+        filtered,
+    )
+
+
+def _velocity(session: Session, time: Floats) -> Floats:
+    """(m, n) differences of the logged positions [rad/s] at the times of the channel."""
+    joint = session.joint
+    clock = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
+    seconds = (clock - clock[0]) * 1e-9
+    speed = np.diff(joint.position, axis=0) / np.diff(seconds)[:, None]
+    middle = 0.5 * (seconds[1:] + seconds[:-1])
+    nearest = np.clip(np.searchsorted(middle, time), 0, len(middle) - 1)
+    return np.asarray(speed[nearest], dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """Results of one experiment. What the run did not come to (no model, no diagnosis) is None or empty.
+    """Results of one experiment. Missing parts (no model, no diagnosis) are None or empty.
 
     path : the folder; summary : content of summary.json.
     """
@@ -37,8 +185,8 @@ class ResultFolder:
         file = folder / "summary.json"
         if not file.is_file():
             raise ConfigurationError(
-                f"{folder}: holds no summary.json; name the folder of an experiment, the last line that "
-                "`lwr-run experiment` prints"
+                f"{folder}: holds no summary.json; name the folder of an experiment, the last line of the output of "
+                "`lwr-run experiment`"
             )
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
@@ -52,13 +200,13 @@ class ResultFolder:
 
     @cached_property
     def model(self) -> DynamicModel | None:
-        """The identified model, None where the run did not come to one."""
+        """The identified model, or None."""
         file = self.path / "model.yaml"
         return read_model(file) if file.is_file() else None
 
     @cached_property
     def sessions(self) -> dict[str, Session]:
-        """The session logs that can be read, by name of the session."""
+        """The readable session logs by name of the session."""
         found: dict[str, Session] = {}
         for entry in self.summary.get("sessions", []):
             file = self.path / entry["file"]
@@ -72,18 +220,18 @@ class ResultFolder:
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """Names of the sessions whose log is missing or broken."""
+        """Names of the sessions with a missing or broken log."""
         return tuple(e["name"] for e in self.summary.get("sessions", []) if e["name"] not in self.sessions)
 
     @property
     def diagnosis_folder(self) -> Path:
-        """Where the files of a diagnosis are: `diagnosis`, or the folder itself."""
+        """Folder of the diagnosis files: `diagnosis`, or the folder itself."""
         own = self.path / "diagnosis"
         return own if (own / "diagnosis.json").is_file() else self.path
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
-        """Content of diagnosis.json, None where there is none. DataError if it is broken."""
+        """Content of diagnosis.json, or None. DataError if it is broken."""
         file = self.diagnosis_folder / "diagnosis.json"
         if not file.is_file():
             return None
@@ -105,7 +253,7 @@ class ResultFolder:
 
     @cached_property
     def curves(self) -> tuple[Curves, ...]:
-        """Measured and computed torque by session and side: what the estimate has seen first, loaded first."""
+        """Measured and computed torque by session and side: held-out sessions last, loaded ones first."""
         if self.model is None:
             return ()
         cutoffs = {entry["name"]: entry["cutoff_hz"] for entry in self.summary.get("signals", [])}
@@ -130,7 +278,7 @@ class ResultFolder:
 
     @property
     def lock_step(self) -> bool:
-        """Whether the emulator waited for each answer, so that reply times say nothing of the link."""
+        """Whether the emulator waited for each answer; reply times are then meaningless."""
         return self.emulated and bool((self._experiment or {}).get("lock_step", True))
 
     @property
@@ -141,6 +289,6 @@ class ResultFolder:
         return tuple(next(iter(self.summary.get("torque_rms", {}).values()), ()))
 
     def text(self, name: str) -> str | None:
-        """Text of a file of the folder, None where there is none."""
+        """Text of a file of the folder, or None."""
         file = self.path / name
         return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else None

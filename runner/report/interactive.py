@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from runner.report.plot import STYLES, Band, Figure, Line, Mark, Panel, limits
+from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits
 
 __all__ = [
-    "DIVERGING",
-    "INSTALL",
-    "heatmap_chart",
-    "heatmap_figure",
-    "panel_chart",
-    "plotly_figure",
+    "DIVERGING", "INSTALL", "heatmap_chart", "heatmap_figure", "panel_chart", "plotly_figure",
     "plotly_script",
-]
+]  # fmt: skip
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +36,7 @@ DIVERGING: tuple[tuple[float, str], ...] = (
 
 
 def plotly_script() -> str:
-    """The plotly library as script text. ConfigurationError where the extra `view` is not installed."""
+    """The plotly library as script text. ConfigurationError without the extra `view`."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
@@ -136,21 +132,21 @@ def heatmap_figure(chart: dict[str, Any], caption: str) -> Any:
     return whole
 
 
-def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:
-    """All panels of a figure as subplots of one `plotly.graph_objects.Figure`."""
+def plotly_figure(panels: Sequence[Panel], *, columns: int = 2) -> Any:
+    """The panels as subplots of one `plotly.graph_objects.Figure`."""
     try:
         import plotly.graph_objects as go
         from plotly.subplots import make_subplots
     except ImportError as error:
         raise ConfigurationError(f"plotly figure: {INSTALL}") from error
-    rows = math.ceil(len(figure.panels) / columns)
+    rows = math.ceil(len(panels) / columns)
     heights: list[float] = []
-    split = any(panel.split for panel in figure.panels)
+    split = any(panel.split for panel in panels)
     for _ in range(rows):
         heights += [0.7, 0.3] if split else [1.0]
     titles: list[str] = []
     for row in range(rows):
-        names = [panel.title for panel in figure.panels[row * columns : (row + 1) * columns]]
+        names = [panel.title for panel in panels[row * columns : (row + 1) * columns]]
         titles += names + [""] * (columns - len(names))
         titles += [""] * columns if split else []
     whole = make_subplots(
@@ -161,7 +157,7 @@ def plotly_figure(figure: Figure, *, columns: int = 2) -> Any:
         vertical_spacing=0.25 / len(heights),
     )
     known: set[str] = set()
-    for index, panel in enumerate(figure.panels):
+    for index, panel in enumerate(panels):
         row, column = (index // columns) * (2 if split else 1) + 1, index % columns + 1
         for mark in panel.marks:
             for trace in _traces(mark):

@@ -11,9 +11,9 @@ from scipy.ndimage import uniform_filter1d
 from ident.effects.words import joints_text
 from runner.diagnosis.look_alikes import LookAlikes, Trace
 from runner.report.figures import bin_means
-from runner.report.plot import Figure, Line, Mark, Panel
+from runner.report.plot import Line, Mark, Panel, thin
 from runner.report.residual_figures import LABELS
-from runner.report.thinning import thin
+from runner.report.svg import Figure
 
 __all__ = ["look_alike_figure"]
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 from runner.report.interactive import panel_chart
-from runner.report.plot import Figure
-from runner.report.svg import legend_key
+from runner.report.svg import Figure, legend_key
 
-__all__ = ["Number", "figure_html", "fold", "paragraph", "section", "table"]
+__all__ = ["Number", "chart_html", "conditions_table", "figure_html", "fold", "paragraph", "section", "table"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class Number:
     key: str = ""
 
     def html(self) -> str:
-        """The number as text; a dash where there is none."""
+        """The number as text, or a dash."""
         if self.value is None or not math.isfinite(self.value):
             return "–" if self.value is None or math.isnan(self.value) else "∞"
         key = f" data-key='{escape(self.key, quote=True)}'" if self.key else ""
@@ -76,6 +75,12 @@ def table(
     )
 
 
+def conditions_table(items: Iterable[Mapping[str, Any]], label: str) -> str:
+    """The conditions of a preflight, each with `subject`, `value`, `limit` and `ok`."""
+    rows = [[i["subject"], i["value"], i["limit"], "held" if i["ok"] else "NOT HELD"] for i in items]
+    return table(("condition", "found", "limit", ""), rows, label)
+
+
 def figure_html(figure: Figure, *, tall: bool = False) -> str:
     """Small multiples: legend, then one chart a panel, drawn by the page's script when it comes into view."""
     keys = "".join(
@@ -106,13 +111,13 @@ def section(anchor: str, title: str, *parts: str) -> str:
 
 
 def fold(title: str, *parts: str, is_open: bool = False) -> str:
-    """A part that opens on a click."""
+    """A foldable part."""
     state = " open" if is_open else ""
     return f"<details{state}><summary>{escape(title)}</summary>{''.join(parts)}</details>"
 
 
 def paragraph(text: str, classes: str = "") -> str:
-    """A paragraph of plain text; what stands between backticks is code."""
+    """A paragraph of plain text, with code between backticks."""
     name = f" class='{classes}'" if classes else ""
     parts = [escape(part) for part in text.split("`")]
     marked = "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))

@@ -1,4 +1,4 @@
-"""`report.html`: one file that opens anywhere, without a network."""
+"""`report.html`: one self-contained file."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _PARTS = (
 def write_report(folder: str | Path) -> Path:
     """Write `report.html` into a folder of results; returns its path.
 
-    ConfigurationError where the folder holds no results or the extra `view` is not installed.
+    ConfigurationError without results in the folder, or without the extra `view`.
     """
     results = ResultFolder.load(folder)
     return write_page(report_html(results), results.path)
@@ -97,9 +97,9 @@ def page_html(
     parts: Sequence[tuple[str, str]],
     software: str,
 ) -> str:
-    """A whole page: what it is about, the verdict with its table, links to its parts, and the parts.
+    """A whole page: title, verdict with its table, links to the parts, and the parts.
 
-    subtitle, content : HTML. parts : anchor and title of what may be in the content.
+    subtitle, content : HTML. parts : anchors and titles of possible sections of the content.
     """
     script = plotly_script()
     links = "".join(
@@ -129,7 +129,7 @@ def _subtitle(results: ResultFolder) -> str:
     )
     emulated = " (emulated)" if results.emulated else ""
     started = logs[0].metadata.get("utc_start", "")[:10] if logs and not emulated else ""
-    # Where a recording has no date its clock begins with the epoch.
+    # A recording without date starts at the epoch.
     started = "" if started.startswith("1970") else started
     parts = [
         "Identification from logs" if summary.get("from_logs") else f"Experiment {summary['experiment']}",

@@ -1,4 +1,4 @@
-"""A figure as data: panels with marks in named roles, drawn later as interactive plot or as SVG.
+"""Panels as data: marks in named roles, drawn as interactive plot or as SVG.
 
 The roles carry the colours (Okabe and Ito, distinguishable with every common colour vision) and the line
 styles of the paper: measured solid blue, computed dotted red, error dashed black.
@@ -7,14 +7,14 @@ styles of the paper: measured solid blue, computed dotted red, error dashed blac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STYLES", "Band", "Figure", "Line", "Mark", "Panel", "Points", "Role", "Style"]
+__all__ = ["STYLES", "Band", "Line", "Mark", "Panel", "Points", "Role", "Style", "limits", "thin"]
 
 Floats = NDArray[np.float64]
 Role = Literal[
@@ -90,7 +90,7 @@ Mark = Line | Band | Points
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot. alt : what it shows, in a sentence, for those who do not see it.
+    """One plot. alt : description in a sentence, for screen readers.
 
     title : short, above the plot; note : a number or two beside the title. lower_label : of the lower part.
     x_names : texts in place of numbers at x = 1, 2, ...
@@ -111,51 +111,8 @@ class Panel:
         return any(mark.lower for mark in self.marks)
 
 
-@dataclass(frozen=True)
-class Figure:
-    """Small multiples under one caption. A notebook shows it by itself.
-
-    name : for file names and anchors.
-    """
-
-    name: str
-    caption: str
-    panels: tuple[Panel, ...] = field(repr=False)
-
-    @property
-    def legend(self) -> tuple[tuple[Role, str, str], ...]:
-        """Role, label and kind of mark (`Line`, `Band`, `Points`) of everything that is drawn, each once."""
-        seen: dict[tuple[Role, str, str], None] = {}
-        for panel in self.panels:
-            for mark in panel.marks:
-                if mark.label:
-                    seen[mark.role, mark.label, type(mark).__name__] = None
-        return tuple(seen)
-
-    def svg(self, *, columns: int = 2, width: float = 720.0) -> str:
-        """The figure as a stand-alone SVG text, `width` px wide; needs no other package."""
-        from runner.report.svg import figure_svg
-
-        return figure_svg(self, columns=columns, width=width)
-
-    def save(self, path: str | Path, *, columns: int = 2, width: float = 720.0) -> Path:
-        """Write the SVG to a file."""
-        target = Path(path)
-        target.write_text(self.svg(columns=columns, width=width), encoding="utf-8")
-        return target
-
-    def plotly(self, *, columns: int = 2) -> Any:
-        """The figure as a plotly `Figure` with one subplot a panel; needs the extra `view`."""
-        from runner.report.interactive import plotly_figure
-
-        return plotly_figure(self, columns=columns)
-
-    def _repr_svg_(self) -> str:
-        return self.svg()
-
-
 def limits(values: Sequence[Floats], *, pad: float = 0.04) -> tuple[float, float]:
-    """Range of an axis that shows all values, a little wider; 0 to 1 where there is none."""
+    """Range of an axis, a little wider than the values; 0 to 1 without values."""
     finite = [v[np.isfinite(v)] for v in values]
     finite = [v for v in finite if len(v)]
     if not finite:
@@ -163,3 +120,26 @@ def limits(values: Sequence[Floats], *, pad: float = 0.04) -> tuple[float, float
     low, high = min(float(v.min()) for v in finite), max(float(v.max()) for v in finite)
     room = pad * (high - low) if high > low else 0.5 * abs(high) or 0.5
     return low - room, high + room
+
+
+def thin(x: Floats, y: Floats, points: int = 1000) -> tuple[Floats, Floats]:
+    """At most `points` of the samples (n,), n > points, in their order: both extremes of each stretch.
+
+    The samples are cut into points / 2 stretches of equal number; of each, the lowest and the highest sample
+    stay at their own x, so a spike of a single sample survives. The first and the last sample stay too.
+    Non-finite samples are left out.
+    """
+    good = np.isfinite(x) & np.isfinite(y)
+    if not good.all():
+        x, y = x[good], y[good]
+    if len(x) <= points:
+        return x, y
+    stretches = max((points - 2) // 2, 1)
+    edges = np.linspace(0, len(x), stretches + 1).astype(np.int64)
+    lowest = np.empty(stretches, dtype=np.int64)
+    highest = np.empty(stretches, dtype=np.int64)
+    for k, (low, high) in enumerate(pairwise(edges)):
+        lowest[k] = low + int(np.argmin(y[low:high]))
+        highest[k] = low + int(np.argmax(y[low:high]))
+    kept = np.union1d(np.concatenate([lowest, highest]), np.array([0, len(x) - 1]))
+    return x[kept], y[kept]

@@ -1,4 +1,4 @@
-"""Held-out residuals against all that they may depend on, without and with the findings of a diagnosis."""
+"""Held-out residuals and replay errors over their variables, without and with the findings of a diagnosis."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.effects import Parameters, find_effect
+from runner.diagnosis.replayed import ReplayErrors
 from runner.diagnosis.residuals import Residuals, SideResiduals
 from runner.report.figures import bin_means
-from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
+from runner.report.plot import Band, Line, Mark, Panel, Points, thin
+from runner.report.svg import Figure
+from sim_backend.monitor import QUANTITIES
 
-__all__ = ["AGAINST", "LABELS", "finding_figure", "residual_figures"]
+__all__ = ["AGAINST", "LABELS", "finding_figure", "replay_figures", "residual_figures"]
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +31,12 @@ LABELS = {
 }
 _GAP_S = 2.0
 _PLACES = 2
+_POINTS = 500
+_QUANTITIES = {
+    "position": ("position", "mrad", 1e3),
+    "motor": ("motor torque", "Nm", 1.0),
+    "joint": ("joint torque", "Nm", 1.0),
+}
 
 
 def residual_figures(residuals: Residuals, side: str) -> list[Figure]:
@@ -44,7 +53,7 @@ def finding_figure(
     parameters: Parameters,
     others: Sequence[int] = (),
 ) -> Figure | None:
-    """Held-out residual without and with the extension where a finding acts, over time and against its variable.
+    """Held-out residual at the place of a finding, without and with it, over time and over its variable.
 
     joints : from 1, none for the whole arm. parameters : of the finding. others : joints of other
     findings, which show a cause of the whole arm less clearly. None where there is nothing to show.
@@ -175,3 +184,34 @@ _MARKS: dict[str, Callable[[Residuals, SideResiduals, int, str], list[Mark]]] = 
     "time": _time_marks,
     "run order": _order_marks,
 }
+
+
+def replay_figures(replayed: ReplayErrors, names: Sequence[str]) -> list[Figure]:
+    """One figure for position, motor and joint torque, one panel a joint."""
+    figures = []
+    for quantity in QUANTITIES:
+        base = replayed.errors.get(("base", quantity))
+        if base is None:
+            continue
+        label, unit, scale = _QUANTITIES[quantity]
+        panels = []
+        for joint, name in enumerate(names):
+            marks: list[Mark] = []
+            rms = []
+            for model, role, said in (
+                ("base", "backward", "base model"),
+                ("extended", "forward", "extended model"),
+            ):
+                error = replayed.errors.get((model, quantity))
+                if error is None:
+                    continue
+                values = scale * error[:, joint]
+                time = np.linspace(0.0, replayed.duration_s, len(values))
+                marks.append(Line(role, said, *thin(time, values, _POINTS)))  # type: ignore[arg-type]
+                rms.append(float(np.sqrt(np.nanmean(values**2))))
+            note = f"{rms[0]:.3g} {unit} rms" + (f", extended {rms[1]:.3g}" if len(rms) > 1 else "")
+            alt = f"Measured minus simulated {label} of {name} over time, {replayed.session}: {note}."
+            panels.append(Panel(name, "time [s]", f"error [{unit}]", tuple(marks), alt, note))
+        caption = f"Measured minus simulated {label}, {replayed.session}"
+        figures.append(Figure(f"replay-{quantity}", caption, tuple(panels)))
+    return figures

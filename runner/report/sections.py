@@ -6,8 +6,8 @@ import math
 from html import escape
 
 from runner.published import SOURCE, TABLE_1, TABLE_2
-from runner.report.correlation import correlation_figure
 from runner.report.figures import (
+    correlation_figure,
     interval_95,
     motion_figure,
     parameter_figure,
@@ -17,19 +17,22 @@ from runner.report.figures import (
     velocity_figure,
 )
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, Number, chart_html, figure_html, fold, paragraph, section, table
+from runner.report.markup import (
+    Cell,
+    Number,
+    chart_html,
+    conditions_table,
+    figure_html,
+    fold,
+    paragraph,
+    section,
+    table,
+)
 
 __all__ = [
-    "assumption_section",
-    "motion_section",
-    "parameter_section",
-    "provenance_section",
-    "residual_section",
-    "session_section",
-    "table_1_section",
-    "table_2_section",
-    "torque_section",
-]
+    "assumption_section", "motion_section", "parameter_section", "provenance_section", "residual_section",
+    "session_section", "table_1_section", "table_2_section", "torque_section",
+]  # fmt: skip
 
 _PAIRS = 12
 _SLOWEST_S = 2e-3
@@ -71,22 +74,14 @@ def session_section(results: ResultFolder) -> str:
     )  # fmt: skip
     parts = [table(head, rows, "Sessions and their link")]
     if results.lock_step:
-        text = "Lock step: the emulator waited for every reply, so the reply times say nothing of a link."
+        text = "Lock step: the emulator waited for every reply, so the reply times are not those of a link."
         parts.append(paragraph(text, "soft"))
     if results.unread:
         parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
     for name, items in results.preflights.items():
-        conditions = [
-            [i["subject"], i["value"], i["limit"], "held" if i["ok"] else "NOT HELD"] for i in items
-        ]
-        parts.append(
-            fold(
-                f"Conditions before the motion of {name}: {sum(i['ok'] for i in items)} of {len(items)} held",
-                table(
-                    ("condition", "found", "limit", ""), conditions, f"Conditions before the motion of {name}"
-                ),
-            )
-        )
+        label = f"Conditions before the motion of {name}"
+        held = f"{sum(i['ok'] for i in items)} of {len(items)} held"
+        parts.append(fold(f"{label}: {held}", conditions_table(items, label)))
     return section("sessions", "Sessions, link and limits", *parts)
 
 
@@ -124,9 +119,9 @@ def table_1_section(results: ResultFolder) -> str:
     )
     strong = range(len(TABLE_1), len(rows))
     note = (
-        "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number is "
-        "that of the unscaled observation matrix of all sessions over the 49 parameters of Table 2, the "
-        "definition with which the published numbers agree; "
+        "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number belongs "
+        "to the unscaled observation matrix of all sessions over the 49 parameters of Table 2, in agreement with "
+        "the published numbers; "
     )
     others = [
         f"over all base parameters it is {condition['base']:.1f}" if condition.get("base") else "",
@@ -184,9 +179,7 @@ def table_2_section(results: ResultFolder) -> str:
         "</div>",
     ]
     if any(str(row[0]).endswith("*") for row in rows):
-        parts.append(
-            paragraph("* not essential in this run; the estimate is that of the full base set.", "soft")
-        )
+        parts.append(paragraph("* not essential in this run; estimate of the full base set.", "soft"))
     if others:
         title = f"{len(others)} further essential parameters of this run, not in Table 2"
         parts.append(fold(title, table(("parameter", "unit", "estimate", "std", "RSD %"), others, title)))
@@ -214,12 +207,12 @@ def table_2_section(results: ResultFolder) -> str:
 
 
 def _why_absent(results: ResultFolder, absent: list[str]) -> str:
-    """What the estimate of this run cannot know."""
+    """Reasons for missing parameters."""
     reasons = []
     if any(name.endswith("8") for name in absent):
         carried = {s.metadata.get("payload", "none") for s in results.sessions.values()} - {"none"}
         reasons.append(
-            "no session without the payload, so it is part of link 7, and of what is regrouped with that"
+            "no session without the payload, so it is part of link 7 and its regrouped parameters"
             if carried
             else "no session with a payload"
         )
@@ -247,29 +240,21 @@ def torque_section(results: ResultFolder) -> str:
     if not results.curves:
         return ""
     head = (
-        "joint",
-        "rms [Nm]",
-        "rms, % of torque",
-        "bias [Nm]",
-        "worst [Nm]",
-        "at [s]",
-        "in the band [Nm]",
-        "floor [Nm]",
-    )
+        "joint", "rms [Nm]", "rms, % of torque", "bias [Nm]", "worst [Nm]", "at [s]", "in the band [Nm]", "floor [Nm]",
+    )  # fmt: skip
     if any(one.unseen for one in results.curves):
-        origin = "The motion that the estimate has not seen stands first."
+        origin = "The held-out motion is first."
     else:
         origin = (
-            "These are the sessions that the estimate was made from: `lwr-run validate` holds a model against "
-            "others, and so does a session with `validation: true` in the experiment file."
+            "These are the sessions of the estimate. Test the model on others with `lwr-run validate`, or with a "
+            "session with `validation: true` in the experiment file."
         )
     parts = [
         paragraph(
-            "Computed torque from the filtered measured motion, against the torque measured. Both lines "
-            f"passed the same low-pass; what was logged stands behind them, every spike included. {origin} "
-            "The relative error is in percent of the largest torque of the joint. In the band: in the pass "
-            "band of the estimation; floor: scatter between the periods of the motion, which no model can "
-            "explain."
+            "Computed torque from the filtered measured motion, and measured torque. Both lines passed the same "
+            f"low-pass; the logged samples are behind them, with every spike. {origin} The relative error is in "
+            "percent of the largest torque of the joint. In the band: in the pass band of the estimation; floor: "
+            "scatter between the periods of the motion, beyond any model."
         )
     ]
     for index, one in enumerate(sorted(results.curves, key=lambda one: not one.unseen)):
@@ -278,11 +263,9 @@ def torque_section(results: ResultFolder) -> str:
                 score.joint,
                 Number(score.rms, ".3f"),
                 Number(100 * score.relative, ".2f"),
-                Number(score.bias, ".3f"),
-                Number(score.worst, ".3f"),
+                *(Number(v, ".3f") for v in (score.bias, score.worst)),
                 Number(score.worst_time_s, ".2f"),
-                Number(score.band_rms, ".4f"),
-                Number(score.floor_rms, ".4f"),
+                *(Number(v, ".4f") for v in (score.band_rms, score.floor_rms)),
             ]
             for score in one.scores
         ]
@@ -308,7 +291,7 @@ def residual_section(results: ResultFolder) -> str:
 
 
 def assumption_section(results: ResultFolder) -> str:
-    """Verdicts on what the standard deviations rest upon."""
+    """Verdicts on the assumptions of the standard deviations."""
     checks = results.summary.get("assumptions")
     if not checks:
         return ""
@@ -323,10 +306,10 @@ def assumption_section(results: ResultFolder) -> str:
     ]
     textbook = str(results.summary["covariance"]).startswith("textbook")
     covered = (
-        "They rest on every assumption above."
+        "They need every assumption above."
         if textbook
-        else "They do not rest on uncorrelated or normal residuals of equal variance; a lack of fit or of "
-        "exogeneity they cannot cover."
+        else "They hold for correlated, non-normal residuals of unequal variance, but do not cover a lack of fit "
+        "or of exogeneity."
     )
     parts = [
         table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
@@ -338,10 +321,9 @@ def assumption_section(results: ResultFolder) -> str:
     if checks.get("lack of fit", {}).get("verdict") == "VIOLATED":
         parts.append(
             paragraph(
-                "Lack of fit: a part of the residual comes back in every period, so it is no noise but physics that "
-                "the base model leaves out. Twisting gears and drives that slide a little after a reversal do this in "
-                "a healthy arm as well; the finding says how many Nm it is. The diagnosis names a cause only where "
-                "there is more than that, so it may find nothing beside a lack of fit.",
+                "Lack of fit: a part of the residual repeats in every period. It is unmodelled physics, not noise. "
+                "Gear twist and presliding friction cause it in a healthy arm too; the finding gives its size in Nm. "
+                "The diagnosis names only causes beyond that, so it may find nothing beside a lack of fit.",
                 "soft",
             )
         )
@@ -400,8 +382,7 @@ def _correlation(results: ResultFolder) -> str:
         "correlation",
         "Correlation of the parameters",
         paragraph(
-            f"{figure.alt} Of a strongly correlated pair the sum or difference is known better than each of "
-            "the two."
+            f"{figure.alt} The sum or difference of a strongly correlated pair is more precise than either one."
         ),
         chart_html(figure.chart(), figure.alt, "square"),
         fold(
@@ -413,7 +394,7 @@ def _correlation(results: ResultFolder) -> str:
 
 
 def provenance_section(results: ResultFolder) -> str:
-    """What ran, with what, on what, and where the files are."""
+    """Versions, logs and files of the run."""
     versions = results.summary.get("versions", {})
     rows: list[list[Cell]] = [[name.replace("_", " "), str(value)] for name, value in versions.items()]
     logs: list[list[Cell]] = []

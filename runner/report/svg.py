@@ -1,17 +1,21 @@
-"""Figures as SVG, written directly: for papers, for print and where no browser runs scripts."""
+"""Figures as small multiples, drawn as SVG: for papers, print and notebooks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.report.plot import STYLES, Band, Figure, Line, Mark, Panel, Points, Role, Symbol, limits
+from runner.report.interactive import plotly_figure
+from runner.report.plot import STYLES, Band, Line, Mark, Panel, Points, Role, Symbol, limits
 
-__all__ = ["figure_svg", "panel_svg", "ticks"]
+__all__ = ["Figure", "figure_svg", "legend_key", "panel_svg", "ticks"]
 
 Floats = NDArray[np.float64]
 
@@ -20,6 +24,45 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 10.0, 24.0, 36.0
 _LEGEND_LINE = 18.0
 _LOWER_SHARE = 0.3
 _GREY = "#595959"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Small multiples under one caption. A notebook shows it by itself.
+
+    name : for file names and anchors.
+    """
+
+    name: str
+    caption: str
+    panels: tuple[Panel, ...] = field(repr=False)
+
+    @property
+    def legend(self) -> tuple[tuple[Role, str, str], ...]:
+        """Role, label and kind (`Line`, `Band`, `Points`) of all marks, each once."""
+        seen: dict[tuple[Role, str, str], None] = {}
+        for panel in self.panels:
+            for mark in panel.marks:
+                if mark.label:
+                    seen[mark.role, mark.label, type(mark).__name__] = None
+        return tuple(seen)
+
+    def svg(self, *, columns: int = 2, width: float = 720.0) -> str:
+        """The figure as a stand-alone SVG text, `width` px wide; needs no other package."""
+        return figure_svg(self, columns=columns, width=width)
+
+    def save(self, path: str | Path, *, columns: int = 2, width: float = 720.0) -> Path:
+        """Write the SVG to a file."""
+        target = Path(path)
+        target.write_text(self.svg(columns=columns, width=width), encoding="utf-8")
+        return target
+
+    def plotly(self, *, columns: int = 2) -> Any:
+        """The figure as a plotly `Figure` with one subplot a panel; needs the extra `view`."""
+        return plotly_figure(self.panels, columns=columns)
+
+    def _repr_svg_(self) -> str:
+        return self.svg()
 
 
 def figure_svg(figure: Figure, *, columns: int = 2, width: float = 720.0, panel_height: float = 190.0) -> str:
@@ -44,7 +87,7 @@ def figure_svg(figure: Figure, *, columns: int = 2, width: float = 720.0, panel_
 
 
 def panel_svg(panel: Panel, *, width: float = 560.0, height: float = 200.0) -> str:
-    """One panel as an SVG element that scales with its container."""
+    """One panel as an SVG element, scaled by its container."""
     return (
         f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width:g} {height:g}' role='img' "
         f"style='width:100%;height:auto' aria-label='{escape(panel.alt, quote=True)}'>"

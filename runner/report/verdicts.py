@@ -1,4 +1,4 @@
-"""Was the run good? One line a question, each with what was found, what was wanted, and a verdict."""
+"""Verdicts on a run: one line per question, with finding, requirement and verdict."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runner.report.curves import Curves
-from runner.report.folder import ResultFolder
+from runner.report.folder import Curves, ResultFolder
 
 __all__ = ["Level", "Verdict", "error_change", "extension_gain", "headline", "largest_gain", "verdicts"]
 
@@ -23,13 +22,13 @@ _SLOWEST_S = 2e-3
 _RESIDUAL_LOOK = 0.05
 _TRUTH_WANTED = 0.95
 _MASS_TOLERANCE = 0.01
-# What all but the textbook's standard deviations allow for.
+# Covered by all standard deviations except the textbook's.
 _COVERED = ("serially uncorrelated", "equal variance", "normality")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line of the first table. section : anchor of the part of the report that has the details."""
+    """One line of the first table. section : anchor of the details in the report."""
 
     subject: str
     found: str
@@ -39,7 +38,7 @@ class Verdict:
 
 
 def verdicts(results: ResultFolder) -> list[Verdict]:
-    """The verdicts that a folder allows, in the order in which they matter."""
+    """The verdicts on a folder, in the order of importance."""
     found = (question(results) for question in _QUESTIONS)
     return [verdict for verdict in found if verdict is not None]
 
@@ -127,7 +126,7 @@ def _residual(results: ResultFolder) -> Verdict | None:
 
 
 def _unseen(results: ResultFolder) -> Verdict | None:
-    return _share("unseen motion", [one for one in results.curves if one.unseen])
+    return _share("held-out motion", [one for one in results.curves if one.unseen])
 
 
 def _share(subject: str, shown: Sequence[Curves]) -> Verdict | None:
@@ -223,19 +222,19 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
     gain = extension_gain(diagnosis)
     if gain is not None:
         place, best = largest_gain(diagnosis, results.joint_names)
-        change = f"{error_change(best)} error on unseen motions, {error_change(gain)} on average"
+        change = f"{error_change(best)} error on held-out motions, {error_change(gain)} on average"
         text += f"; the extended model: {place} {change}"
     return Verdict("diagnosis", text, "", "look" if causes or unexplained else "good", "diagnosis")
 
 
 def error_change(gain: float) -> str:
-    """A share of the error that goes, as the change of the error; small ones with a decimal, none without a sign."""
+    """A removed share of the error as change in percent; small ones with a decimal, zero without a sign."""
     percent = round(-100.0 * gain, 0 if abs(gain) >= 0.01 else 1)
     return f"{percent:+g} %" if percent else "0 %"
 
 
 def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
-    """Share of the error on unseen motions that the extended model removes, mean over joints and sides."""
+    """Share of the held-out error removed by the extended model, mean over joints and sides."""
     gain = diagnosis.get("gain") or {}
     base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
     ratios = [
@@ -248,7 +247,7 @@ def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
 
 
 def largest_gain(diagnosis: Mapping[str, Any], names: Sequence[str]) -> tuple[str, float]:
-    """Joint and side that the extended model helps most, and the share of its error that it removes."""
+    """Joint and side with the largest gain by the extended model, and the removed share of its error."""
     base, extended = diagnosis["gain"]["test_rms_base"], diagnosis["gain"]["test_rms_extended"]
     found = [
         (1.0 - after / before, f"{names[k] if k < len(names) else k + 1} {side}")
@@ -276,7 +275,7 @@ _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
 
 
 def _leading(text: str) -> float:
-    """The number that a text begins with; infinite where there is none."""
+    """The number at the beginning of a text, or infinity."""
     match = re.match(r"\s*([-+]?\d+(?:\.\d+)?)", text)
     return float(match.group(1)) if match else math.inf
 

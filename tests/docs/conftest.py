@@ -12,7 +12,7 @@ import yaml
 from click.testing import CliRunner
 
 import runner.experiment
-from lwr_driver.trace import TraceImport, import_trace
+from lwr_driver.session.trace import TraceImport, import_trace
 from runner.cli import main
 
 LOAD = {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}

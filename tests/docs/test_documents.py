@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
@@ -18,6 +20,7 @@ from click.testing import CliRunner
 from fri.errors import LwrError
 from ident.effects import EFFECTS
 from runner.cli import VERBS, main
+from runner.estimation import KEYS, IdentifySettings
 from runner.experiment_file import Experiment
 from tests.docs.markdown import DOCUMENTS, ROOT, Command, blocks, commands
 
@@ -43,6 +46,8 @@ def test_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]
     place = workplace()
     if document.name == "quick_start.md":
         (place / "my_lab.yaml").write_text(blocks(document, "yaml")[0].text)
+    elif document.name == "identify_settings.md":
+        (place / "my_settings.yaml").write_text(blocks(document, "yaml")[0].text)
     elif document.name == "session_log.md":
         # A log that has no motor torques yet, and the controller's recording of the same motion.
         (place / "other" / "loaded.trace.csv").rename(place / "loaded.trace.csv")
@@ -104,10 +109,14 @@ def test_python_examples_work_one_after_the_other(document: Path, workplace: Cal
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=str)
-def test_experiment_files_in_documents_are_valid(document: Path, tmp_path: Path) -> None:
+def test_yaml_files_in_documents_are_valid(document: Path, tmp_path: Path) -> None:
+    path = tmp_path / "example.yaml"
     for block in blocks(document, "yaml"):
+        if document.name == "identify_settings.md":
+            path.write_text(block.text)
+            IdentifySettings.load(path)
+            continue
         content = {"name": "example", **yaml.safe_load(block.text)}
-        path = tmp_path / "example.yaml"
         path.write_text(yaml.safe_dump(content))
         Experiment.load(path)
 
@@ -172,3 +181,21 @@ def test_the_krl_program_is_explained_line_by_line() -> None:
     data, *program = (block.text for block in blocks(Path("configs/krl/README.md"), "krl"))
     assert lines("\n".join(program)) == lines((folder / "lwr_identification.src").read_text())
     assert lines(data) == lines((folder / "lwr_identification.dat").read_text())
+
+
+def test_the_settings_page_and_template_describe_every_key() -> None:
+    written = runpy.run_path(str(ROOT / "docs/settings_table.py"))
+    assert written["PAGE"].read_text().endswith(written["table"]()), "run python docs/settings_table.py"
+    assert written["TEMPLATE"].read_text() == written["template"](), "run python docs/settings_table.py"
+    assert IdentifySettings.load("identify.yaml") == IdentifySettings()
+    described = {key.name for key in KEYS}
+    assert described == set(_leaves(IdentifySettings()))
+
+
+def _leaves(settings: object, head: str = "") -> Iterator[str]:
+    for field in dataclasses.fields(settings):  # type: ignore[arg-type]
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _leaves(value, f"{head}{field.name}.")
+        else:
+            yield head + field.name

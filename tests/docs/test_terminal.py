@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pty
@@ -28,13 +29,14 @@ from fri.errors import (
     RefusedError,
     RobotError,
 )
+from ident.estimators import ESTIMATORS
 from ident.excitation import ExcitationPlan
-from ident.identify import ESTIMATORS
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.configuration import find
 from runner.cli import VERBS, main
+from runner.estimation import IdentifySettings
 from runner.laboratory import free_port
-from runner.plain import as_json
+from runner.terminal import to_json
 
 LWR_RUN = str(Path(sys.executable).parent / "lwr-run")
 
@@ -53,6 +55,14 @@ def verb(name: str) -> click.Command:
     return command
 
 
+SESSIONS = ("unloaded.mcap", "loaded.mcap", "--model", "1")
+SETTINGS = ("--settings", "settings.yaml")
+
+
+def write_settings(place: Path, **content: Any) -> None:
+    (place / "settings.yaml").write_text(yaml.safe_dump(content))
+
+
 # One call of each, in the folder that the documents speak of; what it must say, as a path into the JSON.
 REPORTS: dict[str, tuple[str, str]] = {
     "doctor": ("doctor", "findings.0.advice"),
@@ -61,7 +71,7 @@ REPORTS: dict[str, tuple[str, str]] = {
     "check": ("check my_lab.yaml", "loaded.0.limit"),
     "preview": ("preview my_lab.yaml --out preview.html", "tightest.distance_m"),
     "report": ("report results", "verdicts.0.level"),
-    "identify": ("identify unloaded.mcap --model 1 --no-essential", "parameters.0.estimate"),
+    "identify": ("identify unloaded.mcap --model 1", "parameters.0.estimate"),
     "validate": ("validate model.yaml another.mcap", "sessions.0.scores.0.rms"),
     "commission": ("commission unloaded.mcap loaded.mcap --out commissioned.yaml", "file"),
     "diagnose": ("diagnose unloaded.mcap loaded.mcap --no-simulation --out diagnosis", "findings"),
@@ -96,7 +106,7 @@ def test_commands_that_report_print_one_json_value(
     (place / "recording" / "arm.csv").write_text("t,q,tau\n0,0,1\n0.01,0.1,1.1\n0.02,0.2,1\n")
     (place / "mapping.yaml").write_text(yaml.safe_dump(MAPPING))
     stored = ExcitationPlan.load(find("plans/default.plan.yaml"))
-    monkeypatch.setattr("runner.commands.plan.plan", lambda problem, report: stored)
+    monkeypatch.setattr("ident.excitation.planner.plan", lambda problem, report: stored)
     line, wanted = REPORTS[name]
     code, text = run(*line.split(), "--json")
     assert code == 0, text
@@ -110,8 +120,9 @@ def test_every_command_reports_but_two() -> None:
 
 
 def test_the_emulator_tells_its_ports_as_json() -> None:
-    port = free_port("127.0.0.1")
-    command = [LWR_RUN, "emulator", "--json", "--lock-step", "--fri-port", str(port)]
+    port, pendant = free_port("127.0.0.1"), free_port("127.0.0.1")
+    command = [LWR_RUN, "emulator", "--json", "--lock-step", "--period-ms", "4"]
+    command += ["--fri-host", "127.0.0.1", "--fri-port", str(port), "--pendant-port", str(pendant)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -124,7 +135,7 @@ def test_the_emulator_tells_its_ports_as_json() -> None:
             process.kill()
     said = json.loads(text)
     assert (said["fri_host"], said["fri_port"]) == ("127.0.0.1", port)
-    assert said["pendant_port"] > 0
+    assert said["pendant_port"] == pendant
 
 
 @pytest.mark.parametrize("name", VERBS)
@@ -268,7 +279,7 @@ def test_bash_takes_the_script(tmp_path: Path) -> None:
 def test_json_is_always_valid() -> None:
     import numpy as np
 
-    text = as_json(
+    text = to_json(
         {"a": float("inf"), "b": np.array([1.0, np.nan]), "c": (Path("x"), np.int64(3), None, True)}
     )
     assert json.loads(text) == {"a": None, "b": [1.0, None], "c": ["x", 3, None, True]}
@@ -276,9 +287,9 @@ def test_json_is_always_valid() -> None:
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_every_estimator_is_reached(estimator: str, workplace: Callable[[], Path]) -> None:
-    workplace()
-    arguments = ["unloaded.mcap", "loaded.mcap", "--model", "1", "--no-essential", "--covariance", "textbook"]
-    code, text = run("identify", *arguments, "--estimator", estimator, "--json")
+    place = workplace()
+    write_settings(place, essential=None, covariance={"kind": "textbook"})
+    code, text = run("identify", *SESSIONS, *SETTINGS, "--estimator", estimator, "--json")
     assert code == 0, text
     content = json.loads(text)
     masses = [entry["estimate"] for entry in content["parameters"] if entry["name"] == "M8"]
@@ -289,48 +300,134 @@ def test_every_estimator_is_reached(estimator: str, workplace: Callable[[], Path
 
 def test_settings_reach_the_identification(workplace: Callable[[], Path]) -> None:
     place = workplace()
-    sessions = ["unloaded.mcap", "loaded.mcap", "--model", "1"]
-    code, text = run(
-        "identify", *sessions, "--essential", "--keep", "MX7", "--drop", "Fvl", "--out", "small.yaml"
-    )
+    write_settings(place, essential={"keep": ["MX7"], "drop": ["Fvl"]})
+    code, text = run("identify", *SESSIONS, *SETTINGS, "--essential", "--out", "small.yaml")
     assert code == 0, text
     small = read_model(place / "small.yaml")
     assert "MX7" in {name.rstrip("R") for name in small.names}
     assert not [name for name in small.names if name.startswith("Fvl")]
-    options = ["--standstill-share", "1", "--cutoff-hz", "8", "--coulomb", "tanh:0.01", "--without", "offl"]
-    code, text = run("identify", *sessions, *options, "--coupling", "A5:A6", "--no-essential", "--json")
+    write_settings(
+        place,
+        essential=None,
+        signals={"standstill_share": 1, "cutoff_hz": 8},
+        coulomb={"kind": "tanh", "width": 0.01},
+        without=["offl"],
+        couplings=[["A5", "A6"]],
+    )
+    code, text = run("identify", *SESSIONS, *SETTINGS, "--json")
     assert code == 0, text
     content = json.loads(text)
     assert content["sessions"][0]["cutoff_hz"] == 8.0
     assert not [entry for entry in content["parameters"] if entry["name"].startswith("offl")]
 
 
+def test_every_key_of_the_settings_reaches_the_identification(tmp_path: Path) -> None:
+    path = tmp_path / "settings.yaml"
+    content: dict[str, Any] = {
+        "without": ["offm3"],
+        "couplings": [["A5", "A6"]],
+        "resonance_hz": 12.0,
+        "coulomb": {"kind": "deadband", "width": 0.02},
+        "covariance": {"kind": "bootstrap", "bandwidth_s": 0.5, "block_s": 2.0, "draws": 50, "seed": 3},
+        "signals": {
+            "cutoff_hz": 9.0, "order": 3, "decimate_hz": 3.0, "rate_hz": 6.0, "attenuation_db": 50.0,
+            "choose_cutoff": True, "average_periods": True, "edge_s": 0.4, "longest_bridge_s": 0.03,
+            "bridged_share": 0.2, "standstill_rad_s": 0.003, "standstill_share": 0.1, "outlier_scale": 6.0,
+            "motor_delay_s": 0.004, "delay_search_s": 0.05,
+        },
+        "essential": {"significance": 0.05, "largest_loss_percent": 2.0, "keep": ["Fcm"], "drop": ["offl7"]},
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(content))
+    found = dataclasses.asdict(IdentifySettings.load(path).identification(2, "wls"))
+    assert (found["model"], found["estimator"]) == (2, "wls")
+    assert found["couplings"] == ({"joints": ("A5", "A6")},)
+    for name in set(content) - {"couplings"}:
+        assert found[name] == read_back(content[name]), name
+    options = {"tuning": 2.0, "memory_s": 8.0, "relative_noise": 0.01, "prior_strength": "evidence"}
+    options |= {"prior_metric": "entropic", "prior_std": 0.1}
+    for estimator, kind in ESTIMATORS.items():
+        mine = {name: options[name] for name in kind.options}
+        path.write_text(yaml.safe_dump({"estimator": mine}))
+        built = IdentifySettings.load(path).identification(1, estimator).estimator
+        assert isinstance(built, str) is not bool(mine)
+    assert {name for kind in ESTIMATORS.values() for name in kind.options} == set(options)
+
+
+def read_back(value: Any) -> Any:
+    return (
+        tuple(value)
+        if isinstance(value, list)
+        else ({key: read_back(item) for key, item in value.items()} if isinstance(value, dict) else value)
+    )
+
+
+def test_options_of_an_estimator_change_its_estimate(workplace: Callable[[], Path]) -> None:
+    place = workplace()
+    plain: dict[str, Any] = {"essential": None, "covariance": {"kind": "textbook"}}
+    for estimator, options in (
+        ("huber", {"tuning": 0.5}),
+        ("recursive", {"memory_s": 2.0}),
+        ("tls", {"relative_noise": 3e-4}),
+        ("map", {"prior_strength": 9.0, "prior_metric": "euclidean", "prior_std": 0.05}),
+    ):
+        values = []
+        for settings in (plain, {**plain, "estimator": options}):
+            write_settings(place, **settings)
+            code, text = run("identify", *SESSIONS, *SETTINGS, "--estimator", estimator, "--json")
+            assert code == 0, text
+            values.append([entry["estimate"] for entry in json.loads(text)["parameters"]])
+        assert values[0] != values[1], estimator
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"estimator": {"tuning": 2.0}},
+            "`estimator.tuning` is 2.0, an option of huber and tukey, not of wls",
+        ),
+        ({"couplings": [["A5", "A5"]]}, "has A5 twice in a pair"),
+        ({"couplings": [["A5"]]}, "`couplings`[0]: expected 2 entries, found 1"),
+        ({"coulomb": {"kind": "tanh"}}, "width 0.0 must be positive"),
+        ({"essential": {"keep": ["M8"], "drop": ["M8"]}}, "in both"),
+        ({"estimator": {"prior_strength": "much"}}, "'much' is not one of evidence, cross_validation"),
+        ({"signals": {"cutof_hz": 8.0}}, "unknown key `cutof_hz`; did you mean `cutoff_hz`?"),
+        ({"signals": {"bridged_share": 1.5}}, "`signals.bridged_share` is 1.5, outside its range (0 to 1)"),
+        ({"covariance": {"block_s": 0.0}}, "`covariance.block_s` is 0, outside its range (above 0)"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(
+    settings: dict[str, Any], message: str, workplace: Callable[[], Path]
+) -> None:
+    write_settings(workplace(), **settings)
+    code, text = run("identify", *SESSIONS, *SETTINGS)
+    assert code == 2
+    said = " ".join(text.split())
+    assert message in said
+    assert "settings.yaml: `" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--tuning", "2"], "--tuning is for huber and tukey, not for wls"),
-        (["--coupling", "A5"], "does not name two joints"),
-        (["--coulomb", "tanh"], "width 0.0 must be positive"),
         (["--payload", "other.mcap=block"], "write FILE=NAME"),
         (["--payload", "loaded.mcap=block:heavy"], "'heavy' is no mass in kg"),
-        (["--no-essential", "--keep", "M8"], "leave --no-essential"),
-        (["--keep", "M8", "--drop", "M8"], "in both"),
-        (["--prior-strength", "much", "--estimator", "map"], "neither a number nor one of evidence"),
+        (["--essential", *SETTINGS], "has `essential: null`; leave one out"),
+        (["--settings", "none.yaml"], "file 'none.yaml' not found"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(
     options: list[str], message: str, workplace: Callable[[], Path]
 ) -> None:
-    workplace()
-    code, text = run("identify", "unloaded.mcap", "loaded.mcap", "--model", "1", *options)
+    write_settings(workplace(), essential=None)
+    code, text = run("identify", *SESSIONS, *options)
     assert code == 2
     assert message in " ".join(text.split())
 
 
 def test_the_payload_of_a_log_can_be_corrected(workplace: Callable[[], Path]) -> None:
-    workplace()
-    arguments = ["unloaded.mcap", "loaded.mcap", "--model", "1", "--no-essential", "--json"]
-    code, text = run("identify", *arguments, "--payload", "loaded.mcap=block:3.3")
+    write_settings(workplace(), essential=None)
+    code, text = run("identify", *SESSIONS, *SETTINGS, "--json", "--payload", "loaded.mcap=block:3.3")
     assert code == 0, text
     assert [session["payload"] for session in json.loads(text)["sessions"]] == [None, "block"]
 
@@ -346,3 +443,45 @@ def test_json_of_recover_attach_and_export(workplace: Callable[[], Path]) -> Non
     assert json.loads(text)["alignment"]["delay_std_s"] < 1e-3
     code, text = run("export", "model.yaml", "out.urdf", "out.c", "--json")
     assert [entry["format"] for entry in json.loads(text)["files"]] == ["URDF", "C"]
+
+
+def test_options_of_commands_for_logs(workplace: Callable[[], Path]) -> None:
+    place = workplace()
+    (place / "other" / "loaded.plain.mcap").rename(place / "bare.mcap")
+    assert run("attach", "bare.mcap", "other/loaded.trace.csv", "--tolerance-ms", "1e-6")[0] == 7
+    (place / "recording").mkdir()
+    (place / "recording" / "arm.csv").write_text("t,q,tau\n0,0,1\n0.01,0.1,1.1\n0.02,0.2,1\n0.03,0.3,1\n")
+    (place / "mapping.yaml").write_text(yaml.safe_dump(MAPPING))
+    options = ["--rows", "1:3", "--serial", "12", "--payload", "block", "--payload-mass", "2.5"]
+    code, text = run("import", "mapping.yaml", "recording", "imported.mcap", *options)
+    assert code == 0, text
+    content = json.loads(run("info", "imported.mcap", "--json")[1])
+    assert content["metadata"]["serial"] == "12"
+    assert (content["metadata"]["payload"], float(content["metadata"]["payload_mass"])) == ("block", 2.5)
+    assert 2 in {channel["samples"] for channel in content["channels"]}
+    assert "is no range of rows" in run("import", "mapping.yaml", "recording", "x.mcap", "--rows", "3")[1]
+    code, text = run("report", "results", "--svg", "figures", "--columns", "1", "--width", "400", "--json")
+    assert code == 0, text
+    assert all("<svg" in Path(file).read_text() for file in json.loads(text)["figures"])
+    assert "width='400'" in Path(json.loads(text)["figures"][0]).read_text()
+
+
+def test_options_of_commands_for_models(workplace: Callable[[], Path]) -> None:
+    place = workplace()
+    assert run("export", "model.yaml", "out.c", "--name", "bench", "--payload", "paper_load")[0] == 0
+    assert "bench_" in (place / "out.c").read_text()
+    code, text = run("compare", "model.yaml", "another_model.yaml", "--level", "0.5", "--json")
+    assert (code, json.loads(text)["level"]) == (0, 0.5)
+    held, free = (run("payload", "model.yaml", "loaded.mcap", *o, "--json") for o in ([], ["--free-offsets"]))
+    assert held[0] == free[0] == 0
+    assert held[1] != free[1]
+    sessions = ["unloaded.mcap", "loaded.mcap", "--allow-seen"]
+    code, text = run("validate", "model.yaml", *sessions, "--forward", "--cross", "--json")
+    assert code == 0, text
+    assert {"forward", "cross_validation"} <= set(json.loads(text))
+
+
+def test_the_period_of_a_check(workplace: Callable[[], Path]) -> None:
+    workplace()
+    texts = [run("check", "my_lab.yaml", "--period-ms", period)[1] for period in ("5", "20")]
+    assert texts[0] != texts[1]

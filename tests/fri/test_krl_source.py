@@ -11,7 +11,7 @@ from fri.krc import EventKind
 from fri.krl import AXES, Interpreter, KrlProgram, NoMachinery
 from fri.packets import JOINT_NAMES, new_cmd, new_msr
 from fri.states import Control, State
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from sim_backend.configuration import krl_program
 from tests.fri.fri_rig import Rig
 

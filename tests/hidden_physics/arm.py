@@ -19,6 +19,8 @@ from tests.hidden_physics.traits import TRAITS, trait_rows
 __all__ = ["Contact", "HiddenArm", "Load"]
 
 _SUBSTEPS = 4
+# Steps in which the angle behind a reading is found; each gains the digits of the eccentricity.
+_READINGS = 8
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ class HiddenArm:
             ]
         )
         self._zero = self._row("zero")
+        self._eccentric, self._eccentric_angle = self._row("eccentric"), self._row("eccentric_angle")
         self._rest = self._drive[1] * self._row("stiffness")
         self._start_warm = self._row("start_warm")
         self.position, self.velocity = np.zeros(n), np.zeros(n)
@@ -163,6 +166,8 @@ class HiddenArm:
         """
         self._bare_data = self.bare.createData()
         q = np.asarray(position) - self._zero
+        for _ in range(_READINGS):
+            q = np.asarray(position) - self._misread(q)
         self.body[:] = 0.0
         self.body[2] = q
         needed = pin.computeGeneralizedGravity(self.model, self._data, q) + self._drive[8] - self._push
@@ -226,9 +231,15 @@ class HiddenArm:
         )
         bias -= jacobian[:3].T @ force
 
+    def _misread(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the encoders show beyond the angle (n,) [rad]: their zero, and a track that turns about a point beside
+        its centre, so that the head sees it from another direction.
+        """
+        return self._zero + np.arcsin(self._eccentric * np.sin(angle + self._eccentric_angle))
+
     def _show(self) -> None:
-        np.add(self.body[2], self._zero, out=self.position)
-        np.add(self.body[0], self._zero, out=self.motor_position)
+        np.add(self.body[2], self._misread(self.body[2]), out=self.position)
+        np.add(self.body[0], self._misread(self.body[0]), out=self.motor_position)
         self.motor_velocity[:] = self.body[1]
         self.velocity[:] = self.body[3]
 

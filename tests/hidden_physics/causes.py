@@ -280,6 +280,18 @@ def _zero(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]
     return sized
 
 
+def _eccentric(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
+    angle = random.uniform(0.0, 2.0 * math.pi)
+
+    def sized(size: float) -> Hidden:
+        off = math.radians(2.0 * ZERO_DEG[joint - 1] * size)
+        setting = trait(joint, eccentric=off, eccentric_angle=angle)
+        truth = {"cosine": off * math.sin(angle), "sine": off * math.cos(angle), "cycles_per_turn": 1.0}
+        return Hidden("encoder_eccentricity", "joint", (joint,), size, everywhere(setting), truth)
+
+    return sized
+
+
 def _contact(random: Random, joint: int, scene: Scene) -> Callable[[float], Hidden]:
     direction = random.normal(0.0, 1.0, 3)
     direction /= np.linalg.norm(direction)
@@ -487,6 +499,7 @@ CAUSES: Mapping[str, Cause] = {
         Cause("motor_torque_delay", "timing", _motor_late, _ARM, absorbed=True),
         Cause("joint_torque_delay", "timing", _joint_late, _ARM),
         Cause("lost_samples", "timing", _held, _ARM),
+        Cause("encoder_eccentricity", "joint", _eccentric, joints=(2, 3, 4, 5, 6, 7), absorbed=True),
     )
 }
 """Causes of the catalogue by name."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ident.diagnosis import ArmData, Reference, commission, diagnose
-from ident.kinematics import Chain
-from ident.model_file import read_model, write_model
+from ident.dynamics.kinematics import Chain
+from ident.model.model_file import read_model, write_model
 from lwr_driver.arm import Arm
 from lwr_driver.session import read_session
 from tests.hidden_physics.cases import Case, Sessions, Store, twin

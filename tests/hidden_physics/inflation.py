@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.identify import IdentificationSettings, identify
-from ident.kinematics import Chain
-from ident.model import DynamicModel, Side
-from ident.signals.prepare import prepare
-from ident.signals.settings import SignalSettings
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Side
+from ident.estimation.identify import IdentificationSettings, identify
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
+from ident.rows.prepare import prepare
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 

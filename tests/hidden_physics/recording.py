@@ -23,10 +23,10 @@ from lwr_driver.control import Control, Job, Result, Word
 from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkSettings
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion
-from lwr_driver.motor_torque import KrlMotorTorque
-from lwr_driver.recording import Recording, SessionRequest
 from lwr_driver.ring import Ring
 from lwr_driver.session import session_metadata
+from lwr_driver.session.motor_torque import KrlMotorTorque
+from lwr_driver.session.recording import Recording, SessionRequest
 from runner.laboratory import free_port
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import load_configuration

@@ -143,6 +143,14 @@ def test_encoders_show_their_zero_and_the_arm_stands_where_they_say() -> None:
     assert hidden.body[2, 1] == pytest.approx(HOME[1] - 0.02)
 
 
+def test_an_encoder_off_its_axis_errs_with_the_angle() -> None:
+    off, angle = 0.01, 0.7
+    _, hidden = plants(traits={"eccentric": {2: off}, "eccentric_angle": {2: angle}})
+    np.testing.assert_allclose(hidden.position, HOME, atol=1e-12)
+    true = hidden.body[2, 1]
+    assert HOME[1] - true == pytest.approx(off * np.sin(true + angle), abs=1e-6)
+
+
 def test_tilt_brings_gravity_to_the_first_joint() -> None:
     _, level = plants()
     _, tilted = plants(tilt=(0.02, 0.0))

@@ -43,6 +43,7 @@ CONTRACT = {
     "motor_torque_delay": "timing",
     "joint_torque_delay": "timing",
     "lost_samples": "timing",
+    "encoder_eccentricity": "joint",
 }
 
 PEAKS = (20.0, 60.0, 15.0, 40.0, 5.0, 12.0, 9.0)

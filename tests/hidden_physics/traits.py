@@ -72,8 +72,10 @@ _HEALTHY: dict[str, float] = {
     "cable_slack": 0.0,
     "cable_rub": 0.0,
     "cable_reach": 0.1,
-    # encoder zero [rad]
+    # encoder zero [rad]; its disc off the axis, over the radius of its track, and the angle of that [rad]
     "zero": 0.0,
+    "eccentric": 0.0,
+    "eccentric_angle": 0.0,
     # what no catalogue lists. The other joint (1 to 7): its angle modulates our friction (share, phase), its
     # speed drags us [Nm s/rad]; drag by our own speed of a while ago [Nm s/rad], how long a while [s];
     # friction that grows with acceleration [s^2/rad]; a shaking foundation [Nm], [Hz]

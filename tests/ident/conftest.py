@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.kinematics import Chain
-from ident.regressor import torque
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
 from lwr_driver.session import JointColumns, Phase, Session
 from tests.ident.known_arm import bench, estimated, truth_model  # noqa: F401  fixtures
 

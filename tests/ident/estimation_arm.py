@@ -1,4 +1,4 @@
-"""A simulated arm that obeys equations (1) to (4) exactly, and sessions of it with sensors that do not."""
+"""A simulated arm with exactly equations (1) to (4), and sessions of it with imperfect sensors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import yaml
 from scipy.signal import lfilter
 
-from ident.kinematics import Chain
-from ident.parameters import DRIVE, INERTIAL
-from ident.regressor import torque
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import DRIVE, INERTIAL
+from ident.dynamics.regressor import torque
 from lwr_driver.session import JointColumns, Phase, Session
 
 Array = np.ndarray
@@ -117,7 +117,7 @@ def session(
     command: bool = False,
     metadata: dict[str, str] | None = None,
 ) -> Session:
-    """A session that runs through the periods with a run-in and a run-out."""
+    """A session of several periods with a run-in and a run-out."""
     sensors = sensors or Sensors()
     random = np.random.default_rng(seed)
     dt = 1.0 / rate_hz

@@ -11,11 +11,11 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from ident import parameters
-from ident.base import numeric_base
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.structure import ModelStructure
+from ident.dynamics import parameters
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import ModelStructure
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import Session, SessionWriter, read_session, session_metadata
 
@@ -26,7 +26,7 @@ LOAD = parameters.from_com(3.3, [0.01, -0.06, 0.14], [[0.02, 0, 0], [0, 0.018, 0
 
 @dataclass(frozen=True)
 class Bench:
-    """An arm whose parameters are known, and sessions of it in a folder."""
+    """An arm with known parameters, and sessions of it in a folder."""
 
     chain: Chain
     structure: ModelStructure
@@ -124,7 +124,7 @@ def bench(truth_model: DynamicModel, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture
 def estimated(truth_model: DynamicModel) -> Callable[..., DynamicModel]:
-    """A model whose parameters scatter about the truth by their stated standard deviations."""
+    """A model with parameters scattered about the truth by their stated standard deviations."""
 
     def build(seed: int = 0, scale: float = 0.01, **changes: object) -> DynamicModel:
         rng = np.random.default_rng(seed)

@@ -54,7 +54,7 @@ def problem(
     dt: float = 0.2,
     measured: Sequence[Array] | None = None,
 ) -> Problem:
-    """Rows matrices @ chi + noise; `measured` replaces the regressor that the estimator sees."""
+    """Rows matrices @ chi + noise; `measured` replaces the regressor of the estimator."""
     seen = matrices if measured is None else measured
     groups = tuple(
         RowGroup(

@@ -5,8 +5,8 @@ import pytest
 
 from fri.errors import ConfigurationError
 from lwr_driver.control import BIN_NS, HISTORY, Control, Mode, Text, Word
+from lwr_driver.link import snapshot
 from lwr_driver.ring import ROW
-from lwr_driver.state import snapshot
 
 
 @pytest.fixture

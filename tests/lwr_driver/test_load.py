@@ -8,7 +8,7 @@ from fri.errors import ConfigurationError, RobotError
 from lwr_driver.driver import Driver, LinkSettings
 from runner.experiment_file import Payload
 from runner.laboratory import free_port
-from runner.payload import load_data
+from runner.preflight import load_data
 from sim_backend.process import EmulatorProcess
 from tests.lwr_driver.driver_rig import arm
 

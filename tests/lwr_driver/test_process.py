@@ -16,8 +16,8 @@ import pytest
 from fri.errors import ConfigurationError, DataError, NetworkError, OperatorError, RefusedError, RobotError
 from lwr_driver.driver import Driver, LinkSettings, Outcome
 from lwr_driver.motion import Motion, move_to
-from lwr_driver.motor_torque import KrlMotorTorque
 from lwr_driver.session import read_session
+from lwr_driver.session.motor_torque import KrlMotorTorque
 from lwr_driver.session.writer import session_metadata
 from sim_backend.process import EmulatorProcess
 from tests.lwr_driver.driver_rig import arm

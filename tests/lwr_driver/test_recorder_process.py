@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.motor_torque import KrlMotorTorque
 from lwr_driver.recorder import Recorder, SessionRequest
 from lwr_driver.ring import Ring
 from lwr_driver.session import read_session
+from lwr_driver.session.motor_torque import KrlMotorTorque
 from tests.lwr_driver.session.session_samples import EPOCH, JOINTS, METADATA, URDF, rows
 
 PATIENCE_S = 60.0

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from lwr_driver.guard import Stop, stop_extent
 from lwr_driver.motion import move_to
-from lwr_driver.stop import Stop, stop_extent
 from tests.lwr_driver.driver_rig import START, arm
 
 unit = st.lists(st.floats(-1.0, 1.0), min_size=7, max_size=7).map(np.array)

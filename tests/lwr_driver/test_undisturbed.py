@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from lwr_driver.undisturbed import undisturbed
+from lwr_driver.realtime import undisturbed
 
 
 def test_interrupt_comes_when_the_block_is_done():

@@ -15,9 +15,8 @@ from fri.controller_end import ControllerEnd
 from fri.packets import Fault
 from fri.states import State
 from lwr_driver.control import Job, Mode, Result, Word
-from lwr_driver.link import advise_command, advise_connect, silence_in_lock_step
+from lwr_driver.link import advise_command, advise_connect, silence_in_lock_step, snapshot
 from lwr_driver.session import read_session
-from lwr_driver.state import snapshot
 
 SEED = 1
 BLOCK = 18

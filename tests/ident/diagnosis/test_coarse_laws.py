@@ -13,8 +13,8 @@ from ident.diagnosis.candidates import Candidate
 from ident.diagnosis.evidence import Rows
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.signatures import signature_bench
+from ident.dynamics.kinematics import Chain
 from ident.effects import find_effect
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]

@@ -10,10 +10,10 @@ import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import ArmData, Diagnosis, Reference, commission, diagnose
-from ident.diagnosis.hygiene import clipped_at, held_times, stuck_at
-from ident.kinematics import Chain
-from ident.model_file import model_text, read_model
-from ident.regressor import torque
+from ident.diagnosis.data_quality import clipped_at, held_times, stuck_at
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
+from ident.model.model_file import model_text, read_model
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]
@@ -155,7 +155,7 @@ def test_gain_is_measured_on_sessions_never_fitted(make: Make, chain: Chain) -> 
 
 @pytest.mark.slow
 def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bodies: np.ndarray) -> None:
-    from ident.regressor import torque
+    from ident.dynamics.regressor import torque
 
     def heavier(s: Signals) -> None:
         extra = np.zeros((3, 10))

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.base import numeric_base
-from ident.diagnosis.commission import delay_std
+from ident.diagnosis.commission import delay_std, with_far_presliding
 from ident.diagnosis.nominal import Arm
-from ident.diagnosis.presliding import with_far_presliding
 from ident.diagnosis.reference import DELAY_STD_S, Reference
-from ident.kinematics import Chain
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import ModelStructure
 from ident.model import DynamicModel
-from ident.structure import ModelStructure
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:

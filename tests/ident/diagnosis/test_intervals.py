@@ -9,8 +9,8 @@ from ident.diagnosis.bench import Bench
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.intervals import estimated, phases_of
 from ident.diagnosis.signatures import signature_bench
+from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 
 AMPLITUDE, VELOCITY = 0.4, 0.15

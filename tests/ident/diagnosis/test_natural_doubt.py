@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import Diagnosis, diagnose
+from ident.dynamics.kinematics import Chain
 from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis.deciding import Deciding
 from runner.diagnosis.decision import decisions
@@ -29,7 +29,12 @@ def of_joint_2(name: str, path: Sequence[float], chain: Chain) -> Deciding:
     points[1] = np.pad(path, 4)
     whole = round((points.shape[1] - 1) * STEP_S / 0.12) * 0.12
     return Deciding(
-        name, Experiment.SLOW_SWEEP, 2, ExcitationPlan(SplineMotion(whole, points), chain.joint_names, 1), (None,), ()
+        name,
+        Experiment.SLOW_SWEEP,
+        2,
+        ExcitationPlan(SplineMotion(whole, points), chain.joint_names, 1),
+        (None,),
+        (),
     )
 
 

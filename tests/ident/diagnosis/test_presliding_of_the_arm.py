@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.nominal import Arm
+from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Setting
-from ident.kinematics import Chain
 
 DT = 1e-3
 

@@ -12,9 +12,9 @@ import pytest
 from fri.errors import DataError
 from ident.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from ident.diagnosis.signatures import signature_bench
-from ident.kinematics import Chain
-from ident.regressor import torque
-from ident.signals.filters import low_pass
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
+from ident.rows.filters import low_pass
 from lwr_driver.session import JointColumns, Session
 
 NOISE = 0.04

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.kinematics import Chain
 from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
-from ident.kinematics import Chain
 from lwr_driver.session import Session
 from runner.diagnosis import Study, study
 from runner.diagnosis.deciding import Deciding

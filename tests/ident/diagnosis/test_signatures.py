@@ -8,7 +8,7 @@ import pytest
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import Bench
 from ident.diagnosis.signatures import overlap, signature_bench, signatures
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]

@@ -1,4 +1,4 @@
-"""Arms that several tests use."""
+"""Arms of several tests."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.kinematics import Chain
+from ident.dynamics.kinematics import Chain
 from lwr_driver.configuration import find
 
 RIGHT = np.pi / 2
@@ -102,14 +102,14 @@ def states(chain: Chain, samples: int, seed: int = 0) -> tuple[np.ndarray, np.nd
 
 def bodies(n: int, seed: int = 0) -> np.ndarray:
     """(n, 10) inertial parameters of real bodies (random positive definite pseudo-inertia)."""
-    from ident.parameters import from_pseudo_inertia
+    from ident.dynamics.parameters import from_pseudo_inertia
 
     root = np.random.default_rng(seed).normal(size=(n, 4, 4))
     return from_pseudo_inertia(root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(4))
 
 
 def shared(path: str) -> Path:
-    """A file of the measured data that may lie beside the project."""
+    """A file of the measured data beside the project."""
     file = DATA / path
     if not file.is_file():
         pytest.skip(f"{file} is absent: the recordings of other people's robots are not part of the project")

@@ -5,10 +5,10 @@ import pytest
 import yaml
 
 from fri.errors import ConfigurationError, DataError
-from ident.base import closed_form_base, numeric_base
-from ident.base.numeric import rank_at_gap
-from ident.kinematics import Chain
-from ident.structure import Condition, Coupling, ModelStructure
+from ident.dynamics.base_closed_form import closed_form_base
+from ident.dynamics.base_set import numeric_base, rank_at_gap
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Condition, Coupling, ModelStructure
 from lwr_driver.configuration import find
 from tests.ident.dynamics.core_arms import (
     lwr,
@@ -152,7 +152,7 @@ def test_the_coupled_wrist_of_the_tx40_adds_three():
 
 
 def test_a_scara_regroups_its_prismatic_drive():
-    """z4 parallel to z1: M4 is Ia4 and a weight, besides what it adds to the links before."""
+    """z4 parallel to z1: M4 is Ia4 and a weight, besides its share in the links before."""
     structure = ModelStructure(scara(), 2, sides=("motor",), without=("Fvl", "Fcl", "offl"))
     base = assert_same(structure)
     assert base.status("M4") == "a base parameter"
@@ -198,7 +198,7 @@ def test_expand_gives_the_nearest_to_the_prior():
     near, least = base.expand(values, prior), base.expand(values)
     assert base.reduce(near) == pytest.approx(values, abs=1e-12)
     assert base.reduce(least) == pytest.approx(values, abs=1e-12)
-    # The way from the prior stands at right angles on everything that the torque does not show.
+    # The step from the prior is orthogonal to everything invisible in the torque.
     _, _, null = np.linalg.svd(base.matrix)
     assert null[102:] @ (near - prior) == pytest.approx(np.zeros(34), abs=1e-12)
 

@@ -1,12 +1,12 @@
-"""Chains from tables and from URDFs whose frames are, or are not, modified-DH frames."""
+"""Chains from tables and from URDFs, with modified-DH frames or others."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError
-from ident import regressor
-from ident.kinematics import Chain
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 from tests.ident.dynamics.core_arms import RIGHT, bodies, lwr, shared, states
 
 INERTIAL = (
@@ -16,7 +16,7 @@ INERTIAL = (
 
 
 def urdf(joints: list[dict[str, str]], extra: str = "") -> str:
-    """A URDF of a chain whose moving links all have a body."""
+    """A URDF of a chain with a body for each moving link."""
     links = ['<link name="l0"/>']
     for number, joint in enumerate(joints, start=1):
         body = INERTIAL.format(m=1.0 + 0.3 * number, x=0.01 * number)
@@ -177,7 +177,7 @@ def test_part_of_a_tree_is_chosen_by_its_tip():
         (urdf([{"type": "floating"}]), "'floating' is not supported"),
         (urdf([{"axis": "0 0 0"}]), "axis has no length"),
         (urdf([{"xyz": "0 0"}]), "must hold 3 finite numbers"),
-        (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', which does not exist"),
+        (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', missing in the file"),
     ],
 )
 def test_unusable_urdfs_are_refused_with_the_reason(text, message):

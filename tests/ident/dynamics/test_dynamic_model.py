@@ -5,9 +5,10 @@ import pytest
 import yaml
 
 from fri.errors import ConfigurationError
-from ident.base import numeric_base
-from ident.model import Condition, Coupling, DynamicModel, ModelStructure
-from ident.model_file import model_text, read_model, write_model
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.structure import Condition, Coupling, ModelStructure
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import model_text, read_model, write_model
 from tests.ident.dynamics.core_arms import bodies, lwr, scara, states, tx40
 
 STRUCTURES = {
@@ -163,7 +164,7 @@ def edited(change) -> dict:
         (lambda c: c["parameters"].append(c["parameters"][0]), "appears twice|rows for"),
         (lambda c: c["covariance"].pop(), "rows for"),
         (lambda c: c["covariance"].__setitem__(1, "1.0"), r"`covariance\[1\]` must hold 2 finite numbers"),
-        (lambda c: c["covariance"].__setitem__(1, "1.0 x"), r"`covariance\[1\]` holds something"),
+        (lambda c: c["covariance"].__setitem__(1, "1.0 x"), r"`covariance\[1\]` holds an entry"),
         (lambda c: c.pop("conditions"), "`conditions` is missing"),
         (lambda c: c["chain"]["joints"][0].update(alfa=1.0), "unknown key `alfa`; did you mean `alpha`"),
     ],

@@ -15,12 +15,12 @@ import yaml
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident import parameters
-from ident.base import numeric_base
+from ident.dynamics import parameters
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.physical import project, reference_bodies
+from ident.dynamics.structure import ModelStructure
 from ident.export import CoupledDrives, Program, StandardModel, to_c, to_mjcf, to_numpy, to_urdf
-from ident.kinematics import Chain
-from ident.physical import project, reference_bodies
-from ident.structure import ModelStructure
 from lwr_driver.configuration import CONFIGS
 
 Floats = NDArray[np.float64]
@@ -187,7 +187,7 @@ def test_a_name_that_is_no_identifier_is_refused() -> None:
 
 
 def consistent_lwr() -> StandardModel:
-    """Bodies that differ from the URDF's, with the base parameters of Table 2."""
+    """Bodies other than the URDF's, with the base parameters of Table 2."""
     chain, rows = table2()
     structure = ModelStructure(chain)
     base = numeric_base(structure)

@@ -9,12 +9,12 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError
-from ident import parameters
-from ident.base import numeric_base
+from ident.dynamics import parameters
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coulomb, Coupling, ModelStructure
 from ident.export import Program, consistent_parameters, standard_model, to_mjcf, to_numpy, to_urdf
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.structure import Coulomb, Coupling, ModelStructure
+from ident.model.dynamic_model import DynamicModel
 
 
 def states(n: int, count: int = 30) -> np.ndarray:
@@ -137,4 +137,4 @@ def test_effects_that_are_left_out_are_named(truth_model: DynamicModel) -> None:
             },
         ),
     )
-    assert "Effects of the model that are not in this file: stribeck." in to_numpy(standard_model(extended))
+    assert "Effects of the model missing in this file: stribeck." in to_numpy(standard_model(extended))

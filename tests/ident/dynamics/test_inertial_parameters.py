@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError
-from ident import parameters
+from ident.dynamics import parameters
 from tests.ident.dynamics.core_arms import bodies
 
 

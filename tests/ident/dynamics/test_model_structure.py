@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from fri.errors import ConfigurationError, DataError
-from ident import regressor
-from ident.parameters import PER_LINK
-from ident.structure import Condition, Coulomb, Coupling, ModelStructure, Samples
+from fri.errors import ConfigurationError
+from ident.dynamics import regressor
+from ident.dynamics.parameters import PER_LINK
+from ident.dynamics.structure import Coulomb, Coupling, ModelStructure
 from tests.ident.dynamics.core_arms import bodies, lwr, states, tx40
 
 
@@ -73,40 +73,6 @@ def test_selected_columns_are_those_of_the_whole_matrix():
         assert np.array_equal(part, whole[:, columns])
 
 
-def test_row_blocks_name_every_row_once():
-    structure = ModelStructure(lwr(), 2, payloads=("load",))
-    sessions = [(Condition(), 5), (Condition("load", ("joint",)), 3)]
-    assert structure.rows(sessions) == 5 * 14 + 3 * 7
-    blocks = list(structure.row_blocks(sessions))
-    covered = np.concatenate([np.arange(91)[block.rows] for block in blocks])
-    assert covered.tolist() == list(range(91))
-    assert [(b.session, b.side, b.joint) for b in blocks[6:8]] == [(0, "motor", 6), (0, "joint", 0)]
-
-
-def test_stack_takes_the_sides_that_were_measured():
-    structure = ModelStructure(lwr(), 2, payloads=("load",))
-    q, qd, qdd = states(structure.chain, 4)
-    tau = np.arange(28.0).reshape(4, 7)
-    sessions = [Samples(q, qd, qdd, joint=tau), Samples(q, qd, qdd, tau, tau + 100, "load")]
-    stacked = structure.stack(sessions)
-    assert stacked.shape == (7 * 4 + 14 * 4, 136)
-    assert np.array_equal(stacked[:28], structure.regressor(q, qd, qdd, sides=("joint",)))
-    assert np.array_equal(stacked[28:], structure.regressor(q, qd, qdd, payload="load"))
-    assert structure.torques(sessions[1])[[0, 1, 4, 28]].tolist() == [0, 7, 1, 100]
-    three = ModelStructure(lwr(), 3)
-    assert three.torques(Samples(q, qd, qdd, tau, tau + 1)).tolist() == [-1.0] * 28
-
-
-def test_a_missing_channel_is_named():
-    q, qd, qdd = states(lwr(), 4)
-    with pytest.raises(DataError, match=r"Model 3 needs difference torque; the session has joint torque"):
-        ModelStructure(lwr(), 3).measured(Samples(q, qd, qdd, joint=q))
-    with pytest.raises(DataError, match=r"Model 1 needs joint torque; the session has motor torque"):
-        ModelStructure(lwr(), 1).measured(Samples(q, qd, qdd, motor=q))
-    with pytest.raises(DataError, match="no session"):
-        ModelStructure(lwr(), 1).stack([])
-
-
 def test_terms_are_left_out_by_symbol_and_by_name():
     structure = ModelStructure(lwr(), 2, without=("Fvl", "offm3"))
     q, qd, qdd = states(structure.chain, 5)
@@ -114,7 +80,7 @@ def test_terms_are_left_out_by_symbol_and_by_name():
     gone = [k for k, name in enumerate(structure.names) if name.startswith("Fvl") or name == "offm3"]
     assert np.flatnonzero(~structure.active).tolist() == gone
     assert not matrix[:, gone].any()
-    with pytest.raises(ConfigurationError, match="'Fvx', which is no parameter"):
+    with pytest.raises(ConfigurationError, match="'Fvx', not a parameter"):
         ModelStructure(lwr(), 2, without=("Fvx",))
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident import parameters
-from ident.physical import project, reference_bodies
+from ident.dynamics import parameters
+from ident.dynamics.physical import project, reference_bodies
 
 
 def bodies(count: int, seed: int = 0) -> np.ndarray:

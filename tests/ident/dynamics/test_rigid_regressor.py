@@ -5,8 +5,8 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident import parameters, regressor
-from ident.kinematics import Chain
+from ident.dynamics import parameters, regressor
+from ident.dynamics.kinematics import Chain
 from tests.ident.dynamics.core_arms import bodies, lwr, puma560, random_chain, scara, states
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Motion, Setting, Shape, find_effect
 from ident.effects.load import leaning, slide
 from ident.effects.model_torque import check_entry
 from ident.effects.motion import dahl, play
-from ident.kinematics import Chain
 
 TABLE = {
     "motor": {
@@ -57,7 +57,7 @@ def motion(chain: Chain, bodies: np.ndarray) -> Motion:
     q = 0.6 * np.sin(w * time[:, None] + phase)
     qd = 0.6 * w * np.cos(w * time[:, None] + phase)
     qdd = -0.6 * w**2 * np.sin(w * time[:, None] + phase)
-    from ident.regressor import torque
+    from ident.dynamics.regressor import torque
 
     joint = torque(chain, q, qd, qdd, bodies)
     return Motion(
@@ -141,7 +141,7 @@ def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: Motion) -> 
 
 def test_tilt_column_is_gravity_of_a_tilted_base(motion: Motion) -> None:
 
-    from ident.regressor import gravity_torque
+    from ident.dynamics.regressor import gravity_torque
 
     angle = 1e-3
     tilted = replace(motion.chain, gravity=9.81 * np.array([0.0, -np.sin(angle), -np.cos(angle)]))

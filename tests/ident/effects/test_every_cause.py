@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,15 +14,18 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError
-from ident import regressor
+from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, Effect, Form, Motion, Setting, Shape, described, find_effect
 from ident.effects.model_torque import check_entry, parameter_values
-from ident.kinematics import Chain
 
 URDF = Path(__file__).parents[3] / "configs" / "lwr4plus.urdf"
 NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 JOINT, DT = 3, 1e-3
 VISCOUS, COULOMB = 2.0, 1.5
+
+# A count of a session log has the name of a cause.
+WORDS_OF_LOGS = ("lost_samples",)
 # Sizes of coefficients by unit: small enough for what is linearised.
 SIZES = {"rad": 1e-3, "rad/Nm": 1e-4, "kg": 0.5, "kg m": 0.05, "N": 5.0, "1": 0.1}
 # Columns that are smoothed, or taken between samples, agree less well.
@@ -248,6 +253,21 @@ def test_every_cause_has_words(effect: Effect, form: Form | None, motion: Motion
     assert effect.cause in repr(effect)
     assert set(effect.confused_with) <= set(EFFECTS) - {effect.cause}
     assert set(effect.mean_of) <= set(EFFECTS)
+
+
+def test_no_other_module_names_a_cause() -> None:
+    names = "|".join(EFFECTS)
+    for package in ("fri", "lwr_driver", "ident", "sim_backend", "runner"):
+        for path in (URDF.parents[1] / package).rglob("*.py"):
+            if "effects" in path.parent.name:
+                continue
+            found = [
+                node.value
+                for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                if isinstance(node, ast.Constant) and isinstance(node.value, str)
+                if re.fullmatch(names, node.value) and node.value not in WORDS_OF_LOGS
+            ]
+            assert not found, (path, found)
 
 
 def test_a_shape_is_a_mapping_with_a_form() -> None:

@@ -80,7 +80,7 @@ def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
     from dataclasses import replace
 
     time, plain = springs()
-    from ident.kinematics import Chain
+    from ident.dynamics.kinematics import Chain
 
     chain = Chain.from_table([{"name": "one"}])
     zero = np.zeros_like(plain.angle)

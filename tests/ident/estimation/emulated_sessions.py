@@ -1,4 +1,4 @@
-"""Sessions of the emulated arm, whose true parameters are known: controller, link and log in one process."""
+"""Sessions of the emulated arm with known true parameters: controller, link and log in one process."""
 
 from __future__ import annotations
 

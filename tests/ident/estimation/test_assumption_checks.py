@@ -1,11 +1,11 @@
-"""Each assumption is found to hold where it does and violated where it is."""
+"""Each assumption is found to hold or to be violated, as it is."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from ident.assumptions import check_assumptions, repeatability
+from ident.estimation.assumptions import check_assumptions, repeatability
 from ident.estimators import InstrumentalVariables, Problem, RowGroup, WeightedLeastSquares
 from tests.ident.regression_problems import ar1, design, problem
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
+from ident.estimation.identify import IdentificationSettings
+from ident.estimation.mounting import find_mounting
 from ident.estimators import nearest_consistent
-from ident.identify import IdentificationSettings
-from ident.kinematics import Chain
-from ident.mounting import find_mounting
-from ident.regressor import torque
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
 
@@ -54,7 +54,7 @@ def recorded(gravity: np.ndarray, *, seed: int, seconds: float = 30.0) -> Sessio
 
 
 def leaning(about_x: float, about_y: float) -> np.ndarray:
-    """Gravity in the axes of a base that was rotated by small angles about x and then y."""
+    """Gravity in the axes of a base rotated by small angles about x and then y."""
     cx, sx, cy, sy = np.cos(about_x), np.sin(about_x), np.cos(about_y), np.sin(about_y)
     rotation = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]) @ np.array(
         [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from ident.identify import Identification, identify
+from ident.estimation.identify import Identification, identify
 from runner.published import TABLE_2
 from tests.ident.estimation.emulated_sessions import record_pair
 from tests.ident.estimation_arm import chain, true_base
@@ -49,7 +49,7 @@ def test_essential_parameters_are_those_of_table_2_and_others_that_the_arm_reall
         assert found.essential is not None
         truth = dict(zip(found.base.names, true_base(found), strict=True))
         essential = set(found.essential.names)
-        # What a random motion hides of Table 2 is small; nothing that the gravity or friction show is lost.
+        # A random motion hides little of Table 2; nothing visible in gravity or friction is lost.
         assert len(published() - essential) <= 4
         zero = [name for name in essential - published() if truth[name] == 0.0]
         assert len(zero) <= 4

@@ -1,4 +1,4 @@
-"""Elimination of parameters that the data do not support."""
+"""Elimination of parameters not supported by the data."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.essential import EssentialSettings, find_essential
+from ident.estimation.essential import EssentialSettings, find_essential
 from ident.estimators import Problem, WeightedLeastSquares
 from tests.ident.regression_problems import ar1, design, problem
 
@@ -93,5 +93,5 @@ def test_impossible_settings_are_refused(settings):
 
 def test_an_unknown_name_is_refused():
     data = case()
-    with pytest.raises(ConfigurationError, match="no base parameter"):
+    with pytest.raises(ConfigurationError, match="not a base parameter"):
         find_essential(data, WeightedLeastSquares().fit(data), EssentialSettings(keep=("Fvl9",)))

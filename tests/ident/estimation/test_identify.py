@@ -1,6 +1,4 @@
-"""From sessions to a model, end to end on a simulated arm, and what happens to sessions that
-cannot be used.
-"""
+"""From sessions to a model, end to end on a simulated arm, and the refusal of unusable sessions."""
 
 from __future__ import annotations
 
@@ -12,10 +10,10 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident.essential import EssentialSettings
+from ident.estimation.essential import EssentialSettings
+from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimators import CovarianceSettings
-from ident.identify import Identification, IdentificationSettings, identify
-from ident.signals import SignalSettings
+from ident.rows import SignalSettings
 from tests.ident import estimation_arm as arm
 
 NOISY = arm.Sensors(position=1e-5, joint=0.1, motor=0.5, correlation_s=0.2, motor_delay_s=0.004)

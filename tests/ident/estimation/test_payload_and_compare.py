@@ -12,20 +12,17 @@ import pytest
 from click.testing import CliRunner
 
 from fri.errors import ConfigurationError, DataError
-from ident import parameters
-from ident.base import numeric_base
-from ident.compare import compare
+from ident.dynamics import parameters
+from ident.dynamics.base_set import numeric_base
+from ident.dynamics.structure import Condition, ModelStructure
+from ident.estimation.compare import compare
+from ident.estimation.payload import identify_payload, with_payload
 from ident.estimators.covariance import CovarianceSettings
 from ident.model import DynamicModel
-from ident.model_file import read_model, write_model
-from ident.payload import identify_payload, with_payload
-from ident.signals.settings import SignalSettings
-from ident.structure import Condition, ModelStructure
+from ident.model.model_file import read_model, write_model
+from ident.rows.filters import SignalSettings
 from runner.cli import main
-from runner.commands import compare as compare_command
-from runner.commands import export as export_command
-from runner.commands import payload as payload_command
-from runner.commands import validate as validate_command
+from runner.commands.models import compare_command, export_command, payload_command, validate_command
 from tests.ident.known_arm import LOAD
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
@@ -63,7 +60,7 @@ def test_payload_of_a_perfectly_known_arm(truth_model: Any, loaded: Any) -> None
 def test_uncertainty_of_the_arm_is_part_of_the_payloads(
     estimated: Callable[..., DynamicModel], loaded: Any
 ) -> None:
-    """Over many arm models that scatter as they say, the payload scatters as it says."""
+    """Over many arm models with the stated scatter, the payload has its stated scatter."""
     z = []
     for seed in range(12):
         found = identify_payload(
@@ -214,19 +211,19 @@ def test_commands_work_on_files(
     whole, arm = tmp_path / "whole.yaml", tmp_path / "arm.yaml"
     write_model(estimated(4, 0.002), whole)
     write_model(bare(estimated(5, 0.002)), arm)
-    table = run(validate_command.command, whole, session.path, "--against", arm)
+    table = run(validate_command, whole, session.path, "--against", arm)
     assert "model of LWR4+" in table
-    content = json.loads(run(validate_command.command, whole, session.path, "--json"))
+    content = json.loads(run(validate_command, whole, session.path, "--json"))
     assert len(content["sessions"][0]["scores"]) == 14
-    assert "differ by more than chance" in run(compare_command.command, whole, arm)
-    assert json.loads(run(compare_command.command, whole, arm, "--json"))["p"] > 0
-    text = run(payload_command.command, arm, loaded.path, "--out", tmp_path / "with_load.yaml")
+    assert "differ by more than chance" in run(compare_command, whole, arm)
+    assert json.loads(run(compare_command, whole, arm, "--json"))["p"] > 0
+    text = run(payload_command, arm, loaded.path, "--out", tmp_path / "with_load.yaml")
     mass = re.search(r"mass (\S+) ± (\S+) kg", text)
     assert mass is not None
     assert float(mass[1]) == pytest.approx(3.3, abs=5 * float(mass[2]))
     assert read_model(tmp_path / "with_load.yaml").structure.payloads == ("load",)
     outputs = [tmp_path / name for name in ("lwr.urdf", "lwr.xml", "lwr.c", "lwr.py")]
-    text = run(export_command.command, whole, *outputs, "--payload", "load")
+    text = run(export_command, whole, *outputs, "--payload", "load")
     assert all(output.exists() for output in outputs)
     refused = CliRunner().invoke(main, ["export", str(whole), str(outputs[0])])
     assert refused.exit_code == ConfigurationError.exit_code

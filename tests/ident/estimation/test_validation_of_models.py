@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident.competitors import competitor_scores
-from ident.cross_validation import cross_validate
-from ident.forward_simulation import simulate, simulate_session
-from ident.identify import IdentificationSettings, identify
-from ident.model import DynamicModel
-from ident.signals.settings import SignalSettings
-from ident.validation import Validation, validate
+from ident.estimation.compare import competitor_scores
+from ident.estimation.forward_simulation import simulate, simulate_session
+from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.validate import Validation, cross_validate, validate
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
 
@@ -81,7 +80,7 @@ def test_a_session_that_the_estimate_has_seen_is_refused_or_labelled(
         {"sessions": ["unloaded.mcap"], "experiment": ""},
     ):
         model = estimated(provenance=provenance)
-        with pytest.raises(DataError, match=r"unloaded\.mcap: the estimate was made from this session"):
+        with pytest.raises(DataError, match=r"unloaded\.mcap: the model was fitted to this session"):
             validate(model, [unloaded, loaded], settings=PLAIN)
         result = validate(model, [unloaded, loaded], settings=PLAIN, allow_seen=True)
         assert [score.seen for score in result.scores] == [True, False]
@@ -177,7 +176,7 @@ def test_forward_simulation_feels_a_wrong_payload(truth_model: Any, loaded: Any)
 
 
 def test_simulated_pendulum_keeps_its_energy_balance(truth_model: Any) -> None:
-    """The work of the controller is what the energy gains and friction takes."""
+    """The work of the controller is the gain of energy plus the loss in friction."""
     times = np.arange(0, 2.0, 5e-4)
     target = 0.3 * np.sin(2 * np.pi * 0.5 * times)[:, None] * np.ones(7)
     q, qd, torque = simulate(truth_model, times, target, side="joint")
@@ -215,5 +214,5 @@ def test_cross_validation_predicts_each_session_by_the_others(bench: Any, unload
     with pytest.raises(DataError, match="two at least"):
         cross_validate([unloaded], chain, settings)
     found = identify([unloaded, other], chain, settings)
-    with pytest.raises(DataError, match="the estimate was made from this session"):
+    with pytest.raises(DataError, match="the model was fitted to this session"):
         validate(found.model, [other], settings=PLAIN)

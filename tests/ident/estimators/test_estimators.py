@@ -1,4 +1,4 @@
-"""Estimators on regressions whose truth is known."""
+"""Estimators on regressions with known truth."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.parameters import from_com, pseudo_inertia
 from ident.estimators import (
     BodyPrior,
     CovarianceSettings,
@@ -30,7 +31,6 @@ from ident.estimators import (
     WeightedLeastSquares,
     nearest_consistent,
 )
-from ident.parameters import from_com, pseudo_inertia
 from tests.ident.regression_problems import ar1, design, problem
 
 CHI = np.linspace(-2.0, 2.5, 12)

@@ -12,8 +12,8 @@ from ident.excitation.information import Columns, Evaluator
 from ident.excitation.motions import FourierBasis, Samples
 from ident.excitation.program import Constraints, Program
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.collision import CollisionChecker
 
 
 @pytest.fixture(scope="module")

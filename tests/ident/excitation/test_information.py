@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
+from ident.dynamics.structure import Condition, ModelStructure
 from ident.excitation.arm_model import ArmEstimate, Mechanism
 from ident.excitation.information import Assembly, Columns, Evaluator, Rows
 from ident.excitation.motions import FourierBasis
-from ident.structure import Condition, ModelStructure
 
 NAMES = (
     "ZZ1R",

@@ -11,7 +11,8 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError, OperatorError, RefusedError
-from ident.base import closed_form_base
+from ident.dynamics.base_closed_form import closed_form_base
+from ident.dynamics.structure import ModelStructure
 from ident.excitation import (
     ExcitationPlan,
     Knowledge,
@@ -36,10 +37,9 @@ from ident.excitation.comparison import random_points
 from ident.excitation.motions import Samples
 from ident.excitation.search import judge, polish
 from ident.model import DynamicModel
-from ident.model_file import write_model
-from ident.structure import ModelStructure
+from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Box, Cell
+from lwr_driver.arm.cell import Box, Cell
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import SessionWriter, session_metadata
 

@@ -7,8 +7,8 @@ import pytest
 from ident.excitation.arm_model import Mechanism, tip_path
 from ident.excitation.clearance import Space, distances, row_gradient, space_of
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Box, Cell, PayloadShape
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Box, Cell, PayloadShape
+from lwr_driver.arm.collision import CollisionChecker
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from ident.dynamics.parameters import from_pinocchio
 from ident.excitation.arm_model import Mechanism
 from ident.excitation.sweep import backward, forward
-from ident.parameters import from_pinocchio
 from lwr_driver.arm import Arm
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.kinematics import Chain
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
 from runner.cli import main
@@ -220,7 +220,7 @@ def test_channels_of_unequal_length_are_an_error(tmp_path: Path) -> None:
     [
         ({"joint_torque": None}, "no torque"),
         ({"offset_rad": [1.0]}, "1 entries for 2 joints"),
-        ({"position": PLAIN["position"] | {"unit": "Nm"}}, "does not measure that"),
+        ({"position": PLAIN["position"] | {"unit": "Nm"}}, "cannot have the unit"),
         ({"position": PLAIN["position"] | {"side": "motor"}}, "give `transmission`"),
         ({"position": PLAIN["position"] | {"sign": [1, 2]}}, "must be 1 or -1"),
         ({"position": PLAIN["position"] | {"unit": "counts"}}, "needs? `scale`|give `scale`"),

@@ -1,7 +1,7 @@
 """Three recordings of a real LWR4+ by FloBaRoID's authors (github kjyv/FloBaRoID, LGPL-3), as sessions.
 
-Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast. The score is the one that others use on
-these files: the file's own q, qd, qdd, all of its 25 s, every ninth sample, ||e|| / ||tau|| over all joints.
+Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast. The score is the usual one for these files:
+the file's own q, qd, qdd, all of its 25 s, every ninth sample, ||e|| / ||tau|| over all joints.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.identify import Identification, IdentificationSettings, identify
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.mounting import Mounting, find_mounting
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.mounting import Mounting, find_mounting
 from lwr_driver.configuration import CONFIGS, find
 from lwr_driver.session import Session, read_session
 

@@ -1,4 +1,4 @@
-"""What the diagnosis names on recordings of real arms, and what that is worth on motion that was not fitted.
+"""Findings of the diagnosis on recordings of real arms, and their worth on held-out motion.
 
 Other software on the LWR4+ runs, relative error over all joints: FloBaRoID with a CAD prior 6.03 % ({1, 2} -> 3) and
 3.48 % (3 -> 1).
@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import ArmData, Diagnosis, Finding, diagnose
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.model import DynamicModel
-from ident.structure import Coupling
+from ident.model.dynamic_model import DynamicModel
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 from tests.ident.real.real_lwr4 import DATA, EVERY, chain, mounted, needs_recordings, repeatability, session
@@ -47,7 +47,7 @@ def relative_percent(model: DynamicModel, run: int) -> float:
 
 
 def finding(found: Diagnosis, cause: str, joints: tuple[int, ...]) -> Finding:
-    """The finding that names a cause, or has it as a look-alike."""
+    """The finding of a cause, or with it as a look-alike."""
     for f in found.findings:
         if (cause, joints) in [(f.cause, f.joints), *((c, j) for c, j, _ in f.alternatives)]:
             return f

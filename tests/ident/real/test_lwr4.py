@@ -1,4 +1,4 @@
-"""What the estimators reach on a real LWR4+, held-out runs and honest deviations.
+"""Errors of the estimators on a real LWR4+, held-out runs and honest deviations.
 
 Other software on the same files and with the same score (relative error, {1, 2} -> 3 and 3 -> 1): FloBaRoID's
 semidefinite program with a CAD prior 6.03 % and 3.48 %, ordinary least squares 14.1 % and 9.6 %. Textbook
@@ -64,7 +64,7 @@ def test_standard_deviations_hold_between_two_recordings_of_one_motion():
 
 
 def test_posterior_deviations_hold_between_two_different_motions():
-    """Where weighted least squares is off by four of its standard deviations."""
+    """Weighted least squares is off by four of its standard deviations here."""
     first, second = (identified(runs, "map").estimate for runs in ((1, 2), (3,)))
     z = (first.values - second.values) / np.hypot(first.std, second.std)
     assert np.sqrt(np.mean(z**2)) < 1.5

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.identify import Identification, IdentificationSettings, identify
-from ident.signals.filters import differentiate, low_pass
-from ident.signals.timebase import stretches
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.rows.filters import differentiate, low_pass
+from ident.rows.timebase import stretches
 from lwr_driver.session import JointColumns, Session
 from tests.ident import estimation_arm as arm
 

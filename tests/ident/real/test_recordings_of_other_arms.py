@@ -1,4 +1,4 @@
-"""Recordings that other people published: imported, and held against what they found."""
+"""Recordings published by others: import, and comparison with their results."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.identify import Identification, IdentificationSettings, identify
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import gravity_torque
+from ident.dynamics.structure import Coupling
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.validate import validate
 from ident.import_log import LogMapping, import_log
-from ident.kinematics import Chain
-from ident.regressor import gravity_torque
-from ident.signals.settings import SignalSettings
-from ident.signals.timebase import flag_outliers
-from ident.structure import Coupling
-from ident.validation import validate
+from ident.rows.filters import SignalSettings
+from ident.rows.timebase import flag_outliers
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import read_session
 
@@ -42,7 +42,7 @@ def folder(name: str) -> Path:
 def tx40(tmp_path_factory: pytest.TempPathFactory) -> Identification:
     """As its source did it: 100 Hz position filter, speeds below 1 % of the limit left out (0.05 rad/s).
 
-    A row stays while its filter rests to one half on samples that move.
+    A row stays while half of its filter is on moving samples.
     """
     source = folder("tx40")
     path = tmp_path_factory.mktemp("tx40") / "tx40.mcap"

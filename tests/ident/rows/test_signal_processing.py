@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fri.errors import ConfigurationError, DataError
-from ident.observation import observe
-from ident.signals import (
+from ident.dynamics.structure import ModelStructure
+from ident.rows import (
     ParallelFilter,
     SignalSettings,
     advice,
@@ -21,9 +21,9 @@ from ident.signals import (
     optimal_cutoff,
     prepare,
 )
-from ident.signals.filters import interpolate_uniform
-from ident.signals.timebase import flag_outliers, sample_period, stretches
-from ident.structure import ModelStructure
+from ident.rows.filters import interpolate_uniform
+from ident.rows.observation import observe
+from ident.rows.timebase import flag_outliers, sample_period, stretches
 from tests.ident import estimation_arm as arm
 
 

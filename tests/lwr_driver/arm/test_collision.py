@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from lwr_driver.cell import Box, Cell, PayloadShape
-from lwr_driver.collision import CollisionChecker
+from lwr_driver.arm.cell import Box, Cell, PayloadShape
+from lwr_driver.arm.collision import CollisionChecker
 from tests.lwr_driver.driver_rig import arm
 
 BENT = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])

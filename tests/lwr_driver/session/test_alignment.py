@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from lwr_driver.alignment import Track, align
+from lwr_driver.session.alignment import Track, align
 from tests.lwr_driver.session.motions import excitation
 from tests.lwr_driver.session.session_samples import JOINTS
 

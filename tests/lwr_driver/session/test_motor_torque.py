@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import parse
-from lwr_driver.motor_torque import KrlMotorTorque, KrlTorqueDecoder, match_torques
 from lwr_driver.session import JointColumns
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder, match_torques
 from tests.lwr_driver.session.session_samples import JOINTS, signals
 
 

@@ -14,8 +14,8 @@ from mcap_ros2.writer import Writer as RosWriter
 
 from fri.errors import DataError
 from lwr_driver.session import SessionWriter, describe, read_session
+from lwr_driver.session.messages import JOINT_STATE, STRING
 from lwr_driver.session.scan import Scan
-from lwr_driver.session.schemas import JOINT_STATE, STRING
 from tests.lwr_driver.session.session_samples import EPOCH, JOINTS, METADATA, signals, write_session
 
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lwr_driver.motor_torque import KrlMotorTorque
-from lwr_driver.recording import Recording, SessionRequest, utc_offset_ns
 from lwr_driver.session import read_session
+from lwr_driver.session.motor_torque import KrlMotorTorque
+from lwr_driver.session.recording import Recording, SessionRequest, utc_offset_ns
 from tests.lwr_driver.session.session_samples import EPOCH, JOINTS, METADATA, URDF, rows
 
 COUNT = 1300

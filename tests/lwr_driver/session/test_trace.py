@@ -9,7 +9,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from fri.errors import DataError
 from lwr_driver.session import SessionWriter, read_session
-from lwr_driver.trace import import_trace, read_trace
+from lwr_driver.session.trace import import_trace, read_trace
 from tests.lwr_driver.session.motions import excitation, loads
 from tests.lwr_driver.session.session_samples import EPOCH, JOINTS, METADATA
 

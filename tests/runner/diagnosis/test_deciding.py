@@ -15,12 +15,11 @@ from ident.effects import EFFECTS
 from ident.effects.words import quantity_text
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from runner.diagnosis.deciding import Deciding, offers, open_findings
 from runner.diagnosis.decision import decision_text, decisions
 from runner.experiment_file import Experiment
-from runner.planning import excitation_rows, plan_excitation
-from runner.preparation import session_motion
+from runner.planning import excitation_rows, plan_excitation, session_motion
 
 Place = tuple[str, tuple[int, ...]]
 

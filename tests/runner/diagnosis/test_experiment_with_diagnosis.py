@@ -15,9 +15,9 @@ import yaml
 from click.testing import CliRunner
 
 from fri.errors import DataError
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
-from lwr_driver.cell import Cell
+from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session
 from runner.cli import main
 from runner.commissioning import record_sets
@@ -209,7 +209,7 @@ def test_validate_and_export_take_the_extended_model(done: Done) -> None:
     told = lwr_run("validate", extended, str(done.folder / "unloaded.mcap"), "--allow-seen")
     assert "presliding_hysteresis" in told
     told = lwr_run("export", extended, str(done.folder / "extended.py"))
-    assert "Effects of the model that are not in this file: presliding_hysteresis" in told
+    assert "Effects of the model missing in this file: presliding_hysteresis" in told
     model = read_model(extended)
     assert model.effects[0]["parameters"]["amplitude"]["std"] > 0.0
     assert model.std is not None

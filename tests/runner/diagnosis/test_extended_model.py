@@ -11,8 +11,8 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
-from ident.model import DynamicModel
-from ident.model_file import read_model, write_model
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import read_model, write_model
 from lwr_driver.configuration import find
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig, load_configuration
@@ -145,7 +145,7 @@ def test_every_exporter_says_what_it_cannot_carry(healthy: DynamicModel) -> None
     plain, bodies = standard_model(extended), standard_model(extended, consistent=True)
     for text in (to_numpy(plain), to_c(plain, "arm"), to_urdf(bodies), to_mjcf(bodies, name="arm")):
         words = " ".join(text.replace("*", " ").replace("#", " ").split())
-        assert "Effects of the model that are not in this file: cable_spring, stribeck." in words
+        assert "Effects of the model missing in this file: cable_spring, stribeck." in words
 
 
 def test_parameters_of_effects_keep_their_intervals_in_the_file(

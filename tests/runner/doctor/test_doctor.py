@@ -19,12 +19,11 @@ from click.testing import CliRunner
 from fri.errors import NetworkError, RobotError
 from fri.packets import MSR_ID, MSR_SIZE, new_msr
 from lwr_driver.arm import Arm
-from lwr_driver.state import LinkState
+from lwr_driver.link import LinkState
 from runner.cli import main
 from runner.computer import Finding, examine_computer, find_interface
-from runner.doctor import Examination, Patient, judge_heard, judge_link
+from runner.doctor import Examination, Heard, LinkTest, Patient, judge_heard, judge_link, listen
 from runner.laboratory import free_port
-from runner.link_test import Heard, LinkTest, listen
 
 PATIENT = Patient(Arm.load(), "127.0.0.1", 49938, counter_int=1)
 
@@ -142,7 +141,7 @@ def test_datagrams_of_something_else_are_described() -> None:
     assert "of 100 bytes with id 0x3001 from 127.0.0.1" in str(heard)
     finding = judge_heard(PATIENT, heard, 10)[0]
     assert (finding.verdict, finding.who) == ("fail", NetworkError)
-    assert "not FRI 1.0" in finding.advice
+    assert "does not speak FRI 1.0" in finding.advice
 
 
 def test_a_controller_elsewhere_or_two_of_them() -> None:

@@ -13,6 +13,7 @@ import pytest
 from fri.errors import OperatorError
 from lwr_driver.driver import Waiting
 from lwr_driver.link import (
+    LinkState,
     advise_command,
     advise_connect,
     advise_leave,
@@ -21,11 +22,9 @@ from lwr_driver.link import (
     advise_quality,
     advise_rest,
 )
-from lwr_driver.state import LinkState
 from runner.experiment_file import Experiment, Payload
-from runner.laboratory import Laboratory
-from runner.operator import Person
-from runner.status import StatusLine
+from runner.laboratory import Laboratory, Person
+from runner.terminal import StatusLine
 
 ADVICE = (
     advise_command,

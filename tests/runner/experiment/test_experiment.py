@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.session import read_session
 from tests.runner.experiment.experiment_rig import Finished, experiment_file, messages, records, run
 
@@ -90,13 +90,13 @@ def test_log_keeps_the_contract(finished: Finished) -> None:
 
 
 @pytest.mark.slow
-def test_a_finished_experiment_is_estimated_again_and_told_as_json(finished: Finished) -> None:
+def test_a_finished_experiment_is_estimated_again_and_reported_as_json(finished: Finished) -> None:
     again = run("experiment", "--resume", str(finished.folder), "--yes", "--json")
     assert again.code == 0, again.text
-    told = json.loads(again.text[again.text.index("{") :])
-    assert told["exit_status"] == "success"
-    assert told["folder"] == str(finished.folder)
-    assert len(told["parameters"]) == 102
+    content = json.loads(again.text[again.text.index("{") :])
+    assert content["exit_status"] == "success"
+    assert content["folder"] == str(finished.folder)
+    assert len(content["parameters"]) == 102
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_a_payload_that_is_not_there_is_noticed_before_anything_moves(tmp_path: 
     done = run("experiment", str(file), "--yes", "--out", str(tmp_path / "out"))
     assert done.code == 3
     assert "payload 'paper_load' announced" in done.text
-    assert "about 3." in done.text
+    assert "corresponds to 3." in done.text
     assert not (tmp_path / "out" / "loaded.mcap").exists()
     assert (tmp_path / "out" / "unloaded.mcap").exists()
 
@@ -160,7 +160,7 @@ def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) 
         ([{"name": "check", "validation": True}], "every session is for validation"),
         (
             [{"name": "unloaded"}, {"name": "check", "validation": True, "payload": LOAD}],
-            "'paper_load', which no session before it identifies",
+            "'paper_load', not identified by another session",
         ),
     ],
 )

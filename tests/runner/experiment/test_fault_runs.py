@@ -19,7 +19,7 @@ from lwr_driver.driver import Driver, LinkSettings
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.session import read_session, session_metadata
 from runner.laboratory import free_port
-from runner.route import dwell
+from runner.planning import dwell
 from sim_backend.process import EmulatorProcess
 
 PERIOD_MS = 5

@@ -11,7 +11,7 @@ import numpy as np
 
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
-from runner.interrupt import Interrupts
+from runner.terminal import Interrupts
 from tests.runner.experiment.experiment_rig import experiment_file
 
 

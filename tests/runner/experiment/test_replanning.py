@@ -11,7 +11,7 @@ import yaml
 
 from ident.excitation import ExcitationPlan
 from ident.excitation.problem import PlanProblem
-from ident.model_file import read_model
+from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import find
 from lwr_driver.session import read_session

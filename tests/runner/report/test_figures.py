@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from runner.report.markup import Number, paragraph, table
-from runner.report.plot import STYLES, Band, Figure, Line, Panel, Points
-from runner.report.svg import figure_svg, ticks
-from runner.report.thinning import thin
+from runner.report.plot import STYLES, Band, Line, Panel, Points, thin
+from runner.report.svg import Figure, figure_svg, ticks
 
 SVG = "{http://www.w3.org/2000/svg}"
 

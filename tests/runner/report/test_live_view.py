@@ -187,8 +187,8 @@ def test_without_the_extra_nothing_is_started(monkeypatch: pytest.MonkeyPatch) -
 def test_driver_and_commands_are_there_without_the_extra() -> None:
     code = (
         "import sys, json\nsys.modules['plotly'] = sys.modules['viser'] = None\n"
-        "import lwr_driver.driver, runner.experiment, runner.commands.experiment, runner.commands.check\n"
-        "import runner.report.figures, runner.commands.report, runner.commands.preview\n"
+        "import lwr_driver.driver, runner.experiment, runner.commands.experiment, runner.commands.logs\n"
+        "import runner.report.figures, runner.commands.motions, runner.preview\n"
         "print(json.dumps('fine'))"
     )
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}

@@ -136,10 +136,10 @@ def test_a_motion_that_the_estimate_has_not_seen_stands_first_in_figure_3(
     assert [entry["name"] for entry in summary["signals"]] == ["unloaded.mcap", "loaded.mcap"]
     assert [(score["session"], score["seen"]) for score in summary["validation"]] == [("check.mcap", False)]
     titles = report.page.locator("#torque details > summary").all_inner_texts()
-    assert titles[0].startswith("check, joint torque, unseen by the estimate: ")
+    assert titles[0].startswith("check, joint torque, held out: ")
     shown = f"{100 * summary['validation'][0]['relative']['joint']:.2f} %"
     assert shown in titles[0]
-    row = report.page.locator("table.verdicts tr", has_text="unseen motion").inner_text()
+    row = report.page.locator("table.verdicts tr", has_text="held-out motion").inner_text()
     assert "motor" in row
     assert torque_figure(finished).name == "torque-check-joint"
     plans = [np.load(io.BytesIO(log.attachments["plan.npz"]))["q"] for log in sessions(finished)]

@@ -17,7 +17,7 @@ from playwright.sync_api import Browser
 from fri.errors import ConfigurationError
 from lwr_driver.session import read_session
 from runner.cli import main
-from runner.report.correlation import STRONG, correlation_figure
+from runner.report.figures import STRONG, correlation_figure
 from runner.report.folder import ResultFolder
 from runner.report.page import write_report
 from runner.report.verdicts import headline, verdicts
@@ -67,14 +67,14 @@ def test_logs_alone_have_a_report_without_an_experiment(imported: Path, chrome: 
         assert seen.errors == []
         assert seen.page.inner_text("h1").startswith("Identification from logs · KUKA LWR4+ · results")
         subjects = seen.page.locator("table.verdicts tbody th").all_inner_texts()
-        assert {"unexplained torque", "unseen motion", "assumptions"} <= set(subjects)
+        assert {"unexplained torque", "held-out motion", "assumptions"} <= set(subjects)
         assert not {"link quality", "tracking error", "truth of the emulated arm"} & set(subjects)
         table = seen.page.inner_text("#table-2")
         assert "no motor torques in the estimate" in table
         assert "no session without the payload" in table
         titles = seen.page.locator("#torque details > summary").all_inner_texts()
         assert [title.split(":")[0] for title in titles] == [
-            "check, joint torque, unseen by the estimate",
+            "check, joint torque, held out",
             "log, joint torque",
         ]
 
@@ -97,7 +97,7 @@ def test_results_go_into_an_empty_folder_only(imported: Path) -> None:
 
 def test_a_session_that_was_tested_was_not_fitted(finished: Path) -> None:
     log = str(finished / "loaded.mcap")
-    done = CliRunner().invoke(main, ["identify", log, "--model", "1", "--no-essential", "--test", log])
+    done = CliRunner().invoke(main, ["identify", log, "--model", "1", "--test", log])
     assert done.exit_code == 7
     assert "proves nothing" in done.output
 

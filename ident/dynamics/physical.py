@@ -1,0 +1,243 @@
+"""Physically consistent bodies nearest to identified base parameters.
+
+Base parameters fix only combinations of the standard ones; the free combinations are chosen here. With P(x)
+the pseudo-inertia of a body (`parameters.pseudo_inertia`) the program over the inertial parameters x is::
+
+    minimise    (K x - chi)' W (K x - chi) / 2  +  w sum_bodies tr[(P0^-1 (P(x) - P0))^2] / 2
+    subject to  P(x) >= margin P0   for every body
+
+The first attempt has K x = chi exactly: the torques are the identified ones, and only the free combinations
+follow the reference bodies P0. If no consistent bodies have these base parameters, the base parameters move in
+units of their standard deviations (W is the inverse covariance), and the result reports the shift.
+
+Reference: Sousa and Cortesao, Physical feasibility of robot base inertial parameter identification, 2014 (the
+linear matrix inequality); Wensing, Kim and Slotine 2018 (pseudo-inertia); Lee, Wensing and Park 2020 (the
+metric of P0).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import sparse
+
+from fri.errors import ConfigurationError, DataError
+from ident.dynamics import parameters
+from ident.dynamics.parameters import Floats
+
+__all__ = ["Projection", "project", "reference_bodies"]
+
+logger = logging.getLogger(__name__)
+
+_SQRT2 = float(np.sqrt(2.0))
+# Rows and columns of the upper triangle, column after column: the order of the solver's cone.
+_TRIANGLE = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Consistent bodies for base parameters.
+
+    bodies : (k, 10) inertial parameters. base : (b,) their base parameters.
+    exact : whether these are the identified ones.
+    shift : (b,) shift of each base parameter in its standard deviations; zero when exact.
+    """
+
+    bodies: Floats
+    base: Floats
+    exact: bool
+    shift: Floats
+
+    @property
+    def worst(self) -> float:
+        """Largest shift of a base parameter in standard deviations."""
+        return float(np.max(np.abs(self.shift), initial=0.0))
+
+
+def project(
+    matrix: ArrayLike,
+    base: ArrayLike,
+    reference: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    margin: float = 1e-3,
+    firmness: float = 0.1,
+) -> Projection:
+    """Consistent bodies for base parameters, see the head of the module.
+
+    matrix : (b, 10 k), K: base parameters of the bodies' inertial parameters. base : (b,), chi.
+    reference : (k, 10) consistent bodies P0.
+    covariance : (b, b) of `base`; without it a parameter's scale is the reference bodies' contribution.
+    margin : smallest pseudo-inertia allowed, as a share of that of the reference body.
+    firmness : weight w of the reference bodies when the base parameters must move; with 0.1 a body differs by
+        three times its own size for one standard deviation.
+
+    Raises ConfigurationError for wrong shapes or an inconsistent reference body, DataError without a solution.
+    """
+    bodies = np.atleast_2d(np.asarray(reference, dtype=np.float64))
+    k_matrix, chi = np.asarray(matrix, dtype=np.float64), np.asarray(base, dtype=np.float64)
+    if k_matrix.shape != (len(chi), bodies.size):
+        raise ConfigurationError(f"matrix has shape {k_matrix.shape}; expected ({len(chi)}, {bodies.size})")
+    roots = _roots(bodies)
+    # x = x0 + T z, with z the entries of L^-1 (P - P0) L^-T: every body has the size of one.
+    step = _steps(roots)
+    slope, missing = k_matrix @ step, chi - k_matrix @ bodies.ravel()
+    scale = _scale(slope, covariance)
+    used = scale > 0.0
+    found = None
+    for closeness in (margin, 1e-3 * margin):
+        found = _solve_exact(
+            slope[used] / scale[used, None], missing[used] / scale[used], len(bodies), closeness
+        )
+        if found is not None:
+            break
+    exact = found is not None
+    if found is None:
+        logger.info(
+            "no real bodies have the identified base parameters; moving these within their uncertainty"
+        )
+        weight = _root_weight(scale, covariance)
+        found = _solve_nearest(weight @ slope, weight @ missing, len(bodies), margin, firmness)
+    x = bodies.ravel() + step @ found
+    if exact:
+        # The solver stops at 1e-9; least squares gives the last digits, far inside the margin.
+        x = x + step @ np.linalg.lstsq(slope, chi - k_matrix @ x, rcond=1e-12)[0]
+    reached = k_matrix @ x
+    sigma = scale if covariance is None else np.sqrt(np.maximum(np.diag(np.asarray(covariance)), 0.0))
+    moved = np.where(sigma > 0.0, (reached - chi) / np.where(sigma > 0.0, sigma, 1.0), 0.0)
+    return Projection(x.reshape(-1, 10), reached, exact, np.zeros_like(moved) if exact else moved)
+
+
+def reference_bodies(
+    bodies: ArrayLike, *, smallest_mass_kg: float = 0.05, gyration_m: float = 0.01
+) -> Floats:
+    """Consistent bodies (k, 10) near the given ones, for inconsistent CAD models and published parameters.
+
+    Masses are raised to `smallest_mass_kg`, principal second moments of mass to mass x `gyration_m`^2.
+    """
+    found = []
+    for body in np.atleast_2d(np.asarray(bodies, dtype=np.float64)):
+        mass = max(float(body[9]), smallest_mass_kg)
+        com = body[6:9] / mass
+        pseudo = parameters.pseudo_inertia(body)
+        second = pseudo[:3, :3] - mass * np.outer(com, com)
+        values, vectors = np.linalg.eigh(0.5 * (second + second.T))
+        second = (vectors * np.maximum(values, mass * gyration_m**2)) @ vectors.T
+        full = np.empty((4, 4))
+        full[:3, :3] = second + mass * np.outer(com, com)
+        full[:3, 3] = full[3, :3] = mass * com
+        full[3, 3] = mass
+        found.append(parameters.from_pseudo_inertia(full))
+    return np.array(found)
+
+
+def _roots(bodies: Floats) -> Floats:
+    try:
+        return np.asarray(np.linalg.cholesky(parameters.pseudo_inertia(bodies)), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        bad = [verdict for verdict in parameters.consistency(bodies) if not verdict.consistent]
+        reason = bad[0].reason if bad else "a pseudo-inertia is singular"
+        raise ConfigurationError(
+            f"a reference body cannot exist: {reason}; see `reference_bodies`"
+        ) from error
+
+
+def _steps(roots: Floats) -> Floats:
+    """(10 k, 10 k) block diagonal T of x = x0 + T z, z the scaled upper triangles of L^-1 (P - P0) L^-T."""
+    count = len(roots)
+    steps = np.zeros((10 * count, 10 * count))
+    for k, root in enumerate(roots):
+        for column, (i, j) in enumerate(_TRIANGLE):
+            unit = np.zeros((4, 4))
+            unit[i, j] = unit[j, i] = 1.0 if i == j else 1.0 / _SQRT2
+            body = parameters.from_pseudo_inertia(root @ unit @ root.T)
+            steps[10 * k : 10 * k + 10, 10 * k + column] = body
+    return steps
+
+
+def _scale(slope: Floats, covariance: ArrayLike | None) -> Floats:
+    """Change of each base parameter when a body changes by its own size."""
+    scale = np.linalg.norm(slope, axis=1)
+    if covariance is not None and np.shape(covariance) != (len(slope), len(slope)):
+        raise ConfigurationError(f"covariance has shape {np.shape(covariance)}; expected {(len(slope),) * 2}")
+    return scale
+
+
+def _root_weight(scale: Floats, covariance: ArrayLike | None) -> Floats:
+    """Square root of the weight W; directions without variance are held to 1e-6 of the scale."""
+    if covariance is None:
+        return np.diag(1.0 / np.where(scale > 0.0, scale, 1.0))
+    matrix = np.asarray(covariance, dtype=np.float64)
+    size = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    floor = max(1e-12, 1e-12 * float(values.max(initial=0.0)))
+    return (vectors / np.sqrt(np.maximum(values, floor))).T / size
+
+
+def _cones(bodies: int, margin: float, offset: int, columns: int) -> tuple[sparse.csc_matrix, Floats]:
+    """A and b of s = b - A x with s in the cones 1 + mat(z) - margin 1 >= 0; z begins at column `offset`."""
+    size = 10 * bodies
+    identity = np.array([1.0 if i == j else 0.0 for i, j in _TRIANGLE])
+    rows = np.arange(size)
+    matrix = sparse.csc_matrix((-np.ones(size), (rows, rows + offset)), shape=(size, columns))
+    return matrix, np.tile((1.0 - margin) * identity, bodies)
+
+
+def _solve_exact(slope: Floats, missing: Floats, bodies: int, margin: float) -> Floats | None:
+    """min |z|^2 / 2 with slope z = missing and all bodies real; None if there are none."""
+    import clarabel
+
+    size = 10 * bodies
+    # The rows of the base set are independent but badly scaled: take orthonormal ones.
+    left, values, right = np.linalg.svd(slope, full_matrices=False)
+    keep = values > 1e-10 * values.max(initial=0.0)
+    rows, target = right[keep], (left.T @ missing)[keep] / values[keep]
+    cone_a, cone_b = _cones(bodies, margin, 0, size)
+    a = sparse.vstack([sparse.csc_matrix(rows), cone_a], format="csc")
+    b = np.concatenate([target, cone_b])
+    cones = [clarabel.ZeroConeT(len(target)), *[clarabel.PSDTriangleConeT(4)] * bodies]
+    return _solve(sparse.identity(size, format="csc"), np.zeros(size), a, b, cones)
+
+
+def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, firmness: float) -> Floats:
+    """min |slope z - missing|^2 / 2 + firmness |z|^2 / 2 with all bodies real."""
+    import clarabel
+
+    size = 10 * bodies
+    _, triangle = np.linalg.qr(np.column_stack([slope, missing]))
+    rows = triangle[:, :size]
+    right = triangle[:, size]
+    unit = max(float(np.linalg.norm(rows, axis=1).max()), 1e-300)
+    rows, right = rows / unit, right / unit
+    # Residuals r = rows z - right are variables, for better scaling.
+    columns = size + len(rows)
+    p = sparse.diags(
+        np.concatenate([np.full(size, firmness / unit**2 + 1e-12), np.ones(len(rows))]), format="csc"
+    )
+    link = sparse.hstack([sparse.csc_matrix(rows), -sparse.identity(len(rows))], format="csc")
+    cone_a, cone_b = _cones(bodies, margin, 0, columns)
+    a = sparse.vstack([link, cone_a], format="csc")
+    cones = [clarabel.ZeroConeT(len(rows)), *[clarabel.PSDTriangleConeT(4)] * bodies]
+    solution = _solve(p, np.zeros(columns), a, np.concatenate([right, cone_b]), cones)
+    if solution is None:
+        raise DataError(
+            "no consistent bodies were found for these parameters; check the estimate and the prior bodies"
+        )
+    return solution[:size]
+
+
+def _solve(
+    p: sparse.csc_matrix, q: Floats, a: sparse.csc_matrix, b: Floats, cones: list[object]
+) -> Floats | None:
+    import clarabel
+
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_iter = 200
+    solution = clarabel.DefaultSolver(sparse.csc_matrix(p), q, a, b, cones, settings).solve()
+    status = str(solution.status)
+    logger.debug("cone program: %s after %s iterations", status, solution.iterations)
+    return np.array(solution.x) if status in ("Solved", "AlmostSolved") else None

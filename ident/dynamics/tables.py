@@ -1,0 +1,48 @@
+"""Results as tables: a data frame, and HTML in a notebook."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import math
+from typing import Any
+
+from fri.errors import ConfigurationError
+
+__all__ = ["Tabular"]
+
+
+class Tabular:
+    """Base of the results with one row for each parameter, joint or session."""
+
+    def records(self) -> list[dict[str, Any]]:
+        """The rows of the table, each a mapping from the name of a column to its value."""
+        raise NotImplementedError
+
+    def to_dataframe(self) -> Any:
+        """The rows as `pandas.DataFrame`. Raises ConfigurationError without pandas."""
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise ConfigurationError(
+                f"{type(self).__name__}: to_dataframe() needs pandas, which is not installed; install it "
+                "(`pip install pandas`) or use records()"
+            ) from error
+        return pandas.DataFrame(self.records())
+
+    def _repr_html_(self) -> str:
+        """First line of the text form and the rows as HTML."""
+        rows = self.records()
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{_cell(row.get(name))}</td>" for name in names) + "</tr>" for row in rows
+        )
+        title = html.escape(repr(self).splitlines()[0])
+        return f"<p>{title}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return html.escape(f"{value:.5g}" if isinstance(value, float) else str(value))

@@ -1,0 +1,56 @@
+"""Identification of a model from session logs, its validation, comparison and payloads."""
+
+from __future__ import annotations
+
+from ident.estimation.compare import Comparison, compare, competitor_scores
+from ident.estimation.essential import EssentialSettings
+from ident.estimation.forward_simulation import simulate_session
+from ident.estimation.identify import (
+    ESTIMATORS,
+    EstimatorFactory,
+    Identification,
+    IdentificationSettings,
+    identify,
+)
+from ident.estimation.mounting import Mounting, find_mounting
+from ident.estimation.payload import PayloadEstimate, identify_payload, with_payload
+from ident.estimation.validate import (
+    CrossValidation,
+    Score,
+    SessionScore,
+    Validation,
+    cross_validate,
+    mounted,
+    predictor,
+    prepared_session,
+    score_session,
+    validate,
+)
+
+__all__ = [
+    "ESTIMATORS",
+    "Comparison",
+    "CrossValidation",
+    "EssentialSettings",
+    "EstimatorFactory",
+    "Identification",
+    "IdentificationSettings",
+    "Mounting",
+    "PayloadEstimate",
+    "Score",
+    "SessionScore",
+    "Validation",
+    "compare",
+    "competitor_scores",
+    "cross_validate",
+    "find_mounting",
+    "identify",
+    "identify_payload",
+    "mounted",
+    "predictor",
+    "prepared_session",
+    "score_session",
+    "simulate_session",
+    "validate",
+    "with_payload",
+]

@@ -1,0 +1,454 @@
+"""From session logs to a dynamic model with the uncertainty of each parameter."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from fri.errors import ConfigurationError, DataError
+from ident.dynamics.base_set import BaseSet, numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
+from ident.dynamics.tables import Tabular
+from ident.estimation.assumptions import Assumptions, check_assumptions
+from ident.estimation.essential import Essential, EssentialSettings, find_essential
+from ident.estimators import ESTIMATORS
+from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.errors_in_variables import InstrumentalVariables
+from ident.estimators.estimate import Estimate, Estimator
+from ident.estimators.physical import cad_prior
+from ident.estimators.problem import Problem
+from ident.model.dynamic_model import DynamicModel
+from ident.rows.filters import SignalSettings
+from ident.rows.observation import commanded, observe, stack
+from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
+from lwr_driver.session import Session
+
+__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "estimator_factory", "identify"]
+
+EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
+
+logger = logging.getLogger(__name__)
+
+_WIDE_CONDITION = 100.0
+
+
+@dataclass(frozen=True)
+class IdentificationSettings:
+    """Model, estimator and signal processing of an identification.
+
+    model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
+    estimator : one of `ESTIMATORS`, or a factory from base set, problem and covariance settings to an
+        estimator. "iv" takes the commanded motion as instruments. "wls" (default) uses the data alone.
+        "physical" (consistent bodies within 20 % of the URDF's) predicts new motions best, above all after a
+        short or weakly exciting recording: on three runs of a real LWR4+ its error is 3 to 4 %, that of least
+        squares 9 to 14 % (`benchmarks/real_data.py`).
+    without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
+    resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
+    essential : settings of the search for essential parameters; None skips it.
+    robot : name of the arm in the model; default from the sessions' metadata.
+    """
+
+    model: int = 2
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    estimator: str | EstimatorFactory = "wls"
+    covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
+    without: tuple[str, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
+    coulomb: Coulomb = field(default_factory=Coulomb)
+    resonance_hz: float | None = None
+    essential: EssentialSettings | None = field(default_factory=EssentialSettings)
+    robot: str = ""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.estimator, str) and self.estimator not in ESTIMATORS:
+            known = ", ".join(ESTIMATORS)
+            raise ConfigurationError(f"estimator {self.estimator!r} is unknown; choose one of {known}")
+
+
+@dataclass(frozen=True)
+class Identification(Tabular):
+    """Result of `identify`.
+
+    base : the base parameters and their regrouping. estimate : values, covariance and residuals.
+    prepared : the filtered sessions, without their samples. problem : the stacked regression.
+    warnings : sentences for the report.
+    """
+
+    settings: IdentificationSettings
+    structure: ModelStructure
+    base: BaseSet
+    problem: Problem
+    estimate: Estimate
+    prepared: tuple[PreparedSession, ...]
+    payloads: tuple[str | None, ...]
+    condition: float
+    condition_normalised: float
+    assumptions: Assumptions
+    essential: Essential | None
+    robot: str
+    warnings: tuple[str, ...]
+
+    @cached_property
+    def model(self) -> DynamicModel:
+        """The identified model with all base parameters."""
+        return self._model(self.base.names, self.estimate)
+
+    @cached_property
+    def essential_model(self) -> DynamicModel:
+        """The identified model with the essential parameters only.
+
+        Raises ConfigurationError when the settings skip the search for them.
+        """
+        if self.essential is None:
+            raise ConfigurationError("essential parameters were not sought; set `essential` in the settings")
+        return self._model(self.essential.names, self.essential.estimate)
+
+    def _model(self, names: tuple[str, ...], found: Estimate) -> DynamicModel:
+        provenance = {
+            "estimator": self.estimate.method,
+            "covariance": self.estimate.covariance.kind,
+            "sessions": [
+                {"file": session.name, "uid": session.uid, "payload": payload or "none"}
+                for session, payload in zip(self.prepared, self.payloads, strict=True)
+            ],
+            "cutoff_hz": self.settings.signals.cutoff_hz,
+            "decimate_hz": self.settings.signals.decimate_hz,
+        }
+        matrix = found.covariance.matrix
+        return DynamicModel(self.robot, self.structure, names, found.values, matrix, self.base, provenance)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of standard, not identifiable, regrouped and base parameters."""
+        return {
+            "standard": int(self.structure.active.sum()),
+            "not_identifiable": len(self.base.not_identifiable),
+            "regrouped": len(self.base.dependent),
+            "base": len(self.base),
+        }
+
+    @property
+    def parameters(self) -> list[dict[str, Any]]:
+        """One row for each base parameter: name, unit, estimate, std, rsd_percent."""
+        return self.estimate.records()
+
+    @property
+    def torque_rms(self) -> dict[str, dict[str, float]]:
+        """Root mean square of the residual torque [Nm] by side and joint."""
+        result: dict[str, dict[str, float]] = {}
+        for fit in self.estimate.classes:
+            result.setdefault(fit.side, {})[fit.joint] = fit.rms
+        return result
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for files and reports."""
+        return {
+            "model": self.settings.model,
+            "estimator": self.estimate.method,
+            "covariance": self.estimate.covariance.kind,
+            "sessions": [
+                {
+                    "name": session.name,
+                    "payload": payload,
+                    "rows": session.counts["rows"],
+                    "lost_samples": session.counts["lost"],
+                    "motor_delay_s": session.delay.seconds if session.delay is not None else None,
+                    "motor_delay_std_s": session.delay.std if session.delay is not None else None,
+                    "excitation_hz": session.excitation_hz,
+                    "cutoff_hz": session.cutoff_hz,
+                }
+                for session, payload in zip(self.prepared, self.payloads, strict=True)
+            ],
+            "counts": self.counts,
+            "condition": self.condition,
+            "condition_normalised": self.condition_normalised,
+            "parameters": self.parameters,
+            "torque_rms": self.torque_rms,
+            "assumptions": self.assumptions.to_dict(),
+            "essential": None if self.essential is None else self.essential.to_dict(),
+            "warnings": list(self.warnings),
+        }
+
+    def records(self) -> list[dict[str, Any]]:
+        """`parameters`."""
+        return self.parameters
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in self.counts.items())
+        violated = [check.name for check in self.assumptions.checks if check.holds is False]
+        return "\n".join(
+            [
+                f"Identification of {self.robot}, Model {self.settings.model}, sessions: {len(self.prepared)}",
+                f"  parameters: {counts}"
+                + ("" if self.essential is None else f", {len(self.essential.names)} essential"),
+                f"  condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}",
+                f"  violated assumptions: {', '.join(violated) or 'none'}; warnings: {len(self.warnings)}",
+                *(f"  {line.strip()}" for line in repr(self.estimate).splitlines()[:6]),
+            ]
+        )
+
+    def summary(self) -> str:
+        """Counts, sessions, parameters, residuals, assumptions and warnings as text."""
+        counts = self.counts
+        lines = [
+            f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} "
+            f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base"
+        ]
+        for session, payload in zip(self.prepared, self.payloads, strict=True):
+            delay = f", motor channel {session.delay}" if session.delay is not None else ""
+            lines.append(
+                f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
+                f"{session.counts['lost']} samples lost{delay}"
+            )
+        lines.append(
+            f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
+        )
+        lines += ["", self.estimate.summary(), "", self.assumptions.summary()]
+        if self.essential is not None:
+            lines += ["", self.essential.summary()]
+        if self.warnings:
+            lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
+        return "\n".join(lines)
+
+
+def identify(
+    sessions: Sessions, chain: Chain, settings: IdentificationSettings | None = None
+) -> Identification:
+    """Identify the arm `chain` from one or more sessions, stacked.
+
+    sessions : a session, the path of a log, or several of either. The payload of each comes from its metadata
+        (`none`: the bare arm). A session without motor or joint torques adds the rows of the other side only.
+
+    Raises ConfigurationError for arguments of a wrong type, DataError for unusable sessions.
+    """
+    settings = settings or IdentificationSettings()
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
+    sessions = as_sessions(sessions)
+    if not sessions:
+        raise DataError("no session given; name at least one session file")
+    chosen = [session.select(chain.joint_names) for session in sessions]
+    _same_robot(chosen)
+    needs_motor = settings.model in (2, 3)
+    with_motor = [session.motor is not None for session in chosen]
+    if needs_motor and not any(with_motor):
+        names = ", ".join(session.path.name for session in chosen)
+        raise DataError(
+            f"Model {settings.model} needs motor torques, and {names} "
+            f"ha{'s' if len(chosen) == 1 else 've'} no /motor_states; choose Model 1 (`--model 1`), or "
+            "record with a motor torque source"
+        )
+    if settings.model == 3:
+        chosen = [session for session, has in zip(chosen, with_motor, strict=True) if has]
+    sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
+    if not sensed and settings.model != 2:
+        raise DataError(
+            f"Model {settings.model} needs joint torques, and no session has them; choose Model 2 "
+            "(`--model 2`), then of motor rows only"
+        )
+    payloads = [payload_name(session) for session in chosen]
+    carried = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
+    structure = ModelStructure(
+        chain,
+        settings.model,
+        carried,
+        settings.without,
+        settings.couplings,
+        settings.coulomb,
+        () if sensed else ("motor",),
+    )
+    mounted = payloads if settings.model != 3 else [None] * len(payloads)
+    base = numeric_base(structure, _conditions(structure, chosen, mounted))
+    prepared, problems, instruments = [], [], []
+    for session, payload in zip(chosen, mounted, strict=True):
+        # One session after the other, so that memory holds the full-rate signals of one only.
+        whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
+        problems.append(
+            observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
+        )
+        motion = None if settings.signals.average_periods else commanded(session, whole)
+        prepared.append(whole.without_samples())
+        del whole
+        if motion is not None:
+            instruments.append(observe([motion], [payload], structure, columns=base.columns))
+            del motion
+    warnings = [warning for session in prepared for warning in session.warnings]
+    _every_joint_moves(prepared, chain)
+    problem = stack(problems)
+    normalised = problem.require_rank()
+    instrumental = _instrumental(problem, problems, instruments, settings)
+    estimate = plain = _estimator(settings, base, problem).fit(problem)
+    if settings.estimator == "iv":
+        if instrumental is None:
+            raise DataError(
+                "estimator `iv` takes its instruments from the commanded motion, missing in a session: record "
+                "/joint_command and do not average periods, or choose `wls`"
+            )
+        estimate = instrumental
+    assumptions = check_assumptions(
+        problem, plain, instrumental=instrumental, period_rows=_common_period(prepared)
+    )
+    essential = None
+    if settings.essential is not None:
+        essential = find_essential(problem, estimate, settings.essential, settings.covariance)
+    warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
+    warnings += _condition_warnings(normalised, estimate)
+    return Identification(
+        settings=settings,
+        structure=structure,
+        base=base,
+        problem=problem,
+        estimate=estimate,
+        prepared=tuple(prepared),
+        payloads=tuple(payloads),
+        condition=problem.condition,
+        condition_normalised=normalised,
+        assumptions=assumptions,
+        essential=essential,
+        robot=settings.robot or chosen[0].metadata.get("robot", "") or "arm",
+        warnings=tuple(warnings),
+    )
+
+
+def estimator_factory(name: str, *, prior_std: float = 0.2, **options: Any) -> EstimatorFactory:
+    """Factory of the estimator `name` with some of its options (`ident.estimators.ESTIMATORS`).
+
+    prior_std : standard deviation of the URDF's inertials as a share of themselves.
+    """
+    kind = ESTIMATORS[name]
+
+    def factory(base: BaseSet, problem: Problem, covariance: CovarianceSettings) -> Estimator:
+        prior = {"prior": cad_prior(base, relative_std=prior_std)} if kind.body_prior else {}
+        return kind.make(covariance=covariance, **prior, **options)
+
+    return factory
+
+
+def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
+    """The estimator; for instrumental variables the WLS they are compared with."""
+    name = settings.estimator
+    factory = estimator_factory(name) if isinstance(name, str) else name
+    return factory(base, problem, settings.covariance)
+
+
+def _instrumental(
+    problem: Problem,
+    problems: Sequence[Problem],
+    instruments: Sequence[Problem],
+    settings: IdentificationSettings,
+) -> Estimate | None:
+    """Instrumental-variable estimate on the commanded motion; None when a session lacks it."""
+    if len(instruments) < len(problems):
+        return None
+    matrices = [group.matrix for one in instruments for group in one.groups]
+    return InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
+
+
+def _common_period(prepared: Sequence[PreparedSession]) -> int | None:
+    """Rows of a period, if all sessions share it and at least one has two periods."""
+    lengths = {session.period_rows for session in prepared}
+    length = lengths.pop() if len(lengths) == 1 else None
+    averaged = any(session.settings.average_periods for session in prepared)
+    return None if averaged or not any(session.periods > 1 for session in prepared) else length
+
+
+def _same_robot(sessions: Sequence[Session]) -> None:
+    for key in ("robot", "serial"):
+        found = {session.metadata.get(key, "") for session in sessions} - {""}
+        if len(found) > 1:
+            listed = ", ".join(f"{s.path.name}: {s.metadata.get(key) or 'unnamed'}" for s in sessions)
+            raise DataError(
+                f"the sessions are of different robots by their `{key}` ({listed}); identify each robot by "
+                "itself"
+            )
+
+
+def _every_joint_moves(prepared: Sequence[PreparedSession], chain: Chain) -> None:
+    still = [name for name in chain.joint_names if not any(name in session.moving for session in prepared)]
+    if still:
+        raise DataError(
+            f"joint{'s' if len(still) > 1 else ''} {', '.join(still)} never "
+            f"move{'s' if len(still) == 1 else ''}; plan an excitation of every joint, or identify "
+            "with a chain in which these joints are fixed"
+        )
+
+
+def _conditions(
+    structure: ModelStructure, sessions: Sequence[Session], payloads: Sequence[str | None]
+) -> tuple[Condition, ...]:
+    found: dict[Condition, None] = {}
+    for session, payload in zip(sessions, payloads, strict=True):
+        joint, motor = bool(session.joint.effort.shape[1]), session.motor is not None
+        sides: tuple[Side, ...] = tuple(
+            side for side in structure.sides if (joint or side == "motor") and (motor or side == "joint")
+        )
+        if sides:
+            found[Condition(payload, sides)] = None
+    return tuple(found)
+
+
+def _payload_warnings(
+    sessions: Sequence[Session],
+    payloads: Sequence[str | None],
+    base: BaseSet,
+    estimate: Estimate,
+    structure: ModelStructure,
+) -> list[str]:
+    """Estimated against stated mass of each payload. DataError for a payload not mounted as stated."""
+    found = []
+    if structure.payloads and None not in payloads:
+        found.append(
+            "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into "
+            "the arm's; add an unloaded session of the same arm"
+        )
+    for payload in structure.payloads:
+        link = structure.payload_link(payload)
+        assert link is not None
+        name = f"M{link + 1}"
+        if name not in base.names:
+            continue
+        place = base.names.index(name)
+        mass, std = float(estimate.values[place]), float(estimate.std[place])
+        carriers = [s for s, p in zip(sessions, payloads, strict=True) if p == payload]
+        stated = next((m for m in map(stated_mass, carriers) if m is not None), None)
+        estimated = f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg"
+        absent = mass < 3.0 * std if stated is None else mass + 3.0 * std < 0.5 * stated
+        if absent:
+            names = ", ".join(s.path.name for s in carriers)
+            bare = ", ".join(s.path.name for s, p in zip(sessions, payloads, strict=True) if p is None)
+            doubt = (
+                f"the payloads of {names} and {bare} are interchanged"
+                if bare and mass < -3.0 * std
+                else f"it was not mounted in {names}, or it was mounted in {bare or 'all sessions'} as well"
+            )
+            raise DataError(
+                f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; name "
+                "the mounted payload (`--payload FILE=NAME`, `none`: the bare arm) or record the session again"
+            )
+        if stated is not None and abs(mass - stated) > max(0.1 * stated, 3.0 * std):
+            found.append(
+                f"{estimated} against {stated:.3f} kg stated; check the mounted payload and the torque "
+                "sensors' gain"
+            )
+        elif mass < 3.0 * std:
+            found.append(f"{estimated} is not above zero; the motion excites so light a payload too little")
+    return found
+
+
+def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
+    if normalised < _WIDE_CONDITION:
+        return []
+    inverse = np.linalg.inv(estimate.correlation + 1e-12 * np.eye(len(estimate.names)))
+    worst = np.argsort(-np.diag(inverse))[:8]
+    names = ", ".join(estimate.names[k] for k in worst)
+    return [
+        f"condition number of the normalised columns {normalised:.0f} exceeds {_WIDE_CONDITION:.0f}; the "
+        f"motion hardly separates {names}: excite them, or judge them by their RSD"
+    ]

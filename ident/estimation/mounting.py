@@ -1,0 +1,250 @@
+"""Tilt of the base: the direction of gravity in the base's own axes, from the sessions of the identification.
+
+Under a tilt t gravity acts on the first joint with about t times the moment of the whole arm: half a newton
+metre per degree on an LWR4+. It varies with the position of the first joint, unlike the torque of any link
+parameter, so the two angles can be estimated together with the base parameters. Gravity enters the torque
+linearly, tau(q, qd, qdd; g + dg) = tau(q, qd, qdd; g) + G(q; dg), so d tau / d t_k = G(q; dg / dt_k), with
+G the regressor at rest under the gravity dg / dt_k. A few Gauss-Newton steps suffice.
+
+Similar causes are crosstalk from joint 2 to the torque sensor of joint 1 and a cable across joint 1. A spirit
+level on the base decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import Floats
+from ident.effects.link import sideways_gravity
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.estimate import Covariance, fisher_tail
+from ident.estimators.physical import cad_prior
+from ident.estimators.prior import MaximumAPosteriori, Prior
+from ident.rows.observation import observe
+from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
+from ident.rows.sessions import Sessions, as_sessions, require
+from lwr_driver.session import Session
+
+__all__ = ["Mounting", "find_mounting"]
+
+_NAMES = ("tilt_1", "tilt_2")
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Estimated direction of gravity in the base's axes.
+
+    axes : (2, 3), unit vectors in the base's axes, perpendicular to the assumed gravity.
+    tilt_rad : (2,), rotation of the base about them; its norm is the tilt.
+    covariance : (2, 2) [rad^2]. assumed, gravity : (3,) before and after, in the base's axes [m/s^2].
+    identification : the arm identified under the estimated gravity, with it in the chain.
+    steps : number of Gauss-Newton steps. converged : the last was below a tenth of a standard deviation.
+    """
+
+    axes: Floats
+    tilt_rad: Floats
+    covariance: Covariance
+    assumed: Floats
+    gravity: Floats
+    identification: Identification
+    steps: int
+    converged: bool
+
+    @property
+    def chain(self) -> Chain:
+        """The arm under the estimated gravity."""
+        return self.identification.structure.chain
+
+    @property
+    def std(self) -> Floats:
+        """Standard deviations of the two angles (2,) [rad]."""
+        return self.covariance.std
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so large a tilt on an upright base (Hotelling's T^2)."""
+        square = float(self.tilt_rad @ np.linalg.solve(self.covariance.matrix, self.tilt_rad))
+        freedom = max(self.covariance.degrees_of_freedom, 2.0)
+        return fisher_tail(square * (freedom - 1.0) / (2.0 * freedom), 2, freedom - 1.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        return {
+            "axes": self.axes.tolist(),
+            "tilt_rad": self.tilt_rad.tolist(),
+            "std_rad": self.std.tolist(),
+            "p_value": self.p_value,
+            "assumed_gravity": self.assumed.tolist(),
+            "gravity": self.gravity.tolist(),
+            "steps": self.steps,
+            "converged": self.converged,
+        }
+
+    def __repr__(self) -> str:
+        return f"Mounting: {self}"
+
+    def __str__(self) -> str:
+        degrees, std = np.rad2deg(self.tilt_rad), np.rad2deg(self.std)
+        parts = [
+            f"{angle:.2f} ± {s:.2f} deg about [{', '.join(f'{x:.3g}' for x in axis)}]"
+            for angle, s, axis in zip(degrees, std, self.axes, strict=True)
+        ]
+        size = float(np.linalg.norm(degrees))
+        return f"the base leans by {size:.2f} deg: {', '.join(parts)} (p = {self.p_value:.1e})" + (
+            "" if self.converged else "; NOT converged"
+        )
+
+
+def find_mounting(
+    sessions: Sessions,
+    chain: Chain,
+    settings: IdentificationSettings | None = None,
+    *,
+    prior_std_rad: float = float(np.deg2rad(2.0)),
+    steps: int = 6,
+) -> Mounting:
+    """Tilt of the base of `chain` from the sessions, and the arm identified under it.
+
+    sessions, settings : as for `identify`. The steps are maximum a posteriori with the inertials of the URDF as
+        prior (`cad_prior`; weighted least squares without a URDF), so that weakly excited parameters do not
+        absorb the tilt.
+    prior_std_rad : standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree
+        from the data, and keeps an unexcited angle at zero.
+
+    The standard deviations are the larger of the block jackknife's and the posterior's; those of the arm's
+    parameters do not include the tilt's.
+
+    Raises ConfigurationError for Model 3 (no gravity), and the errors of `identify`.
+    """
+    settings = settings or IdentificationSettings()
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    sessions = as_sessions(sessions)
+    if settings.model == 3:
+        raise ConfigurationError("Model 3 has no gravity in it; find the mounting with Model 1 or 2")
+    if not np.any(chain.gravity):
+        raise ConfigurationError("the chain has no gravity, so its base cannot lean; give `gravity`")
+    axes = _axes(chain.gravity)
+    tilt = np.zeros(2)
+    # The steps need plausible values of all parameters, with any final estimator.
+    inner = replace(settings, essential=None, estimator="wls" if chain.urdf is None else "map")
+    found = identify(sessions, chain, inner)
+    done, converged = 0, False
+    covariance = None
+    while done < steps and not converged:
+        done += 1
+        step, covariance = _step(found, sessions, axes, tilt, prior_std_rad)
+        tilt = tilt + step
+        turned = replace(chain, gravity=_turned(chain.gravity, axes, tilt))
+        found = identify(sessions, turned, inner)
+        converged = bool(np.all(np.abs(step) < 0.1 * covariance.std))
+    assert covariance is not None
+    found = identify(sessions, found.structure.chain, settings)
+    gravity = found.structure.chain.gravity
+    return Mounting(axes, tilt, covariance, chain.gravity, gravity, found, done, converged)
+
+
+def _axes(gravity: Floats) -> Floats:
+    """Two axes perpendicular to gravity, for gravity along -z those of x and y."""
+    up = -gravity / np.linalg.norm(gravity)
+    first = np.eye(3)[int(np.argmin(np.abs(up)))]
+    first = first - (first @ up) * up
+    first /= np.linalg.norm(first)
+    return np.vstack([first, np.cross(up, first)]) + 0.0
+
+
+def _turned(gravity: Floats, axes: Floats, tilt: Floats) -> Floats:
+    """Gravity in the axes of a base rotated by `tilt` about `axes` (Rodrigues, inverse rotation)."""
+    vector = -(tilt @ axes)
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return gravity.copy()
+    axis = vector / angle
+    return (
+        gravity * np.cos(angle)
+        + np.cross(axis, gravity) * np.sin(angle)
+        + axis * (axis @ gravity) * (1.0 - np.cos(angle))
+    )
+
+
+def _step(
+    found: Identification, sessions: Sequence[Session], axes: Floats, tilt: Floats, prior_std_rad: float
+) -> tuple[Floats, Covariance]:
+    """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
+    gravity = found.structure.chain.gravity
+    columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
+    groups = tuple(
+        replace(group, matrix=np.column_stack([group.matrix, column]))
+        for group, column in zip(found.problem.groups, columns, strict=True)
+    )
+    problem = replace(
+        found.problem,
+        names=(*found.problem.names, *_NAMES),
+        groups=groups,
+        units=(*found.problem.units, "rad", "rad") if found.problem.units else (),
+    )
+    estimator = MaximumAPosteriori(
+        _prior(found, tilt, prior_std_rad), 1.0, CovarianceSettings(kind="jackknife")
+    )
+    estimate = estimator.fit(problem)
+    posterior, jackknife = (estimate.covariances[kind] for kind in ("posterior", "jackknife"))
+    std = np.maximum(posterior.std, jackknife.std)[-2:]
+    correlation = posterior.matrix[-2:, -2:] / np.outer(posterior.std[-2:], posterior.std[-2:])
+    stated = replace(jackknife, matrix=correlation * np.outer(std, std))
+    return estimate.values[-2:], stated
+
+
+def _columns(
+    found: Identification, sessions: Sequence[Session], directions: Sequence[Floats]
+) -> list[Floats]:
+    """Torque (m, 2) of each row group at rest under each gravity, the change of torque for one of gravity."""
+    structure, settings = found.structure, found.settings
+    structures = [
+        replace(
+            structure,
+            chain=replace(structure.chain, gravity=direction),
+            without=(*structure.without, "offl", "offm"),
+        )
+        for direction in directions
+    ]
+    result = []
+    for session, payload in zip(sessions, found.payloads, strict=True):
+        chosen = session.select(structure.chain.joint_names)
+        moving = prepare(
+            chosen, settings.signals, resonance_hz=settings.resonance_hz, motor=settings.model == 2
+        )
+        still = _at_rest(moving)
+        groups = [observe([still], [payload], s, columns=found.base.columns).groups for s in structures]
+        for pair in zip(*groups, strict=True):
+            result.append(np.column_stack([group.matrix @ found.estimate.values for group in pair]))
+    return result
+
+
+def _at_rest(session: PreparedSession) -> PreparedSession:
+    def still(channel: TorqueChannel) -> TorqueChannel:
+        zero = np.zeros_like(channel.qd)
+        return replace(channel, qd=zero, qdd=zero)
+
+    passages = tuple(
+        replace(p, joint=still(p.joint), motor=None if p.motor is None else still(p.motor))
+        for p in session.passages
+    )
+    return replace(session, passages=passages)
+
+
+def _prior(found: Identification, tilt: Floats, prior_std_rad: float) -> Prior:
+    """The arm's prior with the tilt's: zero for the whole tilt, earlier steps included."""
+    p = len(found.base.names)
+    mean, precision = np.zeros(p + 2), np.zeros((p + 2, p + 2))
+    if found.structure.chain.urdf is not None:
+        arm = cad_prior(found.base).prior("pullback")
+        mean[:p], precision[:p, :p] = arm.mean, arm.precision
+    mean[p:] = -tilt
+    precision[p, p] = precision[p + 1, p + 1] = prior_std_rad**-2
+    return Prior(mean, precision)

@@ -1,0 +1,8 @@
+"""The identified model: parameter values with covariance and effects, and its file."""
+
+from __future__ import annotations
+
+from ident.model.dynamic_model import DynamicModel, Projection
+from ident.model.model_file import model_text, read_model, write_model
+
+__all__ = ["DynamicModel", "Projection", "model_text", "read_model", "write_model"]

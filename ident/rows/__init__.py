@@ -1,0 +1,42 @@
+"""Signal processing between the session log and the regression."""
+
+from __future__ import annotations
+
+from ident.rows.filters import (
+    ParallelFilter,
+    SignalSettings,
+    advice,
+    differentiate,
+    excitation_frequency,
+    low_pass,
+    optimal_cutoff,
+)
+from ident.rows.observation import commanded, observe, stack
+from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
+from ident.rows.timebase import Delay, DelayData, estimate_delay
+
+__all__ = [
+    "Delay",
+    "DelayData",
+    "ParallelFilter",
+    "Passage",
+    "PreparedSession",
+    "Sessions",
+    "SignalSettings",
+    "TorqueChannel",
+    "advice",
+    "as_sessions",
+    "commanded",
+    "differentiate",
+    "estimate_delay",
+    "excitation_frequency",
+    "low_pass",
+    "observe",
+    "optimal_cutoff",
+    "payload_name",
+    "prepare",
+    "require",
+    "stack",
+    "stated_mass",
+]

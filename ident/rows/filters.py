@@ -1,0 +1,386 @@
+"""Signal settings, zero-phase filters and cut-off frequencies, from raw channels to rows of the regression.
+
+The filters are Butterworth forward and back, central differences, and the parallel low-pass to the row rate.
+The spectra of the motion decide the cut-off frequencies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+from fri.errors import ConfigurationError
+from ident.dynamics.parameters import Floats
+
+__all__ = [
+    "ParallelFilter",
+    "SignalSettings",
+    "advice",
+    "block_means",
+    "differentiate",
+    "excitation_frequency",
+    "interpolate_uniform",
+    "low_pass",
+    "optimal_cutoff",
+    "thinning",
+]
+
+
+@dataclass(frozen=True)
+class SignalSettings:
+    """Settings from raw channels to rows. The defaults are those of the paper, section 5.
+
+    cutoff_hz, order : Butterworth low-pass on the positions, run forward and back. Phase is zero, the gain
+        is the square of the filter's: -6 dB at `cutoff_hz`, and the roll-off of order 2 x `order`.
+    decimate_hz : -6 dB frequency of the parallel low-pass. Torque and every regressor column, Coulomb columns
+        included, pass this same filter, so that it cannot bias the estimate.
+    rate_hz : rate of the rows, None takes 2.5 x `decimate_hz` (80 % of the band is kept).
+    attenuation_db : stop band of the parallel low-pass.
+    choose_cutoff : take `cutoff_hz` from the spectrum of the positions instead.
+    average_periods : average the rows of all periods; their scatter gives the noise variance.
+    edge_s : time lost at each end of an uninterrupted stretch to the transients of the Butterworth filter,
+        None takes 2 / `cutoff_hz`.
+    longest_bridge_s : longest gap bridged by interpolation; a longer one splits the record.
+    bridged_share : largest share of the filter's weight on bridged samples; rows beyond it are dropped.
+    standstill_rad_s, standstill_share : below this speed the Coulomb torque of a joint is unknown; its rows
+        with more than this share of the filter's weight on such samples are dropped. Share 1 keeps all.
+    outlier_scale : distance of an outlier from the running median, in robust standard deviations.
+    motor_delay_s : delay of the motor channel's times [s], or "estimate" to estimate it from the data.
+    delay_search_s : largest delay searched, in both directions.
+    """
+
+    cutoff_hz: float = 10.0
+    order: int = 4
+    decimate_hz: float = 2.0
+    rate_hz: float | None = None
+    attenuation_db: float = 40.0
+    choose_cutoff: bool = False
+    average_periods: bool = False
+    edge_s: float | None = None
+    longest_bridge_s: float = 0.02
+    bridged_share: float = 0.1
+    standstill_rad_s: float = 2e-3
+    standstill_share: float = 0.05
+    outlier_scale: float = 8.0
+    motor_delay_s: float | Literal["estimate"] = "estimate"
+    delay_search_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        positive = ("cutoff_hz", "order", "decimate_hz", "attenuation_db", "outlier_scale", "delay_search_s")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"`{name}` is {getattr(self, name)}, it must be positive")
+        if self.decimate_hz > self.cutoff_hz:
+            raise ConfigurationError(
+                f"`decimate_hz` {self.decimate_hz} exceeds `cutoff_hz` {self.cutoff_hz}; the parallel "
+                "filter must be the narrower one, lower `decimate_hz` or raise `cutoff_hz`"
+            )
+        if self.rate_hz is not None and self.rate_hz <= 0:
+            raise ConfigurationError(f"`rate_hz` is {self.rate_hz}, it must be positive")
+
+    @property
+    def row_rate_hz(self) -> float:
+        """Rate of the rows [Hz]."""
+        return self.rate_hz if self.rate_hz is not None else 2.5 * self.decimate_hz
+
+    @property
+    def edge(self) -> float:
+        """Time lost at each end to the Butterworth filter [s]."""
+        return self.edge_s if self.edge_s is not None else 2.0 / self.cutoff_hz
+
+
+# Central differences of sixth order: error (w dt)^6 / 140 of the velocity, (w dt)^6 / 560 of the
+# acceleration.
+_FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
+_SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
+_OUTPUTS = 8
+
+
+def low_pass(values: Floats, dt: float, cutoff_hz: float, order: int = 4) -> Floats:
+    """Butterworth low-pass of `order` run forward and back over (n, k) values sampled every `dt` seconds.
+
+    Zero phase. The gain is that of the single pass squared: -6 dB at the cut-off, roll-off of order 2 x `order`.
+    """
+    nyquist = 0.5 / dt
+    if cutoff_hz >= nyquist:
+        raise ConfigurationError(
+            f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate, {nyquist:g} Hz; lower `cutoff_hz`"
+        )
+    # Imported on first use: the import takes a second.
+    from scipy.signal import butter, sosfiltfilt
+
+    sos = butter(order, cutoff_hz / nyquist, output="sos")
+    pad = min(len(values) - 1, int(np.ceil(3.0 / (cutoff_hz * dt))))
+    return sosfiltfilt(sos, values, axis=0, padlen=pad)
+
+
+def differentiate(values: Floats, dt: float) -> tuple[Floats, Floats]:
+    """First and second derivative (n, k) by central differences of sixth order; no phase shift."""
+    first = correlate1d(values, _FIRST / dt, axis=0, mode="nearest")
+    second = correlate1d(values, _SECOND / dt**2, axis=0, mode="nearest")
+    return first, second
+
+
+def interpolate_uniform(values: Floats, start: float, dt: float, times: Floats) -> Floats:
+    """Values (n, k), sampled at start + i dt, at other times (m,): six-point Lagrange for band-limited signals."""
+    position = (times - start) / dt
+    nearest = np.rint(position)
+    if len(times) and float(np.max(np.abs(position - nearest))) < 1e-6:
+        index = np.clip(nearest.astype(np.int64), 0, len(values) - 1)
+        if np.all(np.diff(index) == 1):
+            return values[index[0] : index[-1] + 1]
+        return values[index]
+    return _lagrange(np.ascontiguousarray(values), np.ascontiguousarray(position))
+
+
+@njit(cache=True)
+def _lagrange(values, position):  # type: ignore[no-untyped-def]
+    rows, columns = len(position), values.shape[1]
+    result = np.empty((rows, columns))
+    weight = np.empty(6)
+    for row in range(rows):
+        base = min(max(int(np.floor(position[row])) - 2, 0), max(len(values) - 6, 0))
+        offset = position[row] - base
+        for node in range(6):
+            product = 1.0
+            for other in range(6):
+                if other != node:
+                    product *= (offset - other) / (node - other)
+            weight[node] = product
+        for column in range(columns):
+            total = 0.0
+            for node in range(6):
+                total += weight[node] * values[base + node, column]
+            result[row, column] = total
+    return result
+
+
+def thinning(times: Floats, cutoff_hz: float) -> int:
+    """Number of neighbouring samples to average before a low-pass at `cutoff_hz`: 40 means a period stay."""
+    if len(times) < 2:
+        return 1
+    return max(1, int(1.0 / (40.0 * cutoff_hz * float(np.median(np.diff(times))))))
+
+
+def block_means(values: NDArray[np.generic], factor: int) -> Floats:
+    """Means (m // factor, ...) of `factor` neighbours in (m, ...); a remainder at the end is left out."""
+    count = len(values) // factor
+    grouped = np.asarray(values[: count * factor], dtype=np.float64).reshape(count, factor, -1)
+    means = np.einsum("ijk->ik", grouped) / factor
+    return means.reshape(count, *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class ParallelFilter:
+    """Weighted mean around output times: a Kaiser-windowed sinc, the same for torque and regressor columns.
+
+    times : (m,) sample times [s], need not be equidistant; outputs : (K,) times of the rows [s]. A row is
+        sum_i w_i h(T_k - t_i) x_i / sum_i w_i h(T_k - t_i), with w_i the time represented by sample i. Any
+        such mean of Y = Omega chi holds for the same chi, so irregular or slow sampling adds no bias.
+    """
+
+    times: Floats
+    outputs: Floats
+    cutoff_hz: float
+    attenuation_db: float = 40.0
+
+    @property
+    def half_width(self) -> float:
+        """Half the length of the kernel [s]; the transition band is half the cut-off wide."""
+        return half_width(self.cutoff_hz, self.attenuation_db)
+
+    @cached_property
+    def sample_weights(self) -> Floats:
+        """Time represented by each sample (m,) [s], capped so that the ends of a gap do not dominate."""
+        step = np.diff(self.times)
+        typical = float(np.median(step)) if len(step) else 1.0
+        step = np.minimum(step, 2.0 * typical)
+        return 0.5 * (np.append(step, step[-1:]) + np.append(step[:1], step))
+
+    def apply(self, values: Floats) -> Floats:
+        """Filtered (K, ...) of values (m, ...)."""
+        flat = values.reshape(len(values), -1)
+        result = np.empty((len(self.outputs), flat.shape[1]))
+        for rows, samples, weights in self.blocks():
+            result[rows] = weights @ flat[samples]
+        return result.reshape(len(self.outputs), *values.shape[1:])
+
+    def share(self, flagged: NDArray[np.generic]) -> Floats:
+        """Share (K, ...) of the kernel's absolute weight on flagged samples (m, ...), bool or 0 to 1."""
+        flat = flagged.reshape(len(flagged), -1)
+        result = np.zeros((len(self.outputs), flat.shape[1]))
+        if flat.any():
+            for rows, samples, weights in self.blocks():
+                size = np.abs(weights)
+                result[rows] = (size @ flat[samples]) / size.sum(axis=1, keepdims=True)
+        return result.reshape(len(self.outputs), *flagged.shape[1:])
+
+    def coverage(self) -> Floats:
+        """Share (K,) of the kernel's absolute area covered by samples, less than 1 at a gap or an end."""
+        whole = np.linspace(-self.half_width, self.half_width, 2001)
+        area = float(np.mean(np.abs(self._kernel(np.abs(whole))))) * 2.0 * self.half_width
+        result = np.empty(len(self.outputs))
+        for rows, _, kernel in self._kernels():
+            result[rows] = np.abs(kernel).sum(axis=1) / area
+        return result
+
+    def blocks(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, Floats]]:
+        """Rows, samples and dense weights (rows, samples) of a few outputs at a time; bounds the memory."""
+        for rows, samples, kernel in self._kernels(size):
+            total = kernel.sum(axis=1, keepdims=True)
+            yield rows, samples, kernel / np.where(total != 0.0, total, 1.0)
+
+    def _kernels(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, Floats]]:
+        """Like `blocks`, not normalised. On a regular grid equal offsets share one kernel."""
+        half, weight = self.half_width, self.sample_weights
+        regular = _regular(self.times) and _regular(self.outputs)
+        known: dict[tuple[int, int, int], Floats] = {}
+        for first in range(0, len(self.outputs), size):
+            outputs = self.outputs[first : first + size]
+            low = int(np.searchsorted(self.times, outputs[0] - half))
+            high = int(np.searchsorted(self.times, outputs[-1] + half, side="right"))
+            inner = regular and low > 0 and high < len(self.times)
+            key = (len(outputs), high - low, round(1e9 * (outputs[0] - self.times[low]))) if inner else None
+            kernel = known.get(key) if key is not None else None
+            if kernel is None:
+                distance = np.abs(outputs[:, None] - self.times[None, low:high])
+                kernel = self._kernel(distance) * weight[low:high]
+                if key is not None:
+                    known[key] = kernel
+            yield slice(first, first + len(outputs)), slice(low, high), kernel
+
+    @cached_property
+    def _table(self) -> tuple[Floats, Floats]:
+        time = np.linspace(0.0, self.half_width, 4097)
+        return time, np.sinc(2.0 * self.cutoff_hz * time) * _kaiser(
+            time / self.half_width, self.attenuation_db
+        )
+
+    def _kernel(self, distance: Floats) -> Floats:
+        time, value = self._table
+        return np.interp(distance, time, value, right=0.0)
+
+
+def _regular(times: Floats) -> bool:
+    """Whether the times are equidistant to a nanosecond."""
+    if len(times) < 3:
+        return True
+    step = (times[-1] - times[0]) / (len(times) - 1)
+    return float(np.max(np.abs(times - times[0] - step * np.arange(len(times))))) < 1e-9
+
+
+def half_width(cutoff_hz: float, attenuation_db: float) -> float:
+    """Half length [s] of the Kaiser-windowed sinc with a transition band of half the cut-off."""
+    return (attenuation_db - 7.95) / (2.285 * 2.0 * np.pi * 0.5 * cutoff_hz) / 2.0
+
+
+def _kaiser(position: Floats, attenuation_db: float) -> Floats:
+    # Kaiser, Proc. IEEE ISCAS (1974), for attenuations above 50 dB and from 21 dB on
+    above = max(attenuation_db - 21.0, 0.0)
+    beta = 0.1102 * (attenuation_db - 8.7) if attenuation_db > 50.0 else 0.5842 * above**0.4 + 0.07886 * above
+    return np.i0(beta * np.sqrt(np.maximum(1.0 - position**2, 0.0))) / np.i0(beta)
+
+
+def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> float:
+    """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
+
+    velocity : (n, J) low-passed, equidistant. About the highest harmonic n_f w0 of a Fourier excitation.
+    """
+    highest = 0.0
+    power_of_joint = np.var(velocity, axis=0)
+    for joint in np.flatnonzero(power_of_joint > 1e-4 * power_of_joint.max(initial=0.0)):
+        frequency, power = _spectrum(velocity[:, joint], dt)
+        cumulative = np.cumsum(power)
+        if cumulative[-1] > 0:
+            highest = max(highest, float(frequency[np.searchsorted(cumulative, share * cumulative[-1])]))
+    return highest
+
+
+def optimal_cutoff(position: Floats, dt: float, order: int = 4) -> float:
+    """Cut-off [Hz] of the smallest expected square error of the accelerations, from the data.
+
+    position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; the excess
+        over it is the signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward
+        pass, the error is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by
+        their signal's power. The answer is bounded to 0.02 to 0.4 of the sampling rate.
+    """
+    rate = 1.0 / dt
+    grid = np.geomspace(0.002 * rate, 0.4 * rate, 240)
+    cost = np.zeros(len(grid))
+    for joint in np.flatnonzero(np.ptp(position, axis=0) > 1e-2):
+        frequency, power = _spectrum(position[:, joint], dt)
+        floor = float(np.median(power[len(power) // 2 :]))
+        signal = np.where(power > 4.0 * floor, power - floor, 0.0)
+        weight = (2.0 * np.pi * frequency) ** 4
+        gain = 1.0 / (1.0 + (frequency[None, :] / grid[:, None]) ** (2 * order))
+        error = (weight * ((1.0 - gain) ** 2 * signal + gain**2 * floor)).sum(axis=1)
+        cost += error / max(float((weight * signal).sum()), 1e-30)
+    return float(grid[int(np.argmin(cost))])
+
+
+def advice(
+    settings: SignalSettings,
+    *,
+    excitation_hz: float,
+    joint_rate_hz: float,
+    motor_rate_hz: float | None = None,
+    resonance_hz: float | None = None,
+) -> tuple[str, ...]:
+    """Warnings about the cut-offs against the excitation n_f w0, the sampling rates and the resonance."""
+    found: list[str] = []
+    if settings.decimate_hz < 2.0 * excitation_hz:
+        found.append(
+            f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest "
+            f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms extend that far, raise "
+            "`decimate_hz`"
+        )
+    if settings.cutoff_hz < 5.0 * excitation_hz:
+        found.append(
+            f"the position cut-off {settings.cutoff_hz:g} Hz is below 5 x the highest excitation frequency "
+            f"{excitation_hz:.2f} Hz; accelerations lose amplitude, raise `cutoff_hz`"
+        )
+    rates = [("joint", joint_rate_hz)] + ([("motor", motor_rate_hz)] if motor_rate_hz else [])
+    for name, rate in rates:
+        if settings.row_rate_hz > rate:
+            found.append(
+                f"rows at {settings.row_rate_hz:g} Hz exceed the {name} channel's {rate:.1f} Hz; lower "
+                "`decimate_hz`"
+            )
+    if settings.cutoff_hz > 0.2 * joint_rate_hz:
+        found.append(
+            f"the position cut-off {settings.cutoff_hz:g} Hz is above a fifth of the sampling rate "
+            f"{joint_rate_hz:.0f} Hz; differences lose accuracy there, lower `cutoff_hz`"
+        )
+    if resonance_hz is not None:
+        if excitation_hz > 0.5 * resonance_hz:
+            found.append(
+                f"the motion has {excitation_hz:.2f} Hz, over half the lowest resonance "
+                f"{resonance_hz:g} Hz; the joints' elasticity is excited and the rigid model is biased, "
+                "plan a slower motion"
+            )
+        if settings.decimate_hz > 0.5 * resonance_hz:
+            found.append(
+                f"the parallel filter's cut-off {settings.decimate_hz:g} Hz lets the lowest resonance "
+                f"{resonance_hz:g} Hz through; lower `decimate_hz`"
+            )
+    return tuple(found)
+
+
+def _spectrum(signal: Floats, dt: float) -> tuple[Floats, Floats]:
+    from scipy.signal import welch
+
+    segment = min(len(signal), max(256, round(30.0 / dt)))
+    frequency, power = welch(signal, fs=1.0 / dt, nperseg=segment, detrend="linear", window="blackmanharris")
+    return frequency, power
+
+
+def moving(position: Floats, names: Sequence[str], threshold: float = 1e-2) -> tuple[str, ...]:
+    """Names of the joints with a position (n, J) range above `threshold` [rad]."""
+    return tuple(name for name, span in zip(names, np.ptp(position, axis=0), strict=True) if span > threshold)

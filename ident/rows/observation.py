@@ -1,0 +1,305 @@
+"""From prepared sessions to the stacked regression: one filter for the torque and for every regressor column.
+
+The regressor is evaluated at the sample times of its torque, and both pass the same parallel low-pass down to
+the row rate, Coulomb columns included (parallel decimation). The full-rate matrix exists only for a stretch of
+rows at a time, so the memory does not grow with the sampling rate.
+
+The same rows on the commanded motion are instruments for the estimation: it is known exactly, correlates with
+the true motion and is independent of the sensors. `InstrumentalVariables` and the test of exogeneity use them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from ident.dynamics.parameters import Floats
+from ident.dynamics.structure import ModelStructure, Side
+from ident.estimators.problem import Nuisance, Problem, RowGroup
+from ident.rows.filters import (
+    ParallelFilter,
+    block_means,
+    differentiate,
+    interpolate_uniform,
+    low_pass,
+    thinning,
+)
+from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, clock_ns
+from ident.rows.timebase import Stretch, sample_period, stretches
+
+if TYPE_CHECKING:
+    from lwr_driver.session import Session
+
+__all__ = ["commanded", "observe", "stack"]
+
+# Rows with their full-rate regressor in memory at a time.
+_BLOCKS = 4
+
+
+def observe(
+    sessions: Sequence[PreparedSession],
+    payloads: Sequence[str | None],
+    structure: ModelStructure,
+    *,
+    columns: Sequence[int] | NDArray[np.int64] | None = None,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] = (),
+) -> Problem:
+    """Stacked problem of the sessions, each with the payload mounted in it.
+
+    columns : indices of the structure's columns (default all active ones). names : their names in the result.
+
+    Sessions without a motor channel contribute joint rows only. Rows of a joint at standstill or with missing
+    samples are left out. Raises DataError when no row is left.
+    """
+    chosen = np.flatnonzero(structure.active) if columns is None else np.asarray(columns, dtype=np.int64)
+    titles = [structure.names[c] for c in chosen] if names is None else list(names)
+    groups: list[RowGroup] = []
+    nuisances: list[Nuisance] = []
+    for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
+        slopes: dict[int, Floats] = {}
+        for side in structure.sides:
+            parts = [
+                part
+                for passage in session.passages
+                if (part := _side(passage, side, structure, payload, chosen, session)) is not None
+            ]
+            for group, slope in _groups(session, number, side, parts) if parts else []:
+                if side != "joint":
+                    slopes[len(groups)] = slope
+                groups.append(group)
+        if session.delay is not None and slopes:
+            nuisances.append(Nuisance(f"motor delay of {session.name}", session.delay.std, slopes))
+    if not groups:
+        raise DataError(
+            f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a "
+            "joint stood still, samples were missing or the channel was absent; check the phases and "
+            "channels of the sessions"
+        )
+    return Problem(
+        tuple(titles),
+        tuple(groups),
+        sessions[0].row_time_s,
+        tuple(units),
+        tuple(session.name for session in sessions),
+        tuple(nuisances),
+        tuple(session.period_rows if session.periods > 1 else None for session in sessions),
+    )
+
+
+def stack(problems: Sequence[Problem]) -> Problem:
+    """One problem of the rows of several with the same parameters, record after record."""
+    if not problems:
+        raise DataError("no rows to stack; give at least one session")
+    groups: list[RowGroup] = []
+    nuisances: list[Nuisance] = []
+    names: list[str] = []
+    periods: list[int | None] = []
+    for problem in problems:
+        if problem.names != problems[0].names:
+            raise DataError("problems of different parameters cannot be stacked; observe the same columns")
+        first = len(groups)
+        groups += [replace(group, record=group.record + len(names)) for group in problem.groups]
+        nuisances += [
+            replace(nuisance, columns={first + k: column for k, column in nuisance.columns.items()})
+            for nuisance in problem.nuisances
+        ]
+        names += problem.record_names
+        periods += problem.periods
+    return replace(
+        problems[0],
+        groups=tuple(groups),
+        record_names=tuple(names),
+        nuisances=tuple(nuisances),
+        periods=tuple(periods),
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Rows of one passage and side.
+
+    matrix (n, K, C), target (K, n), its time derivative (K, n), valid (K, n), row numbers (K,).
+    """
+
+    matrix: Floats
+    target: Floats
+    slope: Floats
+    valid: NDArray[np.bool_]
+    index: NDArray[np.int64]
+
+
+def _side(
+    passage: Passage,
+    side: Side,
+    structure: ModelStructure,
+    payload: str | None,
+    columns: NDArray[np.int64],
+    session: PreparedSession,
+) -> _Part | None:
+    if side == "joint":
+        matrix, target = _filtered(passage.joint, passage.rows, side, structure, payload, columns, session)
+        return _Part(matrix, target, np.zeros_like(target), passage.joint_valid, passage.index)
+    if passage.motor is None or passage.motor_valid is None:
+        return None
+    matrix, target = _filtered(passage.motor, passage.rows, side, structure, payload, columns, session)
+    valid = passage.motor_valid
+    slope = _slope(passage.motor, passage.rows, session)
+    if side == "difference":
+        # The joint torque is taken at the motor channel's own times: both then see the same reversals.
+        joint, settings = passage.joint, session.settings
+        start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
+        inside = (passage.motor.times >= start) & (passage.motor.times <= joint.times[-1])
+        times = passage.motor.times[inside]
+        factor = thinning(times, settings.decimate_hz)
+        torque = block_means(interpolate_uniform(joint.torque, start, dt, times), factor)
+        means = block_means(times, factor)
+        parallel = ParallelFilter(means, passage.rows, settings.decimate_hz, settings.attenuation_db)
+        target = target - parallel.apply(torque)
+        valid = valid & passage.joint_valid
+    return _Part(matrix, target, slope, valid, passage.index)
+
+
+def _slope(channel: TorqueChannel, rows: Floats, session: PreparedSession) -> Floats:
+    """Time derivative (K, n) of the filtered torque, the error per second of a wrong delay."""
+    settings = session.settings
+    step = 0.04 / settings.decimate_hz
+    factor = thinning(channel.times, settings.decimate_hz)
+    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
+    ahead, behind = (
+        ParallelFilter(times, rows + shift, settings.decimate_hz, settings.attenuation_db).apply(torque)
+        for shift in (step, -step)
+    )
+    return (ahead - behind) / (2.0 * step)
+
+
+def _filtered(
+    channel: TorqueChannel,
+    rows: Floats,
+    side: Side,
+    structure: ModelStructure,
+    payload: str | None,
+    columns: NDArray[np.int64],
+    session: PreparedSession,
+) -> tuple[Floats, Floats]:
+    """Filtered regressor (n, K, C) and torque (K, n) of one channel at the times of the rows (K,)."""
+    settings = session.settings
+    joints = structure.chain.n
+    matrix = np.empty((joints, len(rows), len(columns)))
+    target = np.empty((len(rows), joints))
+    # Averaging neighbouring samples first saves nine tenths of the work and is the same for both sides.
+    factor = thinning(channel.times, settings.decimate_hz)
+    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
+    mean = np.full(factor, 1.0 / factor)
+    blocks = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db).blocks()
+    while batch := list(islice(blocks, _BLOCKS)):
+        low, high = batch[0][1].start, batch[-1][1].stop
+        part = slice(low * factor, high * factor)
+        wide = structure.regressor(
+            channel.q[part],
+            channel.qd[part],
+            channel.qdd[part],
+            payload=payload,
+            sides=(side,),
+            columns=columns,
+        )
+        # The regressor's memory runs (column, joint, sample): one product filters all columns.
+        flat = (wide.T.reshape(-1, factor) @ mean).reshape(len(columns) * joints, high - low)
+        for outputs, samples, weights in batch:
+            inside = slice(samples.start - low, samples.stop - low)
+            filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
+            matrix[:, outputs] = filtered.transpose(1, 2, 0)
+            target[outputs] = weights @ torque[samples]
+    return matrix, target
+
+
+def _groups(
+    session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]
+) -> list[tuple[RowGroup, Floats]]:
+    """Row group and slope of each joint with rows."""
+    result = []
+    average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
+    for joint, name in enumerate(session.joint_names):
+        keep = [part.valid[:, joint] for part in parts]
+        matrix = np.concatenate([part.matrix[joint][k] for part, k in zip(parts, keep, strict=True)])
+        target = np.concatenate([part.target[k, joint] for part, k in zip(parts, keep, strict=True)])
+        slope = np.concatenate([part.slope[k, joint] for part, k in zip(parts, keep, strict=True)])
+        index = np.concatenate([part.index[k] for part, k in zip(parts, keep, strict=True)])
+        if average and session.period_rows is not None:
+            matrix, target, slope, index = _averaged(
+                matrix, target, slope, index, session.period_rows, session.periods
+            )
+        if len(target):
+            result.append((RowGroup(name, side, number, matrix, target, index), slope))
+    return result
+
+
+def _averaged(
+    matrix: Floats, target: Floats, slope: Floats, index: NDArray[np.int64], period_rows: int, periods: int
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    """Mean of the rows of equal phase over all periods; phases missing in a period are left out."""
+    phase = index % period_rows
+    order = np.argsort(phase, kind="stable")
+    values, starts, counts = np.unique(phase[order], return_index=True, return_counts=True)
+    full = counts == periods
+    if not full.any():
+        return matrix[:0], target[:0], slope[:0], index[:0]
+    stacked = np.column_stack([matrix, target, slope])[order]
+    means = np.add.reduceat(stacked, starts, axis=0)[full] / periods
+    return means[:, :-2], means[:, -2], means[:, -1], values[full]
+
+
+def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | None:
+    """`prepared` with the commanded instead of the measured motion; None without a complete command channel."""
+    if session.command is None or not session.command.position.shape[1]:
+        return None
+    joint, command = session.joint, session.command.select(prepared.joint_names)
+    times = np.asarray((clock_ns(command) - int(clock_ns(joint)[0])) * 1e-9, dtype=np.float64)
+    where = f"{prepared.name}: /joint_command"
+    dt = sample_period(times, command.sequence if command.numbered else None, where)
+    bad: NDArray[np.bool_] = np.asarray(~np.isfinite(command.position).all(axis=1))
+    parts, _ = stretches(times, command.position, bad, dt, prepared.settings.longest_bridge_s)
+    motions = [_Motion(parts.pop(0), prepared) for _ in range(len(parts))]
+    passages = []
+    for passage in prepared.passages:
+        home = next((m for m in motions if m.covers(passage.joint) and m.covers(passage.motor)), None)
+        if home is None:
+            return None
+        passages.append(
+            replace(
+                passage,
+                joint=home.at(passage.joint),
+                motor=None if passage.motor is None else home.at(passage.motor),
+            )
+        )
+    return replace(prepared, passages=tuple(passages))
+
+
+class _Motion:
+    """The commanded motion of one stretch, filtered like the measured one."""
+
+    def __init__(self, part: Stretch, prepared: PreparedSession) -> None:
+        self._start, self._dt, self._end = part.start, part.dt, part.end
+        position = low_pass(part.values, part.dt, prepared.cutoff_hz, prepared.settings.order)
+        self._states = (position, *differentiate(position, part.dt))
+
+    def covers(self, channel: TorqueChannel | None) -> bool:
+        """Whether the channel's times lie within the stretch."""
+        if channel is None:
+            return True
+        slack = 0.5 * self._dt
+        first, last = self._start - slack, self._end + slack
+        return bool(first <= channel.times[0] and channel.times[-1] <= last)
+
+    def at(self, channel: TorqueChannel) -> TorqueChannel:
+        """The channel with the commanded motion at its times."""
+        q, qd, qdd = (
+            interpolate_uniform(state, self._start, self._dt, channel.times) for state in self._states
+        )
+        return replace(channel, q=q, qd=qd, qdd=qdd)

@@ -1,0 +1,469 @@
+"""From the raw channels of a session to filtered motion and torque at their own sample times.
+
+The positions pass the zero-phase Butterworth and are differentiated. The torques stay as measured, because the
+parallel filter of the rows acts on torque and regressor alike. The motion is evaluated at the sample times of
+the motor channel minus its delay, so a slow or irregular torque is never resampled.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from ident.dynamics.parameters import Floats
+from ident.rows.filters import (
+    ParallelFilter,
+    SignalSettings,
+    advice,
+    block_means,
+    differentiate,
+    excitation_frequency,
+    half_width,
+    interpolate_uniform,
+    low_pass,
+    moving,
+    optimal_cutoff,
+    thinning,
+)
+from ident.rows.timebase import (
+    Delay,
+    DelayData,
+    Stretch,
+    estimate_delay,
+    flag_outliers,
+    sample_period,
+    stretches,
+)
+
+if TYPE_CHECKING:
+    from lwr_driver.session import JointColumns, Session
+
+__all__ = ["Passage", "PreparedSession", "TorqueChannel", "clock_ns", "prepare"]
+
+BoolArray = NDArray[np.bool_]
+
+logger = logging.getLogger(__name__)
+
+_DISAGREEMENT = 2.0
+
+
+@dataclass(frozen=True)
+class TorqueChannel:
+    """Torque of one side as measured, and the filtered motion at its sample times.
+
+    times : (m,) [s], delay removed. q, qd, qdd, torque : (m, J). flagged : (m, J), bridged or outliers.
+    """
+
+    side: str
+    times: Floats
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
+    flagged: BoolArray
+
+
+@dataclass(frozen=True)
+class Passage:
+    """An uninterrupted stretch with the times of its rows.
+
+    rows : (K,) times of the rows [s]; index : (K,) int64, their numbers within the session.
+    joint_valid, motor_valid : (K, J), usable rows.
+    """
+
+    rows: Floats
+    index: NDArray[np.int64]
+    joint: TorqueChannel
+    joint_valid: BoolArray
+    motor: TorqueChannel | None
+    motor_valid: BoolArray | None
+
+
+@dataclass(frozen=True)
+class PreparedSession:
+    """A session ready for any regressor.
+
+    row_time_s : time between rows. period_rows : rows in a period of the excitation, None without periods.
+    delay : of the motor channel, None without one. counts : lost samples, outliers, dropped rows.
+    moving : moving joints. warnings : sentences for the report. uid : of the session, from its metadata.
+    mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    settings: SignalSettings
+    passages: tuple[Passage, ...]
+    row_time_s: float
+    period_rows: int | None
+    periods: int
+    delay: Delay | None
+    excitation_hz: float
+    cutoff_hz: float
+    moving: tuple[str, ...]
+    counts: dict[str, int]
+    warnings: tuple[str, ...]
+    uid: str = ""
+    mean_torque: tuple[float, ...] = ()
+
+    def __repr__(self) -> str:
+        return (
+            f"Prepared session {self.name}: {self.counts['rows']} rows, cut-off {self.cutoff_hz:.3g} Hz, "
+            f"excitation up to {self.excitation_hz:.3g} Hz"
+        )
+
+    def without_samples(self) -> PreparedSession:
+        """The same without its passages, to save memory; enough for the report."""
+        return replace(self, passages=())
+
+    @property
+    def has_motor(self) -> bool:
+        """Whether the session has motor torques."""
+        return any(passage.motor is not None for passage in self.passages)
+
+
+def prepare(
+    session: Session,
+    settings: SignalSettings | None = None,
+    *,
+    resonance_hz: float | None = None,
+    motor: bool = True,
+) -> PreparedSession:
+    """Filter and align one session. `motor` False leaves the motor channel aside.
+
+    Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
+    """
+    settings = settings or SignalSettings()
+    name = session.path.name
+    _check_finite(session.joint, name)
+    origin = int(clock_ns(session.joint)[0])
+    times = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
+    position, effort = session.joint.position, session.joint.effort
+    sensed = bool(effort.shape[1])
+    if not sensed:
+        if not motor or session.motor is None:
+            raise DataError(
+                f"{name}: /joint_states has no effort, so no joint torque; record it, or choose Model 2 "
+                "with a session with motor torques"
+            )
+        effort = np.zeros_like(position)
+    sequence = session.joint.sequence if session.joint.numbered else None
+    dt = sample_period(times, sequence, f"{name}: /joint_states")
+    warnings: list[str] = []
+    position_flags, crowded = flag_outliers(position, settings.outlier_scale)
+    effort_flags, also = flag_outliers(effort, settings.outlier_scale)
+    warnings += _jumping(name, "position", session.joint_names, crowded)
+    warnings += _jumping(name, "joint torque", session.joint_names, also)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1))
+    parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
+    if not parts:
+        raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
+    whole = max(parts, key=lambda part: len(part.values)).values[:, : position.shape[1]]
+    if settings.choose_cutoff:
+        settings = _chosen_cutoff(settings, whole, dt)
+    names = moving(position, session.joint_names)
+    if not names:
+        raise DataError(
+            f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone does "
+            "not show inertia and friction"
+        )
+    windows, periods = _windows(session, times)
+    grid, period_rows = _row_grid(windows, periods, settings)
+    count, resampled = len(parts), any(part.resampled for part in parts)
+    del whole
+    motions = [_Motion.of(parts.pop(0), effort_flags, times, settings) for _ in range(count)]
+    longest = max(motions, key=lambda motion: len(motion.qd))
+    excitation = excitation_frequency(longest.qd, dt)
+    motor_data = (
+        _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
+    )
+    delay = None
+    if motor_data is not None:
+        delay = _delay(motor_data, motions, session.joint_names, settings, sensed)
+        if delay.disagreement > _DISAGREEMENT:
+            spread = ", ".join(f"{joint} {1e3 * own:.1f}" for joint, (own, _) in delay.by_joint.items())
+            warnings.append(
+                f"{name}: the joints disagree about the motor channel's delay ({spread} ms), "
+                f"{delay.disagreement:.1f} times beyond their standard deviations; elastic joints do that, "
+                "and the stated deviation of the delay allows for it"
+            )
+    passages = [
+        passage
+        for motion in motions
+        if (passage := _passage(motion, grid, windows, motor_data, delay, settings)) is not None
+    ]
+    if not sensed:
+        passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
+    if not passages:
+        need = 2.0 * (half_width(settings.decimate_hz, settings.attenuation_db) + settings.edge)
+        raise DataError(
+            f"{name}: no stretch is longer than the filters' ends, {need:.1f} s; record a longer motion or "
+            "raise `decimate_hz`"
+        )
+    warnings += advice(
+        settings,
+        excitation_hz=excitation,
+        joint_rate_hz=1.0 / dt,
+        motor_rate_hz=None if motor_data is None else 1.0 / float(np.median(np.diff(motor_data[0]))),
+        resonance_hz=resonance_hz,
+    )
+    counts = {
+        "lost": lost,
+        "position_outliers": int(position_flags.sum()),
+        "joint_torque_outliers": int(effort_flags.sum()),
+        "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
+        "stretches": count,
+        "resampled": int(resampled),
+        "rows": sum(len(passage.rows) for passage in passages),
+        "joint_rows_dropped": sum(int((~passage.joint_valid).sum()) for passage in passages),
+        "motor_rows_dropped": sum(
+            int((~passage.motor_valid).sum()) for passage in passages if passage.motor_valid is not None
+        ),
+    }
+    for warning in warnings:
+        logger.warning("%s", warning)
+    return PreparedSession(
+        name=name,
+        joint_names=session.joint_names,
+        settings=settings,
+        passages=tuple(passages),
+        row_time_s=float(grid[1] - grid[0]) if len(grid) > 1 else 1.0 / settings.row_rate_hz,
+        period_rows=period_rows,
+        periods=len(windows) if period_rows else 0,
+        delay=delay,
+        excitation_hz=excitation,
+        cutoff_hz=settings.cutoff_hz,
+        moving=names,
+        counts=counts,
+        warnings=tuple(warnings),
+        uid=session.metadata.get("uid", ""),
+        mean_torque=_mean_torque(passages) if sensed else (),
+    )
+
+
+def _mean_torque(passages: list[Passage]) -> tuple[float, ...]:
+    sums, count = np.zeros(passages[0].joint.torque.shape[1]), 0
+    for passage in passages:
+        inside = (passage.joint.times >= passage.rows[0]) & (passage.joint.times <= passage.rows[-1])
+        sums += np.abs(passage.joint.torque[inside]).sum(axis=0)
+        count += int(inside.sum())
+    return tuple((sums / max(count, 1)).tolist())
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Filtered motion of one stretch and its joint torque."""
+
+    start: float
+    dt: float
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
+    flagged: BoolArray
+
+    @classmethod
+    def of(cls, part: Stretch, effort_flags: BoolArray, times: Floats, settings: SignalSettings) -> _Motion:
+        joints = effort_flags.shape[1]
+        q = low_pass(part.values[:, :joints], part.dt, settings.cutoff_hz, settings.order)
+        qd, qdd = differentiate(q, part.dt)
+        torque = part.values[:, joints:].copy()
+        flagged = np.repeat(part.bridged[:, None], joints, axis=1)
+        grid = part.times
+        for joint in np.flatnonzero(effort_flags.any(axis=0)):
+            hit = np.rint((times[effort_flags[:, joint]] - part.start) / part.dt).astype(np.int64)
+            spread = np.unique(np.concatenate([hit - 1, hit, hit + 1])) if part.resampled else np.unique(hit)
+            flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
+            good = ~flagged[:, joint]
+            torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
+        return cls(part.start, part.dt, q, qd, qdd, torque, flagged)
+
+    @property
+    def times(self) -> Floats:
+        """Sample times (n,) [s]."""
+        return self.start + self.dt * np.arange(len(self.q), dtype=np.float64)
+
+    def usable(self, settings: SignalSettings) -> tuple[float, float]:
+        """First and last time unaffected by the filter's start and end [s]."""
+        return self.start + settings.edge, self.start + self.dt * (len(self.q) - 1) - settings.edge
+
+    def channel(self, settings: SignalSettings) -> TorqueChannel:
+        """The joint torque channel, without the filter's ends."""
+        cut = int(np.ceil(settings.edge / self.dt))
+        part = slice(cut, len(self.q) - cut)
+        return TorqueChannel(
+            "joint", self.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
+            self.flagged[part],
+        )  # fmt: skip
+
+    def motor_channel(
+        self, times: Floats, torque: Floats, flags: BoolArray, delay: float, settings: SignalSettings
+    ) -> TorqueChannel | None:
+        """The motor torque with the motion at its own times minus the delay.
+
+        Lost positions are bridged, at this bandwidth as good as measured ones.
+        """
+        first, last = self.usable(settings)
+        actual = times - delay
+        inside = (actual >= first) & (actual <= last)
+        if inside.sum() < 16:
+            return None
+        actual = actual[inside]
+        start, dt = self.start, self.dt
+        q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
+        return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside])
+
+
+def _passage(
+    motion: _Motion,
+    grid: Floats,
+    windows: list[tuple[float, float]],
+    motor_data: tuple[Floats, Floats, BoolArray] | None,
+    delay: Delay | None,
+    settings: SignalSettings,
+) -> Passage | None:
+    first, last = motion.usable(settings)
+    half = half_width(settings.decimate_hz, settings.attenuation_db)
+    inside = (grid >= first + half) & (grid <= last - half)
+    within = np.zeros(len(grid), dtype=bool)
+    for low, high in windows:
+        within |= (grid >= low - 1e-9) & (grid <= high + 1e-9)
+    inside &= within
+    if not inside.any():
+        return None
+    rows = grid[inside]
+    joint = motion.channel(settings)
+    motor = motor_valid = None
+    if motor_data is not None and delay is not None:
+        motor = motion.motor_channel(*motor_data, delay.seconds, settings)
+        motor_valid = _valid(motor, rows, settings) if motor is not None else None
+    return Passage(rows, np.flatnonzero(inside), joint, _valid(joint, rows, settings), motor, motor_valid)
+
+
+def _valid(channel: TorqueChannel, rows: Floats, settings: SignalSettings) -> BoolArray:
+    """Rows (K, J) with enough measured samples of a moving joint in their filter."""
+    factor = thinning(channel.times, settings.decimate_hz)
+    times = block_means(channel.times, factor)
+    parallel = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db)
+    covered = parallel.coverage() >= 1.0 - settings.bridged_share
+    bridged = parallel.share(block_means(channel.flagged, factor)) <= settings.bridged_share
+    slow = block_means(np.abs(channel.qd) < settings.standstill_rad_s, factor)
+    still = parallel.share(slow)
+    return covered[:, None] & bridged & (still <= settings.standstill_share)
+
+
+def _motor(
+    session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
+) -> tuple[Floats, Floats, BoolArray]:
+    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
+    assert session.motor is not None
+    _check_finite(session.motor, name)
+    if not session.motor.effort.shape[1]:
+        raise DataError(f"{name}: /motor_states has no effort; record motor torques or choose Model 1")
+    clock, reference = clock_ns(session.motor), clock_ns(session.joint)
+    times = np.asarray((clock - origin) * 1e-9, dtype=np.float64)
+    span = (reference[-1] - reference[0]) * 1e-9
+    overlap = min(times[-1], span) - max(times[0], 0.0)
+    if overlap < 0.5 * (times[-1] - times[0]):
+        shift = np.median(session.motor.log_time - clock) - np.median(session.joint.log_time - reference)
+        times = times + shift * 1e-9
+        warnings.append(
+            f"{name}: the motor channel's clock differs from the joint channel's by {shift * 1e-9:.3f} s; "
+            "aligned by the host's times first, the rest is the estimated delay"
+        )
+    sample_period(times, None, f"{name}: /motor_states")
+    effort = session.motor.effort
+    flags, crowded = flag_outliers(effort, settings.outlier_scale)
+    warnings += _jumping(name, "motor torque", session.joint_names, crowded)
+    effort = effort.copy()
+    for joint in np.flatnonzero(flags.any(axis=0)):
+        good = ~flags[:, joint]
+        effort[~good, joint] = np.interp(times[~good], times[good], effort[good, joint])
+    return times, effort, flags
+
+
+def _jumping(name: str, what: str, joints: tuple[str, ...], columns: list[int]) -> list[str]:
+    return [
+        f"{name}: {joints[column]} {what} jumps too often for outliers, nothing was removed; look at the channel"
+        for column in columns
+    ]
+
+
+def _delay(
+    motor_data: tuple[Floats, Floats, BoolArray],
+    motions: list[_Motion],
+    names: tuple[str, ...],
+    settings: SignalSettings,
+    sensed: bool,
+) -> Delay:
+    if settings.motor_delay_s != "estimate":
+        return Delay(float(settings.motor_delay_s), 0.0, "stated")
+    if not sensed:
+        return Delay(0.0, 0.0, "no joint torque to compare the motor channel with")
+    times, torque, _ = motor_data
+    data = [DelayData(m.times, m.qd, m.qdd, m.torque, times, torque, m.usable(settings)) for m in motions]
+    rate = 1.0 / float(np.median(np.diff(times)))
+    return estimate_delay(
+        data,
+        names,
+        cutoff_hz=min(5.0, settings.cutoff_hz, 0.2 * rate),
+        search_s=settings.delay_search_s,
+        standstill_rad_s=settings.standstill_rad_s,
+    )
+
+
+def clock_ns(columns: JointColumns) -> NDArray[np.int64]:
+    """The source's times [ns], or the host's without them."""
+    return columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
+
+
+def _check_finite(columns: JointColumns, name: str) -> None:
+    for what, values in (("position", columns.position), ("effort", columns.effort)):
+        if values.size and not np.all(np.isfinite(values)):
+            row, joint = np.argwhere(~np.isfinite(values))[0]
+            raise DataError(
+                f"{name}: {columns.topic} {what} of {columns.names[joint]} is {values[row, joint]} at "
+                f"sample {row}; remove or repair the sample"
+            )
+
+
+def _windows(session: Session, times: Floats) -> tuple[list[tuple[float, float]], bool]:
+    """Spans [s] of the rows: the periods, else the excitation, else everything."""
+    for name in ("period", "excitation"):
+        spans = session.spans(name)
+        if spans:
+            log = session.joint.log_time
+            starts = np.searchsorted(log, [start for start, _ in spans])
+            stops = np.minimum(np.searchsorted(log, [stop for _, stop in spans]), len(times) - 1)
+            found = [(float(times[a]), float(times[b])) for a, b in zip(starts, stops, strict=True) if b > a]
+            if found:
+                return found, name == "period"
+    return [(float(times[0]), float(times[-1]))], False
+
+
+def _row_grid(
+    windows: list[tuple[float, float]], periods: bool, settings: SignalSettings
+) -> tuple[Floats, int | None]:
+    """Times of the rows [s], and the rows in a period if the periods are equal and consecutive."""
+    step = 1.0 / settings.row_rate_hz
+    first, last = windows[0][0], windows[-1][1]
+    if periods and len(windows) > 1:
+        lengths = np.array([high - low for low, high in windows])
+        length = float(np.mean(lengths[:-1]))
+        joined = all(abs(a[1] - b[0]) < 0.5 * step for a, b in pairwise(windows))
+        if joined and np.ptp(lengths) < 0.1 * step:
+            count = max(1, round(length / step))
+            total = count * len(windows)
+            return first + (length / count) * np.arange(total, dtype=np.float64), count
+    return np.arange(first, last + 1e-9, step), None
+
+
+def _chosen_cutoff(settings: SignalSettings, position: Floats, dt: float) -> SignalSettings:
+    cutoff = max(optimal_cutoff(position, dt, settings.order), 1.5 * settings.decimate_hz)
+    logger.info("position cut-off %.2f Hz chosen from the spectrum", cutoff)
+    return replace(settings, cutoff_hz=cutoff)

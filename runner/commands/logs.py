@@ -1,0 +1,180 @@
+"""Commands for session logs and results: info, recover, attach, import, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fri.errors import ConfigurationError
+from runner.terminal import PATH, json_option, to_json
+
+__all__ = ["attach_command", "import_command", "info_command", "recover_command", "report_command"]
+
+
+@click.command("info")
+@click.argument("session", type=PATH)
+@json_option
+def info_command(session: Path, as_json: bool) -> None:
+    """Summarise a SESSION log: origin, duration, channels, lost samples.
+
+    \b
+    lwr-run info experiments/lwr4plus-20260101-120000/loaded.mcap
+    """
+    from lwr_driver.session import describe
+
+    summary = describe(session)
+    click.echo(to_json(summary.as_dict()) if as_json else str(summary))
+
+
+@click.command("recover")
+@click.argument("session", type=PATH)
+@click.option("--out", type=PATH, help="Recovered file; default: SESSION.recovered.mcap.")
+@json_option
+def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
+    """Repair the SESSION log of a killed recorder, as a new file.
+
+    Everything up to the last complete chunk is kept. The result is read back as a check.
+
+    \b
+    lwr-run recover experiments/lwr4plus-20260101-120000/loaded.mcap
+    """
+    from lwr_driver.session import recover
+
+    target = out if out is not None else session.with_suffix(".recovered.mcap")
+    done = recover(session, target)
+    click.echo(to_json(done) if as_json else str(done))
+
+
+@click.command("attach")
+@click.argument("session", type=PATH)
+@click.argument("trace", type=PATH)
+@click.option("--out", type=PATH, help="New file; default: replace SESSION in one step.")
+@click.option(
+    "--tolerance-ms", type=click.FloatRange(min=0.0, min_open=True), help="Largest accepted timing error."
+)
+@json_option
+def attach_command(
+    session: Path, trace: Path, out: Path | None, tolerance_ms: float | None, as_json: bool
+) -> None:
+    """Add the motor torques of a controller's TRACE file to a SESSION log.
+
+    The trace has its own clock. It is aligned by the joint positions in both files, without resampling. Delay,
+    clock rate and their uncertainty are printed and stored in the log.
+
+    The file has a header and one line per sample: time_s, tau_m_A1 ... tau_m_A6 [Nm, after the gear],
+    q_A1 ... q_A6 [rad].
+
+    \b
+    lwr-run attach loaded.mcap loaded.trace.csv
+    """
+    from lwr_driver.session.trace import import_trace
+
+    tolerance = None if tolerance_ms is None else tolerance_ms / 1000.0
+    done = import_trace(session, trace, out, tolerance_s=tolerance)
+    click.echo(to_json(done) if as_json else str(done))
+
+
+def _rows(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    first, mark, last = value.partition(":")
+    if not mark or not first.isdigit() or not last.isdigit():
+        raise click.BadParameter(f"{value!r} is no range of rows such as 0:24750", context, parameter)
+    return int(first), int(last)
+
+
+@click.command("import")
+@click.argument("mapping")
+@click.argument("source", type=PATH)
+@click.argument("output", type=PATH)
+@click.option("--rows", callback=_rows, metavar="A:B", help="Rows A to B-1 only, counted from 0.")
+@click.option("--payload", help="Name of the payload; `none`: the bare arm.")
+@click.option("--payload-mass", type=float, metavar="KG", help="Weighed mass of the payload.")
+@click.option("--serial", help="Serial number of the arm.")
+@json_option
+def import_command(
+    mapping: str,
+    source: Path,
+    output: Path,
+    rows: tuple[int, int] | None,
+    payload: str | None,
+    payload_mass: float | None,
+    serial: str | None,
+    as_json: bool,
+) -> None:
+    """Convert a CSV or NPZ recording to a session log.
+
+    MAPPING is a mapping file (columns, units, signs, gears, time base) or the name of one in configs/imports.
+    SOURCE is the recording: a file, or the folder of the files named by the mapping. OUTPUT is the new log.
+
+    \b
+    lwr-run import lwr4_flobaroid measurements_1.npz run_1.mcap
+    lwr-run import tx40 recordings/tx40 tx40.mcap --rows 0:24750
+    """
+    from ident.import_log import LogMapping, import_log
+    from ident.import_log.mapping import mapping_path
+
+    if output.suffix != ".mcap":
+        raise ConfigurationError(f"output {output}: a session log ends in .mcap")
+    done = import_log(
+        LogMapping.load(mapping),
+        source,
+        output,
+        rows=rows,
+        payload=payload,
+        payload_mass=payload_mass,
+        serial=serial,
+        beside=mapping_path(mapping).parent,
+    )
+    click.echo(to_json(done) if as_json else str(done))
+
+
+@click.command("report")
+@click.argument("folder", type=PATH)
+@click.option(
+    "--svg", type=PATH, metavar="FOLDER", help="Write the figures as SVG files to this folder instead."
+)
+@click.option(
+    "--columns",
+    default=2,
+    show_default=True,
+    type=click.IntRange(1, 7),
+    help="Panels side by side in an SVG.",
+)
+@click.option(
+    "--width", default=720, show_default=True, type=click.IntRange(200, 3000), help="Width of an SVG [px]."
+)
+@json_option
+def report_command(folder: Path, svg: Path | None, columns: int, width: int, as_json: bool) -> None:
+    """Write report.html for the results in FOLDER, with a verdict on the run at the top.
+
+    The page is one file and needs no network. Its plots zoom, its tables can be copied, and it has a print style
+    for PDF. All files of the folder are read anew, a diagnosis.json too.
+
+    \b
+    lwr-run report experiments/lwr4plus-20260101-120000
+    lwr-run report experiments/lwr4plus-20260101-120000 --svg figures --columns 1 --width 420
+    lwr-run report experiments/lwr4plus-20260101-120000 --json          the verdicts, for a script
+    """
+    from runner.report.folder import ResultFolder
+
+    if svg is None:
+        from runner.report.page import write_report
+        from runner.report.verdicts import headline, verdicts
+
+        page = write_report(folder)
+        lines = verdicts(ResultFolder.load(folder))
+        level, sentence = headline(lines)
+        content = {"report": page, "level": level, "headline": sentence, "verdicts": lines}
+        click.echo(to_json(content) if as_json else f"{sentence}\n{page}")
+        return
+    from runner.report.figures import every_figure
+
+    results = ResultFolder.load(folder)
+    svg.mkdir(parents=True, exist_ok=True)
+    files = [
+        figure.save(svg / f"{figure.name}.svg", columns=columns, width=float(width))
+        for figure in every_figure(results)
+    ]
+    click.echo(to_json({"figures": files}) if as_json else "\n".join(map(str, files)))

@@ -1,0 +1,194 @@
+"""Commands for identified models: validate, compare, payload, export."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fri.errors import ConfigurationError
+from runner.terminal import PATH, json_option, to_json
+
+__all__ = ["compare_command", "export_command", "payload_command", "validate_command"]
+
+_FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
+
+
+@click.command("validate")
+@click.argument("model", type=PATH)
+@click.argument("sessions", nargs=-1, required=True, type=PATH)
+@json_option
+@click.option("--allow-seen", is_flag=True, help="Accept sessions of the estimate; their scores are marked.")
+@click.option(
+    "--against", multiple=True, type=PATH, metavar="MODEL", help="Another model to compare (repeatable)."
+)
+@click.option("--forward", is_flag=True, help="Simulate along the commanded motion too.")
+@click.option("--cross", is_flag=True, help="Cross-validate over the sessions too.")
+def validate_command(
+    model: Path,
+    sessions: tuple[Path, ...],
+    as_json: bool,
+    allow_seen: bool,
+    against: tuple[Path, ...],
+    forward: bool,
+    cross: bool,
+) -> None:
+    """Test MODEL on SESSIONS it was not fitted to: torque residuals per joint and side.
+
+    Competitors are scored as well: the controller's own mass matrix and gravity (logged through FRI), the
+    inertials of the URDF, other models. A session of the model's own estimate is refused.
+
+    \b
+    lwr-run validate model.yaml check.mcap
+    lwr-run validate model.yaml a.mcap b.mcap --against old.yaml --forward --json
+    """
+    from ident.estimation.compare import competitor_scores
+    from ident.estimation.forward_simulation import simulate_session
+    from ident.estimation.identify import IdentificationSettings
+    from ident.estimation.validate import cross_validate, validate
+    from ident.model.model_file import read_model
+    from lwr_driver.session import read_session
+
+    tested = read_model(model)
+    logs = [read_session(path) for path in sessions]
+    result = validate(tested, logs, allow_seen=allow_seen)
+    others = [read_model(path) for path in against]
+    result = replace(result, competitors=competitor_scores(tested, logs, others=others))
+    content: dict[str, Any] = result.to_dict()
+    texts = [str(result)]
+    if forward:
+        runs = [simulate_session(tested, log) for log in logs]
+        content["forward"] = [run.to_dict() for run in runs]
+        texts += [str(run) for run in runs]
+    if cross:
+        structure = tested.structure
+        wanted = IdentificationSettings(
+            model=structure.model,
+            without=structure.without,
+            couplings=structure.couplings,
+            coulomb=structure.coulomb,
+        )
+        folds = cross_validate(logs, structure.chain, wanted)
+        content["cross_validation"] = folds.to_dict()
+        texts.append(str(folds))
+    click.echo(to_json(content) if as_json else "\n\n".join(texts))
+
+
+@click.command("compare")
+@click.argument("first", type=PATH)
+@click.argument("second", type=PATH)
+@json_option
+@click.option(
+    "--level",
+    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    default=0.05,
+    show_default=True,
+    help="Probability of any false difference.",
+)
+def compare_command(first: Path, second: Path, as_json: bool, level: float) -> None:
+    """List the significant differences between two models: two robots, two dates, two settings.
+
+    Models with different base sets are compared in the parameter combinations common to both.
+
+    \b
+    lwr-run compare robot_a.yaml robot_b.yaml
+    """
+    from ident.estimation.compare import compare
+    from ident.model.model_file import read_model
+
+    labels = (f"{first}", f"{second}")
+    result = compare(read_model(first), read_model(second), level=level, labels=labels)
+    click.echo(to_json(result.to_dict()) if as_json else str(result))
+
+
+@click.command("payload")
+@click.argument("model", type=PATH)
+@click.argument("sessions", nargs=-1, required=True, type=PATH)
+@click.option("--free-offsets", is_flag=True, help="Estimate the torque offsets anew.")
+@click.option("--out", type=PATH, metavar="FILE", help="Model file to write, with the payload.")
+@json_option
+def payload_command(
+    model: Path, sessions: tuple[Path, ...], free_offsets: bool, out: Path | None, as_json: bool
+) -> None:
+    """Estimate mass, centre of mass and inertia of the payload in SESSIONS, with MODEL as the arm.
+
+    The standard deviations include the uncertainty of the arm model. The mass is compared with the announced
+    one.
+
+    \b
+    lwr-run payload model.yaml loaded.mcap
+    lwr-run payload model.yaml loaded.mcap --out with_payload.yaml
+    """
+    from ident.estimation.payload import identify_payload, with_payload
+    from ident.model.model_file import read_model, write_model
+    from lwr_driver.session import read_session
+
+    if out is not None and out.exists():
+        raise ConfigurationError(f"file {out} exists; choose another name")
+    arm = read_model(model)
+    found = identify_payload(arm, [read_session(path) for path in sessions], free_offsets=free_offsets)
+    click.echo(to_json(found.to_dict()) if as_json else str(found))
+    if out is not None:
+        write_model(with_payload(arm, found), out)
+        click.echo(str(out), err=as_json)
+
+
+@click.command("export")
+@click.argument("model", type=PATH)
+@click.argument("outputs", nargs=-1, required=True, type=PATH)
+@click.option("--payload", help="Payload of the model to mount; default: the bare arm.")
+@click.option("--name", default="arm", show_default=True, help="Name in the file; prefix of the C functions.")
+@click.option("--force", is_flag=True, help="Replace existing files.")
+@json_option
+def export_command(
+    model: Path, outputs: tuple[Path, ...], payload: str | None, name: str, force: bool, as_json: bool
+) -> None:
+    """Write a model in other formats, chosen by the endings of OUTPUTS.
+
+    \b
+    .urdf  URDF: consistent inertials, damping and friction
+    .xml   MJCF (MuJoCo): the same with drive inertia as armature
+    .c     C99 inverse dynamics without dependencies
+    .py    numpy inverse dynamics
+
+    URDF and MJCF need physically consistent bodies. Unidentifiable parameters come from the arm's own URDF; an
+    inconsistent estimate is replaced by the nearest consistent body, with a note.
+
+    \b
+    lwr-run export results/model.yaml lwr.urdf lwr.xml lwr.c lwr.py
+    """
+    from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
+    from ident.model.model_file import read_model
+
+    for output in outputs:
+        if output.suffix not in _FORMATS:
+            known = ", ".join(f"{ending} ({kind})" for ending, kind in _FORMATS.items())
+            raise ConfigurationError(f"output {output}: the ending says the format; known: {known}")
+        if output.exists() and not force:
+            raise ConfigurationError(f"output {output} exists; choose another name or give --force")
+    source = read_model(model)
+    plain = standard_model(source, payload=payload)
+    wants_bodies = any(output.suffix in (".urdf", ".xml") for output in outputs)
+    bodies = standard_model(source, payload=payload, consistent=True) if wants_bodies else plain
+    writers = {
+        ".urdf": lambda: to_urdf(bodies),
+        ".xml": lambda: to_mjcf(bodies, name=name),
+        ".c": lambda: to_c(plain, name),
+        ".py": lambda: to_numpy(plain),
+    }
+    for output in outputs:
+        text = writers[output.suffix]()
+        try:
+            output.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"output {output} cannot be written: {error.strerror}") from error
+    if as_json:
+        files = [{"file": output, "format": _FORMATS[output.suffix]} for output in outputs]
+        click.echo(to_json({"files": files, "title": plain.title, "notes": bodies.notes}))
+        return
+    for output in outputs:
+        click.echo(f"{output}: {_FORMATS[output.suffix]}, {plain.title}")
+    for note in bodies.notes:
+        click.echo(f"  {note}")

@@ -1,0 +1,135 @@
+"""Commands for motions before they are driven: plan, check, preview."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fri.errors import ConfigurationError
+from runner.terminal import PATH, StatusLine, json_option, to_json
+
+__all__ = ["check_command", "plan_command", "preview_command"]
+
+_EXPERIMENT = "experiments/default.yaml"
+
+
+@click.command("plan")
+@click.argument("file", default="plans/default.yaml")
+@click.option("--out", type=PATH, help="Plan file; default: NAME.plan.yaml here.")
+@click.option("--force", is_flag=True, help="Replace an existing plan file.")
+@json_option
+def plan_command(file: str, out: Path | None, force: bool, as_json: bool) -> None:
+    """Plan the exciting motion of the problem FILE; by default the one of the stored plan.
+
+    The plan file has coefficients, margins of all limits on the continuous motion, objective values, predicted
+    relative standard deviations, seeds and versions. An experiment uses it through `excitation: {plan: FILE}`.
+    Ctrl-C ends the search and keeps the best motion so far.
+
+    \b
+    lwr-run plan
+    lwr-run plan my_arm.yaml --out my_arm.plan.yaml
+    """
+    from ident.excitation.plan import plan_report
+    from ident.excitation.planner import plan
+    from ident.excitation.problem import PlanProblem
+    from runner.replanning import show_search
+
+    problem = PlanProblem.load(file)
+    target = out if out is not None else Path(f"{problem.name}.plan.yaml")
+    if target.exists() and not force:
+        raise ConfigurationError(f"{target} exists; choose another --out, or replace it with --force")
+    status = StatusLine()
+    found = plan(problem, lambda now: show_search(status, now))
+    status.clear()
+    found.save(target)
+    if as_json:
+        keys = ("constraint", "subject", "value", "limit")
+        content = {
+            "objectives": dict(found.objectives),
+            "rsd_percent": dict(found.rsd_percent),
+            "margins": [{key: getattr(margin, key) for key in keys} for margin in found.check.margins],
+            "provenance": dict(found.provenance),
+        }
+        click.echo(to_json(content))
+    else:
+        click.echo(plan_report(found))
+    click.echo(str(target), err=as_json)
+
+
+@click.command("check")
+@click.argument("file", default=_EXPERIMENT)
+@click.option("--period-ms", default=5.0, show_default=True, type=click.FloatRange(1, 100), help="FRI cycle.")
+@json_option
+def check_command(file: str, period_ms: float, as_json: bool) -> None:
+    """Check the experiment FILE without motion: limits, torques, collisions, from the home position.
+
+    Exits with 3 after a failed check.
+
+    \b
+    lwr-run check my_lab.yaml
+    lwr-run check my_lab.yaml --period-ms 2 --json
+    """
+    from lwr_driver.arm import Arm
+    from lwr_driver.arm.cell import Cell
+    from runner.experiment_file import Experiment
+    from runner.planning import Excitations, session_motion
+    from runner.preflight import Preflight
+
+    experiment = Experiment.load(file)
+    arm = Arm.load(experiment.arm, beside=experiment.folder)
+    cell = Cell.load(experiment.cell, beside=experiment.folder)
+    motions = Excitations.of(experiment, arm, cell)
+    home = experiment.home(len(arm.joint_names))
+    found: dict[str, Preflight] = {}
+    for plan in experiment.sessions:
+        rows = motions.rows(plan, period_ms / 1000)
+        motion, found[plan.name] = session_motion(experiment, arm, cell, plan, rows, home)
+        if not as_json:
+            click.echo(f"\nsession {plan.name}: {motion.duration_s:.1f} s")
+            click.echo(str(found[plan.name]))
+    if as_json:
+        click.echo(to_json({name: list_.items for name, list_ in found.items()}))
+    for preflight in found.values():
+        preflight.enforce()
+
+
+@click.command("preview")
+@click.argument("file", default=_EXPERIMENT)
+@click.option("--session", metavar="NAME", help="Session of the experiment; default: the heaviest payload.")
+@click.option("--out", type=PATH, default=Path("preview.html"), show_default=True, help="The page to write.")
+@click.option("--serve", "serving", is_flag=True, help="Serve an interactive scene until Ctrl-C instead.")
+@click.option("--port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --serve.")
+@json_option
+def preview_command(
+    file: str, session: str | None, out: Path, serving: bool, port: int, as_json: bool
+) -> None:
+    """Show a planned motion in 3D. FILE is an experiment file, a folder of results or a plan file.
+
+    The page is one file and needs no network. It shows the arm along the motion, the path of its flange coloured
+    by clearance, the tightest moment, and the use of every limit.
+
+    \b
+    lwr-run preview my_lab.yaml
+    lwr-run preview my_lab.yaml --session unloaded --out unloaded.html
+    lwr-run preview experiments/lwr4plus-20260101-120000 --serve
+    """
+    from runner.preview import planned_motion, preview_html, serve
+
+    planned = planned_motion(file, session=session)
+
+    def tell(place: str) -> None:
+        if as_json:
+            click.echo(to_json({**planned.facts(), "place": place}))
+            return
+        click.echo(f"{planned.title}: {planned.motion.duration_s:.1f} s, tightest moment {planned.tightest}")
+        for item in planned.preflight.items:
+            if not item.ok:
+                click.echo(str(item))
+        click.echo(place)
+
+    if serving:
+        serve(planned, port, tell)
+        return
+    out.write_text(preview_html(planned), encoding="utf-8")
+    tell(str(out))

@@ -1,0 +1,181 @@
+"""Commands around the computer: doctor, emulator, completion."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from contextlib import ExitStack
+
+import click
+from click.shell_completion import get_completion_class
+
+from fri.errors import ConfigurationError, LwrError
+from runner.terminal import StatusLine, json_option, to_json
+
+__all__ = ["completion_command", "doctor_command", "emulator_command"]
+
+
+@click.command("doctor")
+@click.argument("file", default="experiments/default.yaml")
+@click.option("--link", is_flag=True, help="Test the link too: answer the controller in monitor mode.")
+@click.option(
+    "--seconds", default=10.0, show_default=True, type=click.FloatRange(0.5), help="Length of the test."
+)
+@click.option(
+    "--wait",
+    "wait_s",
+    default=20.0,
+    show_default=True,
+    type=click.FloatRange(0.1),
+    help="For the first packet [s].",
+)
+@click.option("--address", help="Address of this computer, for a real controller; default: from FILE.")
+@click.option("--port", type=click.IntRange(1, 65535), help="UDP port; default: from FILE.")
+@click.option("--period-ms", type=click.FloatRange(1, 100), help="Cycle of the built-in emulator.")
+@json_option
+def doctor_command(
+    file: str,
+    link: bool,
+    seconds: float,
+    wait_s: float,
+    address: str | None,
+    port: int | None,
+    period_ms: float | None,
+    as_json: bool,
+) -> None:
+    """Examine this computer and, with --link, the connection to the controller. Nothing moves.
+
+    Each item has a value, a limit and advice. The experiment FILE gives addresses and KRL program. With backend
+    `emulator` the built-in emulator is tested in real time, as a measure of the computer alone.
+
+    Exits with 0 if ready, 3 (computer), 5 (controller) or 6 (link, real-time rights) by the first failure.
+
+    \b
+    lwr-run doctor                                      this computer
+    lwr-run doctor my_lab.yaml --link                   and the link to the controller
+    lwr-run doctor --link --period-ms 5                 against the built-in emulator
+    lwr-run doctor --link --address 192.168.0.100       a controller, without an experiment file
+    """
+    from lwr_driver.arm import Arm
+    from runner.doctor import Patient, examine
+    from runner.experiment_file import Experiment
+    from runner.laboratory import free_port
+    from sim_backend.process import EmulatorProcess
+
+    experiment = Experiment.load(file)
+    emulated = experiment.backend == "emulator" and address is None
+    if period_ms is not None and not emulated:
+        raise ConfigurationError("--period-ms is for the emulator; a controller chooses its cycle in friOpen")
+    here = address if address is not None else experiment.link.address
+    status = StatusLine()
+    with ExitStack() as stack:
+        # The findings include the driver's warnings.
+        driver_log = logging.getLogger("lwr_driver.driver")
+        driver_log.addFilter(_is_error)
+        stack.callback(driver_log.removeFilter, _is_error)
+        place = port if port is not None else experiment.link.port
+        if emulated:
+            place = free_port(here) if port is None else port
+        torque = experiment.motor_torque
+        patient = Patient(
+            arm=Arm.load(experiment.arm, beside=experiment.folder),
+            address=here,
+            port=place,
+            controller=experiment.link.controller,
+            handshake=experiment.link.handshake,
+            counter_int=torque.krl.counter_int if torque.source == "krl_reals" else None,
+            realtime=not emulated,
+        )
+        if emulated and link:
+            emulator = EmulatorProcess(
+                experiment.emulator_path,
+                lock_step=False,
+                fri_host=here,
+                fri_port=place,
+                period_ms=period_ms,
+                settings={"fri.program": experiment.link.handshake, **experiment.emulator_settings},
+            )
+            stack.enter_context(emulator)
+        stack.callback(status.clear)
+        found = examine(patient, link_s=seconds if link else None, wait_s=wait_s, report=status.show)
+        status.clear()
+    click.echo(to_json(found.to_dict()) if as_json else str(found))
+    sys.exit(found.exit_code)
+
+
+def _is_error(record: logging.LogRecord) -> bool:
+    return record.levelno > logging.WARNING
+
+
+@click.command("emulator")
+@click.argument("config", default="emulator/default.yaml")
+@click.option("--fri-host", default="127.0.0.1", show_default=True, help="Address of the commanding PC.")
+@click.option("--fri-port", default=49938, show_default=True, type=click.IntRange(1, 65535), help="Its port.")
+@click.option(
+    "--pendant-port", default=0, type=click.IntRange(0, 65535), help="Port of the pendant; 0: any free port."
+)
+@click.option("--period-ms", type=click.FloatRange(1, 100), help="FRI cycle; default: as configured.")
+@click.option(
+    "--lock-step", is_flag=True, help="Own clock: one cycle for each answer, repeatable bit for bit."
+)
+@json_option
+def emulator_command(
+    config: str,
+    fri_host: str,
+    fri_port: int,
+    pendant_port: int,
+    period_ms: float | None,
+    lock_step: bool,
+    as_json: bool,
+) -> None:
+    """Run the emulated controller and arm in real time until Ctrl-C.
+
+    It behaves as the KRC of a KUKA LWR4+: it sends to --fri-host:--fri-port and expects an answer in each
+    cycle. Any FRI 1.0 client can connect.
+
+    \b
+    lwr-run emulator                             the default arm at its configured cycle
+    lwr-run emulator --period-ms 2 --fri-port 7001
+    lwr-run emulator --json                      its ports as one JSON value, for a script
+    """
+    from sim_backend.process import EmulatorProcess
+
+    emulator = EmulatorProcess(
+        config,
+        lock_step=lock_step,
+        fri_host=fri_host,
+        fri_port=fri_port,
+        pendant_port=pendant_port,
+        period_ms=period_ms,
+    )
+    with emulator:
+        ports = {"fri_host": fri_host, "fri_port": fri_port, "pendant_port": emulator.pendant_port}
+        text = f"sends to {fri_host}:{fri_port}, pendant on 127.0.0.1:{emulator.pendant_port}; Ctrl-C ends it"
+        try:
+            click.echo(to_json(ports) if as_json else text)
+            emulator.wait()
+        except KeyboardInterrupt:
+            click.echo("ended", err=True)
+            return
+        messages = emulator.messages().strip()
+    if messages:
+        raise LwrError(f"the emulator ended by itself: {messages.splitlines()[-1]}")
+    sys.exit(0)
+
+
+@click.command("completion")
+@click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
+@click.pass_context
+def completion_command(context: click.Context, shell: str) -> None:
+    """Print the completion script for SHELL.
+
+    \b
+    lwr-run completion bash >> ~/.bashrc
+    lwr-run completion zsh >> ~/.zshrc
+    lwr-run completion fish > ~/.config/fish/completions/lwr-run.fish
+    """
+    kind = get_completion_class(shell)
+    assert kind is not None
+    # The script is not tied to the version of the shell here; it may be for another computer.
+    script = kind(context.find_root().command, {}, "lwr-run", "_LWR_RUN_COMPLETE")
+    click.echo(script.source_template % script.source_vars())

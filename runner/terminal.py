@@ -1,0 +1,171 @@
+"""The terminal: shared options, results as JSON, the status line, Ctrl-C."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from enum import Enum
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Self, TextIO, TypeVar
+
+import click
+import numpy as np
+
+__all__ = [
+    "PATH", "GroupedCommand", "Interrupts", "StatusLine", "coupling_option", "gear_ratio_option", "json_option",
+    "plain", "to_json",
+]  # fmt: skip
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+
+PATH = click.Path(path_type=Path)
+_BAR = 24
+
+
+def json_option(command: Decorated) -> Decorated:
+    """The option --json of every command with a result."""
+    return click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")(command)
+
+
+def coupling_option(command: Decorated) -> Decorated:
+    """The option --coupling."""
+    return click.option(
+        "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
+    )(command)
+
+
+def gear_ratio_option(command: Decorated) -> Decorated:
+    """The option --gear-ratio, for arms without an arm file."""
+    return click.option(
+        "--gear-ratio",
+        metavar="N[,N...]",
+        help="Motor turns per turn of the joint, one for all or one per joint; default: from the arm file.",
+    )(command)
+
+
+class GroupedCommand(click.Command):
+    """A command with its options under headings in the help.
+
+    groups : heading -> parameter names of the options; all others follow under "Options".
+    """
+
+    def __init__(self, *arguments: Any, groups: Mapping[str, tuple[str, ...]], **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.groups = groups
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, group by group."""
+        records = {parameter.name: parameter.get_help_record(ctx) for parameter in self.get_params(ctx)}
+        shown = {name for names in self.groups.values() for name in names}
+        rest = tuple(str(name) for name in records if name not in shown)
+        for heading, names in (*self.groups.items(), ("Options", rest)):
+            with formatter.section(heading):
+                formatter.write_dl([record for name in names if (record := records[name]) is not None])
+
+
+def plain(value: Any) -> Any:
+    """`value` as content for JSON.
+
+    Dataclasses and mappings become dicts, sequences and arrays lists, enumerations names, non-finite numbers
+    None, and anything else text.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+
+
+def to_json(value: Any) -> str:
+    """`plain(value)` as text."""
+    return json.dumps(plain(value), indent=1)
+
+
+class StatusLine:
+    """One line, rewritten in place on a terminal; elsewhere one line per phase.
+
+    stream : standard error by default; results go to standard output. interval_s : shortest time between rewrites.
+    """
+
+    def __init__(self, stream: TextIO | None = None, interval_s: float = 0.2) -> None:
+        self._stream = stream if stream is not None else sys.stderr
+        self._interval = interval_s
+        self._live = self._stream.isatty()
+        self._next = 0.0
+        self._heading = ""
+        self._width = 0
+
+    def show(self, heading: str, fraction: float, detail: str) -> None:
+        """Show progress: `heading` (session and phase), `fraction` of the motion from 0 to 1, `detail`."""
+        now = time.monotonic()
+        if self._live and (now >= self._next or fraction >= 1.0 or heading != self._heading):
+            filled = round(_BAR * min(max(fraction, 0.0), 1.0))
+            bar = "█" * filled + "░" * (_BAR - filled)
+            text = f"{heading:<26} {bar} {100 * fraction:3.0f} %  {detail}"
+            self._stream.write("\r" + text.ljust(self._width))
+            self._stream.flush()
+            self._width = len(text)
+            self._next = now + self._interval
+        elif not self._live and heading != self._heading:
+            self._stream.write(f"{heading}  {detail}\n")
+            self._stream.flush()
+        self._heading = heading
+
+    def say(self, text: str) -> None:
+        """Print a permanent line above the status line."""
+        self.clear()
+        self._stream.write(text + "\n")
+        self._stream.flush()
+
+    def clear(self) -> None:
+        """Remove the status line."""
+        if self._live and self._width:
+            self._stream.write("\r" + " " * self._width + "\r")
+            self._stream.flush()
+        self._width = 0
+        self._heading = ""
+
+
+class Interrupts:
+    """Ctrl-C during a motion, as a context manager. SIGTERM counts as one Ctrl-C.
+
+    on_first : called at the first interrupt; requests the jerk-limited stop. on_second : called at the second;
+    stops the answers, and the controller leaves command mode by itself.
+    """
+
+    def __init__(self, on_first: Callable[[], None], on_second: Callable[[], None]) -> None:
+        self._actions = (on_first, on_second)
+        self._previous: dict[int, object] = {}
+        self.count = 0
+
+    def __enter__(self) -> Self:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, previous in self._previous.items():
+            signal.signal(number, previous)  # type: ignore[arg-type]
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        if self.count <= len(self._actions):
+            self._actions[self.count - 1]()
