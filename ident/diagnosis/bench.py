@@ -88,7 +88,7 @@ def some_joint_moves(recordings: Sequence[Recording]) -> None:
     fitted = [s for r in recordings if not r.test for s in r.stretches]
     if not any(np.any(np.ptp(s.q, axis=0) > TRAVEL_RAD) for s in fitted):
         raise DataError(
-            f"no joint moves by more than {TRAVEL_RAD} rad; a pose says nothing about dynamics. Record an "
+            f"no joint moves by more than {TRAVEL_RAD} rad; a static pose excites no dynamics. Record an "
             "excitation"
         )
 
@@ -149,11 +149,9 @@ def _evidence(
     *,
     compared: bool = False,
 ) -> tuple[Evidence, bool]:
-    """Evidence with the noise floor of a first fit.
-
-    A prior that is not `compared` keeps base parameters with weak excitation near the drawing. Repeated excitation
-    makes their uncertainty known, so the prior is left out.
-    """
+    """Evidence with the noise floor of a first fit. A prior that is not `compared` keeps base parameters with weak
+    excitation near the drawing; repeated periods make their uncertainty known, so the prior is left
+    out."""
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
     sigma, inflation, floor, repeatable = _noise(nominal, Evidence(nominal, settings, one, one).residuals())
     if repeatable and not compared:
@@ -162,11 +160,8 @@ def _evidence(
 
 
 def _noise(nominal: Nominal, residual: Mapping[str, Floats]) -> tuple[_BySide, _BySide, _BySide, bool]:
-    """Noise of a row [Nm], its variance inflation and its repeatability [Nm], (n,) by side; and whether all noise
-    comes from repeated periods.
-
-    The repeatability comes from periods, else from sessions with the same motion, else from the residual.
-    """
+    """By side, (n,): noise of a row [Nm], its variance inflation, and its repeatability [Nm] from periods, else from
+    sessions with the same motion, else from the residual; and whether all noise comes from periods."""
     periods = {r.number: (r.start_s, r.period_s) for r in nominal.recordings}
     sigma, inflation, floor, known = {}, {}, {}, True
     for side, rows in nominal.rows.items():
@@ -182,11 +177,7 @@ def _noise(nominal: Nominal, residual: Mapping[str, Floats]) -> tuple[_BySide, _
 def _roughly_stiff(
     arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, reference: Reference | None
 ) -> Arm:
-    """The arm with its compliance times the factor of the best fit, as the start of further steps.
-
-    Links ringing with another period than the model's are soon out of phase with it, and no derivative shows the
-    direction.
-    """
+    """The arm with its compliance times the factor of the best fit, as a start near enough for derivatives."""
     tried = [replace(arm, compliance=factor * arm.compliance) for factor in _FACTORS]
     misfits = [
         prepare_bench(one, recordings, settings, reference, (), fit_compliance=False).evidence.chi_square
@@ -196,11 +187,8 @@ def _roughly_stiff(
 
 
 def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
-    """Gauss-Newton step (n,) of the joints' compliance.
-
-    With the encoders at the links the twist of a joint shows in its own motor row alone; with the encoders at the
-    motors it moves all links.
-    """
+    """Gauss-Newton step (n,) of the joints' compliance. With encoders at the links, the twist of a joint shows in its
+    own motor row alone; with encoders at the motors it moves all links."""
     if nominal.arm.encoder == "motor":
         return _common_compliance_step(nominal, evidence, arm)
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
@@ -216,11 +204,9 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
 
 
 def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
-    """Step (n,) of all joints' compliance at once, beside the channels' delays, at most a third of each.
-
-    The description's stiffness counts as known to a factor of about two. It decides only for joints hardly bent by
-    the motion.
-    """
+    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The description's
+    stiffness, known to a factor of about two, decides only for joints hardly bent by the
+    motion."""
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
     dictionary = Dictionary(nominal, evidence, [e.cause for e in (ELASTICITY, *DELAYS.values())])
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
@@ -243,11 +229,8 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> F
 def again_with(
     bench: Bench, selection: Selection, settings: DiagnosisSettings, causes: Sequence[str] | None
 ) -> Bench | None:
-    """The bench with predictions and noise floor after the claims; None without claims.
-
-    Effects of the load depend on a torque predicted by the base parameters, and these were wrong before the effects
-    were in the model.
-    """
+    """The bench with predictions and noise floor after the claims; None without claims. Effects of the load depend on
+    a torque predicted by the base parameters, wrong before the effects were in the model."""
     if not selection.claims:
         return None
     nominal, evidence = bench.nominal, bench.evidence
@@ -266,10 +249,8 @@ def again_with(
 
 
 def slow_delay(bench: Bench, trial: Trial) -> tuple[float, float]:
-    """Delay [s] of a trial of a late channel, and its standard deviation, from means over a tenth of a second.
-
-    A late channel is late at every frequency; a vibration missing in the positions vanishes in the means.
-    """
+    """Delay [s] of a trial of a late channel, and its standard deviation, from means over a tenth of a second. A late
+    channel is late at every frequency; a vibration missing in the positions vanishes in the means."""
     nominal = bench.nominal
     settings = replace(nominal.settings, bin_s=_SLOW_S)
     slow = replace(nominal, settings=settings)

@@ -193,10 +193,8 @@ class Dictionary:
         return self._kept[candidate.key]
 
     def _step(self, candidate: Candidate) -> Trial | None:
-        """The best edge of a block for an effect with an onset and no end.
-
-        The products of the whole session are made once; those after an edge are a part of their blocks.
-        """
+        """The best edge of a block for an effect with an onset and no end. Products after an edge are a part of their
+        blocks, so those of the whole session are made once."""
         evidence = self.evidence
         best: tuple[Shape, Score, tuple[str, int]] | None = None
         forms = list(dict.fromkeys(s.form for s in self._grid(candidate)))
@@ -300,9 +298,10 @@ class Dictionary:
         speed and an exponent compensate each other along a narrow valley."""
         best = trial
 
-        def loss(shape: Shape) -> float:
+        def loss(spans: Sequence[_Span], point: Sequence[float]) -> float:
             nonlocal best
-            tried = self.trial(trial.candidate, shape, choices)
+            values = {span.name: span.value(x) for span, x in zip(spans, point, strict=True)}
+            tried = self.trial(trial.candidate, best.shape.at(**values), choices)
             if tried is None:
                 return 0.0
             if tried.score.fitted > best.score.fitted:
@@ -311,7 +310,7 @@ class Dictionary:
 
         for span in self._spans(trial):
             minimize_scalar(
-                lambda x, span=span: loss(best.shape.at(**{span.name: span.value(x)})),
+                lambda x, span=span: loss([span], [x]),
                 bounds=(span.low, span.high),
                 method="bounded",
                 options={"maxiter": evaluations},
@@ -319,9 +318,7 @@ class Dictionary:
         spans = [] if trial.candidate.effect.event else self._spans(best)
         if len(spans) > 1 and best.score.fitted > _VALLEY:
             minimize(
-                lambda point: loss(
-                    best.shape.at(**{s.name: s.value(x) for s, x in zip(spans, point, strict=True)})
-                ),
+                lambda point: loss(spans, point),
                 [span.coordinate(best.shape) for span in spans],
                 method="Nelder-Mead",
                 bounds=[(span.low, span.high) for span in spans],
@@ -403,7 +400,7 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
 
 
 def _clipped(nominal: Nominal) -> Floats:
-    """Torque (n,) [Nm] at the limit of each joint's sensor, if all fitted sessions with a visible limit agree, else
+    """Torque (n,) [Nm] at the limit of each joint's sensor, if all fitted sessions that show one agree, else
     NaN."""
     limits = np.array([r.clipped for r in nominal.recordings if not r.test and r.has_effort])
     if not limits.size:

@@ -171,10 +171,7 @@ def _same(effort: Floats) -> Flags:
 
 
 def _repeated(effort: Floats) -> int:
-    """Number of repeated samples beyond chance.
-
-    Smooth or coarse channels repeat by themselves; then equality of all joints at once proves nothing.
-    """
+    """Number of repeated samples beyond chance; in smooth or coarse channels equality of all joints proves nothing."""
     if effort.shape[1] < 2 or len(effort) < 3:
         return 0
     same = _same(effort)[1:]

@@ -23,7 +23,7 @@ from ident.estimators.distributions import chi_square_tail, fisher_tail
 __all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
 
 Floats = NDArray[np.float64]
-# Least share of a column's power left by free base parameters, where the others lean on a drawing.
+# Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3
 
 # A fall of the chi-square up to this is no evidence, whatever its value on the held-back parts.
@@ -245,16 +245,16 @@ class Evidence:
         self.full = self._fit(gram, target)
         self._free = None
         if self.prior is not None and not self.compared:
-            self._free = self._fit(gram, target, leaning=False)
+            self._free = self._fit(gram, target, with_prior=False)
         self._held = [
             self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
         ]
 
-    def _fit(self, gram: Floats, target: Floats, *, leaning: bool = True) -> Fit:
-        """Values from sums of products; `leaning` : with the prior, if any."""
+    def _fit(self, gram: Floats, target: Floats, *, with_prior: bool = True) -> Fit:
+        """Values from sums of products, `with_prior` if there is one."""
         s = self._scale
         gram, target = gram.copy(), target.copy()
-        if self.prior is not None and leaning:
+        if self.prior is not None and with_prior:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
             target[:p] += self.prior[0] @ self.prior[1]
@@ -269,10 +269,7 @@ class Evidence:
         return {key: self._padded(key[0], values) * self.mask[key] for key, values in rows.items()}
 
     def products(self, columns: Mapping[Key, Floats], known: Products | None = None) -> Products:
-        """Products in each block of padded columns (blocks, L, k).
-
-        known : the products of the same columns with the base alone; only those with further columns are made.
-        """
+        """Products in each block of padded columns (blocks, L, k); `known` : those with the base alone."""
         known = self.alone(columns) if known is None else known
         if not self.extra:
             return known

@@ -70,8 +70,7 @@ def companions(dictionary: Dictionary, trial: Trial) -> Rows | None:
 
 
 def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
-    """Functions (m, k) of a drive's speed and of its direction, finer at low speed, the range of the largest
-    differences between friction laws."""
+    """Functions (m, k) of a drive's speed and its direction, finer at low speed, where friction laws differ most."""
     motions = dictionary.nominal.motions
     roots = [np.sqrt(np.abs(m.motor_speed[:, joint])) for m in motions]
     high = max(float(root.max()) for root in roots)

@@ -184,17 +184,16 @@ class Nominal:
         return rigid + drive["Fvl"] * qd + drive["Fcl"] * np.sign(qd) + drive["offl"]
 
     def _hanging(
-        self, stretch: Stretch, start: tuple[Floats, Floats], bodies: Floats, drive: Mapping[str, Floats]
+        self, motors: Stretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
     ) -> tuple[Floats, Floats, Floats, Springs]:
-        """Position, speed and acceleration (N, n) of links on springs behind the published motors, from a first guess
-        `start` of position and speed; and the springs."""
+        """Position, speed and acceleration (N, n) of links on springs behind the motors from a first guess; the
+        springs."""
         stiffness = 1.0 / np.maximum(self.arm.compliance, _RIGID)
-        dt = float(stretch.time[1] - stretch.time[0])
-        (q, qd), qdd = start, np.zeros_like(stretch.q)
+        dt, qdd = float(motors.time[1] - motors.time[0]), np.zeros_like(q)
         for _ in range(2):
             mass = _definite(regressor.mass_matrix(self.arm.chain, q, bodies))
             other = self._link_torque(q, qd, np.zeros_like(q), bodies, drive)
-            springs = Springs(mass, other, stretch.q, stretch.qd, stiffness, _RELAXATION_S * stiffness, dt)
+            springs = Springs(mass, other, motors.q, motors.qd, stiffness, _RELAXATION_S * stiffness, dt)
             q, qd, qdd = springs.links
         return q, qd, qdd, springs
 
@@ -221,12 +220,11 @@ class Nominal:
             else:
                 q, qd, qdd = q - twist, qd - first, qdd - second
                 if bodies is not None and drive is not None:
-                    q, qd, qdd, springs = self._hanging(stretch, (q, qd), bodies, drive)
+                    q, qd, qdd, springs = self._hanging(stretch, q, qd, bodies, drive)
                     link_torque = self._link_torque(q, qd, qdd, bodies, drive)
         values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), np.zeros(n))
         slip = self.arm.slip(speed, dt)
         friction = values["Fvm"] * speed + values["Fcm"] * slip
-        motor = link_torque + values["Ia"] * acceleration + friction + values["offm"]
         return Motion(
             chain=self.arm.chain,
             bodies=np.zeros((n, 10)) if bodies is None else bodies,
@@ -239,7 +237,7 @@ class Nominal:
             motor_speed=speed,
             motor_acceleration=acceleration,
             joint_torque=link_torque,
-            motor_torque=motor,
+            motor_torque=link_torque + values["Ia"] * acceleration + friction + values["offm"],
             gear_ratio=self.arm.gear_ratio,
             inertia=values["Ia"],
             link_coulomb=values["Fcl"],
@@ -255,8 +253,7 @@ class Nominal:
     @property
     def bin_s(self) -> float:
         """Length of a bin [s]."""
-        settings = self.settings
-        return max(settings.bin_s, settings.ringing_s) if self.arm.encoder == "motor" else settings.bin_s
+        return max(self.settings.bin_s, self.settings.ringing_s if self.arm.encoder == "motor" else 0.0)
 
     def _sampling(self, side: str, stretch: Stretch) -> tuple[Floats, float, int]:
         """Stamps (N,) [s] and delay [s] of a side's torque, and the samples in a bin."""
@@ -272,19 +269,19 @@ class Nominal:
         """Rows (m,) or (m, k) of signals on the grid of each motion, (N,) or (N, k)."""
         parts = []
         for number, ((recording, stretch), signal) in enumerate(zip(self.stretches, values, strict=True)):
-            if not _holds(recording, stretch, side):
-                continue
-            operator, dt = self._operator(side, number, stretch)
-            rows = self._slow(side, operator @ signal.reshape(len(signal), -1), dt)
-            parts.append(rows[self._windows(recording, self._stamps(side, stretch))])
+            if _holds(recording, stretch, side):
+                operator, dt = self._operator(side, number, stretch)
+                rows = self._slow(side, operator @ signal.reshape(len(signal), -1), dt)
+                parts.append(rows[self._windows(recording, self._stamps(side, stretch))])
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
     def _operator(self, side: str, number: int, stretch: Stretch) -> tuple[csr_array, float]:
         """Matrix (m, N) from the grid of a stretch to its rows, at the channel's delay, and the rows' distance [s]."""
-        stamp, delay, width = self._sampling(side, stretch)
+        delay = self.arm.joint_delay_s if side == "joint" else self.arm.motor_delay_s
         key = (side, number, delay)
         if key not in self._operators:
+            stamp, _, width = self._sampling(side, stretch)
             count = len(stamp) // width
             place = (stamp[: count * width] - delay - stretch.time[0]) / _step(stretch.time)
             nearest = np.rint(place)
@@ -293,13 +290,9 @@ class Nominal:
             low = place.astype(np.int64)
             share = place - low
             row = np.arange(len(low)) // width
-            matrix = csr_array(
-                (
-                    np.concatenate([1.0 - share, share]) / width,
-                    (np.concatenate([row, row]), np.concatenate([low, low + 1])),
-                ),
-                shape=(count, len(stretch.time)),
-            )
+            weights = np.concatenate([1.0 - share, share]) / width
+            places = np.concatenate([row, row]), np.concatenate([low, low + 1])
+            matrix = csr_array((weights, places), shape=(count, len(stretch.time)))
             self._operators[key] = matrix, width * _step(stamp) if len(stamp) > 1 else 0.0
         return self._operators[key]
 
@@ -310,8 +303,7 @@ class Nominal:
         found: dict[str, float | None] = {}
         for side in self.sides:
             edges = [r.joint_band_hz if side == "joint" else r.motor_band_hz for r in self.recordings]
-            known = [edge for edge in edges if edge is not None]
-            least = min(known, default=np.inf)
+            least = min((edge for edge in edges if edge is not None), default=np.inf)
             found[side] = 0.5 * least if least < 0.5 / self.bin_s else None
         return found
 
@@ -478,10 +470,7 @@ def _binned(values: Floats, width: int) -> Floats:
 
 
 def _definite(mass: Floats) -> Floats:
-    """Mass matrices (N, n, n); if some are not positive definite, all with their eigenvalues limited from below.
-
-    A fit spoiled by a strong effect may give such matrices, and no spring could carry them.
-    """
+    """Mass matrices (N, n, n), made positive definite for the springs after a fit spoiled by a strong effect."""
     try:
         np.linalg.cholesky(mass)
     except np.linalg.LinAlgError:

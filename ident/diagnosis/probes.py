@@ -139,7 +139,7 @@ def find_remainders(
             if evidence.mask[side, joint].sum() < 100:
                 continue
             line = find_line(evidence, side, joint, residuals[side][:, joint])
-            prepared = {}
+            prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]] = {}
             for name, rows in groups(dictionary, variables, side, joint).items():
                 padded = evidence.padded(rows)
                 prepared[name] = rows, padded, evidence.alone(padded)
@@ -159,36 +159,34 @@ def _one(
     joint: int,
 ) -> Remainder | None:
     """The remainder of a joint from its line and its `prepared` groups of columns."""
-    names: list[str] = []
-    taken: list[Rows] = []
-    total = inflation = line_hz = 0.0
-    fixed = list(evidence.extra)
+    taken: list[tuple[str, Score, Rows]] = []
+    fixed, line_hz = list(evidence.extra), 0.0
     if line is not None:
         frequency, waves, choices = line
         score = evidence.score(evidence.padded(waves))
         least = least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
         if score.gain > least and score.inflation > _LEAST_INFLATION:
-            total, inflation, line_hz = score.gain, score.inflation, frequency
-            names.append("time")
-            taken.append(waves)
-            evidence.replace([*fixed, *taken])
+            line_hz = frequency
+            taken.append(("time", score, waves))
+            evidence.replace([*fixed, waves])
     for _ in range(2):
-        best: tuple[str, Score] | None = None
-        for name, (_, padded, known) in prepared.items():
+        best: tuple[str, Score, Rows] | None = None
+        for name, (rows, padded, known) in prepared.items():
             score = evidence.score(padded, ridge=_RIDGE, known=known)
             least = max(least_gain + 2.0 * _HATS, 0.0 if best is None else best[1].gain)
             if score.gain > least and score.inflation > _LEAST_INFLATION:
-                best = name, score
+                best = name, score, rows
         if best is None:
             break
-        total += best[1].gain
-        inflation += best[1].inflation
-        names += [part for part in best[0].split(" ") if part not in names]
-        taken.append(prepared.pop(best[0])[0])
-        evidence.replace([*fixed, *taken])
-    if not names:
+        prepared.pop(best[0])
+        taken.append(best)
+        evidence.replace([*fixed, *(rows for _, _, rows in taken)])
+    if not taken:
         return None
-    return Remainder(side, joint + 1, tuple(names), total, inflation, tuple(taken), line_hz)
+    names = dict.fromkeys(part for name, _, _ in taken for part in name.split(" "))
+    gain, inflation = np.sum([(score.gain, score.inflation) for _, score, _ in taken], axis=0).tolist()
+    columns = tuple(rows for _, _, rows in taken)
+    return Remainder(side, joint + 1, tuple(names), gain, inflation, columns, line_hz)
 
 
 def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
