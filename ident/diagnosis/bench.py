@@ -150,8 +150,7 @@ def _evidence(
     compared: bool = False,
 ) -> tuple[Evidence, bool]:
     """Evidence with the noise floor of a first fit. A prior that is not `compared` keeps base parameters with weak
-    excitation near the drawing; repeated periods make their uncertainty known, so the prior is left
-    out."""
+    excitation near the drawing; repeated periods make their uncertainty known, so it is left out."""
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
     sigma, inflation, floor, repeatable = _noise(nominal, Evidence(nominal, settings, one, one).residuals())
     if repeatable and not compared:
@@ -204,9 +203,8 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
 
 
 def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
-    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The description's
-    stiffness, known to a factor of about two, decides only for joints hardly bent by the
-    motion."""
+    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The
+    description's stiffness, known to a factor of about two, decides for joints hardly bent alone."""
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
     dictionary = Dictionary(nominal, evidence, [e.cause for e in (ELASTICITY, *DELAYS.values())])
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]

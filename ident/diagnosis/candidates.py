@@ -400,7 +400,7 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
 
 
 def _clipped(nominal: Nominal) -> Floats:
-    """Torque (n,) [Nm] at the limit of each joint's sensor, if all fitted sessions that show one agree, else
+    """Torque (n,) [Nm] at the limit of each joint's sensor, equal in the fitted sessions with a limit, else
     NaN."""
     limits = np.array([r.clipped for r in nominal.recordings if not r.test and r.has_effort])
     if not limits.size:

@@ -186,8 +186,7 @@ class Nominal:
     def _hanging(
         self, motors: Stretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
     ) -> tuple[Floats, Floats, Floats, Springs]:
-        """Position, speed and acceleration (N, n) of links on springs behind the motors from a first guess; the
-        springs."""
+        """Position, speed and acceleration (N, n) of links on springs behind the motors; the springs."""
         stiffness = 1.0 / np.maximum(self.arm.compliance, _RIGID)
         dt, qdd = float(motors.time[1] - motors.time[0]), np.zeros_like(q)
         for _ in range(2):
