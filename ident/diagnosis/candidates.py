@@ -12,23 +12,30 @@ from scipy.optimize import minimize, minimize_scalar
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import Nominal
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
-from ident.effects.motion import Motion
 
 __all__ = ["Burst", "Candidate", "Dictionary", "Trial", "find_bursts"]
 
-_WINDOW_S = 0.1
-_FAR = 8.0
-_LONGEST_S = 4.0
-_MOST = 4
-# Filters and wide bins are at a loss so near to the ends of a session.
+# Bursts: window, least excess over its standard deviation, longest duration, largest number.
+_WINDOW_S, _FAR, _LONGEST_S, _MOST = 0.1, 8.0, 4.0, 4
+# Distance from the ends of a session within which filters and wide bins are unreliable.
 _EDGE_S = 0.6
+# Least gain of a further coefficient of the same cause.
+_A_COEFFICIENT = 6.0
+# Standard deviation of a coefficient equal to 1 by physics, for the gain on held-back parts.
+_ABOUT_ONE = 0.3
+# Largest relative difference of one sensor's limit between sessions.
+_ONE_LIMIT = 1e-3
+# Least fall of the chi-square for a common search of a shape's parameters.
+_VALLEY = 30.0
+# Least further fall of the chi-square by a recurring push.
+_TIED = 6.0
+# Least time of a lasting step from the ends of a session, against their transients.
+_STEP_ROOM_S = 1.0
 
 
 @dataclass(frozen=True)
 class Burst:
-    """session : number. start_s, duration_s : from the start of the session. excess : chi-square
-    above usual.
-    """
+    """session : number. start_s, duration_s : from the start of the session. excess : chi-square above usual."""
 
     session: int
     start_s: float
@@ -37,7 +44,7 @@ class Burst:
 
 
 def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
-    """The strongest bursts, at most four, strongest first; none where the residual is even."""
+    """The strongest bursts, at most four, strongest first; none in an even residual."""
     found = []
     side = "joint" if "joint" in evidence.nominal.rows else "motor"
     rows = evidence.nominal.rows[side]
@@ -46,8 +53,8 @@ def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
         mine = (rows.session == session) & ~rows.test
         if not mine.any():
             continue
-        ends = rows.time[mine].min() + _EDGE_S, rows.time[mine].max() - _EDGE_S
-        mine &= (rows.time >= ends[0]) & (rows.time <= ends[1])
+        first, last = rows.time[mine].min() + _EDGE_S, rows.time[mine].max() - _EDGE_S
+        mine &= (rows.time >= first) & (rows.time <= last)
         if mine.sum() < 3:
             continue
         time, values = rows.time[mine], normal[mine]
@@ -55,14 +62,13 @@ def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
         counts = np.bincount(window, np.isfinite(values).sum(axis=1))
         sums = np.bincount(window, np.nansum(values, axis=1))
         usual = float(np.median(sums[counts > 0] / counts[counts > 0])) if np.any(counts > 0) else 1.0
-        scatter = usual * np.sqrt(2.0 * np.maximum(counts, 1.0))
-        far = (counts > 0) & ((sums - usual * counts) > _FAR * scatter)
+        excess = sums - usual * counts
+        far = (counts > 0) & (excess > _FAR * (usual * np.sqrt(2.0 * np.maximum(counts, 1.0))))
         edges = np.flatnonzero(np.diff(np.concatenate([[0], _closed(far).astype(int), [0]])))
         for low, high in zip(edges[::2], edges[1::2], strict=True):
-            duration = (high - low) * _WINDOW_S
-            if duration <= _LONGEST_S:
-                excess = float((sums - usual * counts)[low:high].sum())
-                found.append(Burst(int(session), float(time[0] + low * _WINDOW_S), duration, excess))
+            if (high - low) * _WINDOW_S <= _LONGEST_S:
+                start, total = float(time[0] + low * _WINDOW_S), float(excess[low:high].sum())
+                found.append(Burst(int(session), start, (high - low) * _WINDOW_S, total))
     return tuple(sorted(found, key=lambda b: -b.excess)[:_MOST])
 
 
@@ -70,23 +76,8 @@ def _closed(far: np.ndarray) -> np.ndarray:
     """The same with holes of up to two windows filled."""
     out = far.copy()
     for k in range(1, len(far) - 1):
-        if not far[k] and far[max(0, k - 2) : k].any() and far[k + 1 : k + 3].any():
-            out[k] = True
+        out[k] |= far[max(0, k - 2) : k].any() and far[k + 1 : k + 3].any()
     return out
-
-
-# Gain that a further coefficient of the same cause must bring.
-_A_COEFFICIENT = 6.0
-# Standard deviation of a coefficient that is 1 by the physics, in what is held against parts of the motion.
-_ABOUT_ONE = 0.3
-# Relative difference of the torques at which samples of several sessions stop, of one limit.
-_ONE_LIMIT = 1e-3
-# Fall of the chi-square from which on the parameters of a shape are sought together.
-_VALLEY = 30.0
-# Fall of the chi-square by which a push that recurs explains more than one that does not.
-_TIED = 6.0
-# What comes to stay is told from the transients at the ends of a session by so much time on either side of it.
-_STEP_ROOM_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +99,13 @@ class Candidate:
 
     @property
     def key(self) -> tuple[str, int]:
-        """Identifies it."""
+        """Cause and joint."""
         return self.effect.cause, self.joint
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A candidate with the shape that suits the data best, and its score."""
+    """A candidate with its best shape and the score."""
 
     candidate: Candidate
     shape: Shape
@@ -136,9 +127,12 @@ class _Span:
         return float(np.exp(coordinate)) if self.logarithmic else float(coordinate)
 
     def coordinate(self, shape: Shape) -> float:
-        """Where a shape is."""
+        """Coordinate of a shape."""
         here = float(shape[self.name])
         return float(np.clip(np.log(here) if self.logarithmic else here, self.low, self.high))
+
+
+_Entry = tuple[Shape, Rows, dict[Key, Floats], Products]
 
 
 class Dictionary:
@@ -153,10 +147,10 @@ class Dictionary:
         self.setting = _setting(nominal, compared=evidence.prior is not None and evidence.compared)
         wanted = list(EFFECTS) if causes is None else list(causes)
         motor = "motor" in nominal.rows
-        # A low-pass of another hand may have shifted a channel, and the arm is not to blame.
+        # An earlier low-pass may have shifted a channel, without any fault of the arm.
         hidden = {DELAYS[side].cause for side, band in nominal.band_hz.items() if band is not None}
         if nominal.moving.sum() < 2:
-            # A late channel is late in all joints; of one joint it could be its elasticity as well.
+            # A late channel is late in all joints; in one joint alone it could be elasticity as well.
             hidden |= {delay.cause for delay in DELAYS.values()}
         self.candidates = tuple(
             Candidate(EFFECTS[cause], joint)
@@ -165,23 +159,20 @@ class Dictionary:
             if motor or EFFECTS[cause].side != "motor"
             for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
-        self._kept: dict[tuple[str, int], list[tuple[Shape, Rows, dict[Key, Floats], Products]]] = {}
+        self._kept: dict[tuple[str, int], list[_Entry]] = {}
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
         """Columns of a candidate in rows: (m, k) by side and joint."""
-        nominal = self.nominal
-        by_motion = [
-            candidate.effect.columns(motion, max(candidate.joint, 0), shape) for motion in nominal.motions
-        ]
+        nominal, joint = self.nominal, max(candidate.joint, 0)
+        by_motion = [candidate.effect.columns(motion, joint, shape) for motion in nominal.motions]
         found: dict[Key, Floats] = {}
         for side in nominal.rows:
-            per_column = [
-                [getattr(columns[k], side) for columns in by_motion] for k in range(len(by_motion[0]))
+            signals = [
+                [getattr(column, side) for column in columns] for columns in zip(*by_motion, strict=True)
             ]
-            per_column = [c for c in per_column if c[0] is not None]
-            if not per_column:
+            reduced = [nominal.reduce(side, signal) for signal in signals if signal[0] is not None]
+            if not reduced:
                 continue
-            reduced = [nominal.reduce(side, column) for column in per_column]
             if reduced[0].ndim == 1:
                 found[side, candidate.joint] = np.stack(reduced, axis=1)
                 continue
@@ -191,24 +182,19 @@ class Dictionary:
                     found[side, j] = column
         return found
 
-    def _prepared(self, candidate: Candidate) -> list[tuple[Shape, Rows, dict[Key, Floats], Products]]:
+    def _entry(self, shape: Shape, rows: Rows) -> _Entry:
+        padded = self.evidence.padded(rows)
+        return shape, rows, padded, self.evidence.alone(padded)
+
+    def _prepared(self, candidate: Candidate) -> list[_Entry]:
         if candidate.key not in self._kept:
-            entries = []
-            for shape in candidate.effect.shapes(self.setting, max(candidate.joint, 0)):
-                rows = self.rows(candidate, shape)
-                if not rows or not any(np.any(values) for values in rows.values()):
-                    continue
-                padded = self.evidence.padded(rows)
-                base = self.evidence.alone(padded)
-                entries.append((shape, rows, padded, base))
-            self._kept[candidate.key] = entries
+            by_shape = ((shape, self.rows(candidate, shape)) for shape in self._grid(candidate))
+            self._kept[candidate.key] = [self._entry(shape, rows) for shape, rows in by_shape if _acts(rows)]
         return self._kept[candidate.key]
 
     def _step(self, candidate: Candidate) -> Trial | None:
-        """The best edge of a block for an effect that sets in at a time and stays.
-
-        The products of the whole session are made once; those after an edge are a part of their blocks.
-        """
+        """The best edge of a block for an effect with an onset and no end. Products after an edge are a part of their
+        blocks, so those of the whole session are made once."""
         evidence = self.evidence
         best: tuple[Shape, Score, tuple[str, int]] | None = None
         forms = list(dict.fromkeys(s.form for s in self._grid(candidate)))
@@ -219,9 +205,7 @@ class Dictionary:
             shape = Shape(form, time=starts.min() - 1.0, session=session + 1)
             key = (candidate.cause, -2 - number)
             if key not in self._kept:
-                rows = self.rows(candidate, shape)
-                padded = evidence.padded(rows)
-                self._kept[key] = [(shape, rows, padded, evidence.alone(padded))]
+                self._kept[key] = [self._entry(shape, self.rows(candidate, shape))]
             _, _, padded, known = self._kept[key][0]
             whole = evidence.products(padded, known)
             for edge in np.sort(starts)[1:]:
@@ -229,17 +213,16 @@ class Dictionary:
                     continue
                 on = (evidence.block_session > session).astype(float)
                 on[mine[starts >= edge]] = 1.0
-                score = evidence.event_score(
-                    evidence.score_products(whole.only(on), list(padded)), evidence.blocks
-                )
+                score = evidence.score_products(whole.only(on), list(padded))
+                score = evidence.event_score(score, evidence.blocks)
                 if best is None or score.gain > best[1].gain:
                     best = (shape.at(time=edge), score, key)
         if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
             return None
-        # The rows themselves are made only where the step may matter.
-        if best[1].gain < 10.0:
-            return Trial(candidate, best[0], best[1], self._kept[best[2]][0][1])
-        return Trial(candidate, best[0], best[1], self.rows(candidate, best[0]))
+        # The rows themselves are made only for a step with enough gain.
+        shape, score, key = best
+        rows = self._kept[key][0][1] if score.gain < 10.0 else self.rows(candidate, shape)
+        return Trial(candidate, shape, score, rows)
 
     def _grid(self, candidate: Candidate) -> Sequence[Shape]:
         return candidate.effect.shapes(self.setting, max(candidate.joint, 0))
@@ -248,40 +231,34 @@ class Dictionary:
         """The best contact in a burst of the residual, on any link from the third on."""
         best: Trial | None = None
         n = self.nominal.arm.chain.n
-        for burst in find_bursts(self.evidence):
-            for link in range(min(3, n), n + 1):
-                shape = Shape(
-                    time=burst.start_s + 0.5 * burst.duration_s,
-                    duration=burst.duration_s + 0.1,
-                    session=burst.session + 1,
-                    link=link,
-                )
-                trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
-                if trial is None or (best is not None and trial.score.gain <= best.score.gain):
-                    continue
-                if not self._recurs(trial):
-                    best = trial
+        for burst, link in product(find_bursts(self.evidence), range(min(3, n), n + 1)):
+            middle, duration = burst.start_s + 0.5 * burst.duration_s, burst.duration_s + 0.1
+            shape = Shape(time=middle, duration=duration, session=burst.session + 1, link=link)
+            trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
+            if trial is None or (best is not None and trial.score.gain <= best.score.gain):
+                continue
+            if not self._recurs(trial):
+                best = trial
         return best
 
     def _recurs(self, trial: Trial) -> bool:
-        """Whether the same push, a period earlier or later as well, explains more: then it is tied to the pose and
-        not to the moment, and nobody pushes.
-        """
+        """Whether the same push explains more with a repetition a period earlier or later: then it depends on the
+        pose, and is not an external push."""
         shape = trial.shape
         recording = next(r for r in self.nominal.recordings if r.number == int(shape["session"]) - 1)
         if not recording.repeats:
             return False
         for periods in (-1.0, 1.0):
             again = shape.at(time=shape["time"] + periods * recording.period_s)
-            rows = self.rows(trial.candidate, again)
-            both = {**rows, **trial.rows}
-            both.update({key: trial.rows[key] + rows[key] for key in trial.rows.keys() & rows.keys()})
+            both = {**self.rows(trial.candidate, again)}
+            for key, columns in trial.rows.items():
+                both[key] = columns + both[key] if key in both else columns
             if self.evidence.score(self.evidence.padded(both)).fitted > trial.score.fitted + _TIED:
                 return True
         return False
 
     def best(self, candidate: Candidate) -> Trial | None:
-        """The candidate with the best shape of its grid, None where no shape is plausible."""
+        """The candidate with the best shape of its grid, None without a plausible one."""
         if candidate.effect.repeats:
             return self._contacts(candidate)
         if candidate.effect.step:
@@ -290,9 +267,8 @@ class Dictionary:
         entries = self._prepared(candidate)
         for shape, rows, padded, known in entries:
             score = self.measure(candidate, padded, len(entries), known)
-            if not candidate.effect.plausible(score.coefficients, shape):
-                continue
-            if best is None or _worth(score) > _worth(best.score):
+            better = best is None or _worth(score) > _worth(best.score)
+            if better and candidate.effect.plausible(score.coefficients, shape):
                 best = Trial(candidate, shape, score, rows)
         return best
 
@@ -303,30 +279,29 @@ class Dictionary:
         choices: int = 1,
         known: Products | None = None,
     ) -> Score:
-        """Score of padded columns in the way that suits the candidate."""
+        """Score of padded columns by the rules of the candidate's effect."""
         pull = _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
         score = self.evidence.score(padded, known=known, pull=pull)
         return self.evidence.event_score(score, choices) if candidate.effect.event else score
 
     def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
-        """The candidate with a given shape, None where it has no rows or makes no sense."""
+        """The candidate with a given shape, None without rows or with implausible coefficients."""
         rows = self.rows(candidate, shape)
-        if not rows or not any(np.any(values) for values in rows.values()):
+        if not _acts(rows):
             return None
         score = self.measure(candidate, self.evidence.padded(rows), choices)
-        if not candidate.effect.plausible(score.coefficients, shape):
-            return None
-        return Trial(candidate, shape, score, rows)
+        plausible = candidate.effect.plausible(score.coefficients, shape)
+        return Trial(candidate, shape, score, rows) if plausible else None
 
     def refine(self, trial: Trial, choices: int = 1, evaluations: int = 12) -> Trial:
-        """The same with its continuous shape parameters at the best fit: one after the other, then together, for a
-        speed and an exponent make up for each other along a narrow valley.
-        """
+        """The trial with its continuous shape parameters at the best fit: one after the other, then together, since a
+        speed and an exponent compensate each other along a narrow valley."""
         best = trial
 
-        def loss(shape: Shape) -> float:
+        def loss(spans: Sequence[_Span], point: Sequence[float]) -> float:
             nonlocal best
-            tried = self.trial(trial.candidate, shape, choices)
+            values = {span.name: span.value(x) for span, x in zip(spans, point, strict=True)}
+            tried = self.trial(trial.candidate, best.shape.at(**values), choices)
             if tried is None:
                 return 0.0
             if tried.score.fitted > best.score.fitted:
@@ -335,19 +310,16 @@ class Dictionary:
 
         for span in self._spans(trial):
             minimize_scalar(
-                lambda x, span=span: loss(best.shape.at(**{span.name: span.value(x)})),
+                lambda x, span=span: loss([span], [x]),
                 bounds=(span.low, span.high),
                 method="bounded",
                 options={"maxiter": evaluations},
             )
         spans = [] if trial.candidate.effect.event else self._spans(best)
         if len(spans) > 1 and best.score.fitted > _VALLEY:
-            begin = [span.coordinate(best.shape) for span in spans]
             minimize(
-                lambda point: loss(
-                    best.shape.at(**{s.name: s.value(x) for s, x in zip(spans, point, strict=True)})
-                ),
-                begin,
+                lambda point: loss(spans, point),
+                [span.coordinate(best.shape) for span in spans],
                 method="Nelder-Mead",
                 bounds=[(span.low, span.high) for span in spans],
                 options={"maxfev": 3 * evaluations * (len(spans) - 1), "fatol": 0.1, "xatol": 1e-3},
@@ -355,9 +327,9 @@ class Dictionary:
         return best
 
     def _spans(self, trial: Trial) -> list[_Span]:
-        """Where each continuous parameter of a trial's shape may be: between its neighbours in the grid."""
+        """Range of each continuous parameter of a trial's shape: between its neighbours in the grid."""
         effect, found = trial.candidate.effect, []
-        grid = effect.shapes(self.setting, max(trial.candidate.joint, 0))
+        grid = self._grid(trial.candidate)
         for name in effect.continuous(trial.shape):
             values = sorted({s[name] for s in grid if name in s and _alike(s, trial.shape, name)})
             limits = next(p for p in effect.shape_parameters if p.name == name)
@@ -377,14 +349,15 @@ class Dictionary:
 
     def trials(self) -> Iterator[Trial]:
         """The best shape of every candidate."""
-        for candidate in self.candidates:
-            found = self.best(candidate)
-            if found is not None:
-                yield found
+        return (trial for candidate in self.candidates if (trial := self.best(candidate)) is not None)
+
+
+def _acts(rows: Rows) -> bool:
+    return any(np.any(values) for values in rows.values())
 
 
 def _worth(score: Score) -> float:
-    """Gain less what further coefficients would gain by chance."""
+    """Gain minus the gain of further coefficients by chance."""
     return score.gain - _A_COEFFICIENT * len(score.coefficients)
 
 
@@ -398,41 +371,37 @@ def _neighbours(values: Sequence[float], here: float, *, signed: bool) -> tuple[
     above = [v for v in values if v > here * (1 + 1e-9) + 1e-12]
     low = below[-1] if below else (0.4 * here if here > 0 else here - 0.5)
     high = above[0] if above else (2.5 * here if here > 0 else here + 0.5)
-    if signed:
-        return low, high
-    if here > 0.0 and low <= 0.0:
+    if not signed and here > 0.0 and low <= 0.0:
         low = 0.3 * here
-    if here < 0.0 and high >= 0.0:
+    if not signed and here < 0.0 and high >= 0.0:
         high = 0.3 * here
     return low, high
 
 
 def _setting(nominal: Nominal, *, compared: bool) -> Setting:
-    motions: list[Motion] = nominal.motions
+    motions, arm = nominal.motions, nominal.arm
+    sessions = sorted({m.session for m in motions})
     q = np.concatenate([m.q for m in motions])
     positive = np.mean(np.concatenate([m.joint_torque for m in motions]) > 0.0, axis=0)
     return Setting(
-        sessions=len({m.session for m in motions}),
-        durations_s=tuple(
-            max(m.time[-1] for m in motions if m.session == k) for k in sorted({m.session for m in motions})
-        ),
-        gear_ratio=nominal.arm.gear_ratio,
+        sessions=len(sessions),
+        durations_s=tuple(max(m.time[-1] for m in motions if m.session == k) for k in sessions),
+        gear_ratio=arm.gear_ratio,
         torque_range=np.max([np.abs(m.joint_torque).max(axis=0) for m in motions], axis=0),
         torque_turns=np.minimum(positive, 1.0 - positive) > 0.02,
         speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
-        encoder=nominal.arm.encoder if nominal.arm.encoder_known else None,
-        presliding=nominal.arm.reach,
+        encoder=arm.encoder if arm.encoder_known else None,
+        presliding=arm.presliding,
         compared=compared,
-        compliance=nominal.arm.compliance if all(m.springs is not None for m in motions) else None,
+        compliance=arm.compliance if all(m.springs is not None for m in motions) else None,
         clipped=_clipped(nominal),
     )
 
 
 def _clipped(nominal: Nominal) -> Floats:
-    """Torque (n,) [Nm] at which the samples of each joint's sensor stop, the same in all sessions that are fitted and
-    show one, else NaN.
-    """
+    """Torque (n,) [Nm] at the limit of each joint's sensor, equal in the fitted sessions with a limit, else
+    NaN."""
     limits = np.array([r.clipped for r in nominal.recordings if not r.test and r.has_effort])
     if not limits.size:
         return np.full(nominal.arm.chain.n, np.nan)

@@ -101,7 +101,7 @@ def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
     n = nominal.arm.chain.n
     found = np.zeros((2, len(_LONGER), n))
     found[1] = np.inf
-    reach = nominal.arm.reach
+    reach = nominal.arm.presliding
     if reach is None or "motor" not in nominal.rows:
         return found
     for joint in np.flatnonzero((reach > 0.0) & nominal.moving):
@@ -124,7 +124,7 @@ def with_far_presliding(arm: Arm, days: Sequence[SlowTurns], coulomb: Sequence[F
 
     coulomb : (n,) of each set [Nm].
     """
-    if arm.reach is None or len(days) < 3:
+    if arm.presliding is None or len(days) < 3:
         return arm
     table = np.array(days)
     weight = 1.0 / table[:, 1] ** 2
@@ -136,7 +136,7 @@ def with_far_presliding(arm: Arm, days: Sequence[SlowTurns], coulomb: Sequence[F
     joints = np.arange(len(best))
     level = np.maximum(np.mean(coulomb, axis=0), 1e-9)
     share = np.where(clear[best, joints] > 0.0, mean[best, joints] / level, 0.0)
-    return replace(arm, far=np.array(_LONGER)[best] * arm.reach, far_share=np.minimum(share, 0.5))
+    return replace(arm, far=np.array(_LONGER)[best] * arm.presliding, far_share=np.minimum(share, 0.5))
 
 
 Side = Literal["link", "motor"]
@@ -244,7 +244,7 @@ def _tuned(
         misfit = float(np.log(evidence.chi_square / count) + 2.0 * np.mean(rms))
         arm = replace(
             bench.nominal.arm,
-            reach=presliding_reach(bench.nominal, evidence.full.values[: len(base)]),
+            presliding=presliding_reach(bench.nominal, evidence.full.values[: len(base)]),
             motor_delay_s=arm.motor_delay_s + mean_delay(nuisance, "motor")[0],
             joint_delay_s=arm.joint_delay_s + mean_delay(nuisance, "joint")[0],
         )
@@ -253,7 +253,7 @@ def _tuned(
 
 def _middle(arms: Sequence[Arm]) -> Arm:
     """The mean of tuned arms; of the reaches the geometric one, 0 where most of them see none."""
-    found = np.array([arm.reach for arm in arms])
+    found = np.array([arm.presliding for arm in arms])
     seen = found > 0.0
     reach = np.exp(np.sum(np.log(np.where(seen, found, 1.0)), axis=0) / np.maximum(seen.sum(axis=0), 1))
     return replace(
@@ -261,7 +261,7 @@ def _middle(arms: Sequence[Arm]) -> Arm:
         compliance=np.mean([arm.compliance for arm in arms], axis=0),
         motor_delay_s=float(np.mean([arm.motor_delay_s for arm in arms])),
         joint_delay_s=float(np.mean([arm.joint_delay_s for arm in arms])),
-        reach=np.where(2 * seen.sum(axis=0) > len(arms), reach, 0.0),
+        presliding=np.where(2 * seen.sum(axis=0) > len(arms), reach, 0.0),
     )
 
 
@@ -334,7 +334,7 @@ def _reference(
         null,
         len(days),
         arm.encoder,
-        arm.reach,
+        arm.presliding,
         arm.far,
         arm.far_share,
         {side: delay_std([day.late[side] for day in days]) for side in _CHANNELS},

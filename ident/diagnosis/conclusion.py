@@ -523,7 +523,7 @@ def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:
     if len(still):
         names = ", ".join(bench.nominal.arm.chain.joint_names[j] for j in still)
         notes.append(f"{names}: no motion of {TRAVEL_RAD} rad, so nothing can be said there")
-    if not bench.told:
+    if not bench.repeatable:
         notes.append(
             "no motion repeats within a session: what the model leaves is itself the noise that claims are "
             "held against, so only what explains much of it is named"

@@ -1,4 +1,4 @@
-"""Samples that were lost, repeated, held or clipped, seen in the channels themselves."""
+"""Lost, repeated, held and clipped samples, detected in the channels themselves."""
 
 from __future__ import annotations
 
@@ -14,22 +14,29 @@ if TYPE_CHECKING:
 
 __all__ = ["SampleLoss", "Stuck", "clipped_at", "held_times", "passed_band", "sample_loss", "stuck_at"]
 
-# Number and share of samples amiss in a session from which on they are a finding.
-_LEAST, _SHARE = 3, 0.0005
-# Third difference of a position that is a jolt, over the usual one, which is at least so many steps of the encoder.
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Least number and share of bad samples in a session for a finding.
+_LEAST_AMISS, _SHARE = 3, 0.0005
+# Least third difference of a jolt over the usual one, itself at least this many steps of the encoder.
 _JOLT, _STEPS = 16.0, 4.0
-# Samples by which a jolt is away from a repeated sample that makes it.
+# Distance in samples of a jolt from a repeated sample.
 _NEAR = 4
-# Samples of the very same torque that a noisy channel does not have by chance, also over those of the values next to
-# it; a coarse channel stays at its largest value about twice as long as at the next.
+# Count of one value beyond chance in a noisy channel, also over the counts of the next values; a coarse channel
+# stays at its largest value about twice as long as at the next.
 _FLAT, _OVER_NEXT = 10, 10
-# Speed from which on a motor works.
+# Least speed of a working motor.
 _MOVING_RAD_S = 0.01
+# Share of the power above a quarter of the sampling rate without any sensor's noise: a 17-bit converter makes more.
+_SILENT = 1e-10
+# Share of the power above the band's edge, and least number of samples.
+_BEYOND, _LEAST = 1e-6, 64
 
 
 @dataclass(frozen=True)
 class SampleLoss:
-    """Samples of a channel of a session that are missing, repeat the one before, or are older than they say."""
+    """Samples of a session's channel: missing, repeated from the one before, or older than their stamp."""
 
     session: str
     channel: str
@@ -40,23 +47,23 @@ class SampleLoss:
 
     @property
     def amiss(self) -> int:
-        """Lost, repeated and stale ones."""
+        """Lost, repeated and stale samples."""
         return self.lost + self.repeated + self.stale
 
     @property
     def share(self) -> float:
-        """Of what was sent."""
+        """Share of the published samples."""
         return self.amiss / max(self.samples + self.lost, 1)
 
     @property
     def matters(self) -> bool:
-        """More than one or two, and more than one in two thousand."""
-        return self.amiss >= _LEAST and self.share > _SHARE
+        """Whether number and share are beyond chance."""
+        return self.amiss >= _LEAST_AMISS and self.share > _SHARE
 
 
 @dataclass(frozen=True)
 class Stuck:
-    """A torque [Nm] that a channel reports for a joint (from 0) again and again: count of samples in motion."""
+    """A torque [Nm] repeated by a channel for a joint (from 0), with its count of the samples in motion."""
 
     joint: int
     value: float
@@ -65,20 +72,21 @@ class Stuck:
 
 
 def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
-    """The channels with the losses that matter, worst first."""
-    found = []
-    for session in sessions:
-        found.append(_channel(session.path.name, "joint", session.joint))
-        if session.motor is not None:
-            found.append(_channel(session.path.name, "motor", session.motor))
+    """The channels with relevant losses, worst first."""
+    found = [
+        _channel(session.path.name, name, columns)
+        for session in sessions
+        for name, columns in (("joint", session.joint), ("motor", session.motor))
+        if columns is not None
+    ]
     return tuple(sorted((loss for loss in found if loss.matters), key=lambda loss: -loss.share))
 
 
-def held_times(columns: JointColumns) -> NDArray[np.float64]:
-    """Times (k,) [s] from the first sample of samples that are older than they say.
+def held_times(columns: JointColumns) -> Floats:
+    """Times (k,) [s] from the first sample of samples older than their stamp.
 
-    Where all joints repeat the torques of the sample before, and where all that move jolt at once, as positions do
-    that are a part of a sample old. A few of them are no finding, but derivatives of the positions are wrong there.
+    Either all joints repeat their last torques, or most moving joints jolt at once, like positions a part of a sample
+    old. A few such samples are no finding, but derivatives of the positions are wrong there.
     """
     old = _jolts(columns.position)
     if _repeated(columns.effort):
@@ -86,11 +94,11 @@ def held_times(columns: JointColumns) -> NDArray[np.float64]:
     return (columns.log_time[old] - columns.log_time[0]) * 1e-9
 
 
-def clipped_at(columns: JointColumns) -> NDArray[np.float64]:
-    """Torque (n,) [Nm] beyond which each joint's sensor says nothing, NaN where its samples show no such limit.
+def clipped_at(columns: JointColumns) -> Floats:
+    """Torque (n,) [Nm] at the limit of each joint's sensor, NaN where the samples show no limit.
 
-    What moves and is noisy does not have the very same largest torque many times. What stands still may, and so may
-    all joints at once where samples are held.
+    A noisy sensor in motion does not repeat its largest torque by chance. At standstill it may, and so may all joints
+    at once in held samples.
     """
     effort, n = columns.effort, columns.effort.shape[1]
     found = np.full(n, np.nan)
@@ -107,46 +115,32 @@ def clipped_at(columns: JointColumns) -> NDArray[np.float64]:
 
 
 def stuck_at(motor: JointColumns, joint: JointColumns) -> tuple[Stuck, ...]:
-    """Values that motor torques of joints that move have again and again: what is small or large is not reported.
-
-    A motor that works is as noisy at one torque as at another.
-    """
+    """Values repeated by the motor torques of moving joints, as by a dead zone or a limit. A working motor is as
+    noisy at one torque as at another."""
     if len(motor) < 2 or len(joint) < 2:
         return ()
     found = []
-    seconds = (motor.log_time - joint.log_time[0]) * 1e-9
-    clock = (joint.log_time - joint.log_time[0]) * 1e-9
-    held = _same(motor.effort)
+    seconds, clock = ((channel.log_time - joint.log_time[0]) * 1e-9 for channel in (motor, joint))
+    steps, held = np.maximum(np.diff(seconds, prepend=seconds[0]), 1e-6), _same(motor.effort)
     for k in range(motor.effort.shape[1]):
         angle = np.interp(seconds, clock, joint.position[:, k])
-        speed = np.abs(np.diff(angle, prepend=angle[0])) / np.maximum(
-            np.diff(seconds, prepend=seconds[0]), 1e-6
-        )
+        speed = np.abs(np.diff(angle, prepend=angle[0])) / steps
         moving = (speed > _MOVING_RAD_S) & ~held
         values = motor.effort[moving, k]
         found += [Stuck(k, value, count, int(moving.sum())) for value, count in _flat(values)]
     return tuple(found)
 
 
-def _flat(values: NDArray[np.float64]) -> list[tuple[float, int]]:
-    """Values that a noisy channel has again and again, and how often: more often by far than the two next to each on
-    either side.
-    """
+def _flat(values: Floats) -> list[tuple[float, int]]:
+    """Values and counts far more frequent than the two values next to them on either side."""
     values, counts = np.unique(values, return_counts=True)
-    if len(values) < 3:
-        return []
-    found = []
-    for k in np.flatnonzero(counts >= _FLAT):
-        beside = np.concatenate([counts[max(0, k - 2) : k], counts[k + 1 : k + 3]])
-        if counts[k] > _OVER_NEXT * beside.max():
-            found.append((float(values[k]), int(counts[k])))
-    return found
+    often = np.flatnonzero(counts >= _FLAT) if len(values) > 2 else ()
+    beside = {k: max(*counts[max(0, k - 2) : k], *counts[k + 1 : k + 3]) for k in often}
+    return [(float(values[k]), int(counts[k])) for k in often if counts[k] > _OVER_NEXT * beside[k]]
 
 
-def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Samples (N,) at which most of the joints that move differ from a smooth motion by far more than they usually
-    do, in the third difference of their positions.
-    """
+def _jolts(position: Floats) -> Flags:
+    """Samples (N,) with an unusual third difference of the positions in most of the moving joints."""
     found = np.zeros(len(position), dtype=bool)
     moves = np.ptp(position, axis=0) > 0.0 if len(position) else np.zeros(0, dtype=bool)
     if len(position) < 4 or moves.sum() < 2:
@@ -160,27 +154,24 @@ def _jolts(position: NDArray[np.float64]) -> NDArray[np.bool_]:
     return found
 
 
-def _channel(name: str, channel: str, columns: JointColumns) -> SampleLoss:
+def _channel(session: str, channel: str, columns: JointColumns) -> SampleLoss:
     repeated, jolts = _repeated(columns.effort), _jolts(columns.position)
     if repeated:
         # A repeated sample and the one after it jolt, too.
         jolts &= ~binary_dilation(_same(columns.effort), iterations=_NEAR)
     stale = int(np.count_nonzero(jolts[1:] & ~jolts[:-1])) if len(jolts) else 0
-    return SampleLoss(name, channel, columns.lost, repeated, stale, len(columns))
+    return SampleLoss(session, channel, columns.lost, repeated, stale, len(columns))
 
 
-def _same(effort: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Samples (N,) at which all joints have the torque of the one before; of one joint alone that means nothing."""
+def _same(effort: Floats) -> Flags:
+    """Samples (N,) with the last sample's torques in all joints; a single joint proves nothing."""
     if effort.shape[1] < 2:
         return np.zeros(len(effort), dtype=bool)
     return np.concatenate([[False], np.all(np.diff(effort, axis=0) == 0.0, axis=1)])
 
 
-def _repeated(effort: NDArray[np.float64]) -> int:
-    """Number of repeated samples beyond what chance gives.
-
-    Smooth or coarse channels repeat by themselves; then equality of all joints at once means nothing.
-    """
+def _repeated(effort: Floats) -> int:
+    """Number of repeated samples beyond chance; in smooth or coarse channels equality of all joints proves nothing."""
     if effort.shape[1] < 2 or len(effort) < 3:
         return 0
     same = _same(effort)[1:]
@@ -189,25 +180,13 @@ def _repeated(effort: NDArray[np.float64]) -> int:
     return max(0, int(same.sum() - np.ceil(expected + 3.0 * np.sqrt(expected))))
 
 
-Floats = NDArray[np.float64]
-
-# Share of the power above a quarter of the sampling rate below which no sensor's noise is left: the step of
-# a 17-bit converter makes more.
-_SILENT = 1e-10
-# Share of the power that lies above the band's edge.
-_BEYOND = 1e-6
-_LEAST = 64
-
-
 def passed_band(values: Floats, dt: float) -> float | None:
-    """Upper edge [Hz] of what a low-pass left of the signals (N, k), None where they were not filtered.
+    """Upper edge [Hz] of an earlier low-pass on the signals (N, k), None without one.
 
-    A measured torque holds the noise of its sensor at every frequency. Where the upper half of the band is
-    silent, somebody took it out, and with it whatever happened faster than the edge.
+    A measured torque holds the noise of its sensor at every frequency. A silent upper half of the band is the work of
+    a filter, and every event faster than its edge is lost.
     """
-    if len(values) < _LEAST:
-        return None
-    moving = np.ptp(values, axis=0) > 0.0
+    moving = np.ptp(values, axis=0) > 0.0 if len(values) >= _LEAST else np.zeros(1, dtype=bool)
     if not moving.any():
         return None
     signal = values[:, moving] - values[:, moving].mean(axis=0)

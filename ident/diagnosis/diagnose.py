@@ -139,7 +139,7 @@ def _first(task: _Task) -> _State:
     """The first selection, with the noise of the best candidate's residual where repetition does not give it."""
     bench = task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
     selection = task.select(bench)
-    if bench.told or selection.claims:
+    if bench.repeatable or selection.claims:
         return _State(bench, selection)
     best = best_candidate(bench.dictionary, bench.evidence, task.settings)
     quieter = None if best is None else again_with(bench, best, task.settings, task.causes)

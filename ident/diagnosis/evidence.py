@@ -1,14 +1,14 @@
 """Evidence for columns beyond the base: held-back gain and significance from Gram matrices of blocks.
 
-Rows of all joints and sides are cut into blocks of time. Of each block only products of columns are kept.
-Whatever is asked then (a fit without a part of the motion, the error on that part, the covariance that
-blocks, not rows, give) is linear algebra of small matrices: Schur complements on the base. The parts that are
-held back are the same phases of every period, so a motion that repeats never checks itself.
+Rows of all joints and sides are cut into blocks of time; of each block only products of columns are kept. A fit
+without a part of the motion, its error on that part and the covariance from blocks are then linear algebra of small
+matrices: Schur complements on the base. The held-back parts are the same phases of every period, so a repeating
+motion never checks itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,27 +23,26 @@ from ident.estimators.estimate import chi_square_tail, fisher_tail
 __all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
 
 Floats = NDArray[np.float64]
-# Share of a column's power that free base parameters must leave, where the others lean on a drawing.
+# Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3
+
+# A fall of the chi-square up to this is no evidence, whatever its value on the held-back parts.
+_NO_EVIDENCE = 12.0
 
 Key = tuple[str, int]
 Rows = Mapping[Key, Floats]
-"""Columns in rows: (m, k) for each side and joint in which they are not zero."""
-
-
-# A fall of the chi-square up to this is nothing, whatever the parts that are held back say to it.
-_NOTHING = 12.0
+"""Columns in rows: (m, k) for each side and joint with non-zero entries."""
+_Sums = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What a group of k columns adds to the model.
+    """Contribution of a group of k columns to the model.
 
-    gain : fall of the chi-square on the parts held back in turn. fitted : fall on the rows fitted.
-    coefficients (k,), covariance (k, k) from blocks. p_value : that all are zero. inflation : the gain over
-    the number of rows of the joints and sides it acts on, the relative excess of power that it explains.
-    robust : gives covariance and number of blocks that carry it; asked only where it matters, for most
-    scores it does not. chance : the p-value, where it does not come from the covariance.
+    gain, fitted : fall of the chi-square on the parts held back in turn, and on the fitted rows.
+    coefficients (k,), covariance (k, k) from blocks. p_value : of the hypothesis of all zero. inflation : the gain
+    over the number of rows of the joints and sides it acts on, the explained relative excess of power. robust : gives
+    covariance and number of active blocks, on demand. chance : a p-value from another source.
     """
 
     gain: float
@@ -65,7 +64,14 @@ class Score:
     @cached_property
     def p_value(self) -> float:
         """Probability of such coefficients where all are zero."""
-        return _wald(self.coefficients, *self._robust) if self.chance is None else self.chance
+        if self.chance is not None:
+            return self.chance
+        (covariance, active), k = self._robust, len(self.coefficients)
+        try:
+            value = float(self.coefficients @ np.linalg.solve(covariance, self.coefficients))
+        except np.linalg.LinAlgError:
+            return 1.0
+        return fisher_tail(value / k, k, max(active - k, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +84,8 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Products of a group's columns with the base and among themselves in each block, and their sums over the
-    parts of the motion that are held back in turn; `parts` (parts, blocks) is 1 where a block belongs to one.
-    """
+    """Products of a group's columns with the base and among themselves in each block, and their sums over the parts
+    held back in turn; `parts` (parts, blocks) is 1 for the blocks of a part."""
 
     base: Floats
     own: Floats
@@ -88,23 +93,22 @@ class Products:
     parts: Floats
 
     @cached_property
-    def sums(self) -> tuple[Floats, Floats, Floats]:
+    def sums(self) -> _Sums:
         """Base, own and target of each part."""
         return _sums(self.parts, self.base), _sums(self.parts, self.own), self.parts @ self.target
 
     def only(self, on: Floats) -> Products:
-        """Of the blocks with weight 1 in `on` (blocks,) alone."""
-        return Products(
-            self.base * on[:, None, None], self.own * on[:, None, None], self.target * on[:, None], self.parts
-        )
+        """Products of the blocks with weight 1 in `on` (blocks,) alone."""
+        wide = on[:, None, None]
+        return Products(self.base * wide, self.own * wide, self.target * on[:, None], self.parts)
 
 
 class Evidence:
     """Block products of the base and of accepted columns.
 
-    sigma : noise of a row [Nm] by side, (n,). dilution : by side, (n,), how much less than a row each row
-    counts, because noise is correlated. prior : precision (p, p) and values (p,) of the base parameters, from
-    a reference; then a cause that the base parameters would absorb shows as well, where they are `compared`.
+    sigma : noise of a row [Nm] by side, (n,). variance_inflation : by side, (n,), of correlated noise.
+    prior : precision (p, p) and values (p,) of the base parameters, from a reference. Where they are `compared`,
+    causes otherwise absorbed by the base parameters show as well.
     floor : repeatability of a row [Nm] by side, (n,); default sigma.
     """
 
@@ -113,72 +117,63 @@ class Evidence:
         nominal: Nominal,
         settings: DiagnosisSettings,
         sigma: Mapping[str, Floats],
-        dilution: Mapping[str, Floats],
+        variance_inflation: Mapping[str, Floats],
         prior: tuple[Floats, Floats] | None = None,
         *,
         compared: bool = True,
         floor: Mapping[str, Floats] | None = None,
     ) -> None:
-        self.settings = settings
-        self.prior = prior
-        self.compared = compared
+        self.settings, self.prior, self.compared = settings, prior, compared
         self.floor = dict(sigma if floor is None else floor)
         self.nominal = nominal
         self.sigma = {side: np.array(value) for side, value in sigma.items()}
-        self.dilution = {side: np.array(value) for side, value in dilution.items()}
+        self.variance_inflation = {side: np.array(value) for side, value in variance_inflation.items()}
         self._layout(nominal)
-        self._weights = {
-            (side, j): 1.0 / (self.sigma[side][j] ** 2 * self.dilution[side][j])
-            for side in nominal.rows
-            for j in range(nominal.arm.chain.n)
-        }
+        self.mask: dict[Key, Floats] = {}
+        self._weights: dict[Key, float] = {}
         self._columns: dict[Key, Floats] = {}
         self._acting: dict[Key, NDArray[np.int64]] = {}
         self._targets: dict[Key, Floats] = {}
         for side, rows in nominal.rows.items():
             for j in range(nominal.arm.chain.n):
-                keep = rows.valid[:, j] & ~rows.test
+                key, keep = (side, j), rows.valid[:, j] & ~rows.test
                 wide = np.where(keep[:, None], rows.matrix[j], 0.0)
-                # Most base columns do not reach most joints.
-                self._acting[side, j] = np.flatnonzero(np.any(wide != 0.0, axis=0))
-                self._columns[side, j] = self._padded(side, wide[:, self._acting[side, j]])
-                self._targets[side, j] = self._padded(side, np.where(keep, rows.target[:, j], 0.0)[:, None])
-        self.mask = {
-            (side, j): self._padded(side, (rows.valid[:, j] & ~rows.test).astype(float)[:, None])
-            for side, rows in nominal.rows.items()
-            for j in range(nominal.arm.chain.n)
-        }
+                self._weights[key] = 1.0 / (self.sigma[side][j] ** 2 * self.variance_inflation[side][j])
+                # Most base columns do not act on most joints.
+                self._acting[key] = np.flatnonzero(np.any(wide != 0.0, axis=0))
+                self._columns[key] = self._padded(side, wide[:, self._acting[key]])
+                self._targets[key] = self._padded(side, np.where(keep, rows.target[:, j], 0.0)[:, None])
+                self.mask[key] = self._padded(side, keep.astype(float)[:, None])
         self.base_count = len(nominal.base)
         self.extra: list[Rows] = []
         self._known: dict[int, tuple[Rows, dict[Key, Floats], Products]] = {}
         self._joined: dict[Key, Floats] | None = None
-        self._begin()
+        self._base_products()
         self._gram()
 
     # ---- layout ----
 
     def _layout(self, nominal: Nominal) -> None:
-        """Blocks of time, the same on all sides, and the part of the motion that each belongs to."""
+        """Blocks of time, the same on all sides, and the part of the motion of each."""
         settings = self.settings
         numbers: dict[tuple[int, int], int] = {}
         folds: list[int] = []
         self._place: dict[str, tuple[NDArray[np.int64], NDArray[np.int64], int]] = {}
         start = {r.number: r.start_s for r in nominal.recordings}
         period = {r.number: r.period_s for r in nominal.recordings}
-        # A motion that does not repeat gives half as long a block, for enough of them.
+        # A motion without repetition gives half as long a block, for enough of them.
         parts = {r.number: (2.0 if r.repeats else 4.0) * settings.folds for r in nominal.recordings}
         length = {r.number: min(settings.block_s, r.period_s / parts[r.number]) for r in nominal.recordings}
         ids: dict[str, NDArray[np.int64]] = {}
         for side, rows in nominal.rows.items():
             found = np.full(len(rows.time), -1)
             for k in np.flatnonzero(~rows.test):
-                session, time = rows.session[k], rows.time[k]
-                since = time - start[int(session)]
-                block = (int(session), int(since / length[int(session)]))
+                session = int(rows.session[k])
+                since = rows.time[k] - start[session]
+                block = (session, int(since / length[session]))
                 if block not in numbers:
                     numbers[block] = len(numbers)
-                    phase = since % period[int(session)]
-                    folds.append(int(phase / length[int(session)]) % settings.folds)
+                    folds.append(int(since % period[session] / length[session]) % settings.folds)
                 found[k] = numbers[block]
             ids[side] = found
         self.blocks = len(numbers)
@@ -197,7 +192,7 @@ class Evidence:
             self._place[side] = (found, within, int(counts.max(initial=1)))
 
     def _padded(self, side: str, values: Floats) -> Floats:
-        """(blocks, L, k) of rows (m, k); zeros where a block is shorter. Rows that are never fitted have none."""
+        """(blocks, L, k) of rows (m, k); zeros where a block is shorter. Held-out rows have none."""
         block, within, length = self._place[side]
         fitted = block >= 0
         out = np.zeros((self.blocks, length, values.shape[1]))
@@ -206,46 +201,43 @@ class Evidence:
 
     # ---- products ----
 
-    def _begin(self) -> None:
+    def _base_products(self) -> None:
         """Products of the base, made once."""
         p = self.base_count
         self._base_gram = np.zeros((self.blocks, p, p))
         self._base_target = np.zeros((self.blocks, p))
         self.energy = np.zeros(self.blocks)
         for key, matrix in self._columns.items():
-            weight = self._weights[key]
-            t = self._targets[key]
+            weight, t = self._weights[key], self._targets[key]
             turned = weight * matrix.transpose(0, 2, 1)
             on = self._acting[key]
             self._base_gram[:, on[:, None], on] += np.matmul(turned, matrix)
             self._base_target[:, on] += np.matmul(turned, t)[:, :, 0]
             self.energy += weight * np.sum(t[:, :, 0] ** 2, axis=1)
 
+    def _places(self) -> Iterator[tuple[slice, Rows]]:
+        """The further columns with their places behind the base."""
+        place = self.base_count
+        for rows in self.extra:
+            yield slice(place, place + _width(rows)), rows
+            place += _width(rows)
+
     def _gram(self) -> None:
         """Products of base and further columns, and the fits with and without each part of the motion."""
         p = self.base_count
-        self.gram, self.target = self._base_gram, self._base_target
-        if self.extra:
-            size = p + sum(_width(rows) for rows in self.extra)
-            self.gram = np.zeros((self.blocks, size, size))
-            self.target = np.zeros((self.blocks, size))
-            self.gram[:, :p, :p], self.target[:, :p] = self._base_gram, self._base_target
-            place = p
-            for rows in self.extra:
-                _, padded, products = self._known[id(rows)]
-                end = place + _width(rows)
-                self.gram[:, place:end, :p] = products.base
-                self.gram[:, :p, place:end] = products.base.transpose(0, 2, 1)
-                self.target[:, place:end] = products.target
-                other = p
-                for against in self.extra:
-                    stop = other + _width(against)
-                    if other <= place:
-                        cross = self._cross(padded, self._known[id(against)][1])
-                        self.gram[:, place:end, other:stop] = cross
-                        self.gram[:, other:stop, place:end] = cross.transpose(0, 2, 1)
-                    other = stop
-                place = end
+        size = p + sum(_width(rows) for rows in self.extra)
+        self.gram, self.target = np.zeros((self.blocks, size, size)), np.zeros((self.blocks, size))
+        self.gram[:, :p, :p], self.target[:, :p] = self._base_gram, self._base_target
+        for here, rows in self._places():
+            _, padded, products = self._known[id(rows)]
+            self.gram[:, here, :p] = products.base
+            self.gram[:, :p, here] = products.base.transpose(0, 2, 1)
+            self.target[:, here] = products.target
+            for there, other in self._places():
+                if there.start <= here.start:
+                    cross = self._cross(padded, self._known[id(other)][1])
+                    self.gram[:, here, there] = cross
+                    self.gram[:, there, here] = cross.transpose(0, 2, 1)
         scale = np.sqrt(np.einsum("bii->i", self.gram))
         self._scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
         self._part_gram, self._part_target = _sums(self.parts, self.gram), self.parts @ self.target
@@ -253,36 +245,31 @@ class Evidence:
         self.full = self._fit(gram, target)
         self._free = None
         if self.prior is not None and not self.compared:
-            self._free = self._fit(gram, target, leaning=False)
+            self._free = self._fit(gram, target, with_prior=False)
         self._held = [
             self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
         ]
 
-    def _fit(self, gram: Floats, target: Floats, *, leaning: bool = True) -> Fit:
-        """Values from sums of products, `leaning` on the prior where there is one."""
+    def _fit(self, gram: Floats, target: Floats, *, with_prior: bool = True) -> Fit:
+        """Values from sums of products, `with_prior` if there is one."""
         s = self._scale
         gram, target = gram.copy(), target.copy()
-        if self.prior is not None and leaning:
+        if self.prior is not None and with_prior:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
             target[:p] += self.prior[0] @ self.prior[1]
         gram *= np.outer(s, s)
-        # A motion that leaves a direction open must not blow it up; 1e-9 of the diagonal decides
-        # nothing else.
+        # Keeps directions without excitation finite; 1e-9 of the diagonal decides nothing else.
         gram[np.diag_indices_from(gram)] += 1e-9
         inverse = np.linalg.inv(gram) * np.outer(s, s)
         return Fit(inverse @ target, inverse)
 
     def padded(self, rows: Rows) -> dict[Key, Floats]:
-        """Columns in blocks, zero where a row is not used."""
+        """Columns in blocks, zero in unused rows."""
         return {key: self._padded(key[0], values) * self.mask[key] for key, values in rows.items()}
 
     def products(self, columns: Mapping[Key, Floats], known: Products | None = None) -> Products:
-        """Products in each block of padded columns (blocks, L, k).
-
-        known : the products of the same columns with the base alone; only those with further
-        columns are made.
-        """
+        """Products in each block of padded columns (blocks, L, k); `known` : those with the base alone."""
         known = self.alone(columns) if known is None else known
         if not self.extra:
             return known
@@ -290,21 +277,18 @@ class Evidence:
         return Products(base, known.own, known.target, self.parts)
 
     def _beside(self) -> dict[Key, Floats]:
-        """All further columns side by side, padded, by key."""
+        """All further columns together, padded, by key."""
         if self._joined is None:
-            width = sum(_width(rows) for rows in self.extra)
+            p, size = self.base_count, self.gram.shape[1]
             self._joined = {}
-            place = 0
-            for rows in self.extra:
+            for here, rows in self._places():
                 for key, values in self._known[id(rows)][1].items():
-                    if key not in self._joined:
-                        self._joined[key] = np.zeros((*values.shape[:2], width))
-                    self._joined[key][:, :, place : place + values.shape[2]] = values
-                place += _width(rows)
+                    joined = self._joined.setdefault(key, np.zeros((*values.shape[:2], size - p)))
+                    joined[:, :, here.start - p : here.stop - p] = values
         return self._joined
 
     def replace(self, extra: Sequence[Rows]) -> None:
-        """Let the base be followed by these columns."""
+        """Replace the columns beyond the base."""
         self.extra = list(extra)
         self._joined = None
         for rows in self.extra:
@@ -348,11 +332,11 @@ class Evidence:
         """Score of padded columns.
 
         ridge : pull towards zero, in units of the columns' mean square, for groups of many columns. pull : precision
-        with which coefficients are known to be 1, for what is held against parts of the motion: what acts in a few
-        moments only is hardly there without one of them. known : their products with the base alone, to save time.
+        of coefficients known to be 1, for the parts held back: an effect of a few moments hardly exists without one
+        of them.
+        known : their products with the base alone, to save time.
         """
-        products = self.products(columns, known)
-        return self.score_products(products, list(columns), ridge=ridge, pull=pull)
+        return self.score_products(self.products(columns, known), list(columns), ridge=ridge, pull=pull)
 
     def score_products(
         self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0, pull: float = 0.0
@@ -360,77 +344,71 @@ class Evidence:
         """Score of columns in the rows of `keys` from their products with all present columns."""
         base, own, target = products.sums
         whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
-        lever, inner, reach = _schur(whole, self.full, ridge)
+        projection, inner, moment = _schur(whole, self.full, ridge)
         k = products.own.shape[1]
         if inner is None:
             return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
-        coefficients = inner @ reach
-        fitted = float(reach @ coefficients)
+        coefficients = inner @ moment
+        fitted = float(moment @ coefficients)
         gain = fitted
-        if fitted > _NOTHING:
+        if fitted > _NO_EVIDENCE:
             gain = 0.0
             pulled = whole[0], whole[1] + pull * np.eye(k), whole[2] + pull
-            for part, fit in enumerate(self._held):
+            for part in range(len(self._held)):
                 mine = base[part], own[part], target[part]
                 rest = pulled[0] - mine[0], pulled[1] - mine[1], pulled[2] - mine[2]
-                gain += self._held_gain(mine, rest, fit, part, ridge)
-        rows = sum(float(self.mask[key].sum()) / self.dilution[key[0]][key[1]] for key in keys)
-        if self.prior is not None and self.compared and fitted > _NOTHING:
-            gain += self._strain(self.full.values) - self._strain(self.full.values - lever @ coefficients)
-        # Held-back error can also fall because a base fitted without the part was poor: never more than that.
+                gain += self._held_gain(mine, rest, part, ridge)
+        rows = sum(float(self.mask[key].sum()) / self.variance_inflation[key[0]][key[1]] for key in keys)
+        if self.prior is not None and self.compared and fitted > _NO_EVIDENCE:
+            changed = self.full.values - projection @ coefficients
+            gain += self._prior_penalty(self.full.values) - self._prior_penalty(changed)
+        # Held-back error can also fall after a poor fit of the base without the part: never more than the
+        # fitted gain.
         gain = min(gain, fitted)
-        if self._free is not None and self._absorbed(whole[0], whole[1]):
-            gain = min(gain, 0.0)
-        values, gram, torque = self.full.values - lever @ coefficients, self.gram, self.target
-        return Score(
-            gain,
-            fitted,
-            coefficients,
-            gain / max(rows, 1.0),
-            lambda: _robust(products, gram, torque, values, lever, inner, coefficients),
-        )
+        if self._free is not None:
+            # A cause explained by base parameters without the prior could only make up for a wrong drawing.
+            size, cross = np.diag(whole[1]), whole[0]
+            left = size - np.einsum("kp,pq,kq->k", cross, self._free.inverse, cross)
+            gain = min(gain, 0.0) if np.all(left < _OWN_SHARE * size) else gain
+        values, gram, torque = self.full.values - projection @ coefficients, self.gram, self.target
 
-    def _absorbed(self, base: Floats, own: Floats) -> bool:
-        """Whether base parameters that do not lean on the drawing explain the columns: such a cause could only
-        make up for a wrong drawing."""
-        assert self._free is not None
-        left = np.diag(own) - np.einsum("kp,pq,kq->k", base, self._free.inverse, base)
-        return bool(np.all(left < _OWN_SHARE * np.diag(own)))
+        def robust() -> tuple[Floats, int]:
+            own = products.target - products.base @ values - products.own @ coefficients
+            left = torque - gram @ values - np.einsum("bkp,k->bp", products.base, coefficients)
+            scores = own - left @ projection
+            size = np.einsum("bkk->b", products.own)
+            active = int(np.sum(size > 1e-3 * size.max(initial=0.0)))
+            middle = active / max(active - 1, 1) * scores.T @ scores
+            return _widened(inner @ middle @ inner, inner), active
+
+        return Score(gain, fitted, coefficients, gain / max(rows, 1.0), robust)
 
     def event_score(self, score: Score, choices: int) -> Score:
-        """A score of columns that are active in a few blocks only, the best of `choices`: the fall
-        on the rows
-        fitted, less what the best of so many would fall by chance.
-        """
+        """Score of columns active in a few blocks, the best of `choices`: the fall on the fitted rows less its
+        expectation for the best of so many by chance."""
         k = len(score.coefficients)
         penalty = 2.0 * np.log(max(choices, 1)) + 4.0 * k
         p = float(min(1.0, choices * chi_square_tail(score.fitted, k)))
         gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
         return replace(score, gain=gain, chance=p)
 
-    def _held_gain(
-        self,
-        mine: tuple[Floats, Floats, Floats],
-        rest: tuple[Floats, Floats, Floats],
-        fit: Fit,
-        part: int,
-        ridge: float,
-    ) -> float:
+    def _held_gain(self, mine: _Sums, rest: _Sums, part: int, ridge: float) -> float:
         """Fall of the chi-square on a part of the motion, the columns fitted on the rest."""
-        lever, inner, reach = _schur(rest, fit, ridge)
+        fit = self._held[part]
+        projection, inner, moment = _schur(rest, fit, ridge)
         if inner is None:
             return 0.0
-        c = inner @ reach
-        change = -(lever @ c)
+        c = inner @ moment
+        change = -(projection @ c)
         gram, (cross, own, target) = self._part_gram[part], mine
-        base_reach = self._part_target[part] - gram @ fit.values
-        own_reach = target - cross @ fit.values
-        linear = 2.0 * (change @ base_reach + c @ own_reach)
+        base_moment = self._part_target[part] - gram @ fit.values
+        own_moment = target - cross @ fit.values
+        linear = 2.0 * (change @ base_moment + c @ own_moment)
         square = change @ gram @ change + 2.0 * (c @ cross @ change) + c @ own @ c
         return float(linear - square)
 
-    def _strain(self, values: Floats) -> float:
-        """Chi-square of base parameters against the reference."""
+    def _prior_penalty(self, values: Floats) -> float:
+        """Chi-square of base parameters against the prior."""
         if self.prior is None:
             return 0.0
         difference = values[: self.base_count] - self.prior[1]
@@ -439,12 +417,11 @@ class Evidence:
     # ---- results of a fit ----
 
     def block_of(self, side: str) -> Floats:
-        """Number (m,) of the block of each row of a side, -1 for rows that are never fitted."""
+        """Number (m,) of the block of each row of a side, -1 for held-out rows."""
         return self._place[side][0].astype(float)
 
     def residuals(self, *, test: bool = False) -> dict[str, Floats]:
-        """Residual (m, n) by side with the present columns, NaN where a row is not used; `test`: the rows
-        never fitted instead."""
+        """Residual (m, n) by side with the present columns, NaN in unused rows; `test` : of held-out rows instead."""
         found = {}
         for side, rows in self.nominal.rows.items():
             keep = rows.valid & (rows.test if test else ~rows.test)[:, None]
@@ -454,7 +431,7 @@ class Evidence:
         return found
 
     def held_residuals(self) -> dict[str, Floats]:
-        """Residual (m, n) by side of each part of the motion as predicted from the others."""
+        """Residual (m, n) by side of each part of the motion, predicted from the others."""
         found = {}
         for side, rows in self.nominal.rows.items():
             out = np.full(rows.target.shape, np.nan)
@@ -469,13 +446,10 @@ class Evidence:
         mine = np.ones(len(self.nominal.rows[side].time), dtype=bool) if mine is None else mine
         p = self.base_count
         predicted = np.einsum("jmp,p->mj", self.nominal.rows[side].matrix[:, mine], values[:p])
-        place = p
-        for extra in self.extra:
-            width = _width(extra)
-            for (of_side, j), columns in extra.items():
+        for here, rows in self._places():
+            for (of_side, j), columns in rows.items():
                 if of_side == side:
-                    predicted[:, j] += columns[mine] @ values[place : place + width]
-            place += width
+                    predicted[:, j] += columns[mine] @ values[here]
         return predicted
 
     def covariance(self) -> Floats:
@@ -483,15 +457,13 @@ class Evidence:
         scores = self.target - self.gram @ self.full.values
         middle = self.blocks / max(self.blocks - 1, 1) * scores.T @ scores
         sandwich = self.full.inverse @ middle @ self.full.inverse
-        # Columns that nothing excites leave a variance of nothing, on either side of zero by rounding.
+        # The variance of columns without excitation is zero, on either side of it by rounding.
         np.fill_diagonal(sandwich, np.maximum(np.diag(sandwich), 0.0))
-        floor = np.sqrt(np.maximum(np.diag(self.full.inverse), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
-        widen = np.maximum(floor, 1.0)
-        return sandwich * np.outer(widen, widen)
+        return _widened(sandwich, self.full.inverse)
 
     @property
     def chi_square(self) -> float:
-        """Sum of squares of all rows fitted, in units of their noise."""
+        """Sum of squares of all fitted rows, in units of their noise."""
         v = self.full.values
         return float(self.energy.sum() - 2.0 * v @ self.target.sum(axis=0) + v @ self.gram.sum(axis=0) @ v)
 
@@ -505,53 +477,26 @@ def _sums(parts: Floats, values: Floats) -> Floats:
     return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
 
 
-def _schur(
-    products: tuple[Floats, Floats, Floats], fit: Fit, ridge: float
-) -> tuple[Floats, Floats | None, Floats]:
-    """Image in the base (P, k), inverse of the Schur complement (k, k), and product with the residual (k,) of
+def _schur(products: _Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats | None, Floats]:
+    """Projection on the base (P, k), inverse of the Schur complement (k, k), and product with the residual (k,) of
     columns with the products base (k, P), own (k, k) and target (k,)."""
     cross, own, target = products
-    lever = fit.inverse @ cross.T
-    inner = own - cross @ lever
+    projection = fit.inverse @ cross.T
+    inner = own - cross @ projection
     size = np.diag(own).copy()
-    # A column that the base explains to a millionth has nothing of its own to say.
+    # A column with less than this share beside the base carries no information of its own.
     if np.any(size <= 0.0) or np.any(np.diag(inner) < 1e-7 * size):
-        return lever, None, np.zeros(len(own))
+        return projection, None, np.zeros(len(own))
     inner = inner + ridge * np.diag(size)
     root = np.sqrt(np.diag(inner))
     scaled = inner / np.outer(root, root)
     if len(own) > 1 and np.linalg.eigvalsh(scaled)[0] < 1e-9:
-        return lever, None, np.zeros(len(own))
-    return lever, np.linalg.inv(scaled) / np.outer(root, root), target - cross @ fit.values
+        return projection, None, np.zeros(len(own))
+    return projection, np.linalg.inv(scaled) / np.outer(root, root), target - cross @ fit.values
 
 
-def _robust(
-    products: Products,
-    gram: Floats,
-    target: Floats,
-    values: Floats,
-    lever: Floats,
-    inner: Floats,
-    coefficients: Floats,
-) -> tuple[Floats, int]:
-    """Covariance from blocks, at least that of independent rows; and the number of blocks that carry it."""
-    own = products.target - products.base @ values - products.own @ coefficients
-    base = target - gram @ values - np.einsum("bkp,k->bp", products.base, coefficients)
-    scores = own - base @ lever
-    size = np.einsum("bkk->b", products.own)
-    active = int(np.sum(size > 1e-3 * size.max(initial=0.0)))
-    factor = active / max(active - 1, 1)
-    middle = factor * scores.T @ scores
-    sandwich = inner @ middle @ inner
-    floor = np.sqrt(np.maximum(np.diag(inner), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
+def _widened(sandwich: Floats, independent: Floats) -> Floats:
+    """A covariance from blocks, its standard deviations at least those of independent rows."""
+    floor = np.sqrt(np.maximum(np.diag(independent), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
     widen = np.maximum(floor, 1.0)
-    return sandwich * np.outer(widen, widen), active
-
-
-def _wald(coefficients: Floats, covariance: Floats, active: int) -> float:
-    k = len(coefficients)
-    try:
-        value = float(coefficients @ np.linalg.solve(covariance, coefficients))
-    except np.linalg.LinAlgError:
-        return 1.0
-    return fisher_tail(value / k, k, max(active - k, 1))
+    return sandwich * np.outer(widen, widen)

@@ -1,14 +1,12 @@
-"""Model-form error: what a strong cause leaves beside its law, so that it is not taken for another cause.
+"""Model-form error: the rest beside the law of a strong cause, so that it is not taken for another cause.
 
 A law is an idealisation. A hose is no plain spring, friction falls with speed in its own way, an unannounced payload
-has another inertia too. The rest beside the law of a strong cause may exceed the noise by far, and then another cause
-of a similar torque is significant. It is a cause of its own only if it remains beside any function of the first one's
-own variable, acting on the same rows in the same proportion (Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001)).
+has another inertia too. The rest may exceed the noise by far, and then another cause of a similar torque is
+significant. It is a cause of its own only if it remains beside any function of the first one's own variable, acting
+on the same rows in the same proportion (Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001)).
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,10 +19,10 @@ __all__ = ["companions", "model_form_error"]
 
 
 def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
-    """Columns of the trial's cause beyond its law, None where nothing is known of it.
+    """Columns of the trial's cause beyond its law, None without such knowledge.
 
-    Hat functions of the law's variable on the sides that it acts on, one coefficient for all of them, beside the
-    companions of the cause; of a joint that gives way any turn of the link by the load.
+    Hat functions of the law's variable on the sides of the cause, with common coefficients, beside the companions of
+    the cause; for a compliant joint any turn of the link by the load.
     """
     effect, joint = trial.candidate.effect, trial.candidate.joint
     if effect.displaces:
@@ -43,7 +41,7 @@ def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
         else:
             group = groups(dictionary, own, side, joint)
             wanted = f"{name} sign(qd{joint + 1})" if effect.law.signed else name
-            # All hats together are a constant, which the base has.
+            # The sum of all hats is a constant, already in the base.
             columns = group[wanted][side, joint][:, 0 if effect.law.signed else 1 :]
         more = [beside[side, joint]] if (side, joint) in beside else []
         found[side, joint] = np.column_stack([columns, *more])
@@ -51,36 +49,28 @@ def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
 
 
 def companions(dictionary: Dictionary, trial: Trial) -> Rows | None:
-    """Columns of the torques that come with the trial's cause in a real arm, in the rows of the trial."""
+    """Columns of the torques accompanying the trial's cause in a real arm, in the rows of the trial."""
     effect, joint, nominal = trial.candidate.effect, trial.candidate.joint, dictionary.nominal
     own = max(joint, 0)
     parts: dict[Key, list[Floats]] = {}
-    for columns in zip(
-        *(effect.companions(m, own, dictionary.setting) for m in nominal.motions), strict=True
-    ):
+    by_motion = [effect.companions(m, own, dictionary.setting) for m in nominal.motions]
+    for columns in zip(*by_motion, strict=True):
         for side, at in trial.rows:
             if joint >= 0 and at != joint:
                 continue
-            signals = [column.wide(own, nominal.arm.chain.n)[side == "joint"] for column in columns]
-            if signals[0] is not None:
-                parts.setdefault((side, at), []).append(_reduced(dictionary, side, signals, at))
-    if not effect.whole_arm:
-        return {key: np.column_stack(columns) for key, columns in parts.items()} or None
-    # A body adds nothing where it does not hang, or did not yet.
-    return {
-        key: np.column_stack(columns) * np.any(trial.rows[key] != 0.0, axis=1)[:, None]
-        for key, columns in parts.items()
-    } or None
-
-
-def _reduced(dictionary: Dictionary, side: str, signals: Sequence[Floats | None], joint: int) -> Floats:
-    return dictionary.nominal.reduce(side, [signal[:, joint] for signal in signals if signal is not None])
+            wide = [column.wide(own, nominal.arm.chain.n)[side == "joint"] for column in columns]
+            signals = [signal[:, at] for signal in wide if signal is not None]
+            if signals:
+                parts.setdefault((side, at), []).append(nominal.reduce(side, signals))
+    found = {key: np.column_stack(columns) for key, columns in parts.items()}
+    if effect.whole_arm:
+        # A body adds nothing before it is attached, nor to other joints.
+        found = {key: v * np.any(trial.rows[key] != 0.0, axis=1)[:, None] for key, v in found.items()}
+    return found or None
 
 
 def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
-    """Functions (m, k) of a drive's speed and of its direction, finer the slower it is: laws of friction differ most
-    there.
-    """
+    """Functions (m, k) of a drive's speed and its direction, finer at low speed, where friction laws differ most."""
     motions = dictionary.nominal.motions
     roots = [np.sqrt(np.abs(m.motor_speed[:, joint])) for m in motions]
     high = max(float(root.max()) for root in roots)

@@ -1,8 +1,9 @@
-"""The noise of rows, told by what differs from period to period."""
+"""The noise of rows, from differences between periods."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,11 @@ Floats = NDArray[np.float64]
 def noise_floor(
     rows: SideRows, residual: Floats, periods: Mapping[int, tuple[float, float]]
 ) -> tuple[Floats, Floats, bool]:
-    """Noise (n,) of a row [Nm], the dilution (n,) of rows by correlation, and whether periods told it.
+    """Noise (n,) of a row [Nm], its variance inflation (n,) by correlation, and whether periods gave both.
 
-    Where the excitation repeats, the difference of two periods of the residual is noise and nothing else.
-    Otherwise the residual itself stands for it, counted with its effective number of rows: what a model leaves
-    for seconds is then one observation and not a thousand, and a claim must explain most of it.
+    Where the excitation repeats, the difference of two periods of the residual is noise alone. Otherwise the residual
+    itself stands for it, counted with its effective number of rows: a misfit lasting for seconds is then one
+    observation, not a thousand, and a claim must explain most of it.
     periods : start and length [s] of each session's period.
     """
     n = residual.shape[1]
@@ -42,50 +43,42 @@ def noise_floor(
         nearest = after - earlier
         close = np.abs(rows.time[first[nearest]] - at) < 0.6 * step
         pairs.append((residual[second[close]] - residual[first[nearest[close]]]) / np.sqrt(2.0))
-    sigma, dilution = np.ones(n), np.ones(n)
-    told = bool(pairs)
-    if not told:
+    if not pairs:
         return *_misfit(rows, residual), False
+    sigma, inflation = np.ones(n), np.ones(n)
     differences = np.concatenate(pairs)
+    dt = max(float(np.median(np.diff(rows.time))), 1e-6)
     for j in range(n):
         d = differences[:, j]
         d = d[np.isfinite(d)]
         if len(d) < 20:
             continue
-        d = _without_slow(d, max(4, round(1.0 / max(float(np.median(np.diff(rows.time))), 1e-6))))
+        d = _without_slow(d, max(4, round(1.0 / dt)))
         sigma[j] = max(_robust_rms(d), 1e-9)
-        width = max(2, round(0.2 / max(float(np.median(np.diff(rows.time))), 1e-6)))
+        width = max(2, round(0.2 / dt))
         count = len(d) // width
         if count >= 4:
             means = d[: count * width].reshape(count, width).mean(axis=1)
-            dilution[j] = float(np.clip(width * np.mean(means**2) / np.mean(d**2), 1.0, width))
-            if dilution[j] < 1.0 + 3.0 * np.sqrt(2.0 / count):
-                dilution[j] = 1.0
-    return sigma, dilution, told
+            ratio = float(np.clip(width * np.mean(means**2) / np.mean(d**2), 1.0, width))
+            inflation[j] = 1.0 if ratio < 1.0 + 3.0 * np.sqrt(2.0 / count) else ratio
+    return sigma, inflation, True
 
 
-def repeatability(
-    recordings: Sequence[Recording], rows: SideRows, residual: Floats
-) -> tuple[Floats, tuple[tuple[int, int], ...]]:
-    """Noise (n,) of a row [Nm] from sessions that repeat a motion, and the pairs of their numbers.
-
-    NaN where none does. Everything counts that differs from run to run, a drift as well.
-    """
-    pairs, squares, counts = [], np.zeros(residual.shape[1]), np.zeros(residual.shape[1])
-    for k, one in enumerate(recordings):
-        for other in recordings[k + 1 :]:
-            if not _same_motion(one, other):
-                continue
-            pairs.append((one.number, other.number))
-            first, second = (np.flatnonzero(rows.session == r.number) for r in (one, other))
-            at = rows.time[first] - one.start_s
-            there = rows.time[second] - other.start_s
-            for j in range(residual.shape[1]):
-                d = residual[first, j] - np.interp(at, there, residual[second, j], np.nan, np.nan)
-                d = d[np.isfinite(d)]
-                squares[j] += 0.5 * float(d @ d)
-                counts[j] += len(d)
-    return np.sqrt(np.where(counts > 0, squares / np.maximum(counts, 1.0), np.nan)), tuple(pairs)
+def repeatability(recordings: Sequence[Recording], rows: SideRows, residual: Floats) -> Floats:
+    """Noise (n,) of a row [Nm] from sessions with the same motion, NaN without any. Every difference from run to run
+    counts, drifts as well."""
+    squares, counts = np.zeros((2, residual.shape[1]))
+    for one, other in combinations(recordings, 2):
+        if not _same_motion(one, other):
+            continue
+        first, second = (np.flatnonzero(rows.session == r.number) for r in (one, other))
+        at, there = rows.time[first] - one.start_s, rows.time[second] - other.start_s
+        for j in range(residual.shape[1]):
+            d = residual[first, j] - np.interp(at, there, residual[second, j], np.nan, np.nan)
+            d = d[np.isfinite(d)]
+            squares[j] += 0.5 * float(d @ d)
+            counts[j] += len(d)
+    return np.sqrt(np.where(counts > 0, squares / np.maximum(counts, 1.0), np.nan))
 
 
 def _same_motion(one: Recording, other: Recording) -> bool:
@@ -105,11 +98,12 @@ def _same_motion(one: Recording, other: Recording) -> bool:
 
 
 def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
-    """Size (n,) of the residual and the number (n,) of rows that count as one, from its autocorrelation."""
+    """Size (n,) of the residual and its variance inflation (n,), the number of rows counting as one, from the
+    autocorrelation."""
     from scipy.signal import correlate
 
     n = residual.shape[1]
-    sigma, dilution = np.ones(n), np.ones(n)
+    sigma, inflation = np.ones(n), np.ones(n)
     for j in range(n):
         total, power, count = np.zeros(1), 0.0, 0
         for session in np.unique(rows.session):
@@ -125,12 +119,12 @@ def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
             power, count = power + float(np.sum(d[ok] ** 2)), count + int(ok.sum())
         if count:
             sigma[j] = max(float(np.sqrt(power / count)), 1e-9)
-            dilution[j] = correlation_time(total)
-    return sigma, dilution
+            inflation[j] = correlation_time(total)
+    return sigma, inflation
 
 
 def _without_slow(values: Floats, width: int) -> Floats:
-    """Values less their means over `width` samples: a drift from period to period is no noise."""
+    """Values minus their means over `width` samples: a drift from period to period is not noise."""
     count = len(values) // width * width
     if not count:
         return values
@@ -140,5 +134,5 @@ def _without_slow(values: Floats, width: int) -> Floats:
 
 def _robust_rms(values: Floats) -> float:
     """Root mean square without the largest five per cent, scaled as for a normal distribution."""
-    limit = np.quantile(np.abs(values), 0.95)
-    return float(np.sqrt(np.mean(values[np.abs(values) <= limit] ** 2)) / 0.8711)
+    inside = values[np.abs(values) <= np.quantile(np.abs(values), 0.95)]
+    return float(np.sqrt(np.mean(inside**2)) / 0.8711)

@@ -1,13 +1,12 @@
 """The nominal arm: rows of the base model at the full bandwidth of the channels, and its predictions.
 
-Each side keeps its own sample times. Joint torque is averaged over short bins, the regressor with it; motor
-torque that comes slower than that gives one row a sample, with the regressor at that very instant. Both are
-linear operations on torque and regressor alike, so neither biases anything, and a row depends on a few
-milliseconds only: standstill and reversals spoil few rows.
+Each side keeps its own sample times. Joint torque and its regressor are averaged over short bins. A slower motor
+torque gives one row per sample, with the regressor at the same instant. Both operations are linear and act on torque
+and regressor alike, so neither adds a bias. A row depends on a few milliseconds only, so standstill and reversals
+spoil few rows.
 
-The drive's own columns (Ia, Fvm, Fcm) belong to the motor, which stands elsewhere than the link by the twist
-of the joint; the twist is that of the torque which the model predicts, so no sensor's noise or error leaks
-from one side to the other.
+The drive's own columns (Ia, Fvm, Fcm) belong to the motor, apart from the link by the twist of the joint. The twist
+follows from the predicted torque, so no sensor's noise or error leaks from one side to the other.
 """
 
 from __future__ import annotations
@@ -39,32 +38,32 @@ __all__ = ["TRAVEL_RAD", "Arm", "Nominal", "SideRows", "structure_of"]
 Floats = NDArray[np.float64]
 
 _CHUNK = 2000
-# Share of a low-passed row that must rest on samples of a joint that moves.
+# Least share of a low-passed row from samples of a moving joint.
 _KNOWN = 0.8
-# Length of the windows that are used of a long session [s].
+# Length of the windows used of a long session [s].
 _WINDOW_S = 10.0
-# Compliance [rad/Nm] of a joint that is taken for rigid.
+# Compliance [rad/Nm] of a joint taken as rigid.
 _RIGID = 1e-6
-# Damping over stiffness of the joints [s]: of a link that rings at 7 Hz it takes 4 % of the critical damping.
+# Damping over stiffness of the joints [s]: 4 % of the critical damping for a link ringing at 7 Hz.
 _RELAXATION_S = 2e-3
 # Least eigenvalue of a mass matrix over its largest.
 _LEAST_MASS = 1e-3
-# A joint that stays within this range says nothing about its friction, gears and cables.
+# A joint within this range carries no information on its friction, gears and cables.
 TRAVEL_RAD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What is known of the arm beforehand.
+    """Prior knowledge of the arm.
 
     compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio : (n,), one where
     unknown. motor_delay_s, joint_delay_s : of the healthy channels.
-    encoder : `link` or `motor`, the side of the elastic joints whose positions are published;
-    encoder_known : whether a healthy arm told it.
-    reach : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
+    encoder : `link` or `motor`, the side of the elastic joints with the published positions; encoder_known : whether
+    it comes from a healthy arm.
+    presliding : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
     unknown.
-    far, far_share : (n,) the share of it that turns within a longer distance, and that distance [rad].
-    couplings : pairs of joints whose drives are coupled.
+    far, far_share : (n,) longer distance [rad] for a share of that friction, and the share.
+    couplings : pairs of joints with coupled drives.
     """
 
     chain: Chain
@@ -74,21 +73,21 @@ class Arm:
     joint_delay_s: float = 0.0
     encoder: Literal["link", "motor"] = "link"
     encoder_known: bool = False
-    reach: Floats | None = None
+    presliding: Floats | None = None
     far: Floats | None = None
     far_share: Floats | None = None
     couplings: tuple[Coupling, ...] = ()
 
     def slip(self, speed: Floats, dt: float) -> Floats:
-        """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum
-        of two of them (Maxwell slip: asperities of several lengths side by side)."""
+        """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum of
+        two of them (Maxwell slip: asperities of several lengths side by side)."""
         found = np.sign(speed)
-        if self.reach is not None:
+        if self.presliding is not None:
             path = np.cumsum(speed, axis=0) * dt
-            for joint in np.flatnonzero(self.reach > 0.0):
+            for joint in np.flatnonzero(self.presliding > 0.0):
                 along = np.ascontiguousarray(path[:, joint])
                 start = float(found[0, joint])
-                found[:, joint] = dahl(along, float(self.reach[joint]), start)
+                found[:, joint] = dahl(along, float(self.presliding[joint]), start)
                 if self.far is not None and self.far_share is not None and self.far_share[joint] != 0.0:
                     slow = dahl(along, float(self.far[joint]), start)
                     found[:, joint] += float(self.far_share[joint]) * (slow - found[:, joint])
@@ -100,9 +99,7 @@ def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStruct
     payloads = tuple(dict.fromkeys(r.payload for r in recordings if r.payload is not None))
     motor = any(r.has_motor for r in recordings)
     structure = ModelStructure(arm.chain, 2 if motor else 1, payloads, couplings=arm.couplings)
-    conditions: dict[Condition, None] = {}
-    for r in recordings:
-        conditions[Condition(r.payload, r.sides)] = None
+    conditions = dict.fromkeys(Condition(r.payload, r.sides) for r in recordings)
     return structure, numeric_base(structure, tuple(conditions))
 
 
@@ -111,7 +108,7 @@ class SideRows:
     """Rows of one side, all sessions, in the order of time.
 
     matrix : (n, m, p) base regressor by joint; target : (m, n) [Nm]; valid : (m, n).
-    session : (m,) number; time : (m,) [s]; test : (m,) rows that are never fitted.
+    session : (m,) number; time : (m,) [s]; test : (m,) held-out rows.
     """
 
     matrix: Floats
@@ -126,36 +123,23 @@ class SideRows:
 class Nominal:
     """Rows and predictions of the nominal arm for recordings; `refine` repeats them with better predictions.
 
-    motions : one for each stretch, with the predicted torques.
+    motions : one for each stretch, with the predicted torques; default with the measured joint torque.
     """
 
     arm: Arm
-    recordings: tuple[Recording, ...]
+    recordings: Sequence[Recording]
     settings: DiagnosisSettings
     structure: ModelStructure
     base: BaseSet
     motions: list[Motion] = field(default_factory=list)
-    rows: dict[str, SideRows] = field(default_factory=dict)
+    rows: dict[str, SideRows] = field(default_factory=dict, init=False)
     _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
         default_factory=dict, init=False, repr=False
     )
 
-    @classmethod
-    def of(
-        cls,
-        arm: Arm,
-        recordings: Sequence[Recording],
-        settings: DiagnosisSettings,
-        structure: ModelStructure,
-        base: BaseSet,
-    ) -> Nominal:
-        """Rows with the twist of the measured joint torque, to begin with."""
-        nominal = cls(arm, tuple(recordings), settings, structure, base)
-        nominal.motions = [
-            nominal._motion(r, s, _measured(s)) for r in nominal.recordings for s in r.stretches
-        ]
-        nominal.make_rows()
-        return nominal
+    def __post_init__(self) -> None:
+        self.motions = self.motions or [self._motion(r, s, s.effort) for r, s in self.stretches]
+        self._make_rows()
 
     @property
     def stretches(self) -> list[tuple[Recording, Stretch]]:
@@ -164,17 +148,17 @@ class Nominal:
 
     @property
     def held_out(self) -> bool:
-        """Whether there are recordings that are never fitted."""
+        """Whether there are held-out recordings."""
         return any(r.test for r in self.recordings)
 
     @cached_property
     def sides(self) -> tuple[str, ...]:
-        """Sides that have rows."""
+        """Sides with rows."""
         return tuple(s for s in ("motor", "joint") if any(s in r.sides for r in self.recordings))
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """Joints (n,) that travel in what is fitted; of the others the torque says nothing, and has no rows."""
+        """Joints (n,) in motion in the fitted sessions; the torque of the others has no rows."""
         fitted = [s.q for r, s in self.stretches if not r.test]
         travel = np.max([np.ptp(q, axis=0) for q in fitted], axis=0) if fitted else np.zeros(self.arm.chain.n)
         return np.asarray(travel > TRAVEL_RAD)
@@ -190,7 +174,7 @@ class Nominal:
             link = self._link_torque(before.q, before.qd, before.qdd, body, drive)
             motions.append(self._motion(recording, stretch, link, body, drive))
         self.motions = motions
-        self.make_rows()
+        self._make_rows()
 
     def _link_torque(
         self, q: Floats, qd: Floats, qdd: Floats, bodies: Floats, drive: Mapping[str, Floats]
@@ -200,17 +184,15 @@ class Nominal:
         return rigid + drive["Fvl"] * qd + drive["Fcl"] * np.sign(qd) + drive["offl"]
 
     def _hanging(
-        self, stretch: Stretch, start: tuple[Floats, Floats], bodies: Floats, drive: Mapping[str, Floats]
+        self, motors: Stretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
     ) -> tuple[Floats, Floats, Floats, Springs]:
-        """Position, speed and acceleration (N, n) of links that hang on springs behind the published motors, from a
-        first guess of the former two; and the springs."""
+        """Position, speed and acceleration (N, n) of links on springs behind the motors; the springs."""
         stiffness = 1.0 / np.maximum(self.arm.compliance, _RIGID)
-        dt = float(stretch.time[1] - stretch.time[0])
-        (q, qd), qdd = start, np.zeros_like(stretch.q)
+        dt, qdd = float(motors.time[1] - motors.time[0]), np.zeros_like(q)
         for _ in range(2):
             mass = _definite(regressor.mass_matrix(self.arm.chain, q, bodies))
             other = self._link_torque(q, qd, np.zeros_like(q), bodies, drive)
-            springs = Springs(mass, other, stretch.q, stretch.qd, stiffness, _RELAXATION_S * stiffness, dt)
+            springs = Springs(mass, other, motors.q, motors.qd, stiffness, _RELAXATION_S * stiffness, dt)
             q, qd, qdd = springs.links
         return q, qd, qdd, springs
 
@@ -225,37 +207,23 @@ class Nominal:
         n = self.arm.chain.n
         dt = float(stretch.time[1] - stretch.time[0])
         q, qd, qdd = stretch.q, stretch.qd, stretch.qdd
-        speed, thrust = qd, qdd
+        speed, acceleration, springs = qd, qdd, None
         if np.any(self.arm.compliance > 0.0):
             # A measured torque is noisy, and its second derivative more so; a predicted one is not.
             wanted = self.settings.deflection_hz if bodies is not None else 20.0
-            if self.arm.encoder == "motor":
-                wanted = 10.0
-            cutoff = min(wanted, 0.2 / dt)
-            twist = low_pass(link_torque, dt, cutoff) * self.arm.compliance
+            wanted = 10.0 if self.arm.encoder == "motor" else wanted
+            twist = low_pass(link_torque, dt, min(wanted, 0.2 / dt)) * self.arm.compliance
             first, second = differentiate(twist, dt)
-            if self.arm.encoder == "motor":
-                q, qd, qdd = q - twist, qd - first, qdd - second
+            if self.arm.encoder == "link":
+                speed, acceleration = speed + first, acceleration + second
             else:
-                speed, thrust = speed + first, thrust + second
-        springs = None
-        if (
-            bodies is not None
-            and drive is not None
-            and self.arm.encoder == "motor"
-            and np.any(self.arm.compliance)
-        ):
-            q, qd, qdd, springs = self._hanging(stretch, (q, qd), bodies, drive)
-            link_torque = self._link_torque(q, qd, qdd, bodies, drive)
-        zero = np.zeros(n)
-        values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), zero)
-
-        def friction(v: Floats) -> Floats:
-            return values["Fvm"] * v + values["Fcm"] * np.sign(v)
-
+                q, qd, qdd = q - twist, qd - first, qdd - second
+                if bodies is not None and drive is not None:
+                    q, qd, qdd, springs = self._hanging(stretch, q, qd, bodies, drive)
+                    link_torque = self._link_torque(q, qd, qdd, bodies, drive)
+        values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), np.zeros(n))
         slip = self.arm.slip(speed, dt)
-        drag = values["Fvm"] * speed + values["Fcm"] * slip
-        motor = link_torque + values["Ia"] * thrust + drag + values["offm"]
+        friction = values["Fvm"] * speed + values["Fcm"] * slip
         return Motion(
             chain=self.arm.chain,
             bodies=np.zeros((n, 10)) if bodies is None else bodies,
@@ -266,14 +234,14 @@ class Nominal:
             qd=qd,
             qdd=qdd,
             motor_speed=speed,
-            motor_acceleration=thrust,
+            motor_acceleration=acceleration,
             joint_torque=link_torque,
-            motor_torque=motor,
+            motor_torque=link_torque + values["Ia"] * acceleration + friction + values["offm"],
             gear_ratio=self.arm.gear_ratio,
             inertia=values["Ia"],
             link_coulomb=values["Fcl"],
             motor_coulomb=values["Fcm"],
-            friction=friction,
+            friction=lambda v: values["Fvm"] * v + values["Fcm"] * np.sign(v),
             slip=slip,
             springs=springs,
             loaded=recording.payload is not None or all(r.payload is None for r in self.recordings),
@@ -284,30 +252,26 @@ class Nominal:
     @property
     def bin_s(self) -> float:
         """Length of a bin [s]."""
-        settings = self.settings
-        return max(settings.bin_s, settings.ringing_s) if self.arm.encoder == "motor" else settings.bin_s
+        return max(self.settings.bin_s, self.settings.ringing_s if self.arm.encoder == "motor" else 0.0)
 
-    def _bin(self, stretch: Stretch) -> int:
-        """Samples in a bin of the joint torque."""
-        dt = float(stretch.time[1] - stretch.time[0])
-        return max(1, round(self.bin_s / dt))
-
-    def motor_bin(self, stretch: Stretch) -> int:
-        """Samples in a bin of the motor torque."""
-        if len(stretch.motor_time) < 2:
-            return 1
-        step = float(np.median(np.diff(stretch.motor_time)))
-        return max(1, round(self.bin_s / step)) if step < 0.6 * self.bin_s else 1
+    def _sampling(self, side: str, stretch: Stretch) -> tuple[Floats, float, int]:
+        """Stamps (N,) [s] and delay [s] of a side's torque, and the samples in a bin."""
+        if side == "joint":
+            dt = float(stretch.time[1] - stretch.time[0])
+            return stretch.time, self.arm.joint_delay_s, max(1, round(self.bin_s / dt))
+        width, stamp = 1, stretch.motor_time
+        if len(stamp) > 1 and _step(stamp) < 0.6 * self.bin_s:
+            width = max(1, round(self.bin_s / _step(stamp)))
+        return stamp, self.arm.motor_delay_s, width
 
     def reduce(self, side: str, values: Sequence[Floats]) -> Floats:
-        """Rows (m,) or (m, k) of signals given on the grid of each motion, (N,) or (N, k)."""
+        """Rows (m,) or (m, k) of signals on the grid of each motion, (N,) or (N, k)."""
         parts = []
         for number, ((recording, stretch), signal) in enumerate(zip(self.stretches, values, strict=True)):
-            if not _holds(recording, stretch, side):
-                continue
-            operator, dt = self._operator(side, number, stretch)
-            rows = self._slow(side, operator @ signal.reshape(len(signal), -1), dt)
-            parts.append(rows[self._windows(recording, self._stamps(side, stretch))])
+            if _holds(recording, stretch, side):
+                operator, dt = self._operator(side, number, stretch)
+                rows = self._slow(side, operator @ signal.reshape(len(signal), -1), dt)
+                parts.append(rows[self._windows(recording, self._stamps(side, stretch))])
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
@@ -316,8 +280,7 @@ class Nominal:
         delay = self.arm.joint_delay_s if side == "joint" else self.arm.motor_delay_s
         key = (side, number, delay)
         if key not in self._operators:
-            stamp = stretch.time if side == "joint" else stretch.motor_time
-            width = self._bin(stretch) if side == "joint" else self.motor_bin(stretch)
+            stamp, _, width = self._sampling(side, stretch)
             count = len(stamp) // width
             place = (stamp[: count * width] - delay - stretch.time[0]) / _step(stretch.time)
             nearest = np.rint(place)
@@ -326,52 +289,41 @@ class Nominal:
             low = place.astype(np.int64)
             share = place - low
             row = np.arange(len(low)) // width
-            matrix = csr_array(
-                (
-                    np.concatenate([1.0 - share, share]) / width,
-                    (np.concatenate([row, row]), np.concatenate([low, low + 1])),
-                ),
-                shape=(count, len(stretch.time)),
-            )
+            weights = np.concatenate([1.0 - share, share]) / width
+            places = np.concatenate([row, row]), np.concatenate([low, low + 1])
+            matrix = csr_array((weights, places), shape=(count, len(stretch.time)))
             self._operators[key] = matrix, width * _step(stamp) if len(stamp) > 1 else 0.0
         return self._operators[key]
 
     @cached_property
     def band_hz(self) -> dict[str, float | None]:
-        """By side, the cut-off that torques and columns both get where torques were low-passed before, else
-        None: half of the band that is left, so that of the earlier filter nothing is felt."""
+        """By side, the common cut-off of torques and columns where the torques were low-passed before, else None.
+        Half of the remaining band leaves no effect of the earlier filter."""
         found: dict[str, float | None] = {}
         for side in self.sides:
             edges = [r.joint_band_hz if side == "joint" else r.motor_band_hz for r in self.recordings]
-            known = [edge for edge in edges if edge is not None]
-            least = min(known, default=np.inf)
+            least = min((edge for edge in edges if edge is not None), default=np.inf)
             found[side] = 0.5 * least if least < 0.5 / self.bin_s else None
         return found
 
-    def _slow(self, side: str, rows: Floats, dt: float) -> Floats:
-        """Rows (m, k) every `dt` seconds, low-passed and thinned where the torques were low-passed before."""
+    def _slow(self, side: str, rows: Floats, dt: float, *, smooth: bool = True) -> Floats:
+        """Rows (m, ...) every `dt` seconds, low-passed if `smooth`, thinned and without spoiled ends where the
+        torques were low-passed before."""
         cutoff = self.band_hz[side]
         if cutoff is None or cutoff >= 0.4 / dt:
             return rows
-        return self._thin(side, low_pass(rows, dt, cutoff), dt)
-
-    def _thin(self, side: str, rows: Floats, dt: float) -> Floats:
-        """Every so many of the rows (m, ...), without the ends that the low-pass spoils."""
-        cutoff = self.band_hz[side]
-        if cutoff is None or cutoff >= 0.4 / dt:
-            return rows
+        rows = low_pass(rows, dt, cutoff) if smooth else rows
         step, edge = max(1, int(0.4 / (cutoff * dt))), int(0.5 / (cutoff * dt))
         return rows[edge : len(rows) - edge : step]
 
     def _stamps(self, side: str, stretch: Stretch) -> Floats:
-        """Times (m,) of the rows of a stretch [s], all of them."""
-        stamp = stretch.time if side == "joint" else stretch.motor_time
-        width = self._bin(stretch) if side == "joint" else self.motor_bin(stretch)
-        return self._thin(side, _binned(stamp[:, None], width)[:, 0], width * _step(stamp))
+        """Times (m,) [s] of all rows of a stretch."""
+        stamp, _, width = self._sampling(side, stretch)
+        return self._slow(side, _binned(stamp[:, None], width)[:, 0], width * _step(stamp), smooth=False)
 
     def _windows(self, recording: Recording, stamps: Floats) -> NDArray[np.bool_]:
-        """Rows (m,) to use: of long sessions the beginning, two periods at least, and windows spread evenly, so
-        that what drifts is seen and rows stay within memory."""
+        """Rows (m,) to use. Of a long session: the beginning, two periods at least, and windows spread evenly, so
+        that drifts are seen and the rows stay within memory."""
         share = self.settings.most_s / len(self.recordings)
         since = stamps - recording.start_s
         if recording.duration_s <= share:
@@ -381,58 +333,46 @@ class Nominal:
         every = _WINDOW_S * (recording.duration_s - lead) / (share - lead)
         return np.asarray((since < lead) | (np.mod(since - lead, every) < _WINDOW_S))
 
-    def make_rows(self) -> None:
+    def _make_rows(self) -> None:
         """Rows of all sides from the present motions."""
         self.rows = {side: self._side_rows(side) for side in self.sides}
 
     def _side_rows(self, side: str) -> SideRows:
-        still = self.settings.standstill_rad_s
-        matrices, targets, valid, session, time, test = [], [], [], [], [], []
+        parts = []
         for motion, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
             if not _holds(recording, stretch, side):
                 continue
+            stamp, delay, width = self._sampling(side, stretch)
+            at = stamp - delay
             if side == "motor":
-                width = self.motor_bin(stretch)
-                at = stretch.motor_time - self.arm.motor_delay_s
-                target, usable, stamp = stretch.motor, stretch.motor_usable, stretch.motor_time
+                target, usable, speed = stretch.motor, stretch.motor_usable, motion.motor_speed
             else:
-                width = self._bin(stretch)
-                at = stretch.time - self.arm.joint_delay_s
-                target, usable, stamp = stretch.effort, stretch.usable, stretch.time
-            speed = motion.motor_speed if side == "motor" else motion.qd
-            moves = (np.abs(_at(stretch.time, speed, at)) > still) & (
+                target, usable, speed = stretch.effort, stretch.usable, motion.qd
+            moves = (np.abs(_at(stretch.time, speed, at)) > self.settings.standstill_rad_s) & (
                 _at(stretch.time, self._steady(speed, stretch), at) > 0.999
             )
             dt = width * _step(stamp)
             wide = self._matrix(side, motion, recording, stretch.time, at, width)
-            matrices.append(np.stack([self._slow(side, table, dt) for table in wide]))
-            targets.append(self._slow(side, _binned(target, width), dt))
+            matrix = np.stack([self._slow(side, table, dt) for table in wide])
+            torque = self._slow(side, _binned(target, width), dt)
             if self.band_hz[side] is not None:
-                # The low-pass that rounds reversals is in the columns too; only longer rests are unknown.
-                known = _binned((usable & moves).astype(float), width)
-                valid.append(self._slow(side, known, dt) > _KNOWN)
+                # The columns pass through the same low-pass, so rounded reversals cancel; only longer rests are
+                # unknown.
+                valid = self._slow(side, _binned((usable & moves).astype(float), width), dt) > _KNOWN
             else:
                 moves = _binned(moves.astype(float), width) > 1.0 - 1e-9
                 if side == "joint":
-                    # The positions' low-pass rounds the corner that the link's Coulomb friction makes.
+                    # The positions' low-pass rounds the corner made by the link's Coulomb friction.
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
-                valid.append((_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves)
+                valid = (_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
-            stamps, valid[-1] = stamps[chosen], (valid[-1] & self.moving)[chosen]
-            matrices[-1], targets[-1] = matrices[-1][:, chosen], targets[-1][chosen]
-            time.append(stamps)
-            session.append(np.full(len(stamps), recording.number))
-            test.append(np.full(len(stamps), recording.test))
-        return SideRows(
-            np.concatenate(matrices, axis=1),
-            np.concatenate(targets),
-            np.concatenate(valid),
-            np.concatenate(session),
-            np.concatenate(time),
-            np.concatenate(test),
-        )
+            session, test = (np.full(int(chosen.sum()), v) for v in (recording.number, recording.test))
+            usual = torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test
+            parts.append((matrix[:, chosen], *usual))
+        matrices, *others = zip(*parts, strict=True)
+        return SideRows(np.concatenate(matrices, axis=1), *(np.concatenate(part) for part in others))
 
     def _steady(self, speed: Floats, stretch: Stretch) -> Floats:
         """1 where a joint keeps its direction for a while before and after, 0 elsewhere, (N, n)."""
@@ -452,35 +392,28 @@ class Nominal:
         count = len(at) // width * width
         exact = _on_grid(grid, at)
         drive = self._drive_columns() if side == "motor" else {}
+        speeds = motion.motor_speed, motion.motor_acceleration, motion.direction
         for first in range(0, count, size):
             some = at[first : min(first + size, count)]
             pick = None if exact is None else exact[first : first + len(some)]
-            state = [
+            q, qd, qdd, speed, acceleration, slip = (
                 x[pick] if pick is not None else _at(grid, x, some)
-                for x in (
-                    motion.q,
-                    motion.qd,
-                    motion.qdd,
-                    motion.motor_speed,
-                    motion.motor_acceleration,
-                    motion.direction,
-                )
-            ]
-            q, qd, qdd, speed, thrust, slip = state
+                for x in (motion.q, motion.qd, motion.qdd, *speeds)
+            )
             wide = self.structure.regressor(
                 q, qd, qdd, payload=recording.payload, sides=(chosen,), columns=columns
             )
             table = wide.T.reshape(len(columns), n, len(some))
             if drive:
                 table = table.copy()
-                signals = {"Ia": thrust, "Fvm": speed, "Fcm": slip}
+                signals = {"Ia": acceleration, "Fvm": speed, "Fcm": slip}
                 for place, (symbol, joint) in drive.items():
                     table[place, joint] = signals[symbol][:, joint]
             parts.append(table.reshape(len(columns), n, -1, width).mean(axis=3).transpose(1, 2, 0))
         return np.concatenate(parts, axis=1)
 
     def _drive_columns(self) -> dict[int, tuple[str, int]]:
-        """Places of the base columns that belong to the motor, with symbol and joint."""
+        """Places of the motor's base columns, with symbol and joint."""
         found = {}
         for place, column in enumerate(self.base.columns):
             symbol, link = split_name(self.structure.names[column])[:2]
@@ -498,12 +431,8 @@ def _step(time: Floats) -> float:
     return float(np.median(np.diff(time)))
 
 
-def _measured(stretch: Stretch) -> Floats:
-    return stretch.effort
-
-
 def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
-    """The same (m, n) without the rows next to those that are not set."""
+    """The same (m, n) without the neighbours of rows that are not set."""
     out = moves.copy()
     for k in range(1, rows + 1):
         out[k:] &= moves[:-k]
@@ -512,7 +441,7 @@ def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
 
 
 def _on_grid(grid: Floats, at: Floats) -> NDArray[np.int64] | None:
-    """Indices of the grid at the times, where these all fall on it."""
+    """Indices of the grid at the times, if these all fall on it."""
     dt = float(grid[1] - grid[0])
     place = (at - grid[0]) / dt
     nearest = np.rint(place).astype(np.int64)
@@ -521,7 +450,7 @@ def _on_grid(grid: Floats, at: Floats) -> NDArray[np.int64] | None:
 
 
 def _at(grid: Floats, values: Floats, at: Floats) -> Floats:
-    """Values (N, k) of the grid at other times, linearly; ends are held."""
+    """Values (N, k) of the grid at other times by linear interpolation; ends are held."""
     exact = _on_grid(grid, at) if len(at) else None
     if exact is not None:
         return values[exact]
@@ -540,9 +469,7 @@ def _binned(values: Floats, width: int) -> Floats:
 
 
 def _definite(mass: Floats) -> Floats:
-    """Mass matrices (N, n, n); where some are none of any arm, as a fit that a strong effect spoils may give them, all
-    with their eigenvalues from a small one on, or no spring could carry them.
-    """
+    """Mass matrices (N, n, n), made positive definite for the springs after a fit spoiled by a strong effect."""
     try:
         np.linalg.cholesky(mass)
     except np.linalg.LinAlgError:

@@ -1,50 +1,51 @@
-"""What has no name: generic functions of the motion that still predict the residual on held-back parts.
+"""Unnamed functions of the motion with predictive value for the residual on held-back parts.
 
-For each joint and side a group of hat functions of one variable (angle, speed, acceleration or load of the joint,
-angle or speed of another joint, time), plain and times the sign of the joint's speed, those of an angle times the
-joint's load too, is scored like any candidate, and so is a line in the spectrum (`lines`). What it finds is reported
-by its variables, and names that were given while much was left are doubted.
+For each joint and side, groups of hat functions of one variable (angle, speed, acceleration or load of the joint,
+angle or speed of another joint, time) are scored like any candidate: plain, times the sign of the joint's speed, and
+those of an angle times the joint's load. So is a line in the spectrum. The remainder is reported by its variables; a
+large one casts doubt on the named causes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ident.diagnosis.candidates import Dictionary
-from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
+from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects.motion import Motion
 
 __all__ = ["Remainder", "find_line", "find_remainders", "groups", "hats", "hats_of"]
 
-# Of slower swings a session shows too few to tell them from a drift [Hz].
+# Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
-# Width of the spectrum beside a line that it is held against [Hz].
+# Width of the compared spectrum beside a line [Hz].
 _BESIDE_HZ = 2.0
-# Power of a line over the spectrum beside it; of a thousand frequencies chance makes ten of one.
+# Least power of a line over the spectrum beside it; ten by chance among a thousand frequencies.
 _STANDS_OUT = 16.0
-# The same in every session: what shakes the arm does not stop for one, what a wrong load leaves is in its own only.
+# The same in every session: a vibration lasts through all, the error of a wrong load belongs to its own session.
 _IN_EACH = 4.0
-# Zero padding of the spectrum, so that a line falls between no two of its frequencies.
+# Zero padding of the spectrum, against lines between two of its frequencies.
 _PADDING = 4
+_HATS = 7
+_RIDGE = 1e-3
+# Least explained share of the noise; generic functions find a little everywhere.
+_LEAST_INFLATION = 0.012
 
 
 def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tuple[float, Rows, int] | None:
     """Frequency [Hz] of the strongest line in the rows of a joint (from 0) and side, its columns, and the number of
-    frequencies that it was chosen from; None where none stands out.
+    frequencies tried; None without a clear line.
 
-    residual : (m,) of these rows [Nm], NaN where a row is not used.
-    Columns: a cosine and a sine for each session that is fitted, for nothing ties the phases of two together.
+    residual : (m,) of these rows [Nm], NaN in unused rows.
+    Columns: a cosine and a sine for each fitted session, since the phases of two sessions are independent.
     """
     rows = evidence.nominal.rows[side]
-    parts = [
-        _not_repeating(evidence, side, residual, int(session))
-        for session in np.unique(rows.session[~rows.test])
-    ]
+    sessions = np.unique(rows.session[~rows.test]).tolist()
+    parts = [_not_repeating(evidence, side, residual, session) for session in sessions]
     even = [part for part in parts if part is not None]
     if not even:
         return None
@@ -56,31 +57,30 @@ def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tu
         return None
     each = np.array([_spectrum(values, dt, size, frequency) for values, dt in even])
     power = each.sum(axis=0)
-    width = int(_BESIDE_HZ / (frequency[1] - frequency[0]))
+    grid = float(frequency[1] - frequency[0])
+    width = int(_BESIDE_HZ / grid)
     around = [slice(max(0, k - width), k + width + 1) for k in range(len(power))]
     beside = np.array([np.median(power[near]) for near in around])
     best = int(np.argmax(power / np.maximum(beside, 1e-300)))
-    if power[best] < _STANDS_OUT * beside[best]:
-        return None
-    if np.any(each[:, best] < _IN_EACH * np.median(each[:, around[best]], axis=1)):
+    rare = each[:, best] < _IN_EACH * np.median(each[:, around[best]], axis=1)
+    if power[best] < _STANDS_OUT * beside[best] or np.any(rare):
         return None
     top = float(frequency[best])
     if 0 < best < len(power) - 1:
         # The top of the parabola through the three largest.
         left, here, right = power[best - 1 : best + 2]
-        top += 0.5 * float((left - right) / (left - 2.0 * here + right)) * float(frequency[1] - frequency[0])
+        top += 0.5 * float((left - right) / (left - 2.0 * here + right)) * grid
     turn = 2.0 * np.pi * top * rows.time
     waves = [
         np.where((rows.session == session) & ~rows.test, wave(turn), 0.0)
-        for session in np.unique(rows.session[~rows.test])
+        for session in sessions
         for wave in (np.cos, np.sin)
     ]
-    key: Key = (side, joint)
-    return top, {key: np.column_stack(waves)}, len(frequency) // _PADDING
+    return top, {(side, joint): np.column_stack(waves)}, len(frequency) // _PADDING
 
 
 def _spectrum(values: Floats, dt: float, size: int, frequency: Floats) -> Floats:
-    """Power of a session at the frequencies, over all its power."""
+    """Power of a session at the frequencies, over its total power."""
     power = np.abs(np.fft.rfft(values, size)) ** 2 / max(float(np.sum(values**2)), 1e-300)
     return np.interp(frequency, np.fft.rfftfreq(size, dt), power)
 
@@ -88,19 +88,18 @@ def _spectrum(values: Floats, dt: float, size: int, frequency: Floats) -> Floats
 def _not_repeating(
     evidence: Evidence, side: str, residual: Floats, session: int
 ) -> tuple[Floats, float] | None:
-    """What of a session's residual is another in every period, on an even grid with zeros in gaps, and the grid's
-    step [s]; without repetition all of it. None where there is too little.
-    """
+    """Part of a session's residual different in every period, on an even grid with zeros in gaps, and the grid's step
+    [s]; all of it without repetition, None for too few rows."""
     rows = evidence.nominal.rows[side]
     recording = next(r for r in evidence.nominal.recordings if r.number == session)
     mine = (rows.session == session) & np.isfinite(residual)
     if mine.sum() < 200:
         return None
-    time, values = rows.time[mine] - recording.start_s, residual[mine]
+    time = rows.time[mine] - recording.start_s
     step = float(np.median(np.diff(rows.time[rows.session == session])))
     place = np.round((time - time[0]) / step).astype(np.int64)
     even, known = np.zeros(place[-1] + 1), np.zeros(place[-1] + 1, dtype=bool)
-    even[place], known[place] = values, True
+    even[place], known[place] = residual[mine], True
     even[known] -= even[known].mean()
     period = round(recording.period_s / step)
     if recording.repeats and 0 < period < len(even) / 1.5:
@@ -112,17 +111,11 @@ def _not_repeating(
     return even, step
 
 
-_HATS = 7
-_RIDGE = 1e-3
-# Generic functions find a little everywhere; less than this share of the noise is not worth a word.
-_LEAST_INFLATION = 0.012
-
-
 @dataclass(frozen=True)
 class Remainder:
-    """Something left in the rows of a joint (from 1) and side that depends on the named variables.
+    """A remainder in the rows of a joint (from 1) and side, dependent on the named variables.
 
-    rows : columns of the generic functions that it is made of. line_hz : frequency of a swing of its own, 0 without
+    rows : columns of its generic functions. line_hz : frequency of its line, 0 without one.
     """
 
     side: str
@@ -137,7 +130,7 @@ class Remainder:
 def find_remainders(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> tuple[Remainder, ...]:
-    """Remainders beside the columns that the evidence holds, largest first; at most two variables each."""
+    """Remainders beside the columns of the evidence, largest first; at most two variables each."""
     fixed = list(evidence.extra)
     found = []
     variables, residuals = hats_of(dictionary), evidence.residuals()
@@ -146,7 +139,11 @@ def find_remainders(
             if evidence.mask[side, joint].sum() < 100:
                 continue
             line = find_line(evidence, side, joint, residuals[side][:, joint])
-            remainder = _one(dictionary, evidence, settings, variables, line, side, joint)
+            prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]] = {}
+            for name, rows in groups(dictionary, variables, side, joint).items():
+                padded = evidence.padded(rows)
+                prepared[name] = rows, padded, evidence.alone(padded)
+            remainder = _one(evidence, settings.least_gain, prepared, line, side, joint)
             evidence.replace(fixed)
             if remainder is not None:
                 found.append(remainder)
@@ -154,64 +151,55 @@ def find_remainders(
 
 
 def _one(
-    dictionary: Dictionary,
     evidence: Evidence,
-    settings: DiagnosisSettings,
-    variables: Mapping[str, Sequence[Floats]],
+    least_gain: float,
+    prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]],
     line: tuple[float, Rows, int] | None,
     side: str,
     joint: int,
 ) -> Remainder | None:
-    names: list[str] = []
-    total = inflation = 0.0
-    prepared = {}
-    for name, rows in groups(dictionary, variables, side, joint).items():
-        padded = evidence.padded(rows)
-        prepared[name] = rows, padded, evidence.alone(padded)
-    fixed = list(evidence.extra)
-    taken: list[Rows] = []
-    line_hz = 0.0
+    """The remainder of a joint from its line and its `prepared` groups of columns."""
+    taken: list[tuple[str, Score, Rows]] = []
+    fixed, line_hz = list(evidence.extra), 0.0
     if line is not None:
         frequency, waves, choices = line
         score = evidence.score(evidence.padded(waves))
-        least = settings.least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
+        least = least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
         if score.gain > least and score.inflation > _LEAST_INFLATION:
-            total, inflation, line_hz = score.gain, score.inflation, frequency
-            names.append("time")
-            taken.append(waves)
-            evidence.replace([*fixed, *taken])
+            line_hz = frequency
+            taken.append(("time", score, waves))
+            evidence.replace([*fixed, waves])
     for _ in range(2):
-        best_name, best_gain, best_rows, best_inflation = "", 0.0, None, 0.0
+        best: tuple[str, Score, Rows] | None = None
         for name, (rows, padded, known) in prepared.items():
             score = evidence.score(padded, ridge=_RIDGE, known=known)
-            least = settings.least_gain + 2.0 * _HATS
-            if score.gain > max(least, best_gain) and score.inflation > _LEAST_INFLATION:
-                best_name, best_gain, best_rows = name, score.gain, rows
-                best_inflation = score.inflation
-        if best_rows is None:
+            least = max(least_gain + 2.0 * _HATS, 0.0 if best is None else best[1].gain)
+            if score.gain > least and score.inflation > _LEAST_INFLATION:
+                best = name, score, rows
+        if best is None:
             break
-        total += best_gain
-        inflation += best_inflation
-        names += [part for part in best_name.split(" ") if part not in names]
-        prepared.pop(best_name)
-        taken.append(best_rows)
-        evidence.replace([*fixed, *taken])
-    if not names:
+        prepared.pop(best[0])
+        taken.append(best)
+        evidence.replace([*fixed, *(rows for _, _, rows in taken)])
+    if not taken:
         return None
-    return Remainder(side, joint + 1, tuple(names), total, inflation, tuple(taken), line_hz)
+    names = dict.fromkeys(part for name, _, _ in taken for part in name.split(" "))
+    gain, inflation = np.sum([(score.gain, score.inflation) for _, score, _ in taken], axis=0).tolist()
+    columns = tuple(rows for _, _, rows in taken)
+    return Remainder(side, joint + 1, tuple(names), gain, inflation, columns, line_hz)
 
 
 def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
     """Hat functions of every variable by its name, for each motion."""
-    variables: dict[str, Callable[[Motion], Floats]] = {"time": lambda m: m.time}
+    motions = dictionary.nominal.motions
+    variables: dict[str, list[Floats]] = {"time": [m.time for m in motions]}
     for k in range(dictionary.nominal.arm.chain.n):
-        variables[f"q{k + 1}"] = lambda m, k=k: m.q[:, k]  # type: ignore[misc]
-        variables[f"qd{k + 1}"] = lambda m, k=k: m.motor_speed[:, k]  # type: ignore[misc]
-        variables[f"qdd{k + 1}"] = lambda m, k=k: m.motor_acceleration[:, k]  # type: ignore[misc]
-        variables[f"load{k + 1}"] = lambda m, k=k: m.joint_torque[:, k]  # type: ignore[misc]
+        variables[f"q{k + 1}"] = [m.q[:, k] for m in motions]
+        variables[f"qd{k + 1}"] = [m.motor_speed[:, k] for m in motions]
+        variables[f"qdd{k + 1}"] = [m.motor_acceleration[:, k] for m in motions]
+        variables[f"load{k + 1}"] = [m.joint_torque[:, k] for m in motions]
     found = {}
-    for name, variable in variables.items():
-        values = [variable(m) for m in dictionary.nominal.motions]
+    for name, values in variables.items():
         low = min(float(v.min()) for v in values)
         high = max(float(v.max()) for v in values)
         if high - low >= (TRAVEL_RAD if name[1:].isdigit() else 1e-6):

@@ -24,6 +24,7 @@ __all__ = ["Recording", "Stretch", "record"]
 
 Floats = NDArray[np.float64]
 
+# Distance from held samples within which the filtered positions are wrong too [s].
 _HELD_S = 0.1
 
 
@@ -32,7 +33,7 @@ class Stretch:
     """An uninterrupted part of a session.
 
     time : (N,) even grid [s] from the first sample of the log; q, qd, qdd : (N, n).
-    effort : (N, n) joint torque on the grid; usable : (N, n) samples that are neither bridged nor outliers.
+    effort : (N, n) joint torque on the grid; usable : (N, n) samples neither bridged nor outliers.
     motor_time : (M,) times of the motor torque as published [s]; motor : (M, n); motor_usable : (M, n).
     """
 
@@ -52,11 +53,11 @@ class Recording:
     """A session ready for rows.
 
     number : in the order of the sessions' beginnings. payload : mounted, None for none.
-    period_s : of the excitation, or the duration where it does not repeat; start_s : its beginning.
-    has_effort, has_motor : which channels exist. clipped : (n,) torque [Nm] at which the samples of a joint's sensor
-    stop, NaN where they do not. stuck : motor torques that are reported again and again, and are no measurements.
-    joint_band_hz, motor_band_hz : upper edge of what a low-pass left of the torques, None where they are
-    as measured.
+    period_s : of the excitation, or the duration without repetition; start_s : its beginning.
+    has_effort, has_motor : existing channels. test : held-out session.
+    clipped : (n,) torque [Nm] at the limit of a joint's sensor, NaN without a visible limit. stuck : values reported
+    repeatedly as motor torque without being measurements.
+    joint_band_hz, motor_band_hz : upper edge of an earlier low-pass on the torques, None without one.
     """
 
     name: str
@@ -70,7 +71,6 @@ class Recording:
     has_motor: bool
     test: bool
     joint_names: tuple[str, ...]
-    warnings: tuple[str, ...]
     clipped: Floats
     stuck: tuple[Stuck, ...]
     joint_band_hz: float | None = None
@@ -83,48 +83,46 @@ class Recording:
 
     @property
     def sides(self) -> tuple[Side, ...]:
-        """Sides whose torque was recorded."""
-        present: dict[Side, bool] = {"motor": self.has_motor, "joint": self.has_effort}
-        return tuple(side for side, there in present.items() if there)
+        """Sides with recorded torque."""
+        motor: tuple[Side, ...] = ("motor",) if self.has_motor else ()
+        return (*motor, "joint") if self.has_effort else motor
 
 
 def record(
     session: Session, number: int, chain: Chain, settings: DiagnosisSettings, *, test: bool = False
 ) -> Recording:
-    """Filter one session. Raises DataError, with advice, when it cannot be used."""
+    """Filter one session. Raises DataError for sessions without a stretch long enough."""
     chosen = session.select(chain.joint_names)
     rate = 1.0 / chosen.joint.period_s
     cutoff = min(settings.cutoff_hz, 0.2 * rate)
-    signals = SignalSettings(
-        cutoff_hz=cutoff, decimate_hz=min(10.0, 0.5 * cutoff), motor_delay_s=0.0, standstill_share=1.0
+    decimate = min(10.0, 0.5 * cutoff)
+    prepared = prepare(
+        chosen,
+        SignalSettings(cutoff_hz=cutoff, decimate_hz=decimate, motor_delay_s=0.0, standstill_share=1.0),
     )
-    prepared = prepare(chosen, signals)
-    stuck = () if chosen.motor is None else stuck_at(chosen.motor, chosen.joint)
+    motor = chosen.motor
+    stuck = () if motor is None else stuck_at(motor, chosen.joint)
     stretches = tuple(_stretches(prepared, rate, held_times(chosen.joint), stuck))
     if not stretches:
         raise DataError(f"{prepared.name}: no stretch of the session is long enough for a diagnosis")
     spans = chosen.spans("period")
-    first = stretches[0].time[0]
-    last = stretches[-1].time[-1]
-    period = float(spans[0][1] - spans[0][0]) * 1e-9 if spans else last - first
+    first, last = stretches[0].time[0], stretches[-1].time[-1]
     payload = chosen.metadata.get("payload", "none").strip()
-    motor = chosen.motor
     return Recording(
         name=prepared.name,
         number=number,
         payload=None if payload in ("", "none") else payload,
         stretches=stretches,
         start_s=float(first),
-        period_s=period,
+        period_s=float(spans[0][1] - spans[0][0]) * 1e-9 if spans else last - first,
         duration_s=float(last - first),
         has_effort=bool(chosen.joint.effort.shape[1]),
         has_motor=prepared.has_motor,
         test=test,
         joint_names=prepared.joint_names,
-        warnings=(),
         clipped=clipped_at(chosen.joint),
         stuck=stuck,
-        # Whoever filtered did it sample by sample, so the samples are looked at as they came.
+        # An earlier filter worked sample by sample, so its band is visible in the samples as published.
         joint_band_hz=passed_band(chosen.joint.effort, chosen.joint.period_s),
         motor_band_hz=None if motor is None else passed_band(motor.effort, motor.period_s),
     )
@@ -137,7 +135,7 @@ def _stretches(prepared: PreparedSession, rate: float, held: Floats, stuck: Sequ
         inside = (joint.times >= passage.rows[0]) & (joint.times <= passage.rows[-1])
         if inside.sum() < 32:
             continue
-        # Sampling beyond 1 kHz adds cost and nothing else.
+        # Sampling beyond 1 kHz adds nothing but cost.
         thin = max(1, round(rate / 1000.0))
         pick = np.flatnonzero(inside)[::thin]
         n = joint.q.shape[1]
@@ -150,27 +148,18 @@ def _stretches(prepared: PreparedSession, rate: float, held: Floats, stuck: Sequ
             usable = ~m.flagged[keep] & _apart(motor_time, held)[:, None]
             for one in stuck:
                 usable[:, one.joint] &= motor[:, one.joint] != one.value
-        found.append(
-            Stretch(
-                joint.times[pick],
-                joint.q[pick],
-                joint.qd[pick],
-                joint.qdd[pick],
-                joint.torque[pick],
-                ~joint.flagged[pick] & _apart(joint.times[pick], held)[:, None],
-                motor_time,
-                motor,
-                usable,
-            )
+        time, q, qd, qdd, effort = (
+            x[pick] for x in (joint.times, joint.q, joint.qd, joint.qdd, joint.torque)
         )
+        known = ~joint.flagged[pick] & _apart(time, held)[:, None]
+        found.append(Stretch(time, q, qd, qdd, effort, known, motor_time, motor, usable))
     return found
 
 
 def _apart(times: Floats, held: Floats) -> NDArray[np.bool_]:
-    """Whether times (N,) are far enough from samples that were held, where the filtered positions are wrong too."""
+    """Whether times (N,) are far enough from held samples."""
     if not len(held):
         return np.ones(len(times), dtype=bool)
     after = np.searchsorted(held, times)
-    before = np.maximum(after - 1, 0)
-    after = np.minimum(after, len(held) - 1)
+    before, after = np.maximum(after - 1, 0), np.minimum(after, len(held) - 1)
     return np.minimum(np.abs(times - held[before]), np.abs(times - held[after])) > _HELD_S

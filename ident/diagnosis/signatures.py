@@ -211,6 +211,6 @@ def _weighted(bench: Bench, rows: Rows, lever: Floats | None) -> Floats:
             table = rows[key][used] if key in rows else np.zeros((int(used.sum()), width))
             if images is not None:
                 table = table - np.stack([image[used, joint] for image in images], axis=1)
-            noise = evidence.sigma[side][joint] * np.sqrt(evidence.dilution[side][joint])
+            noise = evidence.sigma[side][joint] * np.sqrt(evidence.variance_inflation[side][joint])
             parts.append(table / noise)
     return np.concatenate(parts)

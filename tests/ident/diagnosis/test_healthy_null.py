@@ -29,7 +29,7 @@ def model(chain: Chain) -> DynamicModel:
 
 @pytest.fixture
 def arm(chain: Chain) -> Arm:
-    return Arm(chain, np.zeros(3), np.ones(3), reach=np.full(3, 2e-4))
+    return Arm(chain, np.zeros(3), np.ones(3), presliding=np.full(3, 2e-4))
 
 
 def days(rng: np.random.Generator, mean: float, scatter: float, count: int) -> list[np.ndarray]:
