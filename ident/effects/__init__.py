@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from fri.errors import ConfigurationError
-from ident.effects import drive, link, load, sensor, timing
+from ident.effects import channel, drive, link, load
 from ident.effects.effect import (
     Column,
     Effect,
@@ -54,8 +54,8 @@ __all__ = [
 PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 ZERO_OFFSET = link.JointZeroOffset()
-LOST_SAMPLES = timing.LostSamples()
-DELAYS = {"motor": timing.MotorTorqueDelay(), "joint": timing.JointTorqueDelay()}
+LOST_SAMPLES = channel.LostSamples()
+DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
 """The effect of a late channel, by side."""
 
 EFFECTS: dict[str, Effect] = {
@@ -79,12 +79,12 @@ EFFECTS: dict[str, Effect] = {
         ZERO_OFFSET,
         link.EncoderEccentricity(),
         load.Contact(),
-        sensor.SensorGain(),
-        sensor.SensorCrosstalk(),
-        sensor.SensorHysteresis(),
-        sensor.SensorSaturation(),
-        sensor.SensorOffsetDrift(),
-        sensor.SensorRipple(),
+        channel.SensorGain(),
+        channel.SensorCrosstalk(),
+        channel.SensorHysteresis(),
+        channel.SensorSaturation(),
+        channel.SensorOffsetDrift(),
+        channel.SensorRipple(),
         *DELAYS.values(),
         LOST_SAMPLES,
     )
@@ -101,7 +101,7 @@ def find_effect(cause: str) -> Effect:
 
 
 def summary_of(cause: str) -> str:
-    """What is wrong, in a few words; the name itself of a cause from a file of another version."""
+    """The fault in a few words; the name itself of a cause from a file of another version."""
     return EFFECTS[cause].summary if cause in EFFECTS else spoken(cause)
 
 

@@ -20,12 +20,12 @@ _ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 def check_entry(entry: Mapping[str, Any], joints: int) -> None:
     """Check an entry of a model's effects: known cause and parameters, joints from 1 to `joints`.
 
-    Raises ConfigurationError with the entry, the value and what is allowed.
+    Raises ConfigurationError with the entry, the value and the allowed ones.
     """
     unknown = set(entry) - _ENTRY
     if unknown or not {"cause", "joints", "parameters"} <= set(entry):
         raise ConfigurationError(
-            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, form where there are several, "
+            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, form if there are several, "
             "parameters, each with value, std, unit"
         )
     effect = find_effect(str(entry["cause"]))
@@ -51,8 +51,8 @@ def effects_torque(
 ) -> Floats:
     """Torque (N, n) [Nm] added to one side by the entries of a model's effects.
 
-    measured : add the errors of the sensors to the physics. Effects of an event (a contact, a payload that came
-    loose) and delayed channels are properties of a session, not of the arm, and are left out.
+    measured : add the errors of the sensors to the physics. Events (a contact, a loosened payload) and delayed
+    channels are properties of a session, not of the arm, and are left out.
     """
     total = np.zeros_like(motion.q)
     for entry in entries:
