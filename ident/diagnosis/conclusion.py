@@ -88,12 +88,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         nuisance=state.selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=(
-            *_notes(bench, task.reference),
-            *_lines(nominal, remainders),
-            *_stuck_notes(nominal),
-            *state.notes,
-        ),
+        notes=(*_notes(bench, task.reference), *_channel_notes(nominal, remainders), *state.notes),
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
@@ -378,15 +373,9 @@ def _models(
 
 def _entry(finding: Finding) -> dict[str, Any]:
     """A finding as an entry of a model's effects."""
-    return {
-        "cause": finding.cause,
-        "side": finding.side,
-        "joints": list(finding.joints),
-        **({} if finding.form is None else {"form": finding.form}),
-        "parameters": {
-            name: {"value": v.value, "std": v.std, "unit": v.unit} for name, v in finding.parameters.items()
-        },
-    }
+    content = finding.to_dict()
+    names = ("cause", "side", "joints", "form", "parameters")
+    return {name: content[name] for name in names if name in content}
 
 
 # ---- notes ----
@@ -398,24 +387,21 @@ def _stuck(nominal: Nominal) -> list[tuple[str, int, tuple[str, ...]]]:
     return [("motor", joint + 1, (f"load{joint + 1}",)) for joint in sorted(joints)]
 
 
-def _stuck_notes(nominal: Nominal) -> list[str]:
+def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
     names = nominal.arm.chain.joint_names
-    return [
-        f"{r.name}: the motor torque of {names[one.joint]} reads exactly {one.value:.4g} Nm in {one.count} of "
-        f"{one.samples} samples in motion; torques near this value are misreported, and these samples are left out"
-        for r in nominal.recordings
-        for one in r.stuck
-    ]
-
-
-def _lines(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
-    names = nominal.arm.chain.joint_names
-    return [
+    lines = [
         f"the {r.side} torque of {names[r.joint - 1]} swings at {r.line_hz:.3g} Hz independently of the motion; look "
         "for a vibration of the arm or hum in the channel at this frequency"
         for r in remainders
         if r.line_hz > 0.0
     ]
+    stuck = [
+        f"{r.name}: the motor torque of {names[one.joint]} reads exactly {one.value:.4g} Nm in {one.count} of "
+        f"{one.samples} samples in motion; torques near this value are misreported, and these samples are left out"
+        for r in nominal.recordings
+        for one in r.stuck
+    ]
+    return lines + stuck
 
 
 def _notes(bench: Bench, reference: Reference | None) -> list[str]:

@@ -156,7 +156,8 @@ class Reference:
         values = own.values[there]
         # Several sets show the changes from day to day themselves; one set cannot.
         share = 1.0 if self.sets < 3 else 0.25
-        tolerance = share * np.array([_tolerance(base.names[b]) for b in here]) * np.abs(values)
+        change = [_DAY_TO_DAY.get(_symbol(base.names[b]), _ELSE) for b in here]
+        tolerance = share * np.array(change) * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
         precision = np.zeros((len(base), len(base)))
@@ -168,10 +169,6 @@ class Reference:
 
 def _listed(values: Floats | None) -> list[float] | None:
     return None if values is None else [float(v) for v in values]
-
-
-def _tolerance(name: str) -> float:
-    return _DAY_TO_DAY.get(_symbol(name), _ELSE)
 
 
 def _symbol(name: str) -> str:

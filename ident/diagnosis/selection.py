@@ -25,6 +25,27 @@ __all__ = ["Claim", "Null", "Selection", "best_candidate", "confidence", "gains"
 
 log = logging.getLogger(__name__)
 
+# Obvious evidence, over the usual one.
+_PLAIN = 10.0
+# Number of foremost trials with refined shapes.
+_CONTEST = 4
+# Least share of a claim's power in the rows of a rival.
+_SAME_ROWS = 0.2
+# Remainder of a law over its gain, and least share of a trial's power in the rows of that law's joint to be it.
+_LAW_ERROR, _MOSTLY = 0.1, 0.8
+# Least time between two separate pushes [s].
+_PAUSE_S = 0.2
+# Least gain of `best_candidate`.
+_LEAST_GAIN = 10.0
+# Factor on the tolerance for a whole channel's delay with a known healthy delay.
+_KNOWN_DELAY = 0.4
+# The same for a stiffness behind published motors.
+_KNOWN_COMPLIANCE = 0.4
+# Confidence in a sensor's error with a record of the joint torque only.
+_SHAPE_ALONE = 0.7
+# Confidence in one of two causes of the same torque in these motions.
+_EITHER = 0.5
+
 Null = Mapping[tuple[str, int], float]
 """Upper limit of each candidate's gain in a healthy set."""
 
@@ -61,10 +82,7 @@ class Selection:
 
 
 def select(
-    dictionary: Dictionary,
-    evidence: Evidence,
-    settings: DiagnosisSettings,
-    null: Null | None = None,
+    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
 ) -> Selection:
     """Accept causes one after the other as long as the evidence suffices.
 
@@ -454,28 +472,6 @@ class _State:
         """The candidate of the same torque in these sessions, by the physics of the effect."""
         cause = candidate.effect.same_as(self.dictionary.setting, candidate.joint)
         return next((c for c in self.dictionary.candidates if c.key == (cause, candidate.joint)), None)
-
-
-# Obvious evidence, over the usual one.
-_PLAIN = 10.0
-# Number of foremost trials with refined shapes.
-_CONTEST = 4
-# Least share of a claim's power in the rows of a rival.
-_SAME_ROWS = 0.2
-# Remainder of a law over its gain, and least share of a trial's power in the rows of that law's joint to be it.
-_LAW_ERROR, _MOSTLY = 0.1, 0.8
-# Least time between two separate pushes [s].
-_PAUSE_S = 0.2
-# Least gain of `best_candidate`.
-_LEAST_GAIN = 10.0
-# Factor on the tolerance for a whole channel's delay with a known healthy delay.
-_KNOWN_DELAY = 0.4
-# The same for a stiffness behind published motors.
-_KNOWN_COMPLIANCE = 0.4
-# Confidence in a sensor's error with a record of the joint torque only.
-_SHAPE_ALONE = 0.7
-# Confidence in one of two causes of the same torque in these motions.
-_EITHER = 0.5
 
 
 def margin(gain: float) -> float:

@@ -286,6 +286,10 @@ class _Delay(Effect):
     whole_arm = True
     experiment = Experiment.CHIRP
     tell_apart = "a 1 to 15 Hz chirp of one joint"
+    parameters = (
+        Parameter("share", "1", "late share of the torque", low=0.5, high=1.5, share=True),
+        Parameter("delay", "s", "age of the torques", shape=True, low=-0.2, high=0.2),
+    )
     grid_s: ClassVar[tuple[float, ...]]
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -325,10 +329,6 @@ class MotorTorqueDelay(_Delay):
     cause = "motor_torque_delay"
     summary = "motor torque late against the position"
     physics = "the motor torques take longer through the controller than the positions"
-    parameters = (
-        Parameter("share", "1", "late share of the torque", low=0.5, high=1.5, share=True),
-        Parameter("delay", "s", "age of the motor torques", shape=True, low=-0.2, high=0.2),
-    )
     channel = "motor"
     confused_with = ("presliding_hysteresis", "joint_elasticity")
     # Close enough for friction's reversals to overlap.
@@ -350,10 +350,6 @@ class JointTorqueDelay(_Delay):
     cause = "joint_torque_delay"
     summary = "joint torque late against the position"
     physics = "the joint torques take longer through the controller than the positions"
-    parameters = (
-        Parameter("share", "1", "late share of the torque", low=0.5, high=1.5, share=True),
-        Parameter("delay", "s", "age of the joint torques", shape=True, low=-0.2, high=0.2),
-    )
     channel = "joint"
     confused_with = ("sensor_hysteresis", "joint_elasticity")
     grid_s = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)

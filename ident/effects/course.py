@@ -8,9 +8,8 @@ and only the step shows.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -47,8 +46,12 @@ class Course(Form):
 
 
 class Drifting(Effect):
-    """An effect with a course in time; its first parameter is the change, its second one the level of all sessions."""
+    """An effect with a course in time; its first parameter is the change, its second one the level of all sessions.
 
+    courses : forms of the drift within a session.
+    """
+
+    courses: ClassVar[tuple[Course, ...]]
     forms = Course
     depends_on = "time"
 
@@ -66,11 +69,6 @@ class Drifting(Effect):
     def known_forms(self) -> tuple[Course, ...]:
         """Those within a session, and all between sessions."""
         return (*self.courses, Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE)
-
-    @property
-    @abstractmethod
-    def courses(self) -> tuple[Course, ...]:
-        """Forms of the drift within a session."""
 
     def mode(self, shape: Shape) -> Literal["within", "between"]:
         """Within a session or between sessions."""

@@ -112,9 +112,7 @@ class PayloadError(_Payload):
     source = "Khalil, Gautier and Lemoine, ICRA 2007"
     parameters = (
         Parameter("mass", "kg", "mass above the announced one", low=-50.0, high=50.0),
-        Parameter("moment_x", "kg m", "first moment in x of the last link's frame"),
-        Parameter("moment_y", "kg m", "first moment in y"),
-        Parameter("moment_z", "kg m", "first moment in z"),
+        *(Parameter(name, "kg m", f"first moment in {name[-1]} of the last link") for name in _AXES),
     )
     depends_on = "position"
     confused_with = ("base_tilt", "joint_zero_offset", "sensor_gain")
@@ -151,9 +149,7 @@ class PayloadChange(_Payload):
     physics = "the payload slips, loosens, or a part of it falls off during the motion"
     source = "Khalil, Gautier and Lemoine, ICRA 2007"
     parameters = (
-        Parameter("moment_x", "kg m", "jump of the first moment in x of the last link's frame"),
-        Parameter("moment_y", "kg m", "jump of the first moment in y"),
-        Parameter("moment_z", "kg m", "jump of the first moment in z"),
+        *(Parameter(name, "kg m", f"jump of the first moment in {name[-1]}") for name in _AXES),
         Parameter("mass", "kg", "jump of the mass", low=-50.0, high=50.0),
         Parameter("time", "s", "from the start of the session", shape=True),
         Parameter("session", "1", "number of the session", shape=True, fixed=True),
@@ -241,9 +237,7 @@ class Contact(Effect):
     physics = "something or somebody outside pushes the arm for a while"
     source = "Haddadin, De Luca and Albu-Schaeffer, IEEE Trans. Robotics 33 (2017)"
     parameters = (
-        Parameter("force_x", "N", "largest force along x of the base"),
-        Parameter("force_y", "N", "largest force along y of the base"),
-        Parameter("force_z", "N", "largest force along z of the base"),
+        *(Parameter(f"force_{axis}", "N", f"largest force along {axis} of the base") for axis in "xyz"),
         Parameter("time", "s", "middle of the contact, from the start of the session", shape=True),
         Parameter("duration", "s", "of the contact", shape=True, low=0.02),
         Parameter("session", "1", "number of the session", shape=True, fixed=True),

@@ -1,4 +1,4 @@
-"""The motion of an arm as effects see it, and operators with memory along it: Dahl's hysteresis, play, low-pass."""
+"""The motion of an arm for effects, and operators with memory along it: Dahl's hysteresis, low-pass."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
 from ident.effects.springs import Springs
 
-__all__ = ["Floats", "Motion", "dahl", "first_order", "play"]
+__all__ = ["Floats", "Motion", "dahl", "first_order"]
 
 Floats = NDArray[np.float64]
 
@@ -125,20 +125,6 @@ def dahl(path, length, start):  # type: ignore[no-untyped-def]
         elif step < 0.0:
             z = -1.0 + (1.0 + z) * np.exp(step / length)
         out[k] = z
-    return out
-
-
-@njit(cache=True)
-def play(signal, half_width):  # type: ignore[no-untyped-def]
-    """Output (N,) of the play operator of `half_width` driven by `signal` (N,)."""
-    out = np.empty(signal.shape[0])
-    value = signal[0]
-    for k in range(signal.shape[0]):
-        if signal[k] - value > half_width:
-            value = signal[k] - half_width
-        elif value - signal[k] > half_width:
-            value = signal[k] + half_width
-        out[k] = value
     return out
 
 

@@ -79,8 +79,7 @@ class Springs:
 
     @property
     def _drive(self) -> Floats:
-        drive: Floats = self.stiffness * self.angle + self.damping * self.speed
-        return drive
+        return np.asarray(self.stiffness * self.angle + self.damping * self.speed)
 
     def _solve(self, force: Floats, angle: Floats, start: Floats) -> tuple[Floats, Floats, Floats]:
         inertia = np.maximum(np.einsum("kii->i", self.mass) / len(self.mass), 1e-9)
