@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import regressor
 from ident.dynamics.parameters import INERTIAL, PER_LINK
-from ident.effects import Parameters, Simulated, find_effect
-from ident.effects.model_torque import parameter_values
+from ident.effects import Parameters, Simulated, find_effect, parameter_values
 from ident.estimators.physical import cad_prior
 from ident.export import consistent_parameters
 from ident.model import DynamicModel

@@ -1,4 +1,4 @@
-"""What the model gets wrong: evidence for causes, an extended model, and what it gains."""
+"""Model errors: evidence for causes, an extended model, and its gain."""
 
 from __future__ import annotations
 

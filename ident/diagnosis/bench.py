@@ -75,7 +75,7 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             reference.joint_delay_s,
             reference.encoder,
             encoder_known=True,
-            presliding=reference.reach,
+            presliding=reference.presliding,
             far=reference.far,
             far_share=reference.far_share,
             couplings=data.couplings,

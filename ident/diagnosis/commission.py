@@ -1,10 +1,11 @@
-"""The healthy arm learned from sets of sessions, each as a later diagnosis will get them."""
+"""A healthy-arm baseline from sets of sessions, each with the sessions of a later diagnosis."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -27,33 +28,44 @@ from ident.model import DynamicModel
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["SlowTurns", "commission", "delay_std", "presliding_reach", "slow_turns", "with_far_presliding"]
+__all__ = ["SlowTurns", "commission", "delay_std", "presliding_length", "slow_turns", "with_far_presliding"]
 
+log = logging.getLogger(__name__)
 
+Side = Literal["link", "motor"]
+
+# Initial presliding lengths [rad], and least fall of the misfit over the noise.
 _GRID = np.geomspace(2e-5, 1e-2, 10)
 _SURE = 30.0
-# Longer distances to try, over the reach; the friction that turns within them, over its own standard error.
+# Longer distances to try, over the presliding length; least slow friction over its own standard error.
 _LONGER = (4.0, 12.0, 36.0)
 _CLEAR = 3.0
+# Rounds of settling the channels' delays.
+_SETTLING = 2
+_TUNING_SETS = 3
+_ROUNDS = 3
+_ENOUGH = 3
+_LATEST_S = 0.02
+_CHANNELS = ("motor", "joint")
+_USUAL_DAYS = 4
 
 SlowTurns = NDArray[np.float64]
-"""(2, longer distances, n): Coulomb friction that turns slowly [Nm], and its standard deviation."""
+"""(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
 
 
-def presliding_reach(nominal: Nominal, values: Floats) -> Floats:
-    """Reach (n,) [rad] of Dahl's friction that suits the motor rows best, 0 where a plain sign does as well.
+def presliding_length(nominal: Nominal, values: Floats) -> Floats:
+    """Presliding length (n,) [rad] of Dahl's friction with the best fit to the motor rows, 0 if a sign fits as well.
 
-    values : base parameters (p,). For each joint by itself what they leave is fitted with the drive's own
-    acceleration, speed and offset, and Coulomb friction with each reach in turn.
+    values : base parameters (p,). For each joint by itself, their residual is fitted with the drive's own
+    acceleration, speed and offset, and Coulomb friction with each length in turn.
     """
     n = nominal.arm.chain.n
-    reach = np.zeros(n)
+    lengths = np.zeros(n)
     if "motor" not in nominal.rows:
-        return reach
-    rows = nominal.rows["motor"]
-    motions = nominal.motions
-    signals = [[getattr(m, name) for m in motions] for name in ("motor_acceleration", "motor_speed")]
-    thrust, speed = (nominal.reduce("motor", parts) for parts in signals)
+        return lengths
+    rows, motions = nominal.rows["motor"], nominal.motions
+    acceleration = nominal.reduce("motor", [m.motor_acceleration for m in motions])
+    speed = nominal.reduce("motor", [m.motor_speed for m in motions])
     predicted = np.einsum("jmp,p->mj", rows.matrix, values)
     before = nominal.reduce("motor", [m.direction for m in motions])
     for joint in range(n):
@@ -62,54 +74,58 @@ def presliding_reach(nominal: Nominal, values: Floats) -> Floats:
         if keep.sum() < 200:
             continue
         target = (rows.target - predicted)[:, joint] + coulomb * before[:, joint]
-        plain = np.column_stack([thrust[:, joint], speed[:, joint], np.ones(len(speed))])
-        # Noise of neighbouring rows, so that the fit does not follow what it cannot know.
+        plain = np.column_stack([acceleration[:, joint], speed[:, joint], np.ones(len(speed))])
+        # Noise from neighbouring rows, against an overfit.
         difference = np.diff(target[keep])
         noise = float(np.quantile(np.abs(difference - np.median(difference)), 0.68) ** 2 / 2.0)
-
-        def misfit(
-            logarithm: float | None,
-            joint: int = joint,
-            keep: NDArray[np.bool_] = keep,
-            plain: Floats = plain,
-            target: Floats = target,
-        ) -> float:
-            state = []
-            for m in motions:
-                v = m.motor_speed[:, joint]
-                if logarithm is None:
-                    state.append(np.sign(v))
-                else:
-                    path = np.ascontiguousarray(np.cumsum(v) * m.dt)
-                    state.append(dahl(path, float(np.exp(logarithm)), float(np.sign(v[0]))))
-            table = np.column_stack([plain, nominal.reduce("motor", state)])[keep]
-            rest = target[keep] - table @ np.linalg.lstsq(table, target[keep], rcond=None)[0]
-            return float(rest @ rest)
-
+        misfit = partial(_misfit, nominal, joint, keep, plain, target)
         errors = [misfit(float(np.log(length))) for length in _GRID]
         best = int(np.argmin(errors))
         low, high = np.log(_GRID[max(best - 1, 0)]), np.log(_GRID[min(best + 1, len(_GRID) - 1)])
         found = minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"maxiter": 8})
         if misfit(None) - float(found.fun) > _SURE * noise:
-            reach[joint] = float(np.exp(found.x))
-    return reach
+            lengths[joint] = float(np.exp(found.x))
+    return lengths
+
+
+def _misfit(
+    nominal: Nominal,
+    joint: int,
+    keep: NDArray[np.bool_],
+    plain: Floats,
+    target: Floats,
+    logarithm: float | None,
+) -> float:
+    """Sum of squares [Nm^2] with the logarithm of a presliding length, None for a sign."""
+    state = []
+    for m in nominal.motions:
+        v = m.motor_speed[:, joint]
+        if logarithm is None:
+            state.append(np.sign(v))
+        else:
+            path = np.ascontiguousarray(np.cumsum(v) * m.dt)
+            state.append(dahl(path, float(np.exp(logarithm)), float(np.sign(v[0]))))
+    table = np.column_stack([plain, nominal.reduce("motor", state)])[keep]
+    rest = target[keep] - table @ np.linalg.lstsq(table, target[keep], rcond=None)[0]
+    return float(rest @ rest)
 
 
 def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
-    """Coulomb friction (2, distances, n) that turns within each of the longer distances, and its standard
-    deviation, beside all columns that the evidence holds; zero and infinite where nothing is known."""
+    """Coulomb friction (2, distances, n) with reversal within each of the longer distances, and its standard
+    deviation, beside the present columns of the evidence; zero and infinite if unknown.
+    """
     n = nominal.arm.chain.n
     found = np.zeros((2, len(_LONGER), n))
     found[1] = np.inf
-    reach = nominal.arm.presliding
-    if reach is None or "motor" not in nominal.rows:
+    lengths = nominal.arm.presliding
+    if lengths is None or "motor" not in nominal.rows:
         return found
-    for joint in np.flatnonzero((reach > 0.0) & nominal.moving):
+    for joint in np.flatnonzero((lengths > 0.0) & nominal.moving):
         for k, longer in enumerate(_LONGER):
             signals = []
             for m in nominal.motions:
                 path = np.ascontiguousarray(np.cumsum(m.motor_speed[:, joint]) * m.dt)
-                state = dahl(path, longer * float(reach[joint]), float(np.sign(m.motor_speed[0, joint])))
+                state = dahl(path, longer * float(lengths[joint]), float(np.sign(m.motor_speed[0, joint])))
                 signals.append(state - m.direction[:, joint])
             rows = {("motor", int(joint)): nominal.reduce("motor", signals)[:, None]}
             score = evidence.score(evidence.padded(rows))
@@ -119,8 +135,8 @@ def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
 
 
 def with_far_presliding(arm: Arm, days: Sequence[SlowTurns], coulomb: Sequence[Floats]) -> Arm:
-    """The arm with the share of friction that turns within a longer distance, where several healthy sets agree
-    on one: the mean of the sets over its standard error, from their scatter, is clear.
+    """The arm with a share of friction with reversal within a longer distance, if several healthy sets agree on one:
+    the mean of the sets is large against its standard error from their scatter.
 
     coulomb : (n,) of each set [Nm].
     """
@@ -139,25 +155,11 @@ def with_far_presliding(arm: Arm, days: Sequence[SlowTurns], coulomb: Sequence[F
     return replace(arm, far=np.array(_LONGER)[best] * arm.presliding, far_share=np.minimum(share, 0.5))
 
 
-Side = Literal["link", "motor"]
-
-log = logging.getLogger(__name__)
-
-# Rounds in which the channels' delays are settled.
-_SETTLING = 2
-_TUNING_SETS = 3
-_ROUNDS = 3
-_ENOUGH = 3
-_LATEST_S = 0.02
-_CHANNELS = ("motor", "joint")
-_USUAL_DAYS = 4
-
-
 @dataclass(frozen=True, eq=False)
 class _Day:
-    """What one set says: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of
-    the drives (n,) [Nm] and what of it turns slowly, see `presliding.slow_turns`; by how much the channels are later
-    than the arm says, with standard deviation, by side [s].
+    """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of the
+    drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels beyond the arm's, with standard
+    deviation, by side [s].
     """
 
     values: Floats
@@ -176,22 +178,25 @@ def commission(
     settings: DiagnosisSettings | None = None,
     robot: str = "",
 ) -> Reference:
-    """The healthy arm from sets of sessions, each as a later diagnosis will get them.
+    """A healthy-arm baseline from sets of sessions, each with the sessions of a later diagnosis.
 
-    The side of the joints that the positions come from, stiffness and presliding come from the first sets;
-    parameters and noise from all, with what changed between them; the null, the mean gain of each candidate,
-    from each set against a reference made of the others. Raises DataError for sessions that cannot
-    be used, and where the sets differ in their payloads or channels.
+    The first sets give the side of the joints with the encoders, stiffness and presliding. All sets give parameters
+    and noise, with their changes between the sets. The null, the mean gain of each candidate, comes from each set
+    against a reference from the others. Raises DataError for unusable sessions, and for sets with different payloads
+    or channels.
     """
     settings = settings or DiagnosisSettings()
     parts = [sorted(part, key=lambda s: s.start) for part in sets if part]
     if not parts:
         raise DataError("no session given; name at least one healthy session")
-    sides: tuple[Side, ...] = ("link", "motor") if np.any(_known(chain, arm).compliance > 0.0) else ("link",)
-    recorded = [_recordings(part, chain, settings) for part in parts]
+    start = replace(nominal_arm(chain, arm, None), encoder_known=True)
+    sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
+    recorded: list[list[Recording]] = []
+    for part in parts:
+        recorded.append([record(s, k, chain, settings) for k, s in enumerate(part)])
+        every_joint_moves(recorded[-1], chain)
     first = recorded[0]
-    start = replace(_known(chain, arm), encoder_known=True)
-    # Both sides in bins in which the links' ringing is not seen, or the one that rings would be at a loss.
+    # Both sides in bins long enough to average the links' ringing, for a fair comparison.
     slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
     _, tuned, _ = min(
         (_tuned(replace(start, encoder=side), first, slow, 2) for side in sides), key=lambda t: t[0]
@@ -205,7 +210,7 @@ def commission(
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
-        # How late a channel seems depends on how friction turns at reversals, so its delay is settled last.
+        # The delay of a channel depends on the reversal of friction, so it is settled last.
         days = [_day(known, recordings, settings, base) for recordings in recorded]
         late = {side: float(np.mean([day.late[side][0] for day in days])) for side in _CHANNELS}
         known = replace(
@@ -228,11 +233,11 @@ def commission(
 def _tuned(
     arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, rounds: int
 ) -> tuple[float, Arm, BaseSet]:
-    """Chi-square of a row, and the arm with stiffness, presliding and delays that suit a set, in turns.
+    """Chi-square of a row, and the arm with stiffness, presliding and delays fitted to a set in turns.
 
-    Each of them is a little like the others near a reversal, so they need a few rounds.
+    They are similar near a reversal, so they need a few rounds.
     """
-    # Whatever the channels' delays are, they are those of the healthy arm.
+    # Any delay of the channels belongs to the healthy arm.
     wide = replace(settings, delay_tolerance_s=_LATEST_S)
     misfit = np.inf
     for _ in range(rounds):
@@ -244,7 +249,7 @@ def _tuned(
         misfit = float(np.log(evidence.chi_square / count) + 2.0 * np.mean(rms))
         arm = replace(
             bench.nominal.arm,
-            presliding=presliding_reach(bench.nominal, evidence.full.values[: len(base)]),
+            presliding=presliding_length(bench.nominal, evidence.full.values[: len(base)]),
             motor_delay_s=arm.motor_delay_s + mean_delay(nuisance, "motor")[0],
             joint_delay_s=arm.joint_delay_s + mean_delay(nuisance, "joint")[0],
         )
@@ -252,38 +257,28 @@ def _tuned(
 
 
 def _middle(arms: Sequence[Arm]) -> Arm:
-    """The mean of tuned arms; of the reaches the geometric one, 0 where most of them see none."""
+    """The mean of tuned arms; of the presliding lengths the geometric one, 0 if most of them have none."""
     found = np.array([arm.presliding for arm in arms])
     seen = found > 0.0
-    reach = np.exp(np.sum(np.log(np.where(seen, found, 1.0)), axis=0) / np.maximum(seen.sum(axis=0), 1))
+    lengths = np.exp(np.sum(np.log(np.where(seen, found, 1.0)), axis=0) / np.maximum(seen.sum(axis=0), 1))
     return replace(
         arms[0],
         compliance=np.mean([arm.compliance for arm in arms], axis=0),
         motor_delay_s=float(np.mean([arm.motor_delay_s for arm in arms])),
         joint_delay_s=float(np.mean([arm.joint_delay_s for arm in arms])),
-        presliding=np.where(2 * seen.sum(axis=0) > len(arms), reach, 0.0),
+        presliding=np.where(2 * seen.sum(axis=0) > len(arms), lengths, 0.0),
     )
-
-
-def _known(chain: Chain, arm: ArmData | None) -> Arm:
-    return nominal_arm(chain, arm, None)
-
-
-def _recordings(part: Sequence[Session], chain: Chain, settings: DiagnosisSettings) -> list[Recording]:
-    recordings = [record(s, k, chain, settings) for k, s in enumerate(part)]
-    every_joint_moves(recordings, chain)
-    return recordings
 
 
 def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, base: BaseSet) -> _Day:
     bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=False)
     if bench.nominal.base.names != base.names:
         raise DataError(
-            "the healthy sets differ in payloads or channels, so their parameters are not the same; give sets "
-            "of the same kind"
+            "the healthy sets have different payloads or channels, and so different parameters; give sets of the "
+            "same kind"
         )
     evidence = bench.evidence
-    # Leaves the tolerated deviations beside the base.
+    # `select` adds the tolerated deviations to the base.
     nuisance = select(bench.dictionary, evidence, settings, None).nuisance
     p = evidence.base_count
     return _Day(
@@ -304,7 +299,7 @@ def _reference(
     sessions: Sequence[Session],
     null: Mapping[tuple[str, int], float],
 ) -> Reference:
-    """Mean of the days, with the covariance that a further day has around it."""
+    """Mean of the days, with the covariance of a further day around it."""
     precisions = [np.asarray(np.linalg.inv(_sound(day.covariance)), dtype=np.float64) for day in days]
     within = np.linalg.inv(_sound(np.sum(precisions, axis=0)))
     pulls = [p @ day.values for p, day in zip(precisions, days, strict=True)]
@@ -313,7 +308,7 @@ def _reference(
     if len(days) >= _ENOUGH:
         scatter = np.var([day.values for day in days], axis=0, ddof=1)
         expected = np.mean([np.diag(day.covariance) for day in days], axis=0)
-        # Scatter beyond what each day's own uncertainty explains is the arm's own change.
+        # Scatter beyond each day's own uncertainty is the arm's own change.
         covariance = covariance + np.diag(np.maximum(scatter - 0.7 * expected, 0.0))
     model = DynamicModel(
         robot or "arm",
@@ -345,7 +340,7 @@ def delay_std(late: Sequence[tuple[float, float]]) -> float:
     """Standard deviation [s] of a healthy channel's delay on a further day around the mean of these, from values with
     standard deviations.
 
-    A few days know their scatter badly, so what is usual counts as further days.
+    The scatter of a few days is uncertain, so the usual one counts as further days.
     """
     values, deviations = np.array(late).T
     own = float(np.sum((values - values.mean()) ** 2 - (1.0 - 1.0 / len(values)) * deviations**2))
@@ -355,7 +350,7 @@ def delay_std(late: Sequence[tuple[float, float]]) -> float:
 
 
 def _sound(matrix: Floats) -> Floats:
-    """A covariance or precision made symmetric and safely positive definite."""
+    """The nearest symmetric, safely positive definite covariance or precision."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     correlation = matrix / np.outer(scale, scale)
     correlation = 0.5 * (correlation + correlation.T)

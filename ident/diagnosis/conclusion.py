@@ -2,184 +2,127 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ident.diagnosis.bench import Bench
 from ident.diagnosis.candidates import Trial
-from ident.diagnosis.data_quality import SampleLoss
+from ident.diagnosis.data_quality import SampleLoss, sample_loss
 from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.held_out import HeldOut, fall, held_out, interval
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions, model_form_error
-from ident.diagnosis.nominal import TRAVEL_RAD, Arm, Nominal
+from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import DELAY_STD_S, Reference
-from ident.diagnosis.result import (
-    Diagnosis,
-    Evident,
-    Finding,
-    RowStates,
-    SimulationError,
-    Unexplained,
-    Value,
-)
-from ident.diagnosis.selection import Claim, Selection
-from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.result import Diagnosis, Evident, Finding, RowStates, Unexplained, Value
+from ident.diagnosis.selection import Claim
+from ident.diagnosis.task import Baseline, State, Task
 from ident.effects import LOST_SAMPLES
 from ident.model import DynamicModel
 
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
+__all__ = ["conclude", "timing_finding"]
 
-__all__ = ["Baseline", "Simulate", "conclude", "timing_finding"]
-
-Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
-"""Replays sessions with a model and says how far off it is; what the runner gives."""
-
+# Largest unexplained part in the rows of a claim without a loss of confidence, over the claim's gain.
 _DOUBT = 0.2
-# Confidence in what the rows fitted show and others bear out on the whole only, and gain over the least one from
-# which on that is said at all.
+# Confidence in a claim supported by the rows fitted and not fully by the held-out ones, and its least gain over the
+# usual one.
 _OPEN, _TO_SPARE = 0.7, 2.0
-# How far below nothing the interval of what a claim takes off the held-out chi-square may begin, over its end, where
-# it all but excludes nothing; or end, over the claim's gain, where held-out sessions that hardly excite the cause say
-# nothing.
+# Lowest tolerated lower bound of the held-out gain, as a share of its upper bound; with hardly any excitation in the
+# held-out sessions the lowest upper bound, as a share of the claim's gain.
 _ALL_BUT = 0.05
-# Share of a claim's gain that nameless functions of other variables may take over.
+# Largest share of a claim's gain replaceable by unnamed functions of other variables.
 _ENCOMPASSED = 0.8
-# Power of a cause in the held-out rows, over that in the rows fitted, from which on these must show it.
+# Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
 _EXCITED = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Baseline:
-    """The base model alone: its residuals on held-out rows, its parameters (p,) and their covariance."""
-
-    held: HeldOut
-    values: Floats
-    covariance: Floats
-
-    @classmethod
-    def of(cls, bench: Bench, tolerated: Sequence[Rows]) -> Baseline:
-        """Fitted on a bench, beside deviations that are no finding."""
-        evidence = bench.evidence
-        held, p = held_out(evidence, tolerated), evidence.base_count
-        return cls(held, evidence.full.values[:p].copy(), evidence.covariance()[:p, :p])
-
-
-def conclude(
-    bench: Bench,
-    selection: Selection,
-    timing: list[Finding],
-    loss: tuple[SampleLoss, ...],
-    settings: DiagnosisSettings,
-    reference: Reference | None,
-    model: DynamicModel | None,
-    simulate: Simulate | None,
-    sessions: Sequence[Session],
-    test: Sequence[Session],
-    baseline: Baseline | None = None,
-) -> Diagnosis:
-    """The diagnosis from the claims of a selection, the timing findings and the lost samples.
-
-    baseline : before channels were put in time; None where none was late
-    """
+def conclude(task: Task, state: State) -> Diagnosis:
+    """The diagnosis from the claims of a selection, the timing findings and the lost samples."""
+    bench, nuisance, settings = state.bench, state.selection.nuisance_rows, task.settings
     evidence, nominal = bench.evidence, bench.nominal
-    nuisance = selection.nuisance_rows
+    baseline = state.baseline if state.timing else None
     baseline = baseline or Baseline.of(bench, nuisance)
-    rows_of = [c.trial.rows for c in selection.claims]
-    after = held_out(evidence, [*rows_of, *nuisance])
-    kept: list[tuple[Claim, Finding]] = []
-    for k, claim in enumerate(selection.claims):
-        others = [*(r for i, r in enumerate(rows_of) if i != k), *nuisance]
-        without = held_out(evidence, others)
-        evidence.replace(others)
-        finding = _finding(claim, bench, without, after, settings)
-        most = _confirmed(claim, finding, bench, fall(without, after, _weights(claim, bench), settings.seed))
-        if most > 0.0:
-            kept.append((claim, _at_most(most, finding)))
+    kept = _confirmed_findings(task, state)
     claims = [claim for claim, _ in kept]
-    evidence.replace([*(c.trial.rows for c in claims), *nuisance])
-    after = held_out(evidence, [*(c.trial.rows for c in claims), *nuisance])
+    fixed = [*(c.trial.rows for c in claims), *nuisance]
+    after = held_out(evidence, fixed)
     remainders = find_remainders(bench.dictionary, evidence, settings)
-    doubts = _beyond(bench, claims, nuisance, remainders, settings)
-    findings = [
-        _doubted(
-            claim, finding, doubts, nominal.arm.chain.n, _encompassed(claim, claims, bench, nuisance, doubts)
-        )
-        for claim, finding in kept
-    ]
-    # No held-out session bears out what was another between the sessions, and what differs between motions is easily
-    # taken for such a change.
-    unnamed = {(r.side, r.joint - 1) for r in remainders}
-    findings = [
-        _at_most(_OPEN, finding) if finding.mode == "between" and unnamed & set(claim.trial.rows) else finding
-        for finding, (claim, _) in zip(findings, kept, strict=True)
-    ]
-    evidence.replace([*(c.trial.rows for c in claims), *nuisance])
-    findings += timing
+    findings = _doubted(task, state, kept, remainders)
+    evidence.replace(fixed)
+    findings += state.timing
+    loss = sample_loss(list(task.sessions))
     if loss:
-        findings.append(_loss_finding(loss))
+        findings.append(_loss_finding(loss[0]))
     findings.sort(key=lambda f: -f.gain)
     before, after = baseline.held.where(after), after.where(baseline.held)
-    extended_rms, base_rms = after.rms(), before.rms()
-    base_model, extended, changes = _models(bench, baseline, claims, nuisance, findings, sessions)
+    extended_rms = after.rms()
+    base_model, extended, changes = _models(task, bench, baseline, findings)
     nameless = [*_stuck(nominal), *((r.side, r.joint, r.depends_on) for r in remainders)]
-    unexplained = tuple(
-        Unexplained(
-            side,
-            joint,
-            depends_on,
-            float(extended_rms[side][joint - 1]),
-            float(evidence.floor[side][joint - 1]),
-        )
-        for side, joint, depends_on in nameless
-    )
-    replayed = list(test) or list(sessions)
+    replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
-    if simulate is not None:
-        simulation = simulate(model or base_model, replayed)
-        extended_simulation = simulate(extended, replayed) if findings else simulation
+    if task.simulate is not None:
+        simulation = task.simulate(task.model or base_model, replayed)
+        extended_simulation = task.simulate(extended, replayed) if findings else simulation
     return Diagnosis(
         train=tuple(r.name for r in nominal.recordings if not r.test),
         test=tuple(r.name for r in nominal.recordings if r.test),
         model_number=nominal.structure.model,
         findings=tuple(findings),
-        unexplained=unexplained,
+        unexplained=tuple(
+            Unexplained(
+                side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])
+            )
+            for side, j, variables in nameless
+        ),
         noise_floor=evidence.floor,
-        rms_base=base_rms,
+        rms_base=before.rms(),
         rms_extended=extended_rms,
         base_model=base_model,
         extended_model=extended,
         changes=changes,
-        scores=selection.scores,
-        nuisance=selection.nuisance,
+        scores=state.selection.scores,
+        nuisance=state.selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=(*_notes(bench, reference), *_lines(nominal, remainders), *_stuck_notes(nominal)),
+        notes=(*_notes(bench, task.reference), *_channel_notes(nominal, remainders), *state.notes),
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
 
 
-def _weights(claim: Claim, bench: Bench) -> dict[Key, float]:
-    """Weight of a row's square [1/Nm^2] for the joints and sides that a claim acts on."""
-    return {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
+# ---- confirmation by held-out rows ----
+
+
+def _confirmed_findings(task: Task, state: State) -> list[tuple[Claim, Finding]]:
+    """The claims confirmed by held-out rows, with their findings."""
+    bench, nuisance, seed = state.bench, state.selection.nuisance_rows, task.settings.seed
+    rows_of = [c.trial.rows for c in state.selection.claims]
+    after = held_out(bench.evidence, [*rows_of, *nuisance])
+    kept = []
+    for k, claim in enumerate(state.selection.claims):
+        others = [*(r for i, r in enumerate(rows_of) if i != k), *nuisance]
+        without = held_out(bench.evidence, others)
+        finding = _finding(claim, bench, without, after, seed)
+        weights = {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
+        most = _confirmed(claim, finding, bench, fall(without, after, weights, seed))
+        if most > 0.0:
+            kept.append((claim, _at_most(most, finding)))
+    return kept
 
 
 def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float, float]) -> float:
-    """Largest confidence that motions which were not fitted leave a claim: 1 where they bear it out, the interval of
-    what it takes off their chi-square excluding nothing; 0 where they do not.
+    """Largest confidence in a claim after the test on held-out rows: 1 confirmed, 0 refuted.
 
-    What the healthy arm is a little like, and what a stronger cause of another form than its law leaves behind,
-    is significant in the rows fitted but makes no prediction. Where the held-out sessions hardly excite the cause,
-    they need only not speak against it; of what was another in other sessions or lasted a moment they say nothing, and
-    what the samples themselves show needs no other.
-    A cause that the rows fitted show with room to spare, or that the others all but bear out for sure, may be it or
-    another. So may one that the rows fitted show weakly; that is said only where the others do bear it out.
+    fallen : interval of the fall of their chi-square by the claim; above zero it confirms the claim. A deviation of
+    the healthy arm, or the error of a stronger cause's law, is significant in the rows fitted but predicts nothing.
+    If the held-out sessions hardly excite the cause, they need only not contradict it. They say nothing about a
+    change between sessions or a brief event, and a cause visible in the samples themselves needs no test.
+    A cause with ample evidence in the rows fitted, or almost confirmed by the others, may be this one or another. So
+    may a weak claim, reported only after a confirmation.
     """
     effect = claim.trial.candidate.effect
     if finding.mode == "between" or effect.repeats or effect.seen_in_samples(claim.trial.shape):
@@ -205,9 +148,8 @@ def _excitation(claim: Claim, bench: Bench) -> float:
         weight = 1.0 / bench.evidence.sigma[side][joint] ** 2
         for k, chosen in enumerate((~rows.test, rows.test)):
             keep = chosen & rows.valid[:, joint]
-            power[k] += (
-                weight * float(np.sum((torque[keep] - torque[keep].mean()) ** 2)) if keep.any() else 0.0
-            )
+            if keep.any():
+                power[k] += weight * float(np.sum((torque[keep] - torque[keep].mean()) ** 2))
             counts[k] += float(keep.sum())
     if not any(rows.test.any() for rows in bench.nominal.rows.values()) or power[0] <= 0.0:
         return 1.0
@@ -215,52 +157,39 @@ def _excitation(claim: Claim, bench: Bench) -> float:
 
 
 def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:
-    """Where the arm was in the rows of a side."""
+    """Position, speed and load in the rows of a side."""
     rows, motions = nominal.rows[side], nominal.motions
-    return RowStates(
-        rows.time,
-        rows.session,
-        block,
-        nominal.reduce(side, [m.q for m in motions]),
-        nominal.reduce(side, [m.motor_speed for m in motions]),
-        nominal.reduce(side, [m.joint_torque for m in motions]),
-    )
+    signals = ([m.q for m in motions], [m.motor_speed for m in motions], [m.joint_torque for m in motions])
+    return RowStates(rows.time, rows.session, block, *(nominal.reduce(side, parts) for parts in signals))
 
 
-def _finding(
-    claim: Claim, bench: Bench, without: HeldOut, after: HeldOut, settings: DiagnosisSettings
-) -> Finding:
-    """The finding of a claim, all others being in the base."""
-    candidate, score = claim.trial.candidate, claim.score
+# ---- findings ----
+
+
+def _finding(claim: Claim, bench: Bench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
+    """The finding of a claim beside the columns of the evidence, with all other claims among them."""
+    candidate, score, form = claim.trial.candidate, claim.score, claim.trial.shape.form
     keys = [key for key in claim.trial.rows if np.any(claim.trial.rows[key])]
     keys = sorted(keys, key=lambda key: -_relative(without, after, key))[: max(1, len(keys) // 7)]
-    rms_before, rms_after, low, high = interval(without, after, keys, settings.seed)
-    count = sum(float(m.sum()) for m in bench.evidence.mask.values())
-    parameters = len(candidate.effect.parameters)
+    rms_before, rms_after, low, high = interval(without, after, keys, seed)
+    cost = np.log(sum(float(m.sum()) for m in bench.evidence.mask.values()))
+    delta_bic = float(-score.fitted + len(candidate.effect.parameters) * cost)
     return Finding(
         cause=candidate.cause,
         side=candidate.effect.side,
         joints=candidate.joints,
         parameters=_parameters(claim.trial, bench),
-        evidence=Evident(
-            float(-score.fitted + parameters * np.log(count)),
-            score.p_value,
-            rms_before,
-            rms_after,
-            (low, high),
-        ),
+        evidence=Evident(delta_bic, score.p_value, rms_before, rms_after, (low, high)),
         confidence=claim.confidence,
-        alternatives=tuple(
-            (c.cause, c.joints, float(-gain + np.log(count))) for c, gain in claim.alternatives
-        ),
+        alternatives=tuple((c.cause, c.joints, float(-gain + cost)) for c, gain in claim.alternatives),
         tell_apart=candidate.effect.tell_apart.format(joint=candidate.joint + 1),
         gain=score.gain,
         mode=candidate.effect.mode(claim.trial.shape),
-        form=None if claim.trial.shape.form is None else str(claim.trial.shape.form.value),
+        form=None if form is None else str(form.value),
     )
 
 
-def _relative(without: HeldOut, after: HeldOut, key: tuple[str, int]) -> float:
+def _relative(without: HeldOut, after: HeldOut, key: Key) -> float:
     side, joint = key
     a, b = without.residual[side][:, joint], after.residual[side][:, joint]
     power = np.nanmean(b**2) if np.isfinite(b).any() else 1.0
@@ -270,8 +199,8 @@ def _relative(without: HeldOut, after: HeldOut, key: tuple[str, int]) -> float:
 def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
     """Values with standard deviations, see `intervals`.
 
-    Of friction near standstill, those beside any way in which it may turn after a reversal, which no law of it
-    says; what that changes is part of the uncertainty.
+    Friction near standstill is estimated beside all ways of reversing, beyond its law; the change of the values is
+    part of the uncertainty.
     """
     effect, evidence = trial.candidate.effect, bench.evidence
     values, deviations = estimated(bench.dictionary, evidence, trial)
@@ -292,111 +221,36 @@ def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
     }
 
 
-def _beyond(
-    bench: Bench,
-    claims: Sequence[Claim],
-    nuisance: Sequence[Rows],
-    remainders: tuple[Remainder, ...],
-    settings: DiagnosisSettings,
-) -> tuple[Remainder, ...]:
-    """What is left beside the claims if each cause may also be of another form than its law.
+def timing_finding(task: Task, after: State, claim: Claim, rest: tuple[float, float]) -> Finding:
+    """Finding of a late channel.
 
-    A hose that is no plain spring leaves much, all of it a function of the joint's angle on both sides: that says
-    the law is coarse, not that the name is wrong.
+    after : with the shift made, and the baseline before it. rest : remaining delay and its standard deviation [s].
     """
-    wide = [
-        rows for rows in (model_form_error(bench.dictionary, c.trial) for c in claims) if rows is not None
-    ]
-    if not remainders or not wide:
-        return remainders
-    fixed = [*(c.trial.rows for c in claims), *nuisance]
-    bench.evidence.replace([*fixed, *wide])
-    found = find_remainders(bench.dictionary, bench.evidence, settings)
-    bench.evidence.replace(fixed)
-    return found
-
-
-def _encompassed(
-    claim: Claim,
-    claims: Sequence[Claim],
-    bench: Bench,
-    nuisance: Sequence[Rows],
-    remainders: Sequence[Remainder],
-) -> float:
-    """Share of a claim's gain that is gone once all that has no name is in the base.
-
-    Friction that follows another joint's angle is another in every session, as if the drive had been warmer; what
-    is left beside that claim explains all that the claim does, and the claim is not needed with it.
-    """
-    if not remainders:
-        return 0.0
-    others = [c.trial.rows for c in claims if c is not claim]
-    bench.evidence.replace([*others, *nuisance, *(rows for r in remainders for rows in r.rows)])
-    again = bench.dictionary.trial(claim.trial.candidate, claim.trial.shape)
-    return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain
-
-
-def _at_most(confidence: float, finding: Finding) -> Finding:
-    """The finding with no more than that confidence."""
-    return replace(finding, confidence=min(finding.confidence, confidence))
-
-
-def _doubted(
-    claim: Claim, finding: Finding, remainders: Sequence[Remainder], joints: int, encompassed: float
-) -> Finding:
-    """Less confidence in a name that leaves much in the rows that it explains, or that what it leaves explains."""
-    if encompassed > _ENCOMPASSED:
-        finding = _at_most(_OPEN, finding)
-    mine = set(claim.trial.rows)
-    left = sum(r.gain for r in remainders if (r.side, r.joint - 1) in mine)
-    if len(mine) > joints:
-        left /= 2.0
-    if left > _DOUBT * claim.gain:
-        return _at_most(float(0.75 * claim.gain / (claim.gain + left)), finding)
-    return finding
-
-
-def timing_finding(
-    claim: Claim,
-    known: Arm,
-    bench: Bench,
-    after: Selection,
-    rest: tuple[float, float],
-    before: HeldOut,
-    settings: DiagnosisSettings,
-    reference: Reference | None,
-) -> Finding:
-    """Finding of a late channel: the shift that was made and the `rest` of it, with its standard deviation [s]."""
-    candidate = claim.trial.candidate
-    side = candidate.effect.channel or ""
-    arm = bench.nominal.arm
-    made = (
-        arm.motor_delay_s - known.motor_delay_s
-        if side == "motor"
-        else arm.joint_delay_s - known.joint_delay_s
-    )
-    left, std = rest
-    # The healthy channel itself is a little later on one day than on another.
-    days = (reference.delay_std_s if reference is not None else {}).get(side, DELAY_STD_S)
-    std = float(np.hypot(std, days))
-    now = held_out(bench.evidence, [*(c.trial.rows for c in after.claims), *after.nuisance_rows])
-    keys = [(side, j) for j in range(bench.nominal.arm.chain.n)]
-    numbers = interval(before, now, keys, settings.seed)
+    assert after.baseline is not None
+    bench, selection, effect = after.bench, after.selection, claim.trial.candidate.effect
+    side = effect.channel or ""
+    arm, known = bench.nominal.arm, task.arm
+    motor, joint = arm.motor_delay_s - known.motor_delay_s, arm.joint_delay_s - known.joint_delay_s
+    # The delay of the healthy channel itself varies from day to day.
+    days = (task.reference.delay_std_s if task.reference is not None else {}).get(side, DELAY_STD_S)
+    std = float(np.hypot(rest[1], days))
+    now = held_out(bench.evidence, [*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
+    keys = [(side, j) for j in range(arm.chain.n)]
+    rms_before, rms_after, low, high = interval(after.baseline.held, now, keys, task.settings.seed)
     return Finding(
-        candidate.cause,
+        effect.cause,
         "timing",
         (),
-        {"delay": Value(made + left, std, "s")},
-        Evident(-claim.score.fitted, claim.score.p_value, numbers[0], numbers[1], (numbers[2], numbers[3])),
+        {"delay": Value((motor if side == "motor" else joint) + rest[0], std, "s")},
+        Evident(-claim.score.fitted, claim.score.p_value, rms_before, rms_after, (low, high)),
         claim.confidence,
         tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),
-        candidate.effect.tell_apart,
+        effect.tell_apart,
         claim.gain,
     )
 
 
-def _loss_finding(loss: tuple[SampleLoss, ...]) -> Finding:
-    worst = loss[0]
+def _loss_finding(worst: SampleLoss) -> Finding:
     count = worst.samples + worst.lost
     std = float(np.sqrt(worst.share * (1.0 - worst.share) / count))
     return Finding(
@@ -414,39 +268,102 @@ def _loss_finding(loss: tuple[SampleLoss, ...]) -> Finding:
     )
 
 
-def _models(
+# ---- doubts ----
+
+
+def _doubted(
+    task: Task, state: State, kept: Sequence[tuple[Claim, Finding]], remainders: tuple[Remainder, ...]
+) -> list[Finding]:
+    """The findings, with less confidence in a name with a large remainder in its rows, or replaceable by one."""
+    bench, nuisance = state.bench, state.selection.nuisance_rows
+    doubts = _beyond(task, bench, [claim for claim, _ in kept], nuisance, remainders)
+    # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
+    unnamed = {(r.side, r.joint - 1) for r in remainders}
+    findings = []
+    for claim, finding in kept:
+        others = [c.trial.rows for c, _ in kept if c is not claim]
+        if _encompassed(claim, [*others, *nuisance], bench, doubts) > _ENCOMPASSED:
+            finding = _at_most(_OPEN, finding)
+        mine = set(claim.trial.rows)
+        left = sum(r.gain for r in doubts if (r.side, r.joint - 1) in mine)
+        if len(mine) > bench.nominal.arm.chain.n:
+            left /= 2.0
+        if left > _DOUBT * claim.gain:
+            finding = _at_most(float(0.75 * claim.gain / (claim.gain + left)), finding)
+        if finding.mode == "between" and unnamed & mine:
+            finding = _at_most(_OPEN, finding)
+        findings.append(finding)
+    return findings
+
+
+def _beyond(
+    task: Task,
     bench: Bench,
-    baseline: Baseline,
     claims: Sequence[Claim],
     nuisance: Sequence[Rows],
-    findings: Sequence[Finding],
-    sessions: Sequence[Session],
+    remainders: tuple[Remainder, ...],
+) -> tuple[Remainder, ...]:
+    """Remainders beside the claims and the errors of their laws.
+
+    A hose unlike a plain spring leaves a large function of the joint's angle on both sides: evidence of a coarse law,
+    not of a wrong name.
+    """
+    errors = (model_form_error(bench.dictionary, c.trial) for c in claims)
+    wide = [rows for rows in errors if rows is not None]
+    if not remainders or not wide:
+        return remainders
+    bench.evidence.replace([*(c.trial.rows for c in claims), *nuisance, *wide])
+    return find_remainders(bench.dictionary, bench.evidence, task.settings)
+
+
+def _encompassed(
+    claim: Claim, others: Sequence[Rows], bench: Bench, remainders: Sequence[Remainder]
+) -> float:
+    """Share of a claim's gain lost with all remainders in the base, beside the columns of the others.
+
+    Friction as a function of another joint's angle differs between sessions, like a warmer drive. Its remainder then
+    explains the same as that claim, and the claim is unnecessary.
+    """
+    if not remainders:
+        return 0.0
+    bench.evidence.replace([*others, *(rows for r in remainders for rows in r.rows)])
+    again = bench.dictionary.trial(claim.trial.candidate, claim.trial.shape)
+    return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain
+
+
+def _at_most(confidence: float, finding: Finding) -> Finding:
+    """The finding with no more than that confidence."""
+    return replace(finding, confidence=min(finding.confidence, confidence))
+
+
+# ---- models ----
+
+
+def _models(
+    task: Task, bench: Bench, baseline: Baseline, findings: Sequence[Finding]
 ) -> tuple[DynamicModel, DynamicModel, dict[str, float]]:
-    """Base and extended model, and the change of the base parameters in their standard deviations."""
+    """Base model, extended model with the columns of the evidence, and the change of the base parameters in their
+    standard deviations.
+    """
     evidence, nominal = bench.evidence, bench.nominal
     p = evidence.base_count
-    robot = sessions[0].metadata.get("robot", "") or "arm"
+    robot = task.sessions[0].metadata.get("robot", "") or "arm"
     provenance: dict[str, Any] = {
         "sessions": [r.name for r in nominal.recordings if not r.test],
         "estimator": "diagnosis",
     }
-    evidence.replace([*(c.trial.rows for c in claims), *nuisance])
     effects = tuple(_entry(f) for f in findings if f.cause != LOST_SAMPLES.cause)
-
-    def fitted(values: Floats, covariance: Floats, entries: tuple[dict[str, Any], ...]) -> DynamicModel:
-        return DynamicModel(
-            robot,
-            nominal.structure,
-            nominal.base.names,
-            values,
-            covariance,
-            nominal.base,
-            provenance,
-            entries,
-        )
-
-    base = fitted(baseline.values, baseline.covariance, ())
-    extended = fitted(evidence.full.values[:p].copy(), evidence.covariance()[:p, :p], effects)
+    base = DynamicModel(
+        robot,
+        nominal.structure,
+        nominal.base.names,
+        baseline.values,
+        baseline.covariance,
+        nominal.base,
+        provenance,
+    )
+    values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]
+    extended = replace(base, values=values, covariance=covariance, effects=effects)
     assert extended.std is not None
     shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
     order = np.argsort(-np.abs(shift))[:10]
@@ -456,81 +373,72 @@ def _models(
 
 def _entry(finding: Finding) -> dict[str, Any]:
     """A finding as an entry of a model's effects."""
-    return {
-        "cause": finding.cause,
-        "side": finding.side,
-        "joints": list(finding.joints),
-        **({} if finding.form is None else {"form": finding.form}),
-        "parameters": {
-            name: {"value": v.value, "std": v.std, "unit": v.unit} for name, v in finding.parameters.items()
-        },
-    }
+    content = finding.to_dict()
+    names = ("cause", "side", "joints", "form", "parameters")
+    return {name: content[name] for name in names if name in content}
+
+
+# ---- notes ----
 
 
 def _stuck(nominal: Nominal) -> list[tuple[str, int, tuple[str, ...]]]:
-    """Side, joint (from 1) and variable of motor torques that the channel does not report as they are."""
+    """Side, joint (from 1) and variable of motor torques with stuck values."""
     joints = {one.joint for r in nominal.recordings if not r.test for one in r.stuck}
     return [("motor", joint + 1, (f"load{joint + 1}",)) for joint in sorted(joints)]
 
 
-def _stuck_notes(nominal: Nominal) -> list[str]:
+def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
     names = nominal.arm.chain.joint_names
-    return [
-        f"{r.name}: the motor torque of {names[one.joint]} reads exactly {one.value:.4g} Nm in {one.count} of "
-        f"{one.samples} samples in motion, so torques near that are not reported as they are; these samples are "
-        "left out"
-        for r in nominal.recordings
-        for one in r.stuck
-    ]
-
-
-def _lines(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
-    names = nominal.arm.chain.joint_names
-    return [
-        f"the {r.side} torque of {names[r.joint - 1]} swings at {r.line_hz:.3g} Hz whatever the arm does: look "
-        "for what shakes the arm, or hums in the channel, at that frequency"
+    lines = [
+        f"the {r.side} torque of {names[r.joint - 1]} swings at {r.line_hz:.3g} Hz independently of the motion; look "
+        "for a vibration of the arm or hum in the channel at this frequency"
         for r in remainders
         if r.line_hz > 0.0
     ]
+    stuck = [
+        f"{r.name}: the motor torque of {names[one.joint]} reads exactly {one.value:.4g} Nm in {one.count} of "
+        f"{one.samples} samples in motion; torques near this value are misreported, and these samples are left out"
+        for r in nominal.recordings
+        for one in r.stuck
+    ]
+    return lines + stuck
 
 
-def _notes(bench: Bench, reference: Reference | None) -> tuple[str, ...]:
-    notes = []
-    if "motor" not in bench.nominal.rows:
+def _notes(bench: Bench, reference: Reference | None) -> list[str]:
+    notes, nominal, evidence = [], bench.nominal, bench.evidence
+    if "motor" not in nominal.rows:
         notes.append(
-            "no motor torque: causes on the motor side cannot be seen, and sensor causes are told "
-            "from physical "
-            "ones by their shape alone"
+            "no motor torque: causes on the motor side are invisible, and a sensor error differs from a torque of "
+            "the arm by its shape alone"
         )
     if reference is None:
         notes.append(
-            "no reference of the healthy arm: a constant change that base parameters absorb (payload, torque "
-            "constant, wear, offsets) cannot be seen, and what the arm always had, such as friction that turns over "
-            "some distance after a reversal, is named like a fault; run `lwr-run commission` when the arm is healthy"
+            "no reference of the healthy arm: a constant change absorbed by base parameters (payload, torque "
+            "constant, wear, offsets) is invisible, and normal properties of the arm, such as presliding friction, "
+            "are reported as if they were faults; run `lwr-run commission` with the healthy arm"
         )
-    elif bench.evidence.prior is None:
+    elif evidence.prior is None:
         notes.append(
             "the reference shares no base parameter with these sessions: parameters are not compared"
         )
-    for side, band in bench.nominal.band_hz.items():
+    for side, band in nominal.band_hz.items():
         if band is not None:
             notes.append(
-                f"the {side} torque was low-passed before it came here, nothing is left above {2.0 * band:.2g} "
-                f"Hz: rows are compared below {band:.2g} Hz; delays, reversals and ripple of the motor's turn "
-                "cannot be seen"
+                f"the {side} torque was low-passed before recording, with nothing left above {2.0 * band:.2g} Hz: "
+                f"rows are compared below {band:.2g} Hz; delays, reversals and ripple per motor turn are invisible"
             )
-    still = np.flatnonzero(~bench.nominal.moving)
+    still = np.flatnonzero(~nominal.moving)
     if len(still):
-        names = ", ".join(bench.nominal.arm.chain.joint_names[j] for j in still)
-        notes.append(f"{names}: no motion of {TRAVEL_RAD} rad, so nothing can be said there")
+        names = ", ".join(nominal.arm.chain.joint_names[j] for j in still)
+        notes.append(f"{names}: motion below {TRAVEL_RAD} rad, too little for a diagnosis")
     if not bench.repeatable:
         notes.append(
-            "no motion repeats within a session: what the model leaves is itself the noise that claims are "
-            "held against, so only what explains much of it is named"
+            "no motion repeats within a session: the residual of the model is the only measure of noise, so only "
+            "causes of a large part of it are named"
         )
-    if bench.evidence.prior is not None and not bench.evidence.compared:
+    if evidence.prior is not None and not evidence.compared:
         notes.append(
-            "what the motion hardly excites is held near the inertia of the URDF, within 20 %: a wrong URDF "
-            "would show as a cause"
+            "hardly excited parameters are held near the inertia of the URDF, within 20 %: a wrong URDF would show "
+            "as a cause"
         )
-    return tuple(notes)
+    return notes

@@ -1,34 +1,25 @@
-"""From sessions to a diagnosis: prepare, fit, select, check what is left, extend, measure."""
+"""From sessions to a diagnosis: prepare, fit, select, check the remainder, extend, measure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fri.errors import DataError
-from ident.diagnosis.bench import (
-    ArmData,
-    Bench,
-    again_with,
-    nominal_arm,
-    prepare_bench,
-    slow_delay,
-    some_joint_moves,
-)
+from ident.diagnosis.bench import ArmData, Bench, again_with, nominal_arm, slow_delay, some_joint_moves
 from ident.diagnosis.candidates import Candidate, Dictionary
-from ident.diagnosis.conclusion import Baseline, Simulate, conclude, timing_finding
-from ident.diagnosis.data_quality import sample_loss
+from ident.diagnosis.conclusion import conclude, timing_finding
 from ident.diagnosis.evidence import Rows, Score
 from ident.diagnosis.nominal import Arm
-from ident.diagnosis.recording import Recording, record
+from ident.diagnosis.recording import record
 from ident.diagnosis.reference import Reference
-from ident.diagnosis.result import Diagnosis, Finding
-from ident.diagnosis.selection import Claim, Null, Selection, best_candidate, select
+from ident.diagnosis.result import Diagnosis
+from ident.diagnosis.selection import Claim, Selection, best_candidate
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.task import Baseline, Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
 from ident.model import DynamicModel
@@ -38,15 +29,15 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose"]
 
-# How often at most a late channel is shifted and looked at again.
+# Largest number of shifts of a late channel.
 _SHIFTS = 5
-# Delay whose trace stands for what is left of a larger one [s].
+# Unit of delay for a column [s].
 _UNIT_S = 1e-3
-# Joints from which on a delay must be seen in more than one.
+# Least number of joints for a delay to be confirmed by more than one.
 _MOST_ALONE = 3
-# Share of the tolerance for delays within which a channel that was shifted is in its place.
+# Largest remaining delay after a shift, as a share of the tolerance for delays.
 _IN_PLACE = 0.2
-# Share of a drive's inertia that the phase of the samples may make up.
+# Largest effect of the samples' phase on a drive's inertia, as a share of it.
 _INERTIA_BY_PHASE = 0.05
 
 
@@ -62,13 +53,12 @@ def diagnose(
     simulate: Simulate | None = None,
     causes: Sequence[str] | None = None,
 ) -> Diagnosis:
-    """What the base model gets wrong in `sessions`, by cause and joint, with an extended model.
+    """Errors of the base model in `sessions`, by cause and joint, with an extended model.
 
-    test : sessions for measuring only. arm : stiffness and gear ratios, from its description. model : the
-    present model, whose simulation the extended one is compared with; default the base model fitted here.
-    reference : the healthy arm. simulate : replay, for the error of the simulation. causes : names
-    to consider.
-    Raises DataError, with advice, for sessions that cannot be used.
+    test : held-out sessions. arm : stiffness and gear ratios, from its description. model : the present model,
+    for comparison with the extended one in simulation; default the base model fitted here. reference : the healthy
+    arm. simulate : replay, for the error of the simulation. causes : names to consider.
+    Raises DataError, with advice, for unusable sessions.
     """
     settings = settings or DiagnosisSettings()
     if not sessions:
@@ -77,79 +67,26 @@ def diagnose(
     held = {id(s) for s in test}
     recordings = tuple(record(s, k, chain, settings, test=id(s) in held) for k, s in enumerate(everything))
     some_joint_moves(recordings)
-    task = _Task(nominal_arm(chain, arm, reference), recordings, settings, reference, causes)
-    state = _refined(task, _in_time(task, _first(task)))
-    found = conclude(
-        state.bench,
-        state.selection,
-        list(state.timing),
-        sample_loss(list(sessions)),
-        settings,
-        reference,
-        model,
-        simulate,
-        sessions,
-        test,
-        state.baseline if state.timing else None,
-    )
-    return replace(found, notes=(*found.notes, *state.notes)) if state.notes else found
+    nominal = nominal_arm(chain, arm, reference)
+    task = Task(sessions, test, nominal, recordings, settings, reference, causes, model, simulate)
+    return conclude(task, _refined(task, _in_time(task, _first(task))))
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """What a diagnosis starts from. causes : names to consider, None for all."""
-
-    arm: Arm
-    recordings: tuple[Recording, ...]
-    settings: DiagnosisSettings
-    reference: Reference | None
-    causes: Sequence[str] | None
-
-    @cached_property
-    def null(self) -> Null | None:
-        """Gain of each candidate in healthy sets."""
-        return None if self.reference is None else self.reference.limits()
-
-    def bench(self, arm: Arm, reference: Reference | None, *, fit_compliance: bool) -> Bench:
-        """Rows, noise and candidates for an arm."""
-        return prepare_bench(
-            arm, self.recordings, self.settings, reference, self.causes, fit_compliance=fit_compliance
-        )
-
-    def select(self, bench: Bench) -> Selection:
-        """The causes that the data of a bench carry."""
-        return select(bench.dictionary, bench.evidence, self.settings, self.null)
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """A diagnosis under way. timing : findings of late channels, put in time on the bench. baseline : before that.
-    left_out : causes dropped from the candidates.
-    """
-
-    bench: Bench
-    selection: Selection
-    timing: tuple[Finding, ...] = ()
-    baseline: Baseline | None = None
-    notes: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
-
-
-def _first(task: _Task) -> _State:
-    """The first selection, with the noise of the best candidate's residual where repetition does not give it."""
+def _first(task: Task) -> State:
+    """The first selection, with the noise from the best candidate's residual if repetition does not give it."""
     bench = task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
     selection = task.select(bench)
     if bench.repeatable or selection.claims:
-        return _State(bench, selection)
+        return State(bench, selection)
     best = best_candidate(bench.dictionary, bench.evidence, task.settings)
     quieter = None if best is None else again_with(bench, best, task.settings, task.causes)
     if quieter is None:
-        return _State(bench, selection)
+        return State(bench, selection)
     again = task.select(quieter)
-    return _State(quieter, again) if again.claims else _State(bench, selection)
+    return State(quieter, again) if again.claims else State(bench, selection)
 
 
-def _in_time(task: _Task, state: _State) -> _State:
+def _in_time(task: Task, state: State) -> State:
     """The same with late channels shifted in time, and findings of them."""
     late = _late(state.selection)
     doubtful = [
@@ -160,7 +97,7 @@ def _in_time(task: _Task, state: _State) -> _State:
     if doubtful:
         task = replace(task, causes=[cause for cause in task.causes or EFFECTS if cause not in doubtful])
         state.bench.dictionary = Dictionary(state.bench.nominal, state.bench.evidence, task.causes)
-        state = _State(state.bench, task.select(state.bench))
+        state = State(state.bench, task.select(state.bench))
         late = _late(state.selection)
     if not late:
         return replace(state, left_out=tuple(doubtful))
@@ -169,33 +106,30 @@ def _in_time(task: _Task, state: _State) -> _State:
     healthy = _at_another_phase(task.reference) if DELAYS["motor"].cause in amounts else task.reference
     for _ in range(_SHIFTS):
         shifted = _shifted(shifted, amounts)
-        bench = task.bench(
-            replace(shifted, compliance=bench.nominal.arm.compliance), healthy, fit_compliance=False
-        )
+        compliant = replace(shifted, compliance=bench.nominal.arm.compliance)
+        bench = task.bench(compliant, healthy, fit_compliance=False)
         selection = task.select(bench)
-        # What spoilt the first estimate may be in the model now, and be itself in its place only now.
+        # Causes with an influence on the first estimate may be in the model by now.
         rest = {cause: _rest(bench, selection, cause) for cause in amounts}
         amounts = {cause: value for cause, (value, _) in rest.items()}
         if max(map(abs, amounts.values())) < _IN_PLACE * task.settings.delay_tolerance_s:
             break
     timing, notes = [], []
+    after = State(bench, selection, baseline=baseline, left_out=tuple(doubtful))
     for claim in late:
-        left = rest[claim.trial.candidate.cause]
-        finding = timing_finding(
-            claim, task.arm, bench, selection, left, baseline.held, task.settings, task.reference
-        )
-        delay, unknown = finding.parameters["delay"], _unknown_delay(task.arm, task.recordings, claim)
+        finding = timing_finding(task, after, claim, rest[claim.trial.candidate.cause])
+        delay, unknown = finding.parameters["delay"], _unknown_delay(task, claim)
         if abs(delay.value) <= unknown:
             notes.append(_own_delay(claim, unknown))
-        # A claim of which nothing is left once all else is in the model was something else.
+        # A delay explained by the rest of the model is no finding.
         elif abs(delay.value) > 3.0 * delay.std:
             timing.append(finding)
     selection.claims = [c for c in selection.claims if c not in _late(selection)]
-    return _State(bench, selection, tuple(timing), baseline, tuple(notes), tuple(doubtful))
+    return replace(after, timing=tuple(timing), notes=tuple(notes))
 
 
-def _refined(task: _Task, state: _State) -> _State:
-    """The selection once more, with predictions and noise that know of the claims."""
+def _refined(task: Task, state: State) -> State:
+    """The selection once more, with predictions and noise of the model with the claims."""
     causes = [cause for cause in task.causes or EFFECTS if cause not in state.left_out]
     bench = again_with(state.bench, state.selection, task.settings, causes)
     if bench is None:
@@ -211,51 +145,48 @@ def _late(selection: Selection) -> list[Claim]:
 
 
 def _made(claim: Claim) -> float:
-    """Delay [s] that a claim of a late channel means."""
+    """Delay [s] in a claim of a late channel."""
     return float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
 
 
 def _without_delays(selection: Selection) -> list[Rows]:
-    """Columns of the tolerated deviations but delays."""
+    """Columns of the tolerated deviations other than delays."""
     named = zip(selection.nuisance, selection.nuisance_rows, strict=True)
     return [rows for name, rows in named if "delay" not in name]
 
 
 def _rest(bench: Bench, selection: Selection, cause: str) -> tuple[float, float]:
-    """How much later a channel still is, and its standard deviation [s], beside all claims but slow turning, which a
-    late motor resembles.
+    """Remaining delay of a channel and its standard deviation [s], beside all claims but presliding, similar to a
+    late motor.
     """
     side = EFFECTS[cause].channel
     alike = (cause, PRESLIDING.cause)
     taken = [c.trial.rows for c in selection.claims if c.trial.candidate.cause not in alike]
-    tolerated = [
-        rows
-        for name, rows in zip(selection.nuisance, selection.nuisance_rows, strict=True)
-        if not name.startswith(f"{side} delay")
-    ]
+    named = zip(selection.nuisance, selection.nuisance_rows, strict=True)
+    tolerated = [rows for name, rows in named if not name.startswith(f"{side} delay")]
     bench.evidence.replace([*taken, *tolerated])
     columns = bench.dictionary.rows(Candidate(EFFECTS[cause], -1), Shape(delay=_UNIT_S))
     return _delay_of(bench.evidence.score(bench.evidence.padded(columns)))
 
 
 def _delay_of(score: Score) -> tuple[float, float]:
-    """Delay and standard deviation [s] from the score of a channel that is late by `_UNIT_S`."""
+    """Delay and standard deviation [s] from the score of a channel late by `_UNIT_S`."""
     return _UNIT_S * float(score.coefficients[0]), _UNIT_S * float(np.sqrt(score.covariance[0, 0]))
 
 
 def _at_another_phase(reference: Reference | None) -> Reference | None:
-    """The healthy arm for motor torques that are later than they were then.
+    """The healthy arm for motor torques with a new delay.
 
-    The cabinet fills the time between two commands with a line, so the motor torque has a ripple of their period that
-    grows with the acceleration. A channel whose samples are whole periods apart meets it at one phase, where it looks
-    like inertia; a late channel meets it at another. With inertias held at their healthy values, viscous friction that
-    comes later still would make up for that.
+    The cabinet interpolates linearly between two commands, so the motor torque has a ripple of their period that
+    grows with the acceleration. Samples whole periods apart see it at one phase, like an inertia; after a change of
+    the delay they see another phase. With inertias held at their healthy values, a further error of the viscous
+    friction would compensate for it.
     """
     return None if reference is None else reference.loosened("Ia", _INERTIA_BY_PHASE)
 
 
 def _shifted(arm: Arm, amounts: Mapping[str, float]) -> Arm:
-    """The arm with channels that are later by so much [s], by cause."""
+    """The arm with channels later by these delays [s], by cause."""
     return replace(
         arm,
         motor_delay_s=arm.motor_delay_s + amounts.get(DELAYS["motor"].cause, 0.0),
@@ -263,15 +194,15 @@ def _shifted(arm: Arm, amounts: Mapping[str, float]) -> Arm:
     )
 
 
-def _unknown_delay(known: Arm, recordings: Sequence[Recording], claim: Claim) -> float:
-    """Delay [s] up to which a late channel may be what the arm is like, 0 where a healthy arm told what it is.
+def _unknown_delay(task: Task, claim: Claim) -> float:
+    """Largest delay [s] of a late channel on a healthy arm, 0 if a reference gives it.
 
-    A motor torque that is published by another clock than the positions waits for a tick of its own and for the
-    next packet: that much is a property of the controller's program, and no fault that could be told from it.
+    A motor torque published by another clock than the positions waits for a tick of its own and for the next packet:
+    a property of the controller's program, indistinguishable from a fault of this size.
     """
-    if known.encoder_known or claim.trial.candidate.effect.channel != "motor":
+    if task.arm.encoder_known or claim.trial.candidate.effect.channel != "motor":
         return 0.0
-    stretches = [s for r in recordings for s in r.stretches if len(s.motor_time) > 1]
+    stretches = [s for r in task.recordings for s in r.stretches if len(s.motor_time) > 1]
     own = max(float(np.median(np.diff(s.motor_time))) for s in stretches)
     positions = max(float(np.median(np.diff(s.time))) for s in stretches)
     return own + positions if own > 1.5 * positions else 0.0
@@ -279,9 +210,9 @@ def _unknown_delay(known: Arm, recordings: Sequence[Recording], claim: Claim) ->
 
 def _own_delay(claim: Claim, limit: float) -> str:
     return (
-        f"motor torques come {1e3 * _made(claim):.1f} ms after the positions, which was corrected; without a reference "
-        f"nobody knows how late they are when all is well, so less than {1e3 * limit:.0f} ms, a sample of each "
-        "channel, is no finding"
+        f"motor torques come {1e3 * _made(claim):.1f} ms after the positions; this delay was corrected. Without a "
+        f"reference the healthy delay is unknown, so a delay below {1e3 * limit:.0f} ms (one sample of each channel) "
+        "is not reported as a finding"
     )
 
 
@@ -294,17 +225,14 @@ def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:
 
 
 def _late_in_all_joints(bench: Bench, claim: Claim) -> bool:
-    """Whether a channel is as late in the other joints as in the one that says most of it: drag that resembles a delay
-    is in one joint.
-    """
+    """Whether the other joints confirm the delay of the joint with most of the evidence, unlike drag in one joint."""
     evidence = bench.evidence
     evidence.replace([])
     padded = evidence.padded(bench.dictionary.rows(claim.trial.candidate, Shape(delay=_UNIT_S)))
     if len(padded) < _MOST_ALONE:
         return True
     loudest = max(padded, key=lambda key: evidence.score({key: padded[key]}).fitted)
-    delay, std = _delay_of(
-        evidence.score({key: columns for key, columns in padded.items() if key != loudest})
-    )
+    others = {key: columns for key, columns in padded.items() if key != loudest}
+    delay, std = _delay_of(evidence.score(others))
     made = _made(claim)
     return abs(delay - made) < 0.5 * abs(made) + 4.0 * std

@@ -1,4 +1,4 @@
-"""How much was gained: errors on rows that were not fitted, before and after, with intervals from blocks."""
+"""Errors on held-out rows, before and after an extension, with intervals from blocks."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ _DRAWS = 1000
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Residual (m, n) [Nm] by side on rows that were not fitted, NaN elsewhere, and the blocks
-    (m,) of rows.
-    """
+    """Residual (m, n) [Nm] by side on held-out rows, NaN elsewhere, and the blocks (m,) of rows."""
 
     residual: dict[str, Floats]
     block: dict[str, Floats]
 
     def where(self, other: HeldOut) -> HeldOut:
-        """The same on the rows that `other` has too: a channel that is put in time is used in other rows."""
+        """The same on the rows of `other`: a shift in time changes the usable rows of a channel."""
         residual = {
             side: np.where(np.isfinite(other.residual[side]), values, np.nan)
             for side, values in self.residual.items()
@@ -42,9 +40,9 @@ class HeldOut:
 
 
 def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
-    """Residuals with the base and further columns: on the test sessions where there are any, else
-    on each part
-    of the motion as predicted from the others."""
+    """Residuals with the base and further columns: on the test sessions if there are any, else on each part of the
+    motion as predicted from the others.
+    """
     evidence.replace(extra)
     rows = evidence.nominal.rows
     if any(side.test.any() for side in rows.values()):
@@ -67,18 +65,13 @@ def interval(
     difference = np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2])
     total = table.sum(axis=0)
     low, high = np.quantile(difference, [0.025, 0.975])
-    return (
-        float(np.sqrt(total[0] / total[2])),
-        float(np.sqrt(total[1] / total[2])),
-        float(low),
-        float(high),
-    )
+    return float(np.sqrt(total[0] / total[2])), float(np.sqrt(total[1] / total[2])), float(low), float(high)
 
 
 def fall(before: HeldOut, after: HeldOut, weights: Mapping[Key, float], seed: int) -> tuple[float, float]:
     """95 % interval of the fall of the weighted sum of squares over the rows of all keys, from draws of blocks.
 
-    weights : of a row's square, by side and joint [1/Nm^2]. Zeros where there are no rows.
+    weights : of a row's square, by side and joint [1/Nm^2]. Zeros without rows.
     """
     table = _by_block(before, after, weights)
     if not len(table):
@@ -102,7 +95,7 @@ def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> 
 
 
 def _drawn(table: Floats, seed: int) -> Floats:
-    """Sums (draws, 3) over as many blocks as there are, drawn with replacement."""
+    """Sums (draws, 3) over the same number of blocks, drawn with replacement."""
     rng = np.random.default_rng(seed)
     drawn: Floats = table[rng.integers(0, len(table), (_DRAWS, len(table)))].sum(axis=1)
     return drawn

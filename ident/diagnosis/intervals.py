@@ -1,17 +1,17 @@
-"""Parameters of a finding with standard deviations that cover: all parameters at a time, from phases of the motion.
+"""Parameters of a finding with their standard deviations, jointly estimated, from phases of the motion.
 
-The torque of a finding is not linear in the parameters of its shape. Around the shape that was chosen, columns of
-the derivatives stand beside the cause's own, and everything is fitted at a time: base parameters, tolerated
-deviations, all other findings. The derivatives' coefficients are the last step of a Gauss-Newton fit, so values are
-those of the least squares in all parameters and not of one after the other.
+The torque of a finding is nonlinear in the parameters of its shape. Columns of the derivatives at the chosen shape
+stand beside the cause's own, and everything is fitted jointly: base parameters, tolerated deviations, all other
+findings. The derivatives' coefficients are the last step of a Gauss-Newton fit, so the values are the least-squares
+solution in all parameters.
 
-What a model gets wrong repeats where the motion repeats, so the same phases of all periods of a session are one
-observation. Their scores `s_k = X_k' r_k` give the covariance, each corrected for what the fit leans towards its own
-phase, so that with noise alone it is exactly that of least squares (Bell and McCaffrey, Survey Methodology 28 (2002)):
+Model errors repeat with the motion, so the same phases of all periods of a session are one observation. Their scores
+`s_k = X_k' r_k` give the covariance, each corrected for the leverage of its phase. With noise alone it equals the
+covariance of least squares (Bell and McCaffrey, Survey Methodology 28 (2002)):
 
     V = sum_k g_k g_k' + G^-1 P G^-1,  g_k = G^-1/2 (1 - A_k)^-1/2 G^-1/2 s_k,  A_k = G^-1/2 X_k' X_k G^-1/2
 
-with `G = sum_k X_k' X_k + P`, P the precision of what a reference says.
+with `G = sum_k X_k' X_k + P`, P the precision of the reference.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 
 __all__ = ["Estimate", "estimated", "phases_of"]
 
-# Largest last step of a shape parameter, over its value: what is linear about a shape is no longer so further away.
+# Largest last step of a shape parameter over its value, for the linearisation to hold.
 _NEAR = 0.3
-# Least share of a direction that other phases must know; of less nothing can be told from one phase.
+# Least share of the information on a direction from the other phases.
 _LEAST_REST = 0.05
 
 Estimate = tuple[dict[str, float], dict[str, float]]
@@ -36,9 +36,9 @@ Estimate = tuple[dict[str, float], dict[str, float]]
 
 
 def estimated(dictionary: Dictionary, evidence: Evidence, trial: Trial) -> Estimate:
-    """Values and standard deviations of a trial's parameters beside the columns that the evidence holds.
+    """Values and standard deviations of a trial's parameters beside the present columns of the evidence.
 
-    The evidence is left as it was. Shape parameters that are chosen and not fitted have no standard deviation.
+    The evidence is restored. Shape parameters chosen from a grid have no standard deviation.
     """
     effect, shape = trial.candidate.effect, trial.shape
     moved, rows = _with_derivatives(dictionary, trial)
@@ -65,7 +65,7 @@ def estimated(dictionary: Dictionary, evidence: Evidence, trial: Trial) -> Estim
 
 
 def phases_of(evidence: Evidence) -> NDArray[np.int64]:
-    """Number (blocks,) of the phase of the motion that each block belongs to: the same in all periods of a session."""
+    """Number (blocks,) of each block's phase of the motion, the same in all periods of a session."""
     numbers: dict[tuple[int, int], int] = {}
     found = np.zeros(evidence.blocks, dtype=np.int64)
     recordings = {r.number: r for r in evidence.nominal.recordings}
@@ -77,7 +77,7 @@ def phases_of(evidence: Evidence) -> NDArray[np.int64]:
 
 
 def _with_derivatives(dictionary: Dictionary, trial: Trial) -> tuple[Sequence[str], Rows]:
-    """Names of the shape parameters that the torque depends on, and the trial's columns with the derivatives."""
+    """Names of the shape parameters with an influence on the torque, and the trial's columns with the derivatives."""
     shape = trial.shape
     parts: dict[Key, list[Floats]] = {key: [columns] for key, columns in trial.rows.items()}
     moved = []
@@ -85,12 +85,8 @@ def _with_derivatives(dictionary: Dictionary, trial: Trial) -> tuple[Sequence[st
         step = 0.02 * abs(shape[name]) or 0.02
         upper = dictionary.rows(trial.candidate, shape.at(**{name: shape[name] + step}))
         lower = dictionary.rows(trial.candidate, shape.at(**{name: shape[name] - step}))
-        derivative = {
-            key: ((upper.get(key, 0.0) - lower.get(key, 0.0)) / (2.0 * step) @ trial.score.coefficients)[
-                :, None
-            ]
-            for key in trial.rows
-        }
+        slopes = {key: (upper.get(key, 0.0) - lower.get(key, 0.0)) / (2.0 * step) for key in trial.rows}
+        derivative = {key: (slope @ trial.score.coefficients)[:, None] for key, slope in slopes.items()}
         if any(np.any(column) for column in derivative.values()):
             moved.append(name)
             for key, column in derivative.items():
@@ -106,7 +102,7 @@ def _clustered(evidence: Evidence) -> Floats:
     scores = target - gram @ evidence.full.values
     inverse = evidence.full.inverse
     size = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-    # A root R of the inverse, R R' = G^-1; any will do, for A_k turns with it.
+    # Any root R of the inverse, R R' = G^-1, for A_k turns with it.
     values, vectors = np.linalg.eigh(inverse / np.outer(size, size))
     root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     covariance = np.zeros_like(inverse)

@@ -1,9 +1,9 @@
-"""The commissioned arm: what its healthy sessions taught, kept in the provenance of its model.
+"""The healthy-arm baseline from commissioning, stored in the provenance of its model.
 
-A reference ties the base parameters to their healthy values, within their uncertainty and a tolerance for
-what changes from day to day, so that causes show which the parameters would otherwise absorb. It also holds
-the noise, the delays and the stiffness of the healthy arm, and the gain that each candidate reached in the mean
-where nothing was wrong, from which follows what a claim must exceed.
+A reference ties the base parameters to their healthy values, within their uncertainty and a tolerance for changes
+from day to day. Causes otherwise absorbed by the parameters become visible. It also holds the noise, the delays and
+the stiffness of the healthy arm, and the mean gain of each candidate in healthy sessions: the basis of the least gain
+of a claim.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ident.model import DynamicModel
 __all__ = ["DELAY_STD_S", "Reference"]
 
 DELAY_STD_S = 2e-4
-"""Standard deviation [s] of a healthy channel's delay from day to day where few sets or none tell it."""
+"""Usual standard deviation [s] of a healthy channel's delay from day to day."""
 
 _KEY = "commissioning"
 _WIDER = 1.5
@@ -40,7 +40,7 @@ class Reference:
     model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
     noise : of a row [Nm] by side, (n,). null : mean gain of each candidate by (cause, joint from 0).
     sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
-    reach : (n,) of presliding [rad], None where unknown. far, far_share : (n,) see `nominal.Arm`.
+    presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal.Arm`.
     delay_std_s : of the channels' delays from day to day, by side.
     """
 
@@ -52,14 +52,14 @@ class Reference:
     null: Mapping[tuple[str, int], float]
     sets: int
     encoder: Literal["link", "motor"] = "link"
-    reach: Floats | None = None
+    presliding: Floats | None = None
     far: Floats | None = None
     far_share: Floats | None = None
     delay_std_s: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, model: DynamicModel) -> Reference:
-        """From a model file that `lwr-run commission` wrote; other models give their parameters alone."""
+        """From a model file of `lwr-run commission`; other models give their parameters alone."""
         n = model.structure.chain.n
         stored = model.provenance.get(_KEY)
         if not isinstance(stored, Mapping):
@@ -71,7 +71,7 @@ class Reference:
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
-            reach, far, far_share = (
+            presliding, far, far_share = (
                 np.array(stored[name], dtype=np.float64) if stored.get(name) else None
                 for name in ("reach", "far", "far_share")
             )
@@ -84,7 +84,7 @@ class Reference:
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
         side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
-        return cls(model, compliance, *delays, noise, null, sets, side, reach, far, far_share, delay_std)
+        return cls(model, compliance, *delays, noise, null, sets, side, presliding, far, far_share, delay_std)
 
     def stored(self) -> dict[str, Any]:
         """Content for the provenance of the model."""
@@ -100,26 +100,26 @@ class Reference:
                 },
                 "sets": self.sets,
                 "encoder": self.encoder,
-                "reach": _listed(self.reach),
+                "reach": _listed(self.presliding),
                 "far": _listed(self.far),
                 "far_share": _listed(self.far_share),
             }
         }
 
     def limits(self) -> dict[tuple[str, int], float]:
-        """Gain of each candidate by (cause, joint from 0) that a healthy set stays below, but for one in a hundred.
+        """Upper 1 % limit of each candidate's gain in a healthy set, by (cause, joint from 0).
 
-        How much a candidate finds in a healthy set differs from set to set: the arm is never quite the nominal
-        one. Taken as a deviation with a normal distribution over sets, whose square is the gain, a further set's
-        gain over the mean of `sets` of them has Fisher's distribution F(1, sets). Few sets know their own mean
-        badly, so that of the same cause in all joints counts as further sets.
+        The gain of a candidate differs between healthy sets, for the arm is never quite the nominal one. It is
+        modelled as the square of a normally distributed deviation. Then the gain of a further set over the mean of
+        `sets` of them has Fisher's distribution F(1, sets). The mean of a few sets is uncertain, so the mean of the
+        same cause over all joints counts as further sets.
         """
         if not self.sets:
             return {}
         by_cause: dict[str, list[float]] = {}
         for (cause, _), gain in self.null.items():
             by_cause.setdefault(cause, []).append(gain)
-        # What noise alone gives to a candidate has no such tail; the smallest gain of a claim sees to it.
+        # The gain from noise alone has no such tail; the least gain of a claim accounts for it.
         noise = float(np.median(list(self.null.values()))) if self.null else 0.0
         sets = self.sets + _AS_SETS
         quantile = fisher_limit(_ONE_IN, 1, sets)
@@ -130,7 +130,7 @@ class Reference:
         return found
 
     def loosened(self, symbol: str, share: float) -> Reference:
-        """The same, but parameters of a symbol, such as `Ia`, known to that share of their value at best."""
+        """The same with parameters of a symbol, such as `Ia`, uncertain by at least that share of their value."""
         model = self.model
         if model.covariance is None:
             return self
@@ -139,9 +139,9 @@ class Reference:
         return replace(self, model=replace(model, covariance=model.covariance + more))
 
     def prior(self, base: BaseSet) -> tuple[Floats, Floats] | None:
-        """Precision (p, p) and values (p,) of base parameters that mean the same in the reference.
+        """Precision (p, p) and values (p,) of the base parameters shared with the reference.
 
-        None where the reference has no covariance or none of them.
+        None for a reference without covariance or without shared parameters.
         """
         own = self.model
         if own.covariance is None or own.base is None:
@@ -154,9 +154,10 @@ class Reference:
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
         covariance = own.covariance[np.ix_(there, there)] * _WIDER**2
         values = own.values[there]
-        # Several sets tell by themselves what changes from day to day; one set cannot.
+        # Several sets show the changes from day to day themselves; one set cannot.
         share = 1.0 if self.sets < 3 else 0.25
-        tolerance = share * np.array([_tolerance(base.names[b]) for b in here]) * np.abs(values)
+        change = [_DAY_TO_DAY.get(_symbol(base.names[b]), _ELSE) for b in here]
+        tolerance = share * np.array(change) * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
         precision = np.zeros((len(base), len(base)))
@@ -170,10 +171,6 @@ def _listed(values: Floats | None) -> list[float] | None:
     return None if values is None else [float(v) for v in values]
 
 
-def _tolerance(name: str) -> float:
-    return _DAY_TO_DAY.get(_symbol(name), _ELSE)
-
-
 def _symbol(name: str) -> str:
     """Symbol of a base parameter: without joint and mark of regrouping."""
     return name.rstrip("R").rstrip("0123456789")
@@ -185,7 +182,7 @@ def _split(key: str) -> tuple[str, int]:
 
 
 def _same(a: BaseSet, b: BaseSet) -> list[tuple[int, int]]:
-    """Pairs of base parameters that stand for the same sum of standard parameters in two sets."""
+    """Pairs of base parameters of two sets with the same sum of standard parameters."""
     rows_a = [_combination(a, k) for k in range(len(a))]
     rows_b = {_combination(b, k): k for k in range(len(b))}
     return [(k, rows_b[row]) for k, row in enumerate(rows_a) if row in rows_b]

@@ -1,4 +1,4 @@
-"""The diagnosis as a value: findings, what is unexplained, what was gained; as text and as plain content."""
+"""The diagnosis as a value: findings, unexplained remainders, gain; as text and as plain content."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Evident:
-    """Evidence of a finding. test_rms [Nm] over the rows that it acts on; interval of their difference."""
+    """Evidence of a finding. test_rms [Nm] over the affected rows; interval of their difference."""
 
     delta_bic: float
     p_value: float
@@ -49,9 +49,10 @@ class Evident:
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions,
-    where it says so.
-    alternatives : (cause, joints, delta_bic). gain : fall of the held-back chi-square."""
+    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions, or None.
+
+    alternatives : (cause, joints, delta_bic). gain : fall of the cross-validated chi-square.
+    """
 
     cause: str
     side: str
@@ -117,7 +118,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is there but has no name, in the rows of a joint (from 1) and side."""
+    """An unnamed remainder in the rows of a joint (from 1) and side."""
 
     side: str
     joint: int
@@ -141,11 +142,10 @@ class SimulationError:
 
 @dataclass(frozen=True, eq=False)
 class RowStates:
-    """Where the arm was in the m rows of a side: what residuals can be held against.
+    """State of the arm in the m rows of a side, for plots of residuals.
 
     time : (m,) [s] in the session. session : (m,) number in the order of the sessions, from 0. block : (m,) of
-    rows that are taken to depend on each other. position, speed, load : (m, n) [rad, rad/s, Nm] of each joint,
-    the load as the model predicts it.
+    mutually dependent rows. position, speed, load : (m, n) [rad, rad/s, Nm] of each joint, with the predicted load.
     """
 
     time: Floats
@@ -158,13 +158,13 @@ class RowStates:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Everything that was found; prints itself.
+    """Result of a diagnosis; prints itself.
 
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
-    notes : sentences on what could not be seen or used.
-    residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN where a row is not
-    used. states : where the arm was in these rows, by side.
+    notes : sentences on limits of the data.
+    residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
+    states : of the arm in these rows, by side.
     """
 
     train: tuple[str, ...]
@@ -187,7 +187,7 @@ class Diagnosis:
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Content of `diagnosis.json`. Errors of a simulation that was not made are null."""
+        """Content of `diagnosis.json`, with null for missing simulation errors."""
         none = {"motor": None, "joint": None, "position": None}
         base = self.simulation_base.to_dict() if self.simulation_base else none
         extended = self.simulation_extended.to_dict() if self.simulation_extended else none

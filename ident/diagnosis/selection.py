@@ -1,9 +1,9 @@
-"""Which causes the data carry: greedy acceptance, second thoughts, look-alikes, and what they leave.
+"""Selection of causes: greedy acceptance, reconsideration, look-alikes, remainders.
 
-A round scores every candidate against the base with what was accepted before, takes the best if the data
-carry it, and asks each earlier one again: whether it is still needed, and whether another cause or joint now
-does better in its place. Small deviations of the nominal arm (sub-millisecond delays, joint stiffness) are
-columns of the base as long as they stay within their tolerance, so they neither hide nor feign a cause.
+A round scores every candidate beside the base and the accepted causes, and accepts the best with enough evidence.
+Then it reconsiders each earlier one: it may be unnecessary now, or another cause or joint may be better in its place.
+Small deviations of the nominal arm (sub-millisecond delays, joint stiffness) are columns of the base within their
+tolerance, so they neither hide nor mimic a cause.
 """
 
 from __future__ import annotations
@@ -25,16 +25,37 @@ __all__ = ["Claim", "Null", "Selection", "best_candidate", "confidence", "gains"
 
 log = logging.getLogger(__name__)
 
+# Obvious evidence, over the usual one.
+_PLAIN = 10.0
+# Number of foremost trials with refined shapes.
+_CONTEST = 4
+# Least share of a claim's power in the rows of a rival.
+_SAME_ROWS = 0.2
+# Remainder of a law over its gain, and least share of a trial's power in the rows of that law's joint to be it.
+_LAW_ERROR, _MOSTLY = 0.1, 0.8
+# Least time between two separate pushes [s].
+_PAUSE_S = 0.2
+# Least gain of `best_candidate`.
+_LEAST_GAIN = 10.0
+# Factor on the tolerance for a whole channel's delay with a known healthy delay.
+_KNOWN_DELAY = 0.4
+# The same for a stiffness behind published motors.
+_KNOWN_COMPLIANCE = 0.4
+# Confidence in a sensor's error with a record of the joint torque only.
+_SHAPE_ALONE = 0.7
+# Confidence in one of two causes of the same torque in these motions.
+_EITHER = 0.5
+
 Null = Mapping[tuple[str, int], float]
-"""Gain of each candidate that a healthy set stays below."""
+"""Upper limit of each candidate's gain in a healthy set."""
 
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """An accepted trial: its score beside all other claims, and the candidates that do almost as well.
+    """An accepted trial: its score beside all other claims, and the candidates of similar gain.
 
-    outdone : a rival that the data do not carry does better on the same rows. weak : too little for a claim by
-    itself, and a finding only where held-out sessions bear it out.
+    outdone : a rival without enough evidence of its own has a larger gain in the same rows. weak : not enough
+    evidence for a claim by itself; a finding only if held-out sessions confirm it.
     """
 
     trial: Trial
@@ -46,7 +67,7 @@ class Claim:
 
     @property
     def gain(self) -> float:
-        """Fall of the held-back chi-square when it is added to all others."""
+        """Fall of the cross-validated chi-square by adding it to all others."""
         return self.score.gain
 
 
@@ -61,13 +82,11 @@ class Selection:
 
 
 def select(
-    dictionary: Dictionary,
-    evidence: Evidence,
-    settings: DiagnosisSettings,
-    null: Null | None = None,
+    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
 ) -> Selection:
-    """Accept causes one after the other until the data carry no more; where they carry none, the one that comes
-    nearest, if there are held-out sessions that it can be held against and a healthy arm told what is usual.
+    """Accept causes one after the other as long as the evidence suffices.
+
+    Without any, accept the best weak one, if there are held-out sessions for its test and gains of a healthy arm.
     """
     state = _State(dictionary, evidence, settings, null or {})
     state.tolerate([])
@@ -89,7 +108,7 @@ def select(
     while doubtful := [
         k for k, c in enumerate(claims) if c.outdone or state.leftover(c.trial, _others(claims, k))
     ]:
-        # What explains the same rows better is itself not carried by the data, or it is what another leaves.
+        # A better explanation of the same rows lacks evidence itself, or the claim is the remainder of another.
         accepted.pop(min(doubtful, key=lambda k: claims[k].gain))
         claims = [state.claim(accepted, k) for k in range(len(accepted))]
     state.tolerate(accepted)
@@ -100,7 +119,7 @@ def select(
 def gains(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> dict[tuple[str, int], float]:
-    """Gain of each candidate where nothing is accepted yet: what a healthy arm adds to the null."""
+    """Gain of each candidate before any acceptance, for the null of a healthy arm."""
     found = _State(dictionary, evidence, settings, {}).contenders([])
     return {t.candidate.key: max(t.score.gain, 0.0) for t in found}
 
@@ -108,11 +127,10 @@ def gains(
 def best_candidate(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> Selection | None:
-    """The best candidate as if it were accepted, whether the data carry it or not; None where none explains
-    anything.
+    """The best candidate as if accepted, even without enough evidence; None if none explains anything.
 
-    Where noise is known from the residual alone, a strong cause counts as noise until it is in the model: how
-    much it explains must be held against what it leaves.
+    With noise known from the residual alone, a strong cause counts as noise until it is in the model. Its gain must
+    be compared with its own residual.
     """
     state = _State(dictionary, evidence, settings, {})
     best = next(iter(state.contenders([])), None)
@@ -127,7 +145,7 @@ def _others(claims: Sequence[Claim], k: int) -> list[Trial]:
 
 
 def _same_moment(trial: Trial, other: Trial) -> bool:
-    """Whether two trials are one cause at one time: what a push leaves while it lasts is its own course."""
+    """Whether two trials are one cause at one time: the remainder of a push while it lasts."""
     one, two = trial.shape, other.shape
     if trial.candidate.key != other.candidate.key or not {"duration", "session"} <= set(one):
         return False
@@ -136,7 +154,7 @@ def _same_moment(trial: Trial, other: Trial) -> bool:
 
 
 def _lasting(trial: Trial) -> bool:
-    """Whether a trial says something about other motions: not what lasts a moment or is another in each session."""
+    """Whether a trial predicts other motions, unlike a brief event or a change between sessions."""
     effect = trial.candidate.effect
     return not effect.event and effect.side != "timing" and effect.mode(trial.shape) != "between"
 
@@ -156,7 +174,7 @@ def _follows(trial: Trial, other: Trial) -> bool:
 
 
 def _gain(trial: Trial) -> float:
-    """Gain by which candidates are ordered: of two that explain the same, the one with less freedom."""
+    """Gain for the order of candidates, with a penalty for freedom."""
     return trial.score.gain - 2.0 * trial.shape.freedom
 
 
@@ -174,46 +192,45 @@ class _State:
     # ---- tolerated deviations ----
 
     def tolerances(self) -> list[tuple[str, Rows, float, float]]:
-        """Name, rows, unit of the coefficient and tolerance of each deviation that is no finding."""
+        """Name, rows, unit of the coefficient and tolerance of each tolerated deviation."""
         if self._tolerances is not None:
             return self._tolerances
         nominal, found = self.dictionary.nominal, []
         limit = self.settings.delay_tolerance_s
         for side in nominal.rows:
-            candidate = Candidate(DELAYS[side], -1)
-            rows = self.dictionary.rows(candidate, Shape(delay=1e-3))
+            rows = self.dictionary.rows(Candidate(DELAYS[side], -1), Shape(delay=1e-3))
             if side == "motor":
                 found.append(("motor delay", rows, 1e-3, limit))
-                continue
-            found += self._joint_delays(rows, limit)
+            else:
+                found += self._joint_delays(rows, limit)
         if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
+            # Behind published motors the links' ringing shows the stiffness, known from the healthy arm.
+            known = nominal.arm.encoder == "motor" and nominal.arm.encoder_known
+            share = self.settings.compliance_tolerance * (_KNOWN_COMPLIANCE if known else 1.0)
+            shape = ELASTICITY.at_encoder(nominal.arm.encoder)
             for joint in range(nominal.arm.chain.n):
-                candidate = Candidate(ELASTICITY, joint)
-                rows = self.dictionary.rows(candidate, ELASTICITY.at_encoder(nominal.arm.encoder))
+                rows = self.dictionary.rows(Candidate(ELASTICITY, joint), shape)
                 if rows:
-                    # Behind published motors the links' ringing tells a stiffness that a healthy arm told once.
-                    told = nominal.arm.encoder == "motor" and nominal.arm.encoder_known
-                    share = self.settings.compliance_tolerance * (_TOLD_COMPLIANCE if told else 1.0)
                     size = share * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
         self._tolerances = found
         return found
 
     def _joint_delays(self, rows: Rows, limit: float) -> list[tuple[str, Rows, float, float]]:
-        """Tolerated delays of the torque sensors: one that all share, and what each differs from it by.
+        """Tolerated delays of the torque sensors: a common one, and the difference of each from it.
 
-        Each sensor has electronics of its own, so each may be late by itself. A delay of the whole channel is the
-        mean of them, weighted by what the rows say of each: seven sensors say it much better than one, and where
-        a healthy arm told what it was, a smaller one is a finding.
+        Each sensor has electronics of its own and a delay of its own. The delay of the whole channel is their mean,
+        weighted by the information in the rows. Seven sensors determine it much better than one, so with a known
+        healthy delay a smaller one is a finding.
         """
         evidence, keys = self.evidence, sorted(rows)
-        told = self.dictionary.nominal.arm.encoder_known
+        known = self.dictionary.nominal.arm.encoder_known
         weight = {
             key: float(np.sum(part**2)) / float(evidence.sigma[key[0]][key[1]] ** 2)
             for key, part in evidence.padded(rows).items()
         }
         best = max(keys, key=lambda key: weight[key])
-        found = [("joint delay", rows, 1e-3, (_TOLD_DELAY if told else 2.0) * limit)]
+        found = [("joint delay", rows, 1e-3, (_KNOWN_DELAY if known else 2.0) * limit)]
         for key in keys:
             if key != best and weight[best] > 0.0:
                 apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
@@ -221,19 +238,17 @@ class _State:
         return found
 
     def tolerate(self, accepted: Sequence[Trial]) -> None:
-        """Base with the accepted columns and with the deviations that stay within their tolerance."""
+        """Base with the accepted columns and the deviations within their tolerance."""
         entries = self.tolerances()
         fixed = [t.rows for t in accepted]
         self.evidence.replace([*fixed, *(rows for _, rows, _, _ in entries)])
         place = self.evidence.base_count + sum(_width(rows) for rows in fixed)
         values = self.evidence.full.values[place:]
-        inside = [
-            entry for entry, value in zip(entries, values, strict=True) if abs(value) * entry[2] <= entry[3]
-        ]
+        inside = [e for e, value in zip(entries, values, strict=True) if abs(value) * e[2] <= e[3]]
         if len(inside) < len(entries):
             self.evidence.replace([*fixed, *(rows for _, rows, _, _ in inside)])
         values = self.evidence.full.values[place:]
-        # A motion that says nothing about a deviation leaves its variance open.
+        # A motion without information on a deviation leaves its variance open.
         std = np.sqrt(np.maximum(np.diag(self.evidence.full.inverse), 0.0))[place:]
         self.nuisance = {
             name: (float(v) * unit, float(s) * unit)
@@ -252,7 +267,7 @@ class _State:
         return sorted(found, key=_gain, reverse=True)
 
     def simplest(self) -> list[Trial]:
-        """Best shapes of all candidates, without those that a special case of them explains as well."""
+        """Best shapes of all candidates, without those replaceable by a special case."""
         found = list(self.dictionary.trials())
         gain = {t.candidate.key: _gain(t) for t in found}
 
@@ -263,7 +278,7 @@ class _State:
         return [t for t in found if needed(t)]
 
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
-        """The foremost of the trials that is not just what the accepted ones leave, None where there is none."""
+        """The foremost of the trials, without remainders of the accepted ones; None if there is none."""
         refined: dict[tuple[str, int], Trial] = {}
         while carried:
             for trial in carried[:_CONTEST]:
@@ -277,21 +292,20 @@ class _State:
         return None
 
     def weak_claims(self) -> list[Trial]:
-        """The foremost of what takes less evidence because other motions can bear it out; none where there is none."""
+        """The foremost trial with less evidence, testable on other motions; empty if there is none."""
         self.weak = True
         found = [t for t in self.contenders([]) if _lasting(t) and self.carried(t)]
         best = self.next([], found)
         return [] if best is None else [best]
 
     def refined(self, trial: Trial) -> Trial:
-        """The trial with its shape at the best fit, where that is still carried: a fit that held-back parts
-        contradict is none."""
+        """The trial with its shape at the best fit, unless cross-validation contradicts that shape."""
         found = self.dictionary.refine(trial, self.choices(trial))
         return found if self.carried(found) else trial
 
     def foremost(self, accepted: Sequence[Trial], contest: Sequence[Trial]) -> Trial:
-        """The best of several trials; of those that come close, the one that leaves least together with the
-        deviations that are tolerated beside it.
+        """The best of several trials; of close ones, the one with the smallest remainder beside the tolerated
+        deviations.
         """
         top = max(_gain(t) for t in contest)
         close = [t for t in contest if _gain(t) > 0.7 * top]
@@ -305,35 +319,33 @@ class _State:
         return close[int(np.argmin(left))]
 
     def choices(self, trial: Trial) -> int:
-        """Number of shapes that an event was chosen from."""
+        """Number of shapes in the choice of an event."""
         return self.evidence.blocks if trial.candidate.effect.event else 1
 
     def carried(self, trial: Trial, score: Score | None = None) -> bool:
-        """Whether the data carry the trial: gain, significance, and size."""
+        """Whether the evidence for the trial suffices: gain, significance, and size."""
         score = trial.score if score is None else score
         settings = self.settings
         strict = trial.candidate.effect.evidence_factor * (settings.weak if self.weak else 1.0)
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
-        known = self.null.get(trial.candidate.key, 0.0)
-        least = max(least, known)
+        least = max(least, self.null.get(trial.candidate.key, 0.0))
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return score.gain > least
         if score.gain <= least or score.p_value >= settings.alpha_rare:
             return False
-        # What lasts a moment is large then, and little of the whole session.
+        # A brief event is large for a moment, and small in the whole session.
         size = np.inf if trial.candidate.effect.event else score.inflation * self.concentration(trial, score)
         needed = strict * settings.least_inflation
-        # What acts in a few blocks only cannot be significant by blocks, however large; predicting parts that were
-        # held back then tells.
+        # A cause in few blocks cannot be significant by blocks, however large; cross-validation decides instead.
         rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
         eased = rare or self.weak
         return size > needed and score.p_value < (settings.alpha_rare if eased else settings.alpha)
 
     def concentration(self, trial: Trial, score: Score) -> float:
-        """Rows that a trial acts on over the rows that it matters in: all over the effective number of them,
-        `(sum p)^2 / sum p^2` of the power p of its torque in the rows of each joint and side, in units of the noise.
+        """Number of a trial's groups of rows over their effective number `(sum p)^2 / sum p^2`.
 
-        A small turn of one joint's zero acts on every row, and shows in two or three.
+        p is the power of its torque in the rows of each joint and side, in units of the noise. A small turn of one
+        joint's zero acts on every row, and is visible in two or three.
         """
         if len(trial.rows) == 1:
             return 1.0
@@ -351,7 +363,7 @@ class _State:
         return found
 
     def share_at(self, trial: Trial, joint: int) -> float:
-        """Share of a trial's power that is in the rows of a joint."""
+        """Share of a trial's power in the rows of a joint."""
         powers = self.powers(trial, trial.score)
         return sum(p for (_, at), p in powers.items() if at == joint) / max(sum(powers.values()), 1e-300)
 
@@ -362,7 +374,7 @@ class _State:
         return rest
 
     def reconsider(self, accepted: list[Trial]) -> list[Trial]:
-        """Each of the accepted beside the others: drop it, refine it, or let another take its place."""
+        """Each of the accepted beside the others: drop it, refine it, or replace it."""
         if len(accepted) == 1:
             return accepted
         for _ in range(2):
@@ -395,9 +407,10 @@ class _State:
     # ---- claims ----
 
     def leftover(self, trial: Trial, others: Sequence[Trial]) -> bool:
-        """Whether a trial beside others is no more carried once the stronger ones in its rows may be of any form, or
-        is so small beside one of them, in the rows of its joint, that the least error of its law explains it; or
-        answers to one.
+        """Whether a trial is a remainder of the others.
+
+        It is one if it follows from another, if the least error of a stronger one's law explains it in the rows of
+        that joint, or if it lacks evidence beside model-form errors of the stronger ones in its rows.
         """
         wide = []
         if any(_follows(trial, other) for other in others):
@@ -405,9 +418,8 @@ class _State:
         for other in others:
             stronger = other.score.gain > trial.score.gain or _is_its_mean(trial, other)
             if stronger and set(trial.rows) & set(other.rows):
-                small = (
-                    trial.score.gain < _LAW_ERROR * other.score.gain and not other.candidate.effect.whole_arm
-                )
+                small = trial.score.gain < _LAW_ERROR * other.score.gain
+                small = small and not other.candidate.effect.whole_arm
                 if small and self.share_at(trial, other.candidate.joint) > _MOSTLY:
                     return True
                 rows = model_form_error(self.dictionary, other)
@@ -430,7 +442,7 @@ class _State:
             key=_gain,
             reverse=True,
         )
-        # What acts on other rows, or where this one hardly does, explains something else.
+        # A rival in other rows, or in rows with little power of this one, explains something else.
         mine = self.powers(again, again.score)
         least = _SAME_ROWS * sum(mine.values())
         rivals = [t for t in rivals if sum(mine.get(key, 0.0) for key in t.rows) > least]
@@ -440,7 +452,7 @@ class _State:
         sure = confidence(_gain(again), [g for _, g in scores])
         alike = tuple((c, g) for c, g in scores if _gain(again) - g < margin(_gain(again)))
         if here.candidate.effect.side == "sensor" and "motor" not in self.dictionary.nominal.rows:
-            # Without a motor torque nothing but the shape tells a sensor's error from a torque of the arm.
+            # Without a motor torque only the shape distinguishes a sensor's error from a torque of the arm.
             sure = min(sure, _SHAPE_ALONE)
             physical = (
                 (t.candidate, _gain(t))
@@ -451,7 +463,7 @@ class _State:
         twin = self.same_torque(here.candidate)
         if twin is not None:
             sure, alike = min(sure, _EITHER), (*alike, (twin, _gain(again)))
-        # Of moments many were tried, and one of them always suits somewhat.
+        # Of many times tried, one always fits to some degree.
         lasting = (t for t in close if not t.candidate.effect.event)
         outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
         return Claim(again, again.score, alike, sure, outdone, self.weak)
@@ -462,39 +474,15 @@ class _State:
         return next((c for c in self.dictionary.candidates if c.key == (cause, candidate.joint)), None)
 
 
-# How many times the usual evidence is plain to see.
-_PLAIN = 10.0
-# Of so many that come first the shapes are refined before one is taken.
-_CONTEST = 4
-# Share of a claim's power in the rows of a rival from which on both speak of the same.
-_SAME_ROWS = 0.2
-# Share of what a law explains that it may leave, and share of a trial's power in the rows of that law's joint from
-# which on the trial may be just that.
-_LAW_ERROR, _MOSTLY = 0.1, 0.8
-# Least time between two pushes that are told from one [s].
-_PAUSE_S = 0.2
-# Gain from which on it is worth seeing what a candidate leaves.
-_LEAST_GAIN = 10.0
-# Share of the tolerance for a whole channel's delay that is left where a healthy arm told what it is.
-_TOLD_DELAY = 0.4
-# The same of a stiffness behind published motors.
-_TOLD_COMPLIANCE = 0.4
-# Confidence in a sensor's error where only the joint torque was recorded.
-_SHAPE_ALONE = 0.7
-# Confidence in one of two causes that these motions show alike.
-_EITHER = 0.5
-
-
 def margin(gain: float) -> float:
-    """Difference of gains within which two causes are not told apart."""
+    """Largest difference of gains between indistinguishable causes."""
     return 12.0 + 0.1 * gain
 
 
 def confidence(gain: float, rivals: Sequence[float]) -> float:
-    """Probability that the best is the right one, among itself, its rivals and chance.
+    """Probability of the best cause among itself, its rivals and chance.
 
-    Gains are differences of chi-square, and count as such up to the misfit that any form of an effect has,
-    taken as 3 % of the gain.
+    Gains are differences of chi-square, up to the misfit of any effect's form, taken as 3 % of the gain.
     """
     scale = 2.0 * (1.0 + 0.03 * gain)
     others = sum(float(np.exp(-max(gain - g, 0.0) / scale)) for g in rivals)

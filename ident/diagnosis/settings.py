@@ -11,30 +11,28 @@ __all__ = ["DiagnosisSettings"]
 
 @dataclass(frozen=True)
 class DiagnosisSettings:
-    """How sessions become rows, and what it takes to make a claim.
+    """Settings of the rows and of the evidence for a claim.
 
-    bin_s : length of the mean that joint torque and regressor pass alike; motor torque too where
-    it is sampled
-        faster. Slower channels give a row a sample.
-    ringing_s : the same where the positions are the motors': about a period of the links' ringing on their
-    springs, which motors held by friction do not show.
-    cutoff_hz : zero-phase low-pass on the positions; lowered to a fifth of the sampling rate.
-    deflection_hz : low-pass on the torque from which the joints' twist is computed.
-    standstill_rad_s : below that speed the friction of a joint is unknown, and its row is left out.
-    reversal_s : rows this close to a reversal are left out: the motor may not have turned yet.
+    bin_s : averaging length of joint torque and regressor, and of a motor torque with a higher sampling rate.
+        Slower channels give one row per sample.
+    ringing_s : the same for positions of the motors: about one period of the links on their springs, invisible in
+        motors held by friction.
+    cutoff_hz : zero-phase low-pass on the positions; at most a fifth of the sampling rate.
+    deflection_hz : low-pass on the torque for the joints' twist.
+    standstill_rad_s : rows of a joint below this speed are left out, for their friction is unknown.
+    reversal_s : rows this close to a reversal are left out: the motor may reverse later.
     guard_s : joint rows this close to a joint's standstill are left out too.
-    block_s : length of the blocks that errors are taken to be independent between, and that are held back.
-    folds : number of parts of the motion that are held back in turn.
-    alpha : significance of a claim, each candidate by itself, from blocks. alpha_rare : of one that is plain to see
-    in what is held back, because a cause that acts in few blocks cannot be as significant.
-    least_gain : fall of the held-back chi-square that a claim takes at least.
-    weak : share of it and of `least_inflation` that a cause takes where nothing else is claimed, provided that the
-    held-out sessions bear it out for sure.
-    least_inflation : smallest relative excess of the residual's power in the affected rows that matters.
+    block_s : length of the blocks with independent errors, also for cross-validation.
+    folds : number of parts of the motion in cross-validation.
+    alpha : significance of a claim, each candidate by itself, from blocks. alpha_rare : for obvious causes in few
+        blocks, with a significance limited by the number of blocks.
+    least_gain : least fall of the cross-validated chi-square by a claim.
+    weak : factor on `least_gain` and `least_inflation` for a single weak claim confirmed by held-out sessions.
+    least_inflation : least relative excess of the residual's power in the affected rows.
     rounds : largest number of effects.
-    most_s : length of motion that is used; of longer sessions windows spread evenly.
-    delay_tolerance_s : delays of a channel up to this are a property of the arm, and no finding.
-    compliance_tolerance : relative deviation of the joints' compliance that is no finding.
+    most_s : largest length of motion in use; evenly spread windows of longer sessions.
+    delay_tolerance_s : largest delay of a channel as a property of the arm and not a finding.
+    compliance_tolerance : the same of the joints' compliance, as a relative deviation.
     """
 
     bin_s: float = 0.02
@@ -62,4 +60,4 @@ class DiagnosisSettings:
             if not getattr(self, name) > 0.0:
                 raise ConfigurationError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.folds < 2:
-            raise ConfigurationError(f"`folds` is {self.folds}; at least 2 are needed to hold one back")
+            raise ConfigurationError(f"`folds` is {self.folds}; cross-validation needs at least 2")

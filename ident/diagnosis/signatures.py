@@ -1,10 +1,10 @@
-"""Signatures: what a cause would leave in the rows after everything else was fitted again.
+"""Signatures: the remainder of a cause in the rows after a fit of everything else.
 
-A cause can be found only by the part of its torque that the base parameters, and the tolerated deviations of
-the nominal arm, cannot imitate: with rows weighted by their noise, the columns `X` of the cause less their
-projection on the columns `W` of the rest, `X - W (W' W)^-1 W' X`. Its length, in units of the noise, says whether
-the sessions can show the cause at all; the angle between the signatures of two causes says whether they can
-tell one from the other. Principal angles: Bjorck and Golub, Mathematics of Computation 27 (1973).
+A cause is found by the part of its torque outside the span of the base parameters and the tolerated deviations of
+the nominal arm: with rows weighted by their noise, the columns `X` of the cause minus their projection on the columns
+`W` of the rest, `X - W (W' W)^-1 W' X`. Its length, in units of the noise, measures the visibility of the cause in
+the sessions. The angle between the signatures of two causes measures their distinguishability. Principal angles:
+Bjorck and Golub, Mathematics of Computation 27 (1973).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
-from ident.effects import Form, Shape, find_effect
+from ident.effects import Form, find_effect
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
@@ -37,14 +37,14 @@ Cause = tuple[str, Sequence[int]]
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """What a cause does to the torques, as the sessions fit it.
+    """The torque of a cause in the rows of sessions.
 
-    cause, joints : see `Cause`. parameters, form : of the torque, those of the shape included.
+    cause, joints : see `Cause`. parameters, form : of the torque, including the shape.
     time, session : by side, (m,) of the rows [s] and their session's number.
-    torque : by side, (m, n) [Nm], the whole torque of the cause. left : the same without what the base
-    parameters make of it; NaN where a row is not used.
-    strength : length of `left` in units of the noise: the square is the fall of the chi-square that the cause
-    would bring. share : part of the torque's power that is left, 0 to 1.
+    torque : by side, (m, n) [Nm], the whole torque of the cause. left : the same without the part absorbed by the
+        base parameters; NaN in unused rows.
+    strength : length of `left` in units of the noise; its square is the fall of the chi-square by the cause.
+    share : remaining part of the torque's power, 0 to 1.
     """
 
     cause: str
@@ -71,7 +71,7 @@ def signature_bench(
 ) -> Bench:
     """The bench of a diagnosis of sessions, with the tolerated deviations of the nominal arm beside its base.
 
-    Raises DataError, with advice, for sessions that cannot be used.
+    Raises DataError, with advice, for unusable sessions.
     """
     settings = settings or DiagnosisSettings()
     if not sessions:
@@ -93,7 +93,7 @@ def signatures(
 ) -> tuple[Signature, ...]:
     """Signatures of causes on the rows fitted of a bench, each by itself beside the base.
 
-    parameters : a full set of values of each cause, None for those of the best fit. forms : their forms. Raises
+    parameters : a full set of values of each cause, None for the best fit. forms : their forms. Raises
     ConfigurationError for an unknown cause, DataError for one without a torque in these sessions.
     """
     none = [None] * len(causes)
@@ -102,12 +102,11 @@ def signatures(
 
 
 def overlap(a: Signature, b: Signature) -> float:
-    """Cosine, 0 to 1, of the angle between what is left of `a` and the nearest that `b` can do.
+    """Cosine, 0 to 1, of the angle between the signature of `a` and the span of the columns of `b`.
 
-    Of `b` the shape is kept and the coefficients are free, so of causes with one column each it is the cosine of
-    the angle between the two; 1 means that these sessions cannot tell `a` from `b`, 0 that neither hides the
-    other. `1 - overlap^2` is the share of the power of `a` that is still left beside `b`. Raises ValueError for
-    signatures of different benches.
+    The shape of `b` is fixed and its coefficients are free. 1: indistinguishable in these sessions; 0: neither hides
+    the other. `1 - overlap^2` is the remaining share of the power of `a` beside `b`. Raises ValueError for signatures
+    of different benches.
     """
     if len(a._columns) != len(b._columns):
         raise ValueError("the signatures come from different benches; make both from one")
@@ -125,26 +124,23 @@ def _signature(
     name, joints = cause
     effect = find_effect(name)
     candidate = Candidate(effect, -1 if effect.whole_arm else int(joints[0]) - 1)
-    rows: Rows
-    shape: Shape
     if values is None:
         trial = _fitted(bench, candidate)
-        shape, coefficients = trial.shape, trial.score.coefficients
-        rows = trial.rows
+        shape, coefficients, rows = trial.shape, trial.score.coefficients, trial.rows
     else:
         shape, coefficients = effect.shape_of(values, form), effect.coefficients_of(values)
         rows = bench.dictionary.rows(candidate, shape)
     if not any(np.any(part) for part in rows.values()):
         raise DataError(f"{name} leaves no torque in these sessions, so it has no signature")
-    # An effect of several forms has no more columns than the form has coefficients.
+    # A form may use fewer coefficients than its effect.
     coefficients = coefficients[: next(iter(rows.values())).shape[1]]
     evidence = bench.evidence
     padded = evidence.padded(rows)
     cross = evidence.products(padded).base.sum(axis=0)
-    lever = evidence.full.inverse @ cross.T
-    torque, left = _torques(bench, rows, lever, coefficients)
+    projection = evidence.full.inverse @ cross.T
+    torque, left = _torques(bench, rows, projection, coefficients)
     whole = _weighted(bench, rows, None)
-    columns = _weighted(bench, rows, lever)
+    columns = _weighted(bench, rows, projection)
     size = np.linalg.norm(columns @ coefficients)
     linear = {p.name: float(v) for p, v in zip(effect.linear, coefficients, strict=False)}
     return Signature(
@@ -164,7 +160,7 @@ def _signature(
 
 
 def _fitted(bench: Bench, candidate: Candidate) -> Trial:
-    """The candidate with the shape that the data like best, whether its coefficients make sense or not."""
+    """The candidate with its best shape, even with implausible coefficients."""
     dictionary = bench.dictionary
     best = dictionary.best(candidate)
     if best is not None:
@@ -181,9 +177,9 @@ def _fitted(bench: Bench, candidate: Candidate) -> Trial:
 
 
 def _torques(
-    bench: Bench, rows: Rows, lever: Floats, coefficients: Floats
+    bench: Bench, rows: Rows, projection: Floats, coefficients: Floats
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """Torque (m, n) [Nm] by side, and what is left of it where rows are used."""
+    """Torque (m, n) [Nm] by side, and its remainder in the rows in use."""
     torque, left = {}, {}
     for side, side_rows in bench.nominal.rows.items():
         torque[side] = np.zeros(side_rows.target.shape)
@@ -191,20 +187,20 @@ def _torques(
             if of_side == side:
                 torque[side][:, joint] = columns @ coefficients
         used = side_rows.valid & ~side_rows.test[:, None]
-        rest = torque[side] - bench.evidence.predicted(side, lever @ coefficients)
+        rest = torque[side] - bench.evidence.predicted(side, projection @ coefficients)
         left[side] = np.where(used, rest, np.nan)
     return torque, left
 
 
-def _weighted(bench: Bench, rows: Rows, lever: Floats | None) -> Floats:
-    """Columns (all rows used, k) in units of the noise, less their image in the present columns."""
+def _weighted(bench: Bench, rows: Rows, projection: Floats | None) -> Floats:
+    """Columns (all rows used, k) in units of the noise, minus their projection on the present columns."""
     evidence = bench.evidence
     width = next(iter(rows.values())).shape[1]
     parts = []
     for side, side_rows in bench.nominal.rows.items():
         images = None
-        if lever is not None:
-            images = [evidence.predicted(side, lever[:, k]) for k in range(width)]
+        if projection is not None:
+            images = [evidence.predicted(side, projection[:, k]) for k in range(width)]
         for joint in range(side_rows.target.shape[1]):
             key: Key = (side, joint)
             used = side_rows.valid[:, joint] & ~side_rows.test

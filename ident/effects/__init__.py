@@ -8,11 +8,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from fri.errors import ConfigurationError
-from ident.effects import drive, link, load, sensor, timing
+from ident.dynamics.structure import Side
+from ident.effects import channel, drive, link, load
 from ident.effects.effect import (
     Column,
     Effect,
@@ -25,7 +28,7 @@ from ident.effects.effect import (
     Shape,
     Simulated,
 )
-from ident.effects.motion import Motion
+from ident.effects.motion import Floats, Motion
 from ident.effects.words import Values, spoken
 
 __all__ = [
@@ -46,16 +49,21 @@ __all__ = [
     "Setting",
     "Shape",
     "Simulated",
+    "check_entry",
     "described",
+    "effects_torque",
     "find_effect",
+    "parameter_values",
     "summary_of",
 ]
+
+_ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 
 PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 ZERO_OFFSET = link.JointZeroOffset()
-LOST_SAMPLES = timing.LostSamples()
-DELAYS = {"motor": timing.MotorTorqueDelay(), "joint": timing.JointTorqueDelay()}
+LOST_SAMPLES = channel.LostSamples()
+DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
 """The effect of a late channel, by side."""
 
 EFFECTS: dict[str, Effect] = {
@@ -79,12 +87,12 @@ EFFECTS: dict[str, Effect] = {
         ZERO_OFFSET,
         link.EncoderEccentricity(),
         load.Contact(),
-        sensor.SensorGain(),
-        sensor.SensorCrosstalk(),
-        sensor.SensorHysteresis(),
-        sensor.SensorSaturation(),
-        sensor.SensorOffsetDrift(),
-        sensor.SensorRipple(),
+        channel.SensorGain(),
+        channel.SensorCrosstalk(),
+        channel.SensorHysteresis(),
+        channel.SensorSaturation(),
+        channel.SensorOffsetDrift(),
+        channel.SensorRipple(),
         *DELAYS.values(),
         LOST_SAMPLES,
     )
@@ -101,7 +109,7 @@ def find_effect(cause: str) -> Effect:
 
 
 def summary_of(cause: str) -> str:
-    """What is wrong, in a few words; the name itself of a cause from a file of another version."""
+    """The fault in a few words; the name itself of a cause from a file of another version."""
     return EFFECTS[cause].summary if cause in EFFECTS else spoken(cause)
 
 
@@ -118,3 +126,52 @@ def described(cause: str, values: Values, form: Any, names: Sequence[str]) -> st
         except (ConfigurationError, KeyError):
             return "; ".join(Effect.sentence(effect, values, None, names))
     return ", ".join(f"{spoken(name)} {value:.4g} {unit}" for name, (value, _, unit) in values.items())
+
+
+def check_entry(entry: Mapping[str, Any], joints: int) -> None:
+    """Check an entry of a model's effects: known cause and parameters, joints from 1 to `joints`.
+
+    Raises ConfigurationError with the entry, the value and the allowed ones.
+    """
+    unknown = set(entry) - _ENTRY
+    if unknown or not {"cause", "joints", "parameters"} <= set(entry):
+        raise ConfigurationError(
+            f"effect {dict(entry)!r}: an entry has the keys cause, side, joints, form if there are several, "
+            "parameters, each with value, std, unit"
+        )
+    effect = find_effect(str(entry["cause"]))
+    numbers = list(entry["joints"])
+    if any(not isinstance(j, int) or not 1 <= j <= joints for j in numbers):
+        raise ConfigurationError(f"effect {effect.cause}: joints {numbers} must lie between 1 and {joints}")
+    if effect.whole_arm == bool(numbers):
+        wanted = "no joint, for it belongs to the whole arm" if effect.whole_arm else "the joints it acts on"
+        raise ConfigurationError(f"effect {effect.cause}: `joints` is {numbers}; give {wanted}")
+    effect.check(entry["parameters"], entry.get("form"))
+
+
+def parameter_values(entry: Mapping[str, Any]) -> dict[str, float]:
+    """Values of an entry's parameters by name."""
+    return {
+        name: float(value["value"] if isinstance(value, Mapping) else value)
+        for name, value in entry["parameters"].items()
+    }
+
+
+def effects_torque(
+    entries: Iterable[Mapping[str, Any]], motion: Motion, *, side: Side, measured: bool = False
+) -> Floats:
+    """Torque (N, n) [Nm] added to one side by the entries of a model's effects.
+
+    measured : add the errors of the sensors to the physics. Events (a contact, a loosened payload) and delayed
+    channels are properties of a session, not of the arm, and are left out.
+    """
+    total = np.zeros_like(motion.q)
+    for entry in entries:
+        effect = find_effect(str(entry["cause"]))
+        if effect.event or effect.side == "timing" or (effect.side == "sensor" and not measured):
+            continue
+        values = parameter_values(entry)
+        for joint in entry["joints"] or [1]:
+            motor, link = effect.torque(motion, int(joint) - 1, values, entry.get("form"))
+            total += motor if side == "motor" else link if side == "joint" else motor - link
+    return total

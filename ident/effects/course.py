@@ -1,6 +1,6 @@
-"""The course of what drifts: within each session, from one session to the next, or since the reference.
+"""The course of a drift: within each session, from one session to the next, or since the reference.
 
-Between two sessions a zero moves, or a drive cools down, by whatever it likes. Compared with a reference each session
+Between two sessions a zero moves, or a drive cools down, by an unknown amount. Compared with a reference each session
 then has a value of its own: a level of the first ones and a step to the later ones. One number for all of them would
 leave the rest to any cause with another mean in each session. Without a reference the base parameters hold the level,
 and only the step shows.
@@ -8,13 +8,12 @@ and only the step shows.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from ident.effects.effect import Effect, Form, Parameter, Parameters, Setting, Shape
+from ident.effects.effect import Effect, Form, FormName, Parameter, Parameters, Setting, Shape
 from ident.effects.motion import Floats, Motion, first_order
 from ident.effects.words import Values, quantity
 
@@ -22,7 +21,13 @@ __all__ = ["TIME_CONSTANT", "Course", "Drifting"]
 
 TIME_CONSTANT = (
     Parameter("time_constant", "s", "within a session", shape=True, low=0.0),
-    Parameter("since", "1", "number of the first session after a change between the sessions", shape=True),
+    Parameter(
+        "since",
+        "1",
+        "number of the first session after a change between the sessions",
+        shape=True,
+        fixed=True,
+    ),
 )
 # Time constants to begin with, over the longest session: from a part of it to a steady drift.
 _SHARES = (0.15, 0.4, 1.0, 5.0)
@@ -41,13 +46,17 @@ class Course(Form):
 
 
 class Drifting(Effect):
-    """An effect with a course in time; its first parameter is the change, its second one the level of all sessions."""
+    """An effect with a course in time; its first parameter is the change, its second one the level of all sessions.
 
+    courses : forms of the drift within a session.
+    """
+
+    courses: ClassVar[tuple[Course, ...]]
     forms = Course
     depends_on = "time"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """From a fifth of the session to a steady drift, and between sessions where there are several."""
+        """From a fifth of the session to a steady drift, and between sessions if there are several."""
         longest = max(setting.durations_s)
         step = Course.LEVEL_AND_STEP if setting.compared else Course.STEP
         return [
@@ -61,18 +70,9 @@ class Drifting(Effect):
         """Those within a session, and all between sessions."""
         return (*self.courses, Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE)
 
-    @property
-    @abstractmethod
-    def courses(self) -> tuple[Course, ...]:
-        """Forms of the drift within a session."""
-
     def mode(self, shape: Shape) -> Literal["within", "between"]:
         """Within a session or between sessions."""
         return "within" if shape.form in (Course.WITHIN, Course.HEATED) else "between"
-
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """The time constant, where there is one."""
-        return ("time_constant",) if "time_constant" in shape else ()
 
     def course(self, motion: Motion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
@@ -89,15 +89,15 @@ class Drifting(Effect):
         step = float(motion.session + 1 >= round(shape.get("since", 2.0))) * whole
         return (step, whole) if shape.form is Course.LEVEL_AND_STEP else (step,)
 
-    def in_session(self, parameters: Parameters, form: str | Form | None, number: int | None) -> Parameters:
+    def in_session(self, parameters: Parameters, form: FormName, number: int | None) -> Parameters:
         """Without the step in the sessions before it."""
         between = self.form_of(form) in (Course.STEP, Course.LEVEL_AND_STEP)
         if between and number is not None and number + 1 < parameters.get("since", 2.0):
             return {**parameters, self.linear[0].name: 0.0}
         return parameters
 
-    def drift(self, parameters: Parameters, form: str | Form | None, time_s: float) -> float:
-        """Change and level of a simulated arm at a time of the session [s]; in HEATED form not of the time alone."""
+    def drift(self, parameters: Parameters, form: FormName, time_s: float) -> float:
+        """Change and level of a simulated arm at a time of the session [s]; without the heat of HEATED form."""
         change, level = self.coefficients_of(parameters)
         if self.form_of(form) is Course.WITHIN:
             change *= 1.0 - np.exp(-time_s / parameters["time_constant"])

@@ -1,4 +1,4 @@
-"""Causes in the drive, seen in the motor torque only: friction, ripple of the gear, torque constant."""
+"""Causes in the drive, seen in the motor torque only: friction, gear ripple, torque constant."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from ident.effects.effect import (
     Law,
     Loads,
     Parameter,
-    Parameters,
     Plant,
     Reading,
     Setting,
@@ -34,14 +33,24 @@ __all__ = [
     "GearRipple",
     "MotorTorqueGain",
     "PreslidingHysteresis",
+    "ScaleError",
     "Stribeck",
     "ViscousNonlinear",
-    "gain_sentence",
+    "dahl_step",
 ]
 
 
+def dahl_step(run: Simulated, here: float, length: float) -> float:
+    """Dahl's state of a simulated effect at the coordinate `here`, one cycle later."""
+    state, before = run.state or (0.0, here)
+    step = here - before
+    sign = 1.0 if step > 0.0 else -1.0
+    run.state = sign - (sign - state) * float(np.exp(-abs(step) / length)), here
+    return float(run.state[0])
+
+
 class PreslidingHysteresis(Effect):
-    """Part of the Coulomb friction is Dahl's: it turns over within a sliding distance, not at once."""
+    """Part of the Coulomb friction is Dahl's: it reverses within a sliding distance, not at once."""
 
     cause = "presliding_hysteresis"
     side = "motor"
@@ -60,7 +69,7 @@ class PreslidingHysteresis(Effect):
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """From half a milliradian, or ten times the presliding length of the model, to a tenth of a radian."""
-        # Near the length of the healthy drive it is that length which is a little different.
+        # A length near that of the healthy drive is a small change of the latter, not another friction.
         least = 0.0 if setting.presliding is None else 10.0 * float(setting.presliding[joint])
         return [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
 
@@ -71,26 +80,12 @@ class PreslidingHysteresis(Effect):
         state = dahl(path, shape["length"], float(np.sign(speed[0])))
         return (Column(motor=state - motion.direction[:, joint]),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
-        """Takes the amplitude out of the set-valued friction and gives it back through Dahl's state."""
-        return _Dahl(joint, float(parameters["amplitude"]), float(parameters["length"]))
-
-
-class _Dahl(Simulated):
-    def __init__(self, joint: int, amplitude: float, length: float) -> None:
-        super().__init__()
-        self.joint, self.amplitude, self.length = joint, amplitude, length
-        self.state = 0.0
-        self.before: float | None = None
-
-    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
-        here = float(plant.motor_position[self.joint])
-        step = 0.0 if self.before is None else here - self.before
-        self.before = here
-        sign = 1.0 if step > 0.0 else -1.0
-        self.state = sign - (sign - self.state) * float(np.exp(-abs(step) / self.length))
-        loads.Fcm[self.joint] = max(0.0, loads.Fcm[self.joint] - self.amplitude)
-        loads.motor_torque[self.joint] -= self.amplitude * self.state
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
+        """Moves the amplitude from the set-valued friction to Dahl's."""
+        joint, amplitude = run.joint, run.values["amplitude"]
+        state = dahl_step(run, float(plant.motor_position[joint]), run.values["length"])
+        loads.Fcm[joint] = max(0.0, loads.Fcm[joint] - amplitude)
+        loads.motor_torque[joint] -= amplitude * state
 
 
 class Stribeck(Effect):
@@ -125,27 +120,22 @@ class Stribeck(Effect):
         return (Column(motor=motion.direction[:, joint] * fall),)
 
     def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
-        """Bristles that carry more at low speed are no stiffer: they bend further before they slip."""
+        """Bristles with a higher load at low speed are no stiffer: they bend further before they slip."""
         turning = PreslidingHysteresis()
         shapes = turning.shapes(setting, joint)
         return tuple(column for shape in shapes for column in turning.columns(motion, joint, shape))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """Raises the Coulomb friction of the drive."""
-        amplitude, velocity = float(parameters["amplitude"]), float(parameters["velocity"])
-        exponent = float(parameters.get("exponent", 1.0))
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            speed = abs(plant.motor_velocity[joint])
-            loads.Fcm[joint] += amplitude * np.exp(-((speed / velocity) ** exponent))
-
-        return Simulated(load)
+        values, speed = run.values, abs(plant.motor_velocity[run.joint])
+        fall = np.exp(-((speed / values["velocity"]) ** values.get("exponent", 1.0)))
+        loads.Fcm[run.joint] += values["amplitude"] * fall
 
 
 class ViscousNonlinear(Effect):
     """Friction `coefficient |v|^exponent sign(v)` beside the linear viscous one.
 
-    It bends the course of the viscous friction; a friction that falls as the speed rises is Stribeck's.
+    It bends the curve of the viscous friction; friction falling with rising speed is Stribeck's.
     """
 
     cause = "viscous_nonlinear"
@@ -177,18 +167,14 @@ class ViscousNonlinear(Effect):
         rises = shape["exponent"] > 1.0 or bool(coefficients[0] > 0.0)
         return super().plausible(coefficients, shape) and rises
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A resisting torque at the motor."""
-        coefficient, exponent = float(parameters["coefficient"]), float(parameters["exponent"])
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            speed = plant.motor_velocity[joint]
-            loads.motor_torque[joint] -= coefficient * np.sign(speed) * abs(speed) ** exponent
-
-        return Simulated(load)
+        speed = plant.motor_velocity[run.joint]
+        signed = run.values["coefficient"] * np.sign(speed)
+        loads.motor_torque[run.joint] -= signed * abs(speed) ** run.values["exponent"]
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """The course, and the power law."""
+        """The curve, and the power law."""
         (coefficient, std, _), (exponent, spread, _) = values["coefficient"], values["exponent"]
         slower = (coefficient > 0.0) == (exponent < 1.0)
         power = quantity_text(exponent, spread, "1")
@@ -239,15 +225,11 @@ class FrictionAsymmetry(Effect):
         # Of the Coulomb part, as much as has built up since the last reversal.
         return viscous, Column(motor=motion.direction[:, joint] * np.sign(motion.motor_speed[:, joint]))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque at the motor."""
-        viscous, coulomb = self.coefficients_of(parameters)
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            loads.offm[joint] += coulomb
-            loads.motor_torque[joint] -= viscous * abs(plant.motor_velocity[joint])
-
-        return Simulated(load)
+        viscous, coulomb = run.coefficients
+        loads.offm[run.joint] += coulomb
+        loads.motor_torque[run.joint] -= viscous * abs(plant.motor_velocity[run.joint])
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Both parts, as far as they are seen."""
@@ -283,14 +265,9 @@ class FrictionLoad(Effect):
         """|tau_l| sign(v) in the motor torque."""
         return (Column(motor=np.abs(motion.joint_torque[:, joint]) * motion.direction[:, joint]),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """Raises the Coulomb friction of the drive."""
-        factor = float(parameters["factor"])
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            loads.Fcm[joint] += factor * abs(plant.joint_torque[joint])
-
-        return Simulated(load)
+        loads.Fcm[run.joint] += run.values["factor"] * abs(plant.joint_torque[run.joint])
 
 
 class FrictionTemperature(Drifting):
@@ -307,16 +284,9 @@ class FrictionTemperature(Drifting):
     physics = "the lubricant thins as it warms up, so friction drifts with the time in use"
     source = "Bittencourt, Wernholt, Sander-Tavallaey and Brogardh, IROS 2010; Simoni et al., Robotica 2017"
     parameters = (
+        Parameter("change", "1", "relative change, cold to warm", low=-0.9, high=2.0, share=True),
         Parameter(
-            "change", "1", "relative change of the friction, cold to warm", low=-0.9, high=2.0, share=True
-        ),
-        Parameter(
-            "level",
-            "1",
-            "relative change in all sessions, against the reference",
-            low=-0.9,
-            high=2.0,
-            share=True,
+            "level", "1", "the same in all sessions, from the reference", low=-0.9, high=2.0, share=True
         ),
         *TIME_CONSTANT,
     )
@@ -331,25 +301,20 @@ class FrictionTemperature(Drifting):
         friction = motion.drive_friction[:, joint]
         return tuple(Column(motor=friction * factor) for factor in self.course(motion, joint, shape))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """Scales the friction of the drive."""
-        warmth = 0.0
-        heated = self.form_of(form) is Course.HEATED
-        change, level = self.coefficients_of(parameters)
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            nonlocal warmth
-            factor = 1.0 + self.drift(parameters, form, time_s)
-            if heated:
-                coulomb, viscous = loads.Fcm[joint], loads.Fvm[joint]
-                speed = abs(float(plant.motor_velocity[joint]))
-                power = (coulomb + viscous * speed) * speed / max(coulomb + viscous, 1e-9)
-                warmth += (power - warmth) * plant.cycle_s / parameters["time_constant"]
-                factor = 1.0 + change * warmth + level
-            loads.Fcm[joint] *= factor
-            loads.Fvm[joint] *= factor
-
-        return Simulated(load)
+        joint = run.joint
+        factor = 1.0 + self.drift(run.values, run.form, time_s)
+        if self.form_of(run.form) is Course.HEATED:
+            change, level = run.coefficients
+            coulomb, viscous = loads.Fcm[joint], loads.Fvm[joint]
+            speed = abs(float(plant.motor_velocity[joint]))
+            power = (coulomb + viscous * speed) * speed / max(coulomb + viscous, 1e-9)
+            warmth = run.state or 0.0
+            run.state = warmth + (power - warmth) * plant.cycle_s / run.values["time_constant"]
+            factor = 1.0 + change * run.state + level
+        loads.Fcm[joint] *= factor
+        loads.Fvm[joint] *= factor
 
 
 class _Place(Form):
@@ -369,12 +334,12 @@ class FrictionPosition(Effect):
     cause = "friction_position"
     side = "motor"
     summary = "friction depends on the joint angle"
-    physics = "a gear or bearing that runs out of true, or is worn in a spot, grips more at some angles of the joint"
+    physics = "a gear or bearing with run-out or a worn spot grips more at some angles of the joint"
     source = "Armstrong-Helouvry, Control of Machines with Friction (1991), chapter 4"
     parameters = (
         Parameter("cosine", "Nm", "Coulomb friction with cos(k q), or at the centre of a spot"),
         Parameter("sine", "Nm", "Coulomb friction with sin(k q)"),
-        Parameter("cycles_per_turn", "1", "k, of a wave", shape=True),
+        Parameter("cycles_per_turn", "1", "k, of a wave", shape=True, fixed=True),
         Parameter("centre", "rad", "of a spot", shape=True),
         Parameter("half_width", "rad", "of a spot", shape=True, low=0.1, high=1.5),
     )
@@ -398,25 +363,16 @@ class FrictionPosition(Effect):
         ]
         return [*(Shape(_Place.WAVE, cycles_per_turn=k) for k in (1, 2, 3, 4)), *spots]
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Place and size of a spot; cycles are whole numbers."""
-        return ("centre", "half_width") if shape.form is _Place.SPOT else ()
-
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) cos(k q) and sign(v) sin(k q), or sign(v) in the spot, in the motor torque."""
         sign = motion.direction[:, joint]
         return tuple(Column(motor=sign * curve) for curve in _curves(motion.q[:, joint], shape))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """Changes the Coulomb friction of the drive."""
-        coefficients, shape = self.coefficients_of(parameters), self.shape_of(parameters, form)
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            curves = _curves(plant.motor_position[joint], shape)
-            change = sum(c * x for c, x in zip(coefficients, curves, strict=False))
-            loads.Fcm[joint] = max(0.0, loads.Fcm[joint] + change)
-
-        return Simulated(load)
+        curves = _curves(plant.motor_position[run.joint], run.shape)
+        change = sum(c * x for c, x in zip(run.coefficients, curves, strict=False))
+        loads.Fcm[run.joint] = max(0.0, loads.Fcm[run.joint] + change)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Amplitude and cycles, or size and place."""
@@ -429,7 +385,7 @@ class FrictionPosition(Effect):
 
 
 def _curves(angle: Any, shape: Shape) -> tuple[Any, ...]:
-    """What the coefficients of a shape multiply, at `angle` [rad]."""
+    """Factors of the coefficients of a shape at `angle` [rad]."""
     if shape.form is _Place.SPOT:
         away = np.clip((angle - shape["centre"]) / shape["half_width"], -1.0, 1.0)
         return (0.5 * (1.0 + np.cos(np.pi * away)),)
@@ -437,7 +393,7 @@ def _curves(angle: Any, shape: Shape) -> tuple[Any, ...]:
     return np.cos(cycles * angle), np.sin(cycles * angle)
 
 
-# Ripple of the motor torque over that of the sensor's reading up to which the controller may have made it.
+# Largest ripple of the motor torque made by the controller, over the ripple of the sensor's reading.
 _ANSWER = 0.4
 
 
@@ -452,8 +408,8 @@ class GearRipple(Effect):
     parameters = (
         Parameter("cosine", "Nm", "torque with cos(k N q)"),
         Parameter("sine", "Nm", "torque with sin(k N q)"),
-        Parameter("cycles_per_turn", "1/turn of the motor", "k", shape=True),
-        Parameter("gear_ratio", "1", "N", shape=True),
+        Parameter("cycles_per_turn", "1/turn of the motor", "k", shape=True, fixed=True),
+        Parameter("gear_ratio", "1", "N", shape=True, fixed=True),
     )
     depends_on = "motor angle"
     law = Law("q")
@@ -466,42 +422,51 @@ class GearRipple(Effect):
         ratio = float(setting.gear_ratio[joint])
         return [Shape(cycles_per_turn=k, gear_ratio=ratio) for k in (1.0, 2.0)] if ratio > 1.0 else []
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Cycles are whole numbers."""
-        return ()
-
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Cosine and sine in the motor torque."""
         angle = shape["cycles_per_turn"] * shape["gear_ratio"] * motion.q[:, joint]
         return Column(motor=np.cos(angle)), Column(motor=np.sin(angle))
 
     def follows_from(self, shape: Shape, coefficients: Floats, other: Effect, at: Shape, of: Floats) -> bool:
-        """Whether it answers to a larger ripple of the joint torque sensor: the controller acts on that reading."""
+        """Whether the controller makes it from a larger ripple of the joint torque sensor's reading."""
         if other.cause != "sensor_ripple":
             return False
         same = (shape["cycles_per_turn"], shape["gear_ratio"]) == (at["cycles_per_turn"], at["ratio"])
         return same and float(np.linalg.norm(coefficients)) < _ANSWER * float(np.linalg.norm(of))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque at the motor."""
-        cosine, sine = self.coefficients_of(parameters)
-        cycles = float(parameters["cycles_per_turn"]) * float(parameters["gear_ratio"])
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            angle = cycles * plant.motor_position[joint]
-            loads.motor_torque[joint] -= cosine * np.cos(angle) + sine * np.sin(angle)
-
-        return Simulated(load)
+        cosine, sine = run.coefficients
+        cycles = run.values["cycles_per_turn"] * run.values["gear_ratio"]
+        angle = cycles * plant.motor_position[run.joint]
+        loads.motor_torque[run.joint] -= cosine * np.cos(angle) + sine * np.sin(angle)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Amplitude and cycles."""
         return [f"{wave(values)}, {times(values['cycles_per_turn'][0])} a turn of the motor"]
 
 
-class MotorTorqueGain(Effect):
+class ScaleError(Effect):
+    """A torque is reported `1 + error` times too large."""
+
+    parameters = (Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),)
+    depends_on = "load"
+    law = Law("load")
+    experiment = Experiment.STATIC_POSES
+    every_payload = True
+    tell_apart = "static poses of joint {joint} with a weighed mass and without it"
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """Too much or too little."""
+        error, std, _ = values["error"]
+        much = "much" if error > 0.0 else "little"
+        return [f"reads {quantity_text(100.0 * abs(error), 100.0 * std, '1')} % too {much}"]
+
+
+class MotorTorqueGain(ScaleError):
     """The motor torque is reported `1 + error` times too large.
 
-    Friction and drive inertia take up their share of the error; what shows is the load of the joint.
+    Friction and drive inertia take up their share of the error; the load of the joint shows the rest.
     """
 
     cause = "motor_torque_gain"
@@ -509,34 +474,12 @@ class MotorTorqueGain(Effect):
     summary = "wrong torque constant"
     physics = "the constant between current and torque is wrong"
     source = "Gautier and Briot, ICRA 2011; Jubien, Gautier and Janot, IFAC 2014"
-    parameters = (Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),)
-    depends_on = "load"
-    law = Law("load")
     confused_with = ("friction_load", "sensor_gain", "friction_temperature")
-    experiment = Experiment.STATIC_POSES
-    every_payload = True
-    tell_apart = "static poses of joint {joint} with a weighed mass and without it"
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The predicted motor torque."""
         return (Column(motor=motion.motor_torque[:, joint]),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense_motor(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Scales the reported motor torque."""
-        error = float(parameters["error"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.motor_torque[joint] *= 1.0 + error
-
-        return Simulated(sense_motor=sense)
-
-    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Too much or too little."""
-        return gain_sentence(values)
-
-
-def gain_sentence(values: Values) -> list[str]:
-    """Phrase of a wrong scale."""
-    error, std, _ = values["error"]
-    much = "much" if error > 0.0 else "little"
-    return [f"reads {quantity_text(100.0 * abs(error), 100.0 * std, '1')} % too {much}"]
+        reading.motor_torque[run.joint] *= 1.0 + run.values["error"]

@@ -1,17 +1,18 @@
-"""What an effect is: a cause with its physics, its torque, its simulation and its words.
+"""The interface of an effect: a cause with its physics, torque, simulation and description.
 
-An effect adds torque to the model's. It is linear in some parameters, the coefficients, and not in the others, its
-*shape* (a speed, a length, a time): the torque is `sum_i c_i x_i(motion, shape)`, with the columns x_i as seen in the
-motor torque and in the joint torque. Estimation needs the columns, a grid of shapes to begin with, and the way from
-coefficients to physical parameters and back. Simulation needs the change of an arm in each millisecond.
+An effect adds torque to the model's. The torque is linear in some parameters, the coefficients, and nonlinear in the
+others, its *shape* (a speed, a length, a time): `sum_i c_i x_i(motion, shape)`, with the columns x_i as seen in the
+motor torque and in the joint torque. Estimation needs the columns, a grid of initial shapes, and the conversion
+between coefficients and physical parameters. Simulation needs the change of an arm in each millisecond.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, StrEnum
+from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
@@ -27,6 +28,7 @@ __all__ = [
     "EffectSide",
     "Experiment",
     "Form",
+    "FormName",
     "Law",
     "Loads",
     "Parameter",
@@ -59,6 +61,10 @@ class Form(Enum):
         return member
 
 
+FormName = str | Form | None
+"""A form, its name in a file, or None for an effect of a single form."""
+
+
 class Experiment(StrEnum):
     """Discriminating experiments: motions to decide between causes alike in the sessions at hand."""
 
@@ -85,8 +91,8 @@ class Law:
 class Parameter:
     """A parameter of an effect: name, SI unit, meaning.
 
-    shape : the torque is not linear in it. low, high : physically sensible range. share : said in percent.
-    optional : may be left out.
+    shape : the torque is nonlinear in it. low, high : physically sensible range. share : reported in percent.
+    optional : may be left out. fixed : a shape parameter with values on the grid only, such as a whole number.
     """
 
     name: str
@@ -97,6 +103,7 @@ class Parameter:
     high: float = np.inf
     share: bool = False
     optional: bool = False
+    fixed: bool = False
 
 
 class Shape(Mapping[str, float]):
@@ -129,7 +136,7 @@ class Shape(Mapping[str, float]):
 
     @property
     def freedom(self) -> int:
-        """Number of choices behind it: its values, and the form where there are several."""
+        """Number of choices behind it: its values, and the form if there are several."""
         return len(self) + (self.form is not None)
 
     def at(self, **values: float) -> Shape:
@@ -141,7 +148,7 @@ class Shape(Mapping[str, float]):
 class Column:
     """Torque of a unit coefficient [Nm]: (N,) in the rows of the effect's own joint, or (N, n) in all rows.
 
-    motor, joint : as seen in the motor torque and in the joint torque; None where it does not appear.
+    motor, joint : as seen in the motor torque and in the joint torque; None if it does not appear there.
     """
 
     motor: Floats | None = None
@@ -167,14 +174,14 @@ def _wide(values: Floats | None, joint: int, joints: int) -> Floats | None:
 
 @dataclass(frozen=True)
 class Setting:
-    """What the grid of shapes depends on.
+    """The sessions and the arm, as far as the grid of shapes depends on them.
 
     sessions : number of sessions. durations_s : of each. gear_ratio : (n,). torque_range, speed_range : (n,)
         largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad]. torque_turns :
         (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic joints
-        with the published positions, None where unknown. presliding : (n,) presliding length of the model [rad],
-        None where unknown. compared : whether the sessions are compared with a reference. compliance : (n,) [rad/Nm]
-        of the springs behind published motors, None where the links' positions are published. clipped : (n,) torque
+        with the published positions, None if unknown. presliding : (n,) presliding length of the model [rad],
+        None if unknown. compared : whether the sessions are compared with a reference. compliance : (n,) [rad/Nm]
+        of the springs behind published motors, None if the links' positions are published. clipped : (n,) torque
         limit seen in the samples of a joint's sensor [Nm], NaN for none.
     """
 
@@ -215,65 +222,67 @@ class Loads(Protocol):
 
 
 class Reading(Protocol):
-    """What the sensors report in a cycle, (n,) each; an effect changes it in place."""
+    """Sensor readings of a cycle, (n,) each; an effect changes them in place."""
 
     position: Floats
     joint_torque: Floats
     motor_torque: Floats
 
 
-Act = Callable[[float, Plant, Loads], None]
-Sense = Callable[[float, Plant, Reading], None]
-
-
 class Simulated:
-    """The effect in a simulated arm, called each millisecond like `sim_backend.plant.Effect`.
+    """An effect in a simulated arm, called each millisecond like `sim_backend.plant.Effect`.
 
-    load, sense, sense_motor : what to do in place of the methods of these names; effects with a memory are subclasses.
+    joint : from 0. values, form : of the parameters. coefficients : of the columns. state : memory of the effect.
     """
 
-    def __init__(
-        self, load: Act | None = None, sense: Sense | None = None, sense_motor: Sense | None = None
-    ) -> None:
-        self._load, self._sense, self._sense_motor = load, sense, sense_motor
+    def __init__(self, effect: Effect, joint: int, values: Parameters, form: FormName) -> None:
+        self.effect, self.joint, self.form = effect, joint, form
+        self.values = {name: float(value) for name, value in values.items()}
+        self.coefficients = effect.coefficients_of(values)
+        self.random = np.random.default_rng(0)
+        self.state: Any = None
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Form and nonlinear parameters."""
+        return self.effect.shape_of(self.values, self.form)
 
     def start(self, joints: int, random: np.random.Generator) -> None:
         """Begin a run of an arm with `joints` joints."""
+        self.random = random
+        self.effect.start(self)
 
     def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
         """Change the torques and the friction of the cycle from `time_s` on."""
-        if self._load is not None:
-            self._load(time_s, plant, loads)
+        self.effect.load(self, time_s, plant, loads)
 
     def sense(self, time_s: float, plant: Plant, reading: Reading) -> None:
         """Change position and joint torque as reported."""
-        if self._sense is not None:
-            self._sense(time_s, plant, reading)
+        self.effect.sense(self, time_s, plant, reading)
 
     def sense_motor(self, time_s: float, plant: Plant, reading: Reading) -> None:
         """Change the motor torque as reported."""
-        if self._sense_motor is not None:
-            self._sense_motor(time_s, plant, reading)
+        self.effect.sense_motor(self, time_s, plant, reading)
 
 
 class Effect(ABC):
-    """One cause: all that the software knows of it. Subclasses state the class variables and implement the methods.
+    """One cause. Subclasses set the class variables and implement the methods.
 
-    cause, side : as in the table of the diagnosis. summary : what is wrong, in a few words. physics : a sentence.
+    cause, side : as in the table of the diagnosis. summary : the fault in a few words. physics : a sentence.
     source : literature. parameters : all of them, the linear ones first in the order of the columns.
-    forms : its forms, where it has several. depends_on : the variable that its torque follows.
-    law : the variable of its law, for the model-form error; None where that is unknown.
+    forms : its forms, if it has several. depends_on : the independent variable of its torque.
+    law : the variable of its law, for the model-form error; None if unknown.
     whole_arm : the effect belongs to no single joint. event : it acts during a part of the time only, found by a
         search over times. step : it sets in at its `time` and stays. displaces : it turns the link under load.
     channel : the torque channel it delays. counted : seen by counting samples, without a torque of its own.
-    hidden : linear parameters that are 1 by the physics, left free in the search and not reported.
-    evidence_factor : multiple of the usual evidence, where the nominal arm itself resembles it a little.
-    beside_companions : its law is so coarse that parameters are estimated beside the companions.
-    confused_with : causes alike in many motions.
-    contains : causes that are special cases of it.
-    mean_of : causes whose model-form error has this one as its mean.
-    experiment, tell_apart : the motion that decides between it and the causes alike, and the same in words;
+    hidden : linear parameters equal to 1 by the physics, free in the search and not reported.
+    evidence_factor : multiple of the usual evidence, for a cause the nominal arm itself resembles slightly.
+    beside_companions : the law is coarse, so parameters are estimated beside the companions.
+    confused_with : causes alike in many motions. contains : special cases of it.
+    mean_of : causes with this one as the mean of their model-form error.
+    experiment, tell_apart : the motion to decide between it and similar causes, and the same in words;
         `{joint}` stands for the joint's number. every_payload : the experiment needs every payload.
+    simulated : its class in a simulated arm.
     """
 
     cause: ClassVar[str]
@@ -300,6 +309,7 @@ class Effect(ABC):
     experiment: ClassVar[Experiment]
     every_payload: ClassVar[bool] = False
     tell_apart: ClassVar[str]
+    simulated: ClassVar[type[Simulated]] = Simulated
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.cause}, {self.side} side: {self.summary})"
@@ -307,7 +317,7 @@ class Effect(ABC):
     # ---- torque ----
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Shapes to begin the search with; by default a single empty one, for a torque linear in everything."""
+        """Initial shapes of the search; by default a single empty one, for a torque linear in all parameters."""
         return [Shape()]
 
     @abstractmethod
@@ -315,38 +325,38 @@ class Effect(ABC):
         """Columns for the joint (counted from 0) and the shape."""
 
     def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
-        """Columns of what comes with the cause in a real arm and is not in its law."""
+        """Columns of side effects in a real arm, beyond the law of the cause."""
         return ()
 
     @property
     def repeats(self) -> bool:
-        """Whether it may be claimed several times: contacts come and go, what comes to stay comes once."""
+        """Whether it may be claimed several times, like a contact and unlike a lasting change."""
         return self.event and not self.step
 
     @property
     def linear(self) -> tuple[Parameter, ...]:
-        """The parameters that are the coefficients of the columns."""
+        """The coefficients of the columns."""
         return tuple(p for p in self.parameters if not p.shape)
 
     @property
     def shape_parameters(self) -> tuple[Parameter, ...]:
-        """The parameters that make the shape."""
+        """The nonlinear parameters."""
         return tuple(p for p in self.parameters if p.shape)
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Names of the shape parameters that may be refined between the points of the grid."""
-        return tuple(p.name for p in self.shape_parameters if p.name in shape)
+        """Names of the shape parameters to refine between the points of the grid."""
+        return tuple(p.name for p in self.shape_parameters if p.name in shape and not p.fixed)
 
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
         """Whether the coefficients lie in their physically sensible ranges."""
         return all(p.low <= value <= p.high for p, value in zip(self.linear, coefficients, strict=False))
 
     def seen_in_samples(self, shape: Shape) -> bool:
-        """Whether the samples themselves show the cause, so that significance by blocks is not needed as well."""
+        """Whether the samples themselves show the cause, without a test of significance by blocks."""
         return False
 
     def law_std(self, parameters: Parameters, form: Form | None) -> Parameters:
-        """Standard deviations of parameters from the law itself, which is coarser than the physics."""
+        """Standard deviations of parameters from the coarseness of the law itself."""
         return {}
 
     def mode(self, shape: Shape) -> Literal["within", "between"] | None:
@@ -354,7 +364,7 @@ class Effect(ABC):
         return None
 
     def variable(self, parameters: Parameters) -> Variable:
-        """The variable that its torque follows, with these parameters."""
+        """The independent variable of its torque, with these parameters."""
         return self.depends_on
 
     # ---- beside other causes ----
@@ -367,17 +377,17 @@ class Effect(ABC):
         return False
 
     def same_as(self, setting: Setting, joint: int) -> str | None:
-        """A cause of the same torque in these sessions, None where there is none."""
+        """A cause of the same torque in these sessions, or None."""
         return None
 
     # ---- values ----
 
     @property
     def known_forms(self) -> tuple[Form, ...]:
-        """The forms of the effect, none where there is only one."""
+        """The forms of the effect, empty for a single one."""
         return () if self.forms is None else tuple(self.forms)
 
-    def form_of(self, name: str | Form | None) -> Form | None:
+    def form_of(self, name: FormName) -> Form | None:
         """The form of a name from a file. Raises ConfigurationError for a missing, unknown or foreign one."""
         if self.known_forms:
             known = {form.value: form for form in self.known_forms}
@@ -398,10 +408,10 @@ class Effect(ABC):
         shown = (p for p in self.parameters if p.name not in self.hidden)
         return tuple(p for p in shown if form is None or p.name in form.uses)
 
-    def check(self, parameters: Mapping[str, Any], form: str | Form | None, *, whole: bool = False) -> None:
-        """Check names of parameters. whole : coefficients must be there too, and not only the shape.
+    def check(self, parameters: Mapping[str, Any], form: FormName, *, whole: bool = False) -> None:
+        """Raise ConfigurationError for a foreign and for a missing parameter.
 
-        Raises ConfigurationError for a foreign and for a missing one.
+        whole : coefficients are needed too, besides the shape.
         """
         used = self.used(self.form_of(form))
         foreign = sorted(set(parameters) - {p.name for p in (used if whole else self.parameters)})
@@ -412,7 +422,7 @@ class Effect(ABC):
             listed = ", ".join(p.name for p in used)
             raise ConfigurationError(f"effect {self.cause} {wrong}; its parameters: {listed}")
 
-    def shape_of(self, parameters: Parameters, form: str | Form | None = None) -> Shape:
+    def shape_of(self, parameters: Parameters, form: FormName = None) -> Shape:
         """The shape in a full set of parameter values."""
         values = {p.name: float(parameters[p.name]) for p in self.shape_parameters if p.name in parameters}
         return Shape(self.form_of(form), **values)
@@ -424,9 +434,9 @@ class Effect(ABC):
         )
 
     def torque(
-        self, motion: Motion, joint: int, parameters: Parameters, form: str | Form | None = None
+        self, motion: Motion, joint: int, parameters: Parameters, form: FormName = None
     ) -> tuple[Floats, Floats]:
-        """Torque (N, n) [Nm] that the effect adds to the motor torque and to the joint torque."""
+        """Torque (N, n) [Nm] of the effect in the motor torque and in the joint torque."""
         total = np.zeros((2, len(motion.time), motion.n))
         columns = self.columns(motion, joint, self.shape_of(parameters, form))
         for value, column in zip(self.coefficients_of(parameters), columns, strict=False):
@@ -436,7 +446,7 @@ class Effect(ABC):
         return total[0], total[1]
 
     def derivative(
-        self, motion: Motion, joint: int, parameters: Parameters, name: str, form: str | Form | None = None
+        self, motion: Motion, joint: int, parameters: Parameters, name: str, form: FormName = None
     ) -> tuple[Floats, Floats]:
         """Derivative (N, n) of both torques by the parameter `name`.
 
@@ -454,18 +464,30 @@ class Effect(ABC):
         lower = self.torque(motion, joint, {**parameters, name: low}, form)
         return (upper[0] - lower[0]) / (high - low), (upper[1] - lower[1]) / (high - low)
 
-    def in_session(self, parameters: Parameters, form: str | Form | None, number: int | None) -> Parameters:
+    def in_session(self, parameters: Parameters, form: FormName, number: int | None) -> Parameters:
         """The parameters in force in a session (from 0), None for a further one."""
         return parameters
 
     # ---- simulation and words ----
 
-    @abstractmethod
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def simulate(self, joint: int, parameters: Parameters, form: FormName = None) -> Simulated:
         """The effect as a part of a simulated arm."""
+        return self.simulated(self, joint, parameters, form)
+
+    def start(self, run: Simulated) -> None:  # noqa: B027
+        """Begin a run of a simulated arm."""
+
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:  # noqa: B027
+        """Change the torques and the friction of a simulated cycle."""
+
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:  # noqa: B027
+        """Change position and joint torque as reported by a simulated arm."""
+
+    def sense_motor(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:  # noqa: B027
+        """Change the motor torque as reported by a simulated arm."""
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Phrases that say a finding's parameters. names : of the joints. KeyError where a value is missing."""
+        """Phrases with a finding's parameters. names : of the joints. KeyError for a missing value."""
         known = {p.name: p for p in self.parameters}
         return [
             f"{spoken(name)} {quantity(value, share=name in known and known[name].share)}"

@@ -43,14 +43,14 @@ _LINK_HZ, _MOTOR_HZ = 8.0, 30.0
 
 
 class _Encoder(Form):
-    """Where the published positions come from: the other end of the joint is elsewhere."""
+    """Side of the published positions; the other end of the joint is elsewhere."""
 
     MOTOR = "encoder at the motor", "compliance", "gap", "width", "size"
     LINK = "encoder at the link", "compliance", "gap", "width"
 
 
 class _Twisting(Effect):
-    """A joint whose link and motor stand at different angles."""
+    """A joint with link and motor at different angles."""
 
     side = "joint"
     forms = _Encoder
@@ -58,32 +58,25 @@ class _Twisting(Effect):
     displaces = True
     evidence_factor = 2.0
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """The size."""
-        return ("size",) if "size" in shape else ()
-
     def twist(self, torque: Any, parameters: Parameters) -> Any:
         """Angle of the motor minus angle of the link [rad] under a joint torque [Nm]."""
         raise NotImplementedError
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
-        """Displaces the published position; with the link's encoder, the motor drags against its friction."""
-        past: list[float] = []
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            past.append(float(self.twist(plant.joint_torque[joint], parameters)))
-            if len(past) > 3:
-                past.pop(0)
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
+        """With the link's encoder, the motor drags against its friction."""
+        if self.form_of(run.form) is not _Encoder.MOTOR:
+            past = [*(run.state or []), float(self.twist(plant.joint_torque[run.joint], run.values))][-3:]
+            run.state = past
             if len(past) == 3:
-                loads.motor_torque[joint] -= loads.Fvm[joint] * (past[2] - past[0]) / 2e-3
+                loads.motor_torque[run.joint] -= loads.Fvm[run.joint] * (past[2] - past[0]) / 2e-3
 
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.position[joint] += self.twist(plant.joint_torque[joint], parameters)
-
-        return Simulated(sense=sense) if self.form_of(form) is _Encoder.MOTOR else Simulated(load)
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
+        """Displaces the position published by the motor's encoder."""
+        if self.form_of(run.form) is _Encoder.MOTOR:
+            reading.position[run.joint] += self.twist(plant.joint_torque[run.joint], run.values)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Size, and where the encoder sits."""
+        """Size, and the place of the encoder."""
         first = self.linear[0].name
         width = [f"crossed within {quantity(values['width'])}"] if "width" in values else []
         place = "the motors" if form is _Encoder.MOTOR else "the links"
@@ -96,7 +89,7 @@ def _places(setting: Setting) -> tuple[_Encoder, ...]:
     return tuple(_Encoder) if setting.encoder is None else known[setting.encoder]
 
 
-# Compliances to begin with, over the joint's own: less is no other joint. And one [rad/Nm] for a derivative.
+# Initial compliances over the joint's own (a smaller one is within the joint's tolerance), and a step [rad/Nm].
 _SHARES = (0.3, 0.45, 0.65, 1.0, 1.6)
 _SMALL = 1e-6
 
@@ -112,22 +105,14 @@ class JointElasticity(_Twisting):
     source = "Spong, J. Dyn. Syst. Meas. Control 109 (1987); Janot, Gautier, Jubien and Vandanjon, 2014"
     parameters = (
         Parameter("compliance", "rad/Nm", "twist per torque beyond the model's", low=0.0, high=0.02),
-        Parameter(
-            "size",
-            "rad/Nm",
-            "compliance of the ringing links",
-            shape=True,
-            low=1e-7,
-            high=0.02,
-            optional=True,
-        ),
+        Parameter("size", "rad/Nm", "of the ringing links", shape=True, low=1e-7, high=0.02, optional=True),
     )
     confused_with = ("backlash", "joint_zero_offset", "joint_torque_delay")
     experiment = Experiment.CHIRP
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Places of the encoder; sizes where the links ring on springs of known stiffness."""
+        """Places of the encoder; sizes for links ringing on springs of known stiffness."""
         found = []
         for place in _places(setting):
             if place is _Encoder.MOTOR and setting.compliance is not None:
@@ -165,17 +150,17 @@ _GAPS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 class Backlash(_Twisting):
     """The link lags the motor by half the `gap`, to the side of the joint torque.
 
-    With published motors the link crosses the gap almost free, arrives, and rings on its spring: how, depends on the
-    `size` of the gap.
+    With published motors the link crosses the gap almost free, arrives, and rings on its spring in a way that depends
+    on the `size` of the gap.
     """
 
     cause = "backlash"
     summary = "lost motion when the torque reverses"
-    physics = "gear teeth lose contact and cross a gap where the transmitted torque changes its sign"
+    physics = "gear teeth lose contact and cross a gap when the transmitted torque changes its sign"
     source = "Nordin and Gutman, Automatica 38 (2002)"
     parameters = (
         Parameter("gap", "rad", "lost motion", low=0.0, high=0.1),
-        Parameter("width", "Nm", "torque over which the gap is crossed", shape=True),
+        Parameter("width", "Nm", "range of torque for crossing the gap", shape=True, fixed=True),
         Parameter("size", "rad", "gap of the ringing links", shape=True, low=1e-5, high=0.1, optional=True),
     )
     confused_with = ("joint_elasticity", "joint_zero_offset", "presliding_hysteresis")
@@ -183,7 +168,7 @@ class Backlash(_Twisting):
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Places of the encoder, sharp and soft crossing; none where the torque keeps its sign."""
+        """Places of the encoder, sharp and soft crossing; none if the torque keeps its sign."""
         if not setting.torque_turns[joint]:
             return []
         top = float(setting.torque_range[joint])
@@ -223,8 +208,8 @@ def _deflected(
     of the linearisation. The links are taken to follow at once.
     """
     dt = motion.dt
-    # The torque's own acceleration part is noisy, and two more derivatives amplify it: with the link's inertia
-    # behind them more than with the drive's friction.
+    # Two derivatives amplify the noisy acceleration part of the torque, with the link's inertia as a factor more than
+    # with the drive's friction.
     cutoff = min(_LINK_HZ if encoder_at_motor else _MOTOR_HZ, 0.2 / dt)
     twist = low_pass(twist[:, None], dt, cutoff)
     first, second = differentiate(twist, dt)
@@ -232,7 +217,7 @@ def _deflected(
         shifts = (_alone(motion, joint, -scale * part[:, 0]) for part in (twist, first, second))
         return (both_sides(motion.displaced(*shifts) / scale),)
     first, second = first[:, 0], second[:, 0]
-    # The jump of Coulomb friction moves by a millisecond or so; a column of spikes would say nothing else.
+    # Without the jump of Coulomb friction: it moves by a millisecond or so, and would give a column of spikes.
     here, there = motion.motor_speed, motion.motor_speed.copy()
     there[:, joint] += scale * first
     friction = (motion.friction(there) - motion.friction(here))[:, joint]
@@ -251,8 +236,8 @@ def _alone(motion: Motion, joint: int, values: Floats) -> Floats:
 def _changed_springs(springs: Springs, changed: Springs, size: float) -> tuple[Column, ...]:
     """Column of a change of the springs behind the published motors, over its `size`.
 
-    The links follow as the springs let them, and ring; that is not proportional to the size, so the column belongs
-    to one size, and its coefficient is that size where it suits the data.
+    The links ring on their springs, which is not proportional to the size. The column belongs to one size, and its
+    coefficient equals that size for the right one.
     """
     return (both_sides((changed.torque - springs.torque) / size),)
 
@@ -266,7 +251,7 @@ class _Spring(Form):
     PLAY = "play", "stiffness", "slack", "play"
 
 
-# Distance in which the friction of a hose along the arm turns over [rad].
+# Distance in which the friction of a hose along the arm reverses [rad].
 _RUB_RAD = 0.1
 
 
@@ -274,7 +259,7 @@ class CableSpring(Effect):
     """Hoses and cables pull with `stiffness f(q)`.
 
     f is q; q^3 (cubic); the angle above or below `slack` (taut above, taut below); the angle beyond `play` on either
-    side of `slack` (play). One that hardens pulls with `stiffness q + quadratic q^2 + cubic q^3`, which is
+    side of `slack` (play). A hardening one pulls with `stiffness q + quadratic q^2 + cubic q^3`, equal to
     `k (q - c) + h (q - c)^3` about its angle of rest c.
     """
 
@@ -285,11 +270,9 @@ class CableSpring(Effect):
     source = "Swevers, Verdonck and De Schutter, IEEE Control Systems Magazine 27 (2007)"
     parameters = (
         Parameter("stiffness", "Nm/rad", "of the spring (Nm/rad^3 for a cubic one)"),
-        Parameter("quadratic", "Nm/rad^2", "of one that hardens: the angle it rests at is not zero"),
-        Parameter("cubic", "Nm/rad^3", "of one that hardens"),
-        Parameter(
-            "slack", "rad", "angle where the cable becomes taut, or the middle of its play", shape=True
-        ),
+        Parameter("quadratic", "Nm/rad^2", "of a hardening one with its rest away from zero"),
+        Parameter("cubic", "Nm/rad^3", "of a hardening one"),
+        Parameter("slack", "rad", "angle at which the cable becomes taut, or middle of its play", shape=True),
         Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
     )
     forms = _Spring
@@ -303,22 +286,18 @@ class CableSpring(Effect):
         """Linear, cubic, hardening and one-sided springs, and springs with play."""
         low, high = setting.position_range[joint]
         angles = [float(low + share * (high - low)) for share in (0.3, 0.5, 0.7)]
+        taut, plays = (
+            (_Spring.TAUT_ABOVE, _Spring.TAUT_BELOW),
+            [share * (high - low) for share in (0.1, 0.25)],
+        )
         return [
             *(Shape(form) for form in (_Spring.LINEAR, _Spring.CUBIC, _Spring.HARDENING)),
-            *(
-                Shape(form, slack=angle)
-                for form in (_Spring.TAUT_ABOVE, _Spring.TAUT_BELOW)
-                for angle in angles
-            ),
-            *(
-                Shape(_Spring.PLAY, slack=angle, play=share * (high - low))
-                for angle in angles
-                for share in (0.1, 0.25)
-            ),
+            *(Shape(form, slack=angle) for form in taut for angle in angles),
+            *(Shape(_Spring.PLAY, slack=angle, play=play) for angle in angles for play in plays),
         ]
 
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
-        """Whether it pulls back; one that hardens over a radian to both sides at least in the mean."""
+        """Whether it pulls back; a hardening one at least in the mean over a radian to both sides."""
         if shape.form is _Spring.HARDENING:
             return bool(coefficients[0] + coefficients[2] >= 0.0)
         return bool(coefficients[0] >= 0.0)
@@ -331,34 +310,28 @@ class CableSpring(Effect):
         """A hose rubs along the arm: Dahl's friction along the angle."""
         return (both_sides(dahl(np.ascontiguousarray(motion.q[:, joint]), _RUB_RAD, 0.0)),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque on the link."""
-        coefficients, shape = self.coefficients_of(parameters), self.shape_of(parameters, form)
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            pulls = _pulls(plant.position[joint], shape)
-            loads.link_torque[joint] -= sum(c * pull for c, pull in zip(coefficients, pulls, strict=False))
-
-        return Simulated(load)
+        pulls = _pulls(plant.position[run.joint], run.shape)
+        pull = sum(c * one for c, one in zip(run.coefficients, pulls, strict=False))
+        loads.link_torque[run.joint] -= pull
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Stiffness, and the course of the pull."""
+        """Stiffness, and the curve of the pull."""
         stiffness = quantity(values["stiffness"])
         if form is _Spring.CUBIC:
             return [f"grows with the cube of the angle, {quantity_text(*values['stiffness'][:2], 'Nm/rad³')}"]
         if form is _Spring.HARDENING:
-            bent = ", ".join(
-                f"{name} {quantity(values[name])}" for name in ("quadratic", "cubic") if name in values
-            )
+            terms = [name for name in ("quadratic", "cubic") if name in values]
+            bent = ", ".join(f"{name} {quantity(values[name])}" for name in terms)
             return [f"{stiffness}, hardening: {bent}"]
         if form is _Spring.PLAY:
-            return [
-                f"{stiffness}, with no pull within {quantity(values['play'])} of {quantity(values['slack'])}"
-            ]
+            play, slack = quantity(values["play"]), quantity(values["slack"])
+            return [f"{stiffness}, with no pull within {play} of {slack}"]
         if form is _Spring.LINEAR:
             return [stiffness]
-        where = "above" if form is _Spring.TAUT_ABOVE else "below"
-        return [f"{stiffness}, taut {where} {quantity(values['slack'])} and slack elsewhere"]
+        sense = "above" if form is _Spring.TAUT_ABOVE else "below"
+        return [f"{stiffness}, taut {sense} {quantity(values['slack'])} and slack elsewhere"]
 
 
 def _pulls(angle: Any, shape: Shape) -> tuple[Any, ...]:
@@ -404,33 +377,24 @@ class BaseTilt(Effect):
         down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
         return tuple(both_sides(motion.gravity_along(side)) for side in sideways_gravity(down, np.eye(3)[:2]))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
-        """Gravity of the simulated arm turned."""
-        return _Tilt(np.append(self.coefficients_of(parameters), 0.0))
+    def start(self, run: Simulated) -> None:
+        """Gravity is that of the new arm."""
+        run.state = None
 
-
-class _Tilt(Simulated):
-    def __init__(self, tilt: Floats) -> None:
-        super().__init__()
-        self.tilt = tilt
-        self.turned: Any = None
-
-    def start(self, joints: int, random: np.random.Generator) -> None:
-        self.turned = None
-
-    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
+        """Turns gravity of the simulated arm."""
         gravity = np.array(plant.model.gravity.linear)
-        if self.turned is None:
-            self.turned = gravity - np.cross(self.tilt, gravity)
-        if not np.array_equal(gravity, self.turned):
-            # The links may be another arm's as well, and a payload that is mounted brings new ones.
+        if run.state is None:
+            run.state = gravity - np.cross(np.append(run.coefficients, 0.0), gravity)
+        if not np.array_equal(gravity, run.state):
+            # Other arms may share the links, and a mounted payload brings new ones.
             model = plant.model.copy()
-            model.gravity.linear = self.turned
+            model.gravity.linear = run.state
             plant.model = model
 
 
 class JointZeroOffset(Effect):
-    """The joint stands at q + `offset` when q is published."""
+    """The joint stands at q + `offset` for a published q."""
 
     cause = "joint_zero_offset"
     side = "joint"
@@ -458,14 +422,9 @@ class JointZeroOffset(Effect):
         """Backlash behind the motor's encoder: a gap under a torque of one sign holds the link to one side."""
         return "backlash" if setting.encoder == "motor" and not setting.torque_turns[joint] else None
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Shifts the published positions."""
-        offset = float(parameters["offset"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.position[joint] -= offset
-
-        return Simulated(sense=sense)
+        reading.position[run.joint] -= run.values["offset"]
 
 
 # Reading error of the linearisation [rad].
@@ -490,7 +449,7 @@ class EncoderEccentricity(Effect):
     parameters = (
         Parameter("cosine", "rad", "reading error with cos(k q)", low=-0.1, high=0.1),
         Parameter("sine", "rad", "reading error with sin(k q)", low=-0.1, high=0.1),
-        Parameter("cycles_per_turn", "1", "k", shape=True),
+        Parameter("cycles_per_turn", "1", "k", shape=True, fixed=True),
     )
     depends_on = "position"
     law = Law("q")
@@ -503,10 +462,6 @@ class EncoderEccentricity(Effect):
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """One and two cycles a turn."""
         return [Shape(cycles_per_turn=k) for k in (1, 2)]
-
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Cycles are whole numbers."""
-        return ()
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of the joint torque with the joint displaced by the error, in all rows."""
@@ -521,16 +476,11 @@ class EncoderEccentricity(Effect):
             found.append(both_sides(motion.displaced(*shifts) / _STEP_RAD))
         return tuple(found)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Shifts the published position."""
-        cosine, sine = self.coefficients_of(parameters)
-        cycles = float(parameters["cycles_per_turn"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            angle = cycles * plant.position[joint]
-            reading.position[joint] += cosine * np.cos(angle) + sine * np.sin(angle)
-
-        return Simulated(sense=sense)
+        cosine, sine = run.coefficients
+        angle = run.values["cycles_per_turn"] * plant.position[run.joint]
+        reading.position[run.joint] += cosine * np.cos(angle) + sine * np.sin(angle)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Amplitude and cycles."""

@@ -1,4 +1,4 @@
-"""Causes at the flange and along the arm: a payload that differs, one that changes, a push from outside."""
+"""Causes at the flange and along the arm: a wrong payload, a changing payload, a push from outside."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ident.effects.effect import (
     Effect,
     Experiment,
     Form,
+    FormName,
     Loads,
     Parameter,
     Parameters,
@@ -43,11 +44,49 @@ def _body_torque(motion: Motion, place: int) -> Floats:
     return motion.rigid_torque(motion.q, motion.qd, motion.qdd, bodies)
 
 
+class _Body(Simulated):
+    """Mass and first moments on the last link of a simulated arm from a time on: gravity and inertia."""
+
+    def __init__(self, effect: Effect, joint: int, values: Parameters, form: FormName) -> None:
+        super().__init__(effect, joint, values, form)
+        self.masses = np.array([self.values.get(name, 0.0) for name in ("mass", *_AXES)])
+        self.since_s = self.values.get("time", -1.0)
+        self.sliding = effect.form_of(form) is _Change.LOOSE
+        self.speed: Any = None
+
+    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
+        import pinocchio as pin
+
+        before, self.speed = self.speed, plant.velocity.copy()
+        if time_s < self.since_s or before is None:
+            return
+        model = plant.model.copy()
+        for link in range(1, model.njoints):
+            model.inertias[link] = pin.Inertia.Zero()
+        mass, *moments = self.masses * self.shares(plant) if self.sliding else self.masses
+        model.inertias[model.njoints - 1] = pin.Inertia.FromDynamicParameters(
+            np.array([mass if abs(mass) > 1e-9 else 1e-9, *moments, 0, 0, 0, 0, 0, 0], dtype=float)
+        )
+        acceleration = (self.speed - before) / plant.cycle_s
+        loads.link_torque -= pin.rnea(model, model.createData(), plant.position, plant.velocity, acceleration)
+
+    def shares(self, plant: Plant) -> Floats:
+        """Factors (4,) of mass and first moments in the present pose of a sliding body."""
+        import pinocchio as pin
+
+        data = plant.model.createData()
+        pin.forwardKinematics(plant.model, data, plant.position)
+        down = np.array(plant.model.gravity.linear)
+        lean = data.oMi[plant.model.nv].rotation.T @ down / np.linalg.norm(down)
+        return np.append(1.0, slide(lean))
+
+
 class _Payload(Effect):
-    """A body that differs from the model's, on the last link."""
+    """A body on the last link, different from the model's."""
 
     side = "joint"
     whole_arm = True
+    simulated = _Body
 
     def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """The inertia of the body."""
@@ -69,13 +108,11 @@ class PayloadError(_Payload):
 
     cause = "payload_error"
     summary = "the payload is not the announced one"
-    physics = "what hangs on the flange is not what was announced"
+    physics = "the payload on the flange is not the announced one"
     source = "Khalil, Gautier and Lemoine, ICRA 2007"
     parameters = (
         Parameter("mass", "kg", "mass above the announced one", low=-50.0, high=50.0),
-        Parameter("moment_x", "kg m", "first moment in x of the last link's frame"),
-        Parameter("moment_y", "kg m", "first moment in y"),
-        Parameter("moment_z", "kg m", "first moment in z"),
+        *(Parameter(name, "kg m", f"first moment in {name[-1]} of the last link") for name in _AXES),
     )
     depends_on = "position"
     confused_with = ("base_tilt", "joint_zero_offset", "sensor_gain")
@@ -88,17 +125,13 @@ class PayloadError(_Payload):
         share = float(motion.loaded)
         return tuple(both_sides(share * _body_torque(motion, place)) for place in (_MASS, *_MOMENTS))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
-        """Gravity and inertia of the difference."""
-        return _Body(self.coefficients_of(parameters), -1.0)
-
 
 class _Change(Form):
     JUMP = "jump", *_AXES, "mass", "time", "session"
     LOOSE = "loose", *_AXES, "time", "session"
 
 
-# A lost part hangs within this distance of the last link's frame [m]; a load of 7 kg slips by 0.2 m at most.
+# Largest distance of a lost part from the last link's frame [m]; a load of 7 kg slips by 0.2 m at most.
 _ARM_M = 0.5
 _SLIP_KG_M = 1.4
 
@@ -107,8 +140,8 @@ class PayloadChange(_Payload):
     """Mass and first moments of the last link jump at `time`, in the session number `session` from 1, and stay so in
     the sessions after it.
 
-    A loose payload slides along the last link's axes to where gravity pulls it; nothing falls off, and the first
-    moments, of half the way each, change their signs with the pose.
+    A loose payload slides along the last link's axes under gravity. Nothing falls off, and the first moments, of half
+    the way each, change their signs with the pose.
     """
 
     cause = "payload_change"
@@ -116,12 +149,10 @@ class PayloadChange(_Payload):
     physics = "the payload slips, loosens, or a part of it falls off during the motion"
     source = "Khalil, Gautier and Lemoine, ICRA 2007"
     parameters = (
-        Parameter("moment_x", "kg m", "jump of the first moment in x of the last link's frame"),
-        Parameter("moment_y", "kg m", "jump of the first moment in y"),
-        Parameter("moment_z", "kg m", "jump of the first moment in z"),
+        *(Parameter(name, "kg m", f"jump of the first moment in {name[-1]}") for name in _AXES),
         Parameter("mass", "kg", "jump of the mass", low=-50.0, high=50.0),
         Parameter("time", "s", "from the start of the session", shape=True),
-        Parameter("session", "1", "number of the session", shape=True),
+        Parameter("session", "1", "number of the session", shape=True, fixed=True),
     )
     forms = _Change
     depends_on = "time"
@@ -140,10 +171,6 @@ class PayloadChange(_Payload):
             for time in np.arange(1.0, duration - 1.0, 0.5)
         ]
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """The time."""
-        return ("time",)
-
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
         """Whether the lost part, or the slip, is near the flange."""
         mass = float(coefficients[3]) if len(coefficients) > 3 else 0.0
@@ -151,9 +178,7 @@ class PayloadChange(_Payload):
         return super().plausible(coefficients, shape) and bool(near)
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Torque of unit first moments and a unit mass in the last link after the time, in all rows of loaded
-        sessions.
-        """
+        """Torque of unit first moments and a unit mass in the last link after the time, in all loaded rows."""
         changed = round(shape["session"]) - 1
         after = np.full(len(motion.time), motion.loaded and motion.session > changed)
         if motion.session == changed:
@@ -166,65 +191,17 @@ class PayloadChange(_Payload):
             torques.append(_body_torque(motion, _MASS))
         return tuple(both_sides(after[:, None] * torque) for torque in torques)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
-        """Gravity and inertia of the lost part, or of the way of a loose one, from the time on."""
-        values = np.array([float(parameters.get(name, 0.0)) for name in ("mass", *_AXES)])
-        kind = _Sliding if self.form_of(form) is _Change.LOOSE else _Body
-        return kind(values, float(parameters["time"]))
-
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Size, and when it changed."""
+        """Size, and time of the change."""
         when = f"at {quantity(values['time'])} of session {values['session'][0]:.0f}"
         loose = ["it slides back and forth", f"from {when}"] if form is _Change.LOOSE else [when]
         return [*super().sentence(values, form, names), *loose]
 
 
-class _Body(Simulated):
-    """Mass and first moments (4,) on the last link of a simulated arm from a time on: gravity and inertia."""
-
-    def __init__(self, values: Floats, since_s: float) -> None:
-        super().__init__()
-        self.values, self.since_s = values, since_s
-        self.speed: Any = None
-
-    def load(self, time_s: float, plant: Plant, loads: Loads) -> None:
-        import pinocchio as pin
-
-        before, self.speed = self.speed, plant.velocity.copy()
-        if time_s < self.since_s or before is None:
-            return
-        model = plant.model.copy()
-        for link in range(1, model.njoints):
-            model.inertias[link] = pin.Inertia.Zero()
-        mass, *moments = self.values * self.shares(plant)
-        model.inertias[model.njoints - 1] = pin.Inertia.FromDynamicParameters(
-            np.array([mass if abs(mass) > 1e-9 else 1e-9, *moments, 0, 0, 0, 0, 0, 0], dtype=float)
-        )
-        acceleration = (self.speed - before) / plant.cycle_s
-        loads.link_torque -= pin.rnea(model, model.createData(), plant.position, plant.velocity, acceleration)
-
-    def shares(self, plant: Plant) -> Floats:
-        """Factors (4,) of mass and first moments in the present pose."""
-        return np.ones(4)
-
-
-class _Sliding(_Body):
-    """The same of a body that slides along the last link's axes to where gravity pulls it."""
-
-    def shares(self, plant: Plant) -> Floats:
-        import pinocchio as pin
-
-        data = plant.model.createData()
-        pin.forwardKinematics(plant.model, data, plant.position)
-        down = np.array(plant.model.gravity.linear)
-        lean = data.oMi[plant.model.nv].rotation.T @ down / np.linalg.norm(down)
-        return np.append(1.0, slide(lean))
-
-
 def slide(lean: Floats) -> Floats:
     """Place of a loose body along an axis, -1 to 1, for the component of the direction of gravity along it.
 
-    On a slope beyond that of friction it lies at the lower end; on a smaller one it may be anywhere between.
+    On a slope steeper than friction holds it lies at the lower end; on a smaller one it may be anywhere between.
     """
     return np.tanh(lean / _FRICTION)
 
@@ -247,7 +224,7 @@ def leaning(motion: Motion) -> Floats:
     return turned
 
 
-# Share of its duration by which the middle of a force of any course may differ from that of a half sine.
+# Uncertainty of the middle of a force, as a share of its duration: the true time curve is not a half sine.
 _COURSE = 0.1
 
 
@@ -260,13 +237,11 @@ class Contact(Effect):
     physics = "something or somebody outside pushes the arm for a while"
     source = "Haddadin, De Luca and Albu-Schaeffer, IEEE Trans. Robotics 33 (2017)"
     parameters = (
-        Parameter("force_x", "N", "largest force along x of the base"),
-        Parameter("force_y", "N", "largest force along y of the base"),
-        Parameter("force_z", "N", "largest force along z of the base"),
+        *(Parameter(f"force_{axis}", "N", f"largest force along {axis} of the base") for axis in "xyz"),
         Parameter("time", "s", "middle of the contact, from the start of the session", shape=True),
         Parameter("duration", "s", "of the contact", shape=True, low=0.02),
-        Parameter("session", "1", "number of the session", shape=True),
-        Parameter("link", "1", "link that is pushed, at the origin of the frame after it", shape=True),
+        Parameter("session", "1", "number of the session", shape=True, fixed=True),
+        Parameter("link", "1", "pushed link, at the origin of the frame after it", shape=True, fixed=True),
     )
     depends_on = "time"
     whole_arm = True
@@ -279,16 +254,12 @@ class Contact(Effect):
         """None: times and durations come from the residual's bursts."""
         return []
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Middle and duration."""
-        return ("time", "duration")
-
     def law_std(self, parameters: Parameters, form: Form | None) -> Parameters:
-        """Middle and duration: nobody pushes by half a sine, so these are known to a part of the duration."""
+        """Middle and duration, known to a part of the duration: a real push is no half sine."""
         return {"time": _COURSE * parameters["duration"], "duration": 2.0 * _COURSE * parameters["duration"]}
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Minus the Jacobian's transpose times the force's course, in all rows."""
+        """Minus the Jacobian's transpose times the force over time, in all rows."""
         since = motion.time - shape["time"]
         inside = (np.abs(since) <= 0.5 * shape["duration"]) & (motion.session == round(shape["session"]) - 1)
         course = np.where(inside, np.cos(np.pi * since / shape["duration"]), 0.0)
@@ -302,19 +273,14 @@ class Contact(Effect):
             columns.append(both_sides(torque))
         return tuple(columns)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque on the links."""
-        force = self.coefficients_of(parameters)
-        middle, duration = float(parameters["time"]), float(parameters["duration"])
-        link = int(parameters["link"])
-
-        def load(time_s: float, plant: Plant, loads: Loads) -> None:
-            since = time_s - middle
-            if abs(since) <= 0.5 * duration:
-                course = np.cos(np.pi * since / duration)
-                loads.link_torque += course * (_plant_jacobian(plant, link).T @ force)
-
-        return Simulated(load)
+        since, duration = time_s - run.values["time"], run.values["duration"]
+        if abs(since) <= 0.5 * duration:
+            course = np.cos(np.pi * since / duration)
+            loads.link_torque += course * (
+                _plant_jacobian(plant, int(run.values["link"])).T @ run.coefficients
+            )
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Force, link and time."""

@@ -1,9 +1,9 @@
-"""The motion of an arm as effects see it, and operators with memory along it: Dahl's hysteresis, play, low-pass."""
+"""The motion of an arm for effects, and operators with memory along it: Dahl's hysteresis, low-pass."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
@@ -13,21 +13,21 @@ from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
 from ident.effects.springs import Springs
 
-__all__ = ["Floats", "Motion", "dahl", "first_order", "play"]
+__all__ = ["Floats", "Motion", "dahl", "first_order"]
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of n joints at N samples and the torques that the present model predicts for it.
+    """Motion of n joints at N samples and its torques as predicted by the present model.
 
     chain : the arm. bodies : (n, 10) inertial parameters of the links, the payload in the last one.
     session : number of the session (from 0), in the order of the recordings.
     time : (N,) [s] from the start of the session, evenly spaced. duration_s : length of the session [s].
     q, qd, qdd : (N, n), positions as published [rad], and their derivatives.
-    motor_speed, motor_acceleration : (N, n) of the motors referred to the joints; equal to qd and qdd where
-        the joints are taken for stiff.
+    motor_speed, motor_acceleration : (N, n) of the motors referred to the joints; equal to qd and qdd for
+        stiff joints.
     joint_torque, motor_torque : (N, n) predicted torque through the joint and at the motor [Nm], free of any
         sensor's noise.
     gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
@@ -35,9 +35,9 @@ class Motion:
     friction : the model's drive friction (N, n) [Nm] as a function of the motors' speed (N, n).
     slip : (N, n) Coulomb friction of the drives over its level: from one sign to the other within the presliding
         length after a reversal; None: at once.
-    springs : between published motors and the links; None where the positions are the links', or the stiffness is
-        unknown.
-    loaded : whether the payload hangs there.
+    springs : between published motors and the links; None if the links' positions are published, or the stiffness
+        is unknown.
+    loaded : whether the payload is attached.
     """
 
     chain: Chain
@@ -96,8 +96,6 @@ class Motion:
 
     def gravity_along(self, direction: Floats) -> Floats:
         """Gravity torque (N, n) [Nm] in a field of 9.81 m/s^2 along `direction` (3,), in frame 0."""
-        from dataclasses import replace
-
         tilted = replace(self.chain, gravity=9.81 * np.asarray(direction, dtype=np.float64))
         return regressor.gravity_torque(tilted, self.q, self.bodies)
 
@@ -131,22 +129,8 @@ def dahl(path, length, start):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def play(signal, half_width):  # type: ignore[no-untyped-def]
-    """Output (N,) of the play operator of `half_width` driven by `signal` (N,)."""
-    out = np.empty(signal.shape[0])
-    value = signal[0]
-    for k in range(signal.shape[0]):
-        if signal[k] - value > half_width:
-            value = signal[k] - half_width
-        elif value - signal[k] > half_width:
-            value = signal[k] + half_width
-        out[k] = value
-    return out
-
-
-@njit(cache=True)
 def first_order(signal, keep, start):  # type: ignore[no-untyped-def]
-    """Low-pass of first order (N,) of `signal` (N,) that keeps the share `keep` of its value each sample."""
+    """First-order low-pass (N,) of `signal` (N,): value = keep value + (1 - keep) signal."""
     out = np.empty(signal.shape[0])
     value = start
     for k in range(signal.shape[0]):

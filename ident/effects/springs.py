@@ -1,16 +1,16 @@
-"""Links that hang on the springs of their joints while the motors' motion is known.
+"""Links on the springs of their joints, for a known motion of the motors.
 
 With the encoders at the motors a joint's torque bends it, and the links ring on the springs whenever a motor stops
-or turns: the positions show nothing of it, the joint torques do. Given the motors' angles theta the links follow
+or turns. The joint torques show it, the positions do not. Given the motors' angles theta the links follow
 
     M(q) q'' + b(q, q') = tau,  tau = K s(theta - q) + D (theta' - q'),
 
 with mass matrix M, all other torques b, stiffness K and damping D (Spong, J. Dyn. Syst. Meas. Control 109 (1987),
-with the motors' side given); s is the twist itself, or less of it where the joint has play (Nordin and Gutman,
-Automatica 38 (2002)): then the link crosses the gap almost free, arrives, and rings. M and b vary little over the
-twist of a joint, so they are taken along a first guess of the links' motion. What is left has coefficients that
-change in time. It is integrated by the trapezoidal rule where a link rings slower than the samples, and by the
-backward rule where it rings faster, so that a light wrist follows its motor and does not chatter.
+with the motors' side given); s is the twist, less the part within the play of a joint (Nordin and Gutman,
+Automatica 38 (2002)): with play the link crosses the gap almost free, arrives, and rings. M and b vary little over
+the twist of a joint, so they are taken along a first guess of the links' motion. The remaining linear equation has
+time-varying coefficients. It is integrated by the trapezoidal rule for a link ringing slower than the samples, and by
+the backward rule for a faster one: a light wrist follows its motor and does not chatter.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 # Weight of the end of a step for a slow mode: half is the trapezoidal rule, one is the backward one.
 _LATE = 0.505
-# Stiffness that is left within the play, of seals and lubricant, over that beyond it.
+# Stiffness within the play (seals, lubricant) over the stiffness beyond it.
 _SOFT = 0.02
 
 
@@ -36,7 +36,7 @@ _SOFT = 0.02
 class Springs:
     """Springs of n joints along a motion of N samples.
 
-    mass : (N, n, n) of the links [kg m^2]; other : (N, n) torques that the links need besides their inertia [Nm].
+    mass : (N, n, n) of the links [kg m^2]; other : (N, n) torques of the links besides their inertia [Nm].
     angle, speed : (N, n) of the motors. stiffness : (n,) [Nm/rad]; damping : (n,) [Nm s/rad]; dt : [s].
     loose, play : a joint (from 0) with lost motion and half of it [rad]; -1 for none.
     """
@@ -53,7 +53,7 @@ class Springs:
 
     @cached_property
     def links(self) -> tuple[Floats, Floats, Floats]:
-        """Position, speed and acceleration (N, n) of the links, which begin at rest on their springs."""
+        """Position, speed and acceleration (N, n) of the links, initially at rest on their springs."""
         start = np.stack([self.angle[0] - self.other[0] / self.stiffness, self.speed[0]])
         return self._solve(self._drive - self.other, self.angle, start)
 
@@ -72,19 +72,18 @@ class Springs:
         return replace(self, loose=joint, play=0.5 * gap)
 
     def softer(self, joint: int, compliance: float) -> Springs:
-        """The same with `compliance` [rad/Nm] more in a joint; what it loses rubs as much as before."""
+        """The same with `compliance` [rad/Nm] more in a joint, and the damping unchanged."""
         stiffness = self.stiffness.copy()
         stiffness[joint] = 1.0 / (1.0 / stiffness[joint] + compliance)
         return replace(self, stiffness=stiffness)
 
     @property
     def _drive(self) -> Floats:
-        drive: Floats = self.stiffness * self.angle + self.damping * self.speed
-        return drive
+        return np.asarray(self.stiffness * self.angle + self.damping * self.speed)
 
     def _solve(self, force: Floats, angle: Floats, start: Floats) -> tuple[Floats, Floats, Floats]:
         inertia = np.maximum(np.einsum("kii->i", self.mass) / len(self.mass), 1e-9)
-        # Square of the phase by which a link rings within a step.
+        # Square of the ringing phase within a step.
         fast = self.stiffness * self.dt**2 / inertia
         late = _LATE + (1.0 - _LATE) * np.minimum(1.0, 0.25 * fast)
         lost = np.zeros(len(self.stiffness))
@@ -143,7 +142,7 @@ def _integrate(mass, force, angle, stiffness, damping, lost, play, dt, start, la
             if loose >= 0:
                 twist = angle[step - 1, loose] - q[step - 1, loose]
                 fixed[loose] -= lost[loose] * early[loose] * min(play, max(-play, twist))
-            # On which side of the gap, or within it, the link is at the end of the step.
+            # The link's side of the gap at the end of the step, 0 within the gap.
             for _attempt in range(3):
                 for i in range(n):
                     right[i] = fixed[i]

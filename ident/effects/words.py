@@ -24,7 +24,7 @@ Values = Mapping[str, Triple]
 
 
 def quantity_text(value: float, std: float, unit: str) -> str:
-    """A value with its standard deviation to two digits, and the value to no more than that says."""
+    """A value with its standard deviation to two digits, and no more digits of the value."""
     unit = "" if unit == "1" else f" {unit.replace('^2', '²')}"
     if not (std > 0.0 and math.isfinite(std)):
         return f"{value:.4g}{unit}"
@@ -38,7 +38,7 @@ def quantity_text(value: float, std: float, unit: str) -> str:
 
 
 def quantity(triple: Triple, *, share: bool = False) -> str:
-    """A value as people say it: a share in percent, an angle in degrees as well."""
+    """A value for reading: a share in percent, an angle in degrees too."""
     value, std, unit = triple
     if share:
         return quantity_text(100.0 * value, 100.0 * std, "1") + " %"
@@ -75,7 +75,7 @@ def joints_text(joints: Sequence[int], names: Sequence[str]) -> str:
 
 
 def one_joint(joint: int, names: Sequence[str]) -> str:
-    """A joint (from 1) as `joint A2`; its name alone where that says joint already."""
+    """A joint (from 1) as `joint A2`; its name alone if it contains "joint" already."""
     name = names[joint - 1] if 0 < joint <= len(names) else str(joint)
     return name if "joint" in name.lower() else f"joint {name}"
 

@@ -16,7 +16,7 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
 from ident.dynamics.structure import Condition, ModelStructure, Side
 from ident.dynamics.tables import Tabular
-from ident.effects.model_torque import check_entry, effects_torque
+from ident.effects import check_entry, effects_torque
 from ident.effects.motion import Motion
 
 __all__ = ["DynamicModel", "Projection"]

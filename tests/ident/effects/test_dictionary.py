@@ -8,10 +8,9 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.effects import EFFECTS, Motion, Setting, Shape, find_effect
+from ident.effects import EFFECTS, Motion, Setting, Shape, check_entry, find_effect
 from ident.effects.load import leaning, slide
-from ident.effects.model_torque import check_entry
-from ident.effects.motion import dahl, play
+from ident.effects.motion import dahl
 
 TABLE = {
     "motor": {
@@ -159,11 +158,6 @@ def test_dahl_turns_over_within_its_length() -> None:
     state = dahl(path, 0.01, 0.0)
     assert state[499] == pytest.approx(1.0, abs=1e-9)
     assert state[-1] == pytest.approx(-1.0 + 2.0 * np.exp(-1.0), abs=1e-6)
-
-
-def test_play_lags_by_half_its_width() -> None:
-    out = play(np.array([0.0, 1.0, 2.0, 1.5, 0.0]), 0.5)
-    np.testing.assert_allclose(out, [0.0, 0.5, 1.5, 1.5, 0.5])
 
 
 def test_unknown_cause_names_the_nearest() -> None:

@@ -16,8 +16,19 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
-from ident.effects import DELAYS, EFFECTS, Effect, Form, Motion, Setting, Shape, described, find_effect
-from ident.effects.model_torque import check_entry, parameter_values
+from ident.effects import (
+    DELAYS,
+    EFFECTS,
+    Effect,
+    Form,
+    Motion,
+    Setting,
+    Shape,
+    check_entry,
+    described,
+    find_effect,
+    parameter_values,
+)
 
 URDF = Path(__file__).parents[3] / "configs" / "lwr4plus.urdf"
 NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")

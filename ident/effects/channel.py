@@ -1,13 +1,14 @@
-"""Causes in the joint torque sensor, seen in the joint torque only."""
+"""Causes in the recorded channels: errors of the joint torque sensor, late torques, lost samples."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from ident.effects.course import TIME_CONSTANT, Course, Drifting
-from ident.effects.drive import gain_sentence
+from ident.effects.drive import ScaleError, dahl_step
 from ident.effects.effect import (
     Column,
     Effect,
@@ -23,10 +24,13 @@ from ident.effects.effect import (
     Simulated,
     Variable,
 )
-from ident.effects.motion import Motion, dahl
+from ident.effects.motion import Floats, Motion, dahl
 from ident.effects.words import Values, one_joint, quantity, times, wave
 
 __all__ = [
+    "JointTorqueDelay",
+    "LostSamples",
+    "MotorTorqueDelay",
     "SensorCrosstalk",
     "SensorGain",
     "SensorHysteresis",
@@ -36,7 +40,7 @@ __all__ = [
 ]
 
 
-class SensorGain(Effect):
+class SensorGain(ScaleError):
     """The joint torque is reported `1 + error` times."""
 
     cause = "sensor_gain"
@@ -44,30 +48,15 @@ class SensorGain(Effect):
     summary = "scale of the joint torque sensor"
     physics = "the strain gauges' bridge is calibrated wrongly"
     source = "Jubien, Gautier and Janot, IFAC 2014; Gautier and Briot, ICRA 2011"
-    parameters = (Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),)
-    depends_on = "load"
-    law = Law("load")
     confused_with = ("sensor_crosstalk", "payload_error", "sensor_saturation")
-    experiment = Experiment.STATIC_POSES
-    every_payload = True
-    tell_apart = "static poses of joint {joint} with a weighed mass and without it"
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The predicted joint torque."""
         return (Column(joint=motion.joint_torque[:, joint]),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Scales the reported joint torque."""
-        error = float(parameters["error"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.joint_torque[joint] *= 1.0 + error
-
-        return Simulated(sense=sense)
-
-    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Too much or too little."""
-        return gain_sentence(values)
+        reading.joint_torque[run.joint] *= 1.0 + run.values["error"]
 
 
 class SensorCrosstalk(Effect):
@@ -80,7 +69,7 @@ class SensorCrosstalk(Effect):
     source = "Hirzinger et al., ICRA 2002; Aksman, Carignan and Akin, ICRA 2007"
     parameters = (
         Parameter("factor", "1", "share of the other joint's torque", low=-0.5, high=0.5, share=True),
-        Parameter("source", "1", "number of the other joint", shape=True),
+        Parameter("source", "1", "number of the other joint", shape=True, fixed=True),
     )
     depends_on = "load"
     confused_with = ("sensor_gain", "joint_zero_offset")
@@ -92,22 +81,14 @@ class SensorCrosstalk(Effect):
         """All other joints."""
         return [Shape(source=k + 1) for k in range(len(setting.gear_ratio)) if k != joint]
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """A number of a joint is whole."""
-        return ()
-
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The other joint's predicted torque."""
         return (Column(joint=motion.joint_torque[:, round(shape["source"]) - 1]),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Adds to the reported joint torque."""
-        other, factor = round(float(parameters["source"])) - 1, float(parameters["factor"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.joint_torque[joint] += factor * plant.joint_torque[other]
-
-        return Simulated(sense=sense)
+        other = plant.joint_torque[round(run.values["source"]) - 1]
+        reading.joint_torque[run.joint] += run.values["factor"] * other
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Share and source."""
@@ -116,7 +97,7 @@ class SensorCrosstalk(Effect):
 
 
 class SensorHysteresis(Effect):
-    """The sensor lags by up to `amplitude`, the lag turning over within the torque `width`."""
+    """The sensor lags by up to `amplitude`, with the lag reversing within the torque `width`."""
 
     cause = "sensor_hysteresis"
     side = "sensor"
@@ -145,25 +126,10 @@ class SensorHysteresis(Effect):
             Column(joint=-dahl(np.ascontiguousarray(motion.joint_torque[:, joint]), shape["width"], 0.0)),
         )
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Delays the reported joint torque."""
-        return _Loop(joint, float(parameters["amplitude"]), float(parameters["width"]))
-
-
-class _Loop(Simulated):
-    def __init__(self, joint: int, amplitude: float, width: float) -> None:
-        super().__init__()
-        self.joint, self.amplitude, self.width = joint, amplitude, width
-        self.state = 0.0
-        self.before: float | None = None
-
-    def sense(self, time_s: float, plant: Plant, reading: Reading) -> None:
-        here = float(plant.joint_torque[self.joint])
-        step = 0.0 if self.before is None else here - self.before
-        self.before = here
-        sign = 1.0 if step > 0.0 else -1.0
-        self.state = sign - (sign - self.state) * float(np.exp(-abs(step) / self.width))
-        reading.joint_torque[self.joint] -= self.amplitude * self.state
+        state = dahl_step(run, float(plant.joint_torque[run.joint]), run.values["width"])
+        reading.joint_torque[run.joint] -= run.values["amplitude"] * state
 
 
 class _Clipping(Form):
@@ -176,7 +142,7 @@ _SHARP = 1e-3
 
 
 class SensorSaturation(Effect):
-    """Joint torques beyond `limit` are reported as the limit: a fitted one, or one where the samples stop."""
+    """Joint torques beyond `limit` are reported as the limit: a fitted one, or the end of the samples."""
 
     cause = "sensor_saturation"
     side = "sensor"
@@ -185,7 +151,7 @@ class SensorSaturation(Effect):
     source = "Haddadin, De Luca and Albu-Schaeffer, IEEE Trans. Robotics 33 (2017)"
     parameters = (
         Parameter("share", "1", "share of the excess that is cut", low=0.2, high=1.3, share=True),
-        Parameter("limit", "Nm", "largest torque that is reported", shape=True, low=1e-2),
+        Parameter("limit", "Nm", "largest reported torque", shape=True, low=1e-2),
     )
     forms = _Clipping
     depends_on = "load"
@@ -196,7 +162,7 @@ class SensorSaturation(Effect):
     tell_apart = "raise the load of joint {joint} slowly in a static pose until the reading stops"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Where the samples stop, if they do; else from half to all of the predicted range."""
+        """The end of the samples, if there is one; else from half to all of the predicted range."""
         if setting.clipped is not None and np.isfinite(setting.clipped[joint]):
             return [Shape(_Clipping.SEEN, limit=setting.clipped[joint])]
         top = float(setting.torque_range[joint])
@@ -212,7 +178,7 @@ class SensorSaturation(Effect):
         return shape.form is _Clipping.SEEN
 
     def law_std(self, parameters: Parameters, form: Form | None) -> Parameters:
-        """A limit that is read from the samples is as sure as an amplifier's end is sharp."""
+        """Of a limit read from the samples: the sharpness of an amplifier's end."""
         return {"limit": _SHARP * parameters["limit"]} if form is _Clipping.SEEN else {}
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
@@ -220,14 +186,10 @@ class SensorSaturation(Effect):
         torque = motion.joint_torque[:, joint]
         return (Column(joint=np.clip(torque, -shape["limit"], shape["limit"]) - torque),)
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Clips the reported joint torque."""
-        limit = float(parameters["limit"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.joint_torque[joint] = min(limit, max(-limit, reading.joint_torque[joint]))
-
-        return Simulated(sense=sense)
+        limit = run.values["limit"]
+        reading.joint_torque[run.joint] = min(limit, max(-limit, reading.joint_torque[run.joint]))
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """The limit."""
@@ -255,19 +217,15 @@ class SensorOffsetDrift(Drifting):
     tell_apart = "hold one static pose for a minute at the start, in the middle and at the end of the session"
 
     def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """The course of the zero."""
+        """The drift of the zero."""
         return tuple(Column(joint=factor) for factor in self.course(motion, joint, shape))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Shifts the reported joint torque."""
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            reading.joint_torque[joint] += self.drift(parameters, form, time_s)
-
-        return Simulated(sense=sense)
+        reading.joint_torque[run.joint] += self.drift(run.values, run.form, time_s)
 
 
-# Turns of the source of a ripple for a turn of the joint from which on it is the motor.
+# Least number of turns of a ripple's source for a turn of the joint to be the motor's.
 _MOTOR_TURNS = 1.5
 
 
@@ -282,8 +240,8 @@ class SensorRipple(Effect):
     parameters = (
         Parameter("cosine", "Nm", "torque with cos(k r q)"),
         Parameter("sine", "Nm", "torque with sin(k r q)"),
-        Parameter("cycles_per_turn", "1", "k", shape=True),
-        Parameter("ratio", "1", "r: turns of its source for a turn of the joint", shape=True),
+        Parameter("cycles_per_turn", "1", "k", shape=True, fixed=True),
+        Parameter("ratio", "1", "r: turns of its source for a turn of the joint", shape=True, fixed=True),
     )
     depends_on = "position"
     law = Law("q")
@@ -297,10 +255,6 @@ class SensorRipple(Effect):
         own = [Shape(cycles_per_turn=k, ratio=1.0) for k in (1, 2, 3, 4, 5, 6)]
         return [*own, *(Shape(cycles_per_turn=k, ratio=ratio) for k in (1, 2) if ratio > 1.0)]
 
-    def continuous(self, shape: Shape) -> tuple[str, ...]:
-        """Cycles are whole numbers."""
-        return ()
-
     def variable(self, parameters: Parameters) -> Variable:
         """The angle of the joint or of the motor."""
         return "motor angle" if parameters.get("ratio", 1.0) > _MOTOR_TURNS else "position"
@@ -310,18 +264,126 @@ class SensorRipple(Effect):
         angle = shape["cycles_per_turn"] * shape["ratio"] * motion.q[:, joint]
         return Column(joint=np.cos(angle)), Column(joint=np.sin(angle))
 
-    def simulate(self, joint: int, parameters: Parameters, form: str | Form | None = None) -> Simulated:
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Adds to the reported joint torque."""
-        cosine, sine = self.coefficients_of(parameters)
-        cycles = float(parameters["cycles_per_turn"]) * float(parameters["ratio"])
-
-        def sense(time_s: float, plant: Plant, reading: Reading) -> None:
-            angle = cycles * plant.position[joint]
-            reading.joint_torque[joint] += cosine * np.cos(angle) + sine * np.sin(angle)
-
-        return Simulated(sense=sense)
+        cosine, sine = run.coefficients
+        angle = run.values["cycles_per_turn"] * run.values["ratio"] * plant.position[run.joint]
+        reading.joint_torque[run.joint] += cosine * np.cos(angle) + sine * np.sin(angle)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Amplitude and cycles."""
         turn = "a turn of the motor" if values["ratio"][0] > _MOTOR_TURNS else "a turn of the joint"
         return [f"{wave(values)}, {times(values['cycles_per_turn'][0])} {turn}"]
+
+
+class _Delay(Effect):
+    """The torques of a channel are `delay` older than the positions beside them."""
+
+    side = "timing"
+    source = "Swevers, Verdonck and De Schutter, IEEE Control Systems Magazine 27 (2007)"
+    depends_on = "velocity"
+    hidden = ("share",)
+    whole_arm = True
+    experiment = Experiment.CHIRP
+    tell_apart = "a 1 to 15 Hz chirp of one joint"
+    parameters = (
+        Parameter("share", "1", "late share of the torque", low=0.5, high=1.5, share=True),
+        Parameter("delay", "s", "age of the torques", shape=True, low=-0.2, high=0.2),
+    )
+    grid_s: ClassVar[tuple[float, ...]]
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """From a millisecond to thirty, late and early."""
+        return [Shape(delay=sign * delay) for delay in self.grid_s for sign in (1.0, -1.0)]
+
+    def late(self, motion: Motion, torque: Floats, delay: float) -> Floats:
+        """Torque (N, n) of `delay` before, minus that of now."""
+        before = motion.time - delay
+        return np.column_stack([np.interp(before, motion.time, column) for column in torque.T]) - torque
+
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
+        """Reports old joint torques."""
+        if self.channel == "joint":
+            _hold_back(run, reading.joint_torque)
+
+    def sense_motor(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
+        """Reports old motor torques."""
+        if self.channel == "motor":
+            _hold_back(run, reading.motor_torque)
+
+
+def _hold_back(run: Simulated, torque: Floats) -> None:
+    """Replace the torques of a simulated cycle by those of `delay` before."""
+    cycles = max(0, round(1e3 * run.values["delay"]))
+    run.state = [*(run.state or []), torque.copy()][-cycles - 1 :]
+    torque[:] = run.state[0]
+
+
+# Time in which friction reverses, about: a presliding length of 0.1 mrad at 5 rad/s^2.
+_TURN_S = 5e-3
+
+
+class MotorTorqueDelay(_Delay):
+    """The motor torque is `delay` older than the positions beside it."""
+
+    cause = "motor_torque_delay"
+    summary = "motor torque late against the position"
+    physics = "the motor torques take longer through the controller than the positions"
+    channel = "motor"
+    confused_with = ("presliding_hysteresis", "joint_elasticity")
+    # Close enough for friction's reversals to overlap.
+    grid_s = (0.001, 0.002, 0.004, 0.007, 0.011, 0.015, 0.021, 0.03)
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Earlier minus present predicted torque, in all motor rows.
+
+        Coulomb friction is in it for a delay longer than the friction's reversal. A shorter delay looks like another
+        presliding length there.
+        """
+        torque = motion.motor_torque if abs(shape["delay"]) > _TURN_S else motion.smooth_torque("motor")
+        return (Column(motor=self.late(motion, torque, shape["delay"])),)
+
+
+class JointTorqueDelay(_Delay):
+    """The joint torque is `delay` older than the positions beside it."""
+
+    cause = "joint_torque_delay"
+    summary = "joint torque late against the position"
+    physics = "the joint torques take longer through the controller than the positions"
+    channel = "joint"
+    confused_with = ("sensor_hysteresis", "joint_elasticity")
+    grid_s = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """Earlier minus present predicted torque without the jumps at reversals, in all joint rows."""
+        return (Column(joint=self.late(motion, motion.smooth_torque("joint"), shape["delay"])),)
+
+
+class LostSamples(Effect):
+    """A share of the samples of a channel repeats the one before, or is missing."""
+
+    cause = "lost_samples"
+    side = "timing"
+    summary = "dropped, repeated or held samples"
+    physics = "packets are lost, come twice, or a value is held on its way"
+    source = "the channels themselves: equal values in a row, gaps of the counter"
+    parameters = (Parameter("share", "1", "share of the samples", low=0.0, high=1.0, share=True),)
+    depends_on = "time"
+    whole_arm = True
+    counted = True
+    experiment = Experiment.REPEATED_RUN
+    tell_apart = "record at rest for ten seconds and look at the counter and at repeated values"
+
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """None: seen in the channels, not in residuals."""
+        return []
+
+    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+        """No torque of its own."""
+        return (Column(motor=np.zeros_like(motion.q), joint=np.zeros_like(motion.q)),)
+
+    def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
+        """Holds the reported joint torque for a cycle, at random."""
+        if run.state is not None and run.random.random() < run.values["share"]:
+            reading.joint_torque[:] = run.state
+        run.state = reading.joint_torque.copy()

@@ -1,0 +1,92 @@
+"""The task of a diagnosis, and its state between the steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from ident.diagnosis.bench import Bench, prepare_bench
+from ident.diagnosis.evidence import Floats, Rows
+from ident.diagnosis.held_out import HeldOut, held_out
+from ident.diagnosis.nominal import Arm
+from ident.diagnosis.recording import Recording
+from ident.diagnosis.reference import Reference
+from ident.diagnosis.result import Finding, SimulationError
+from ident.diagnosis.selection import Null, Selection, select
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.model import DynamicModel
+
+if TYPE_CHECKING:
+    from lwr_driver.session import Session
+
+__all__ = ["Baseline", "Simulate", "State", "Task"]
+
+Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
+"""Replays sessions with a model and returns the error; provided by the runner."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """The input of a diagnosis, see `diagnose`. sessions, test : as given. arm : the nominal arm.
+
+    causes : names to consider, None for all. model : the present model, None for the base model.
+    """
+
+    sessions: Sequence[Session]
+    test: Sequence[Session]
+    arm: Arm
+    recordings: tuple[Recording, ...]
+    settings: DiagnosisSettings
+    reference: Reference | None
+    causes: Sequence[str] | None
+    model: DynamicModel | None
+    simulate: Simulate | None
+
+    @cached_property
+    def null(self) -> Null | None:
+        """Gain of each candidate in healthy sets."""
+        return None if self.reference is None else self.reference.limits()
+
+    def bench(self, arm: Arm, reference: Reference | None, *, fit_compliance: bool) -> Bench:
+        """Rows, noise and candidates for an arm."""
+        return prepare_bench(
+            arm, self.recordings, self.settings, reference, self.causes, fit_compliance=fit_compliance
+        )
+
+    def select(self, bench: Bench) -> Selection:
+        """The causes supported by the data of a bench."""
+        return select(bench.dictionary, bench.evidence, self.settings, self.null)
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """The base model alone: its residuals on held-out rows, its parameters (p,) and their covariance."""
+
+    held: HeldOut
+    values: Floats
+    covariance: Floats
+
+    @classmethod
+    def of(cls, bench: Bench, tolerated: Sequence[Rows]) -> Baseline:
+        """Fitted on a bench, with tolerated deviations."""
+        evidence = bench.evidence
+        held, p = held_out(evidence, tolerated), evidence.base_count
+        return cls(held, evidence.full.values[:p].copy(), evidence.covariance()[:p, :p])
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A diagnosis in progress.
+
+    timing : findings of late channels, already shifted on the bench. baseline : before the shift. left_out : causes
+    dropped from the candidates.
+    """
+
+    bench: Bench
+    selection: Selection
+    timing: tuple[Finding, ...] = ()
+    baseline: Baseline | None = None
+    notes: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
