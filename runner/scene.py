@@ -51,9 +51,9 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
     # viser reports connections on its own loggers and on standard output.
     logging.getLogger("websockets").setLevel(logging.ERROR)
     # viser would silently take the next free port.
-    _check_free(host, port)
+    port = _free_port(host, port)
     with redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port or _free_port(host), verbose=False)
+        server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=False)
     server.initial_camera.position = (1.45, -1.35, 1.05)
@@ -73,7 +73,8 @@ def line_colour(colour: Colour) -> Colour:
     return red, green, blue
 
 
-def _check_free(host: str, port: int) -> None:
+def _free_port(host: str, port: int) -> int:
+    """The port, or any free one for 0. ConfigurationError for a port in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -82,11 +83,6 @@ def _check_free(host: str, port: int) -> None:
             raise ConfigurationError(
                 f"port {port} of {host} is in use ({error.strerror}); choose another one"
             ) from error
-
-
-def _free_port(host: str) -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
         return int(probe.getsockname()[1])
 
 
@@ -123,14 +119,8 @@ class ArmShape:
             joint = int(shape.parentJoint)
             parent = name if joint == 0 else self._frames[joint - 1][2]
             ball = isinstance(shape.geometry, coal.Sphere)
-            _add_shape(
-                scene,
-                f"{parent}/shape_{index}",
-                shape.geometry,
-                shape.placement,
-                colour or (JOINT if ball else BODY),
-                opacity,
-            )
+            shade = colour or (JOINT if ball else BODY)
+            _add_shape(scene, f"{parent}/shape_{index}", shape.geometry, shape.placement, shade, opacity)
         if payload is not None:
             tip = self._frames[-1][2]
             geometry, placement = _payload_shape(payload)
@@ -139,7 +129,7 @@ class ArmShape:
     def pose(self, q: Floats) -> None:
         """Put the arm into the posture q, (7,) [rad]."""
         for (frame, rotation, _), angle in zip(self._frames, q, strict=True):
-            frame.wxyz = _wxyz(rotation @ _about_z(float(angle)))
+            frame.wxyz = _wxyz(rotation @ pin.utils.rotate("z", float(angle)))
 
     def tip(self, q: Floats) -> Floats:
         """Position (3,) of the last frame of the URDF, the flange, in the posture q, (7,) [rad]."""
@@ -197,11 +187,6 @@ def _add_shape(
             f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the "
             "URDF"
         )
-
-
-def _about_z(angle: float) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _wxyz(rotation: Floats) -> tuple[float, float, float, float]:

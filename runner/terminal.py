@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self, TextIO, TypeVar
 
 import click
@@ -151,7 +151,7 @@ class Interrupts:
 
     def __init__(self, on_first: Callable[[], None], on_second: Callable[[], None]) -> None:
         self._actions = (on_first, on_second)
-        self._previous: dict[int, object] = {}
+        self._previous: dict[int, Any] = {}
         self.count = 0
 
     def __enter__(self) -> Self:
@@ -159,11 +159,9 @@ class Interrupts:
             self._previous[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, previous in self._previous.items():
-            signal.signal(number, previous)  # type: ignore[arg-type]
+            signal.signal(number, previous)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
