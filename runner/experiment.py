@@ -308,14 +308,9 @@ class Run:
     def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
         """The motion of a session from the present posture. RefusedError after a failed check."""
         bench, state = self.bench, self.bench.driver.state()
+        rows = self.excite(plan, state.period_s)
         motion, preflight = session_motion(
-            self.experiment,
-            bench.arm,
-            bench.cell,
-            plan,
-            self.excite(plan, state.period_s),
-            state.q_command,
-            self.folder,
+            self.experiment, bench.arm, bench.cell, plan, rows, state.q_command, self.folder
         )
         preflight += (
             check_link(state),
@@ -367,13 +362,13 @@ class Run:
     def _import_trace(self, path: Path) -> None:
         """Add the motor torques of the controller's trace, if present, to the log."""
         trace = path.with_suffix(".trace.csv")
+        text = (
+            f"{trace.name} is not there: {path.name} has no motor torques and serves Model 1; "
+            f"`lwr-run attach {path} TRACE` adds them later"
+        )
         if self.bench.operator.save_trace(trace):
-            self.bench.status.say(str(import_trace(path, trace)))
-        else:
-            self.bench.status.say(
-                f"{trace.name} is not there: {path.name} has no motor torques and serves Model 1; "
-                f"`lwr-run attach {path} TRACE` adds them later"
-            )
+            text = str(import_trace(path, trace))
+        self.bench.status.say(text)
 
     def _cycles(self, seconds: float) -> int:
         return max(10, round(seconds / self.bench.driver.state().period_s))
@@ -398,9 +393,8 @@ class Run:
         )
 
     def _attachments(self, motion: Motion, preflight: Preflight) -> dict[str, bytes]:
-        time = np.arange(len(motion)) * motion.period_s
+        buffer, time = io.BytesIO(), np.arange(len(motion)) * motion.period_s
         qd = np.gradient(motion.q, motion.period_s, axis=0)
-        buffer = io.BytesIO()
         qdd = np.gradient(qd, motion.period_s, axis=0)
         np.savez_compressed(buffer, time=time, q=motion.q, qd=qd, qdd=qdd)
         return {

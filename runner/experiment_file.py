@@ -26,6 +26,15 @@ __all__ = [
 DEFAULT = "experiments/default.yaml"
 
 
+def _require(condition: object, message: str) -> None:
+    if not condition:
+        raise ConfigurationError(message)
+
+
+def _require_word(name: str, message: str) -> None:
+    _require(name.replace("-", "").replace("_", "").isalnum(), message)
+
+
 @dataclass(frozen=True)
 class Payload:
     """The payload on the flange as announced: from scale and drawing, not from identification.
@@ -276,12 +285,3 @@ class Experiment:
         """The announced payload with the largest mass, or None."""
         payloads = sorted(self.payloads().values(), key=lambda payload: payload.mass)
         return payloads[-1] if payloads else None
-
-
-def _require(condition: object, message: str) -> None:
-    if not condition:
-        raise ConfigurationError(message)
-
-
-def _require_word(name: str, message: str) -> None:
-    _require(name.replace("-", "").replace("_", "").isalnum(), message)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import itertools
 import json
 import os
 import queue
@@ -280,8 +279,7 @@ def main(arguments: list[str], commands: IO[str], answers: IO[str]) -> None:
     server = start_server(int(settings["port"]))
     page = Dashboard(server, arm, cell)
     announced: queue.Queue[str | None] = queue.Queue()
-    lines = itertools.chain(commands, (None,))
-    threading.Thread(target=lambda: [announced.put(line) for line in lines], daemon=True).start()
+    threading.Thread(target=lambda: _read(commands, announced), daemon=True).start()
     answers.write(f"http://127.0.0.1:{server.get_port()}\n")
     answers.flush()
     seen = 0
@@ -301,6 +299,12 @@ def main(arguments: list[str], commands: IO[str], answers: IO[str]) -> None:
                     seen = head
     finally:
         stop_server(server)
+
+
+def _read(stream: IO[str], lines: queue.Queue[str | None]) -> None:
+    for line in stream:
+        lines.put(line)
+    lines.put(None)
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ class ArmShape:
     def pose(self, q: Floats) -> None:
         """Put the arm into the posture q, (7,) [rad]."""
         for (frame, rotation, _), angle in zip(self._frames, q, strict=True):
-            frame.wxyz = _wxyz(rotation @ pin.utils.rotate("z", float(angle)))
+            frame.wxyz = _wxyz(rotation @ _about_z(float(angle)))
 
     def tip(self, q: Floats) -> Floats:
         """Position (3,) of the last frame of the URDF, the flange, in the posture q, (7,) [rad]."""
@@ -187,6 +187,11 @@ def _add_shape(
             f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the "
             "URDF"
         )
+
+
+def _about_z(angle: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _wxyz(rotation: Floats) -> tuple[float, float, float, float]:

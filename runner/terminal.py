@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
 from types import FrameType
-from typing import Any, Self, TextIO, TypeVar
+from typing import Any, Self, TextIO
 
 import click
 import numpy as np
@@ -22,31 +22,19 @@ __all__ = [
     "plain", "to_json",
 ]  # fmt: skip
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
-
 PATH = click.Path(path_type=Path)
 _BAR = 24
 
 
-def json_option(command: Decorated) -> Decorated:
-    """The option --json of every command with a result."""
-    return click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")(command)
-
-
-def coupling_option(command: Decorated) -> Decorated:
-    """The option --coupling."""
-    return click.option(
-        "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
-    )(command)
-
-
-def gear_ratio_option(command: Decorated) -> Decorated:
-    """The option --gear-ratio, for arms without an arm file."""
-    return click.option(
-        "--gear-ratio",
-        metavar="N[,N...]",
-        help="Motor turns per turn of the joint, one for all or one per joint; default: from the arm file.",
-    )(command)
+json_option = click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+coupling_option = click.option(
+    "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
+)
+gear_ratio_option = click.option(
+    "--gear-ratio",
+    metavar="N[,N...]",
+    help="Motor turns per turn of the joint, one for all or one per joint; default: from the arm file.",
+)
 
 
 class GroupedCommand(click.Command):
@@ -79,12 +67,10 @@ def plain(value: Any) -> Any:
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
     if isinstance(value, Enum):
         return value.name
     if isinstance(value, float):

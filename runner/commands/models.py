@@ -11,8 +11,6 @@ import click
 from fri.errors import ConfigurationError
 from runner.terminal import PATH, json_option, to_json
 
-__all__ = ["compare_command", "export_command", "payload_command", "validate_command"]
-
 _FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
 
 

@@ -12,8 +12,6 @@ from click.shell_completion import get_completion_class
 from fri.errors import ConfigurationError, LwrError
 from runner.terminal import StatusLine, json_option, to_json
 
-__all__ = ["completion_command", "doctor_command", "emulator_command"]
-
 
 @click.command("doctor")
 @click.argument("file", default="experiments/default.yaml")
