@@ -26,10 +26,7 @@ from lwr_driver.driver import Driver, LinkSettings, LinkState
 from lwr_driver.link import advise_quality
 from runner.computer import Finding, examine_computer, find_interface, graded
 
-__all__ = [
-    "Examination", "Heard", "LinkTest", "Patient", "examine", "exercise", "judge_heard", "judge_link",
-    "listen",
-]  # fmt: skip
+__all__ = ["Examination", "Heard", "LinkTest", "Patient", "examine", "judge_heard", "judge_link", "listen"]
 
 _HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
 _LARGEST = 65535
@@ -98,9 +95,8 @@ def listen(
                 datagram, source = end.recvfrom(_LARGEST)
             except TimeoutError:
                 continue
-            number = -1
-            if len(datagram) >= _HEADER.itemsize:
-                number = int(np.frombuffer(datagram, _HEADER, 1)[0]["datagram_id"])
+            whole = len(datagram) >= _HEADER.itemsize
+            number = int(np.frombuffer(datagram, _HEADER, 1)[0]["datagram_id"]) if whole else -1
             kinds[(source[0], len(datagram), number)] += 1
 
 
@@ -156,8 +152,7 @@ def exercise(
     # The controller rates the last hundred packets, so the beginning is left out.
     settle = max(100, round(0.5 / first.period_s))
     trouble: LwrError | None = None
-    worst, count_before = len(_RANKS) - 1, 0
-    start = first
+    worst, count_before, start = len(_RANKS) - 1, 0, first
     _, counts_before = driver.latency_histogram()
     began = time.monotonic()
     try:

@@ -40,7 +40,7 @@ from runner.preflight import (
 )
 from runner.terminal import Interrupts, StatusLine
 
-__all__ = ["Bench", "LinkReport", "Operator", "Progress", "Record", "Run"]
+__all__ = ["Bench", "Operator", "Progress", "Record", "Run"]
 
 Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]

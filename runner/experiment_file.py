@@ -18,10 +18,7 @@ from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session.motor_torque import KrlMotorTorque
 
-__all__ = [
-    "DiagnosisPlan", "Excitation", "Experiment", "Identification", "Link", "MotorTorque", "Moves",
-    "Payload", "Replan", "SessionPlan",
-]  # fmt: skip
+__all__ = ["Experiment", "Payload", "SessionPlan"]
 
 DEFAULT = "experiments/default.yaml"
 
@@ -246,16 +243,14 @@ class Experiment:
         """
         path = find(name)
         experiment = parse(cls, read_mapping(path), str(path))
-        object.__setattr__(experiment, "source", path)
-        object.__setattr__(experiment, "folder", path.parent if beside is None else beside)
-        object.__setattr__(experiment, "text", path.read_text(encoding="utf-8"))
+        folder = path.parent if beside is None else beside
+        vars(experiment).update(source=path, folder=folder, text=path.read_text(encoding="utf-8"))
         return experiment
 
     def changed(self, **values: Any) -> Experiment:
         """The same experiment and file with other values of some keys."""
         other = dataclasses.replace(self, **values)
-        for name in ("source", "folder", "text"):
-            object.__setattr__(other, name, getattr(self, name))
+        vars(other).update(source=self.source, folder=self.folder, text=self.text)
         return other
 
     @property
@@ -283,5 +278,4 @@ class Experiment:
     @property
     def heaviest(self) -> Payload | None:
         """The announced payload with the largest mass, or None."""
-        payloads = sorted(self.payloads().values(), key=lambda payload: payload.mass)
-        return payloads[-1] if payloads else None
+        return max(reversed(self.payloads().values()), key=lambda payload: payload.mass, default=None)

@@ -21,7 +21,7 @@ from sim_backend.pendant import Pendant
 from sim_backend.process import EmulatorProcess
 from sim_backend.robot import robot_file
 
-__all__ = ["EmulatedOperator", "Laboratory", "Operator", "Person"]
+__all__ = ["Laboratory", "Person"]
 
 
 class Person:
@@ -76,15 +76,16 @@ class EmulatedOperator:
 
     def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
         """Mount or unmount, and enter the announced load data."""
-        load = () if wanted is None else (wanted.mass, wanted.com, wanted.inertia)
         if wanted is None:
             self._pendant.unmount()
         elif wanted.name in self._known:
             self._pendant.mount(wanted.name)
         else:
             self._pendant.mount(mass=wanted.mass, com=wanted.com, inertia=wanted.inertia)
-        if self._enters_load:
-            self._pendant.set_load(*(load or (0.0,)))
+        if self._enters_load and wanted is None:
+            self._pendant.set_load(0.0)
+        elif self._enters_load and wanted is not None:
+            self._pendant.set_load(wanted.mass, wanted.com, wanted.inertia)
 
     def start_trace(self) -> None:
         """Begin the controller's trace."""
@@ -133,9 +134,8 @@ class Laboratory:
 
     def _set_up(self, stack: ExitStack) -> Bench:
         experiment = self.experiment
-        beside = experiment.folder
-        arm = Arm.load(experiment.arm, beside=beside)
-        cell = Cell.load(experiment.cell, beside=beside)
+        arm = Arm.load(experiment.arm, beside=experiment.folder)
+        cell = Cell.load(experiment.cell, beside=experiment.folder)
         port = experiment.link.port
         enters_load = experiment.link.handshake != IdentificationHandshake.name
         operator: Operator = Person(self._assume_yes, enters_load=enters_load)

@@ -31,7 +31,7 @@ from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
 from runner.experiment_file import Experiment, Payload
 
-__all__ = ["Dashboard", "LiveView", "Sample", "main"]
+__all__ = ["LiveView", "Sample"]
 
 Floats = NDArray[np.float64]
 

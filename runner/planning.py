@@ -29,10 +29,7 @@ from runner.preflight import (
     check_torque,
 )
 
-__all__ = [
-    "PLAN", "VALIDATION_PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation",
-    "route", "session_motion", "way",
-]  # fmt: skip
+__all__ = ["PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation", "session_motion"]
 
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"

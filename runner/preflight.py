@@ -31,9 +31,8 @@ from runner.computer import free_disk
 from runner.experiment_file import Payload
 
 __all__ = [
-    "Item", "PayloadCheck", "Preflight", "Rest", "check_disk", "check_gravity", "check_link",
-    "check_motion_limits", "check_path", "check_payload", "check_rights", "check_start", "check_torque",
-    "gravity_torque", "load_data",
+    "Item", "Preflight", "Rest", "check_disk", "check_gravity", "check_link", "check_motion_limits",
+    "check_path", "check_payload", "check_rights", "check_start", "check_torque", "load_data",
 ]  # fmt: skip
 
 Vector = npt.NDArray[np.float64]
@@ -226,8 +225,7 @@ def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
     model = _loaded(arm, payload)
     data = model.createData()
     step = max(1, math.ceil(0.01 / motion.period_s))
-    time = motion.period_s * step
-    q = motion.q[::step]
+    time, q = motion.period_s * step, motion.q[::step]
     if len(q) < 3:
         q = np.repeat(motion.q[:1], 3, axis=0)
     qd = np.gradient(q, time, axis=0)

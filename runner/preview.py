@@ -31,7 +31,7 @@ from runner.report.plot import STYLES, Line, Panel, Points
 from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
 
-__all__ = ["Planned", "planned_motion", "preview_html", "serve"]
+__all__ = ["planned_motion", "preview_html", "serve"]
 
 Floats = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from runner.preflight import check_start
 from runner.results import estimate, named_model, summarise, unseen_sessions, write_results
 from runner.terminal import StatusLine
 
-__all__ = ["Rounds", "next_problem", "planned_near_home", "rounds_begun", "show_search"]
+__all__ = ["Rounds", "planned_near_home", "rounds_begun", "show_search"]
 
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"

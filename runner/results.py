@@ -26,13 +26,10 @@ from runner.computer import software, versions
 from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
-from runner.terminal import plain
+from runner.terminal import to_json
 from sim_backend.robot import truth
 
-__all__ = [
-    "agreement", "estimate", "named_model", "new_folder", "summarise", "true_base",
-    "write_log_results", "write_results",
-]  # fmt: skip
+__all__ = ["estimate", "named_model", "new_folder", "summarise", "write_log_results", "write_results"]
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
@@ -192,7 +189,7 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
 _ANNOUNCED = ("payload", "payload_mass")
 
 
-def new_folder(folder: Path) -> Path:
+def new_folder(folder: Path) -> None:
     """Make an empty folder for results. ConfigurationError if this is impossible."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigurationError(f"{folder} is not an empty folder; choose another --results")
@@ -202,7 +199,6 @@ def new_folder(folder: Path) -> Path:
         raise ConfigurationError(
             f"{folder} cannot be made: {error.strerror}; choose another --results"
         ) from error
-    return folder
 
 
 def write_log_results(
@@ -237,7 +233,7 @@ def write_log_results(
     }
     write_model(model, folder / "model.yaml")
     (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(plain(summary), indent=1) + "\n", encoding="utf-8")
+    (folder / "summary.json").write_text(to_json(summary) + "\n", encoding="utf-8")
     from runner.report.page import write_report
 
     return write_report(folder)

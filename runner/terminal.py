@@ -104,28 +104,27 @@ class StatusLine:
             filled = round(_BAR * min(max(fraction, 0.0), 1.0))
             bar = "█" * filled + "░" * (_BAR - filled)
             text = f"{heading:<26} {bar} {100 * fraction:3.0f} %  {detail}"
-            self._stream.write("\r" + text.ljust(self._width))
-            self._stream.flush()
+            self._write("\r" + text.ljust(self._width))
             self._width = len(text)
             self._next = now + self._interval
         elif not self._live and heading != self._heading:
-            self._stream.write(f"{heading}  {detail}\n")
-            self._stream.flush()
+            self._write(f"{heading}  {detail}\n")
         self._heading = heading
 
     def say(self, text: str) -> None:
         """Print a permanent line above the status line."""
         self.clear()
-        self._stream.write(text + "\n")
-        self._stream.flush()
+        self._write(text + "\n")
 
     def clear(self) -> None:
         """Remove the status line."""
         if self._live and self._width:
-            self._stream.write("\r" + " " * self._width + "\r")
-            self._stream.flush()
-        self._width = 0
-        self._heading = ""
+            self._write("\r" + " " * self._width + "\r")
+        self._width, self._heading = 0, ""
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
 
 
 class Interrupts:

@@ -13,7 +13,7 @@ from runner.report.folder import ResultFolder
 from runner.report.interactive import plotly_script
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 
-__all__ = ["REPORT", "page_html", "report_html", "write_page", "write_report"]
+__all__ = ["page_html", "report_html", "write_page", "write_report"]
 
 REPORT = "report.html"
 
