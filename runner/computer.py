@@ -36,9 +36,12 @@ def software() -> str:
 def git_commit() -> str:
     """Commit of the running checkout, with `+` after local changes; empty outside of a checkout."""
     root = Path(__file__).resolve().parents[1]
+    ask = functools.partial(
+        subprocess.check_output, cwd=root, text=True, timeout=10, stderr=subprocess.DEVNULL
+    )
     try:
-        commit = _git(root, "rev-parse", "HEAD")
-        return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
+        commit = ask(["git", "rev-parse", "HEAD"]).strip()
+        return commit + ("+" if ask(["git", "status", "--porcelain", "--untracked-files=no"]).strip() else "")
     except (OSError, subprocess.SubprocessError):
         return ""
 
@@ -52,13 +55,6 @@ def versions() -> dict[str, str]:
         "platform": platform.platform(),
         **{name: metadata.version(name) for name in _PACKAGES},
     }
-
-
-def _git(root: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        ["git", *arguments], cwd=root, capture_output=True, text=True, timeout=10, check=True
-    )
-    return done.stdout.strip()
 
 
 Verdict = Literal["ok", "advice", "fail"]

@@ -450,15 +450,15 @@ def _robot(state: LinkState) -> list[Finding]:
 def _program(patient: Patient, link: LinkTest) -> list[Finding]:
     """The KRL program: its name, its load data, its motor torques."""
     handshake = find_handshake(patient.handshake)
-    found = [Finding("KRL program", f"{handshake.name} takes requests", handshake.name, "ok")]
-    if not handshake.opened(link.msr):
-        advice = (
-            "another program runs, or it waits at a message: look at the pendant, and set `link.handshake` "
-            "to the program"
-        )
-        value = f"$FRI_TO_INT = {np.trim_zeros(link.msr['krl_int'], 'b').tolist()}"
-        found[0] = Finding("KRL program", value, handshake.name, "fail", advice, RobotError)
-    elif isinstance(handshake, IdentificationHandshake):
+    opened = handshake.opened(link.msr)
+    integers = np.trim_zeros(link.msr["krl_int"], "b").tolist()
+    value = f"{handshake.name} takes requests" if opened else f"$FRI_TO_INT = {integers}"
+    other = (
+        "another program runs, or it waits at a message: look at the pendant, and set `link.handshake` "
+        "to the program"
+    )
+    found = [graded("KRL program", value, handshake.name, (not opened, other), who=RobotError)]
+    if opened and isinstance(handshake, IdentificationHandshake):
         mass, *centre = handshake.load(link.msr).tolist()
         place = ", ".join(f"{value:.0f}" for value in centre)
         text = f"{mass:.3f} kg at ({place}) mm from the flange" if mass else "none: the empty flange"
