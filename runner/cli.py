@@ -15,8 +15,6 @@ from fri.errors import LwrError, OperatorError
 # Before the import of numpy: for small matrices a second BLAS thread costs time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-__all__ = ["main"]
-
 VERBS = {
     "doctor": "examine this computer, the link and the controller",
     "experiment": "the whole chain: plan, drive, log, swap the payload, estimate",

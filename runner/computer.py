@@ -21,10 +21,7 @@ from typing import Any, Literal
 from fri.errors import LwrError, NetworkError, RefusedError
 from lwr_driver.realtime import assess
 
-__all__ = [
-    "Finding", "Interface", "Verdict", "examine_computer", "find_interface", "git_commit", "software",
-    "versions",
-]  # fmt: skip
+__all__ = ["Finding", "examine_computer", "find_interface", "git_commit", "software", "versions"]
 
 _PACKAGES = ("numpy", "scipy", "pin", "ruckig", "numba", "mcap")
 _DISTRIBUTION = "lwr-identification"
@@ -39,30 +36,25 @@ def software() -> str:
 def git_commit() -> str:
     """Commit of the running checkout, with `+` after local changes; empty outside of a checkout."""
     root = Path(__file__).resolve().parents[1]
+    ask = functools.partial(
+        subprocess.check_output, cwd=root, text=True, timeout=10, stderr=subprocess.DEVNULL
+    )
     try:
-        commit = _git(root, "rev-parse", "HEAD")
-        return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
+        commit = ask(["git", "rev-parse", "HEAD"]).strip()
+        return commit + ("+" if ask(["git", "status", "--porcelain", "--untracked-files=no"]).strip() else "")
     except (OSError, subprocess.SubprocessError):
         return ""
 
 
 def versions() -> dict[str, str]:
     """Versions by package, with Python, the platform and the commit of this software."""
-    found = {name: metadata.version(name) for name in _PACKAGES}
     return {
         "software": software(),
         "git_commit": git_commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        **found,
+        **{name: metadata.version(name) for name in _PACKAGES},
     }
-
-
-def _git(root: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        ["git", *arguments], cwd=root, capture_output=True, text=True, timeout=10, check=True
-    )
-    return done.stdout.strip()
 
 
 Verdict = Literal["ok", "advice", "fail"]
@@ -102,6 +94,22 @@ class Finding:
         content = asdict(self)
         content.pop("who")
         return content | {"exit_code": self.who.exit_code if self.verdict == "fail" else 0}
+
+
+def graded(
+    subject: str,
+    value: str,
+    limit: str,
+    failure: tuple[bool, str] = (False, ""),
+    shortcoming: tuple[bool, str] = (False, ""),
+    who: type[LwrError] = NetworkError,
+) -> Finding:
+    """A finding from its conditions, each with its advice: of a failure, and of a mere shortcoming."""
+    if failure[0]:
+        return Finding(subject, value, limit, "fail", failure[1], who)
+    if shortcoming[0]:
+        return Finding(subject, value, limit, "advice", shortcoming[1])
+    return Finding(subject, value, limit, "ok")
 
 
 @dataclass(frozen=True)
@@ -155,15 +163,11 @@ def _interface(address: str) -> Finding:
     found = find_interface(address)
     if found is None:
         known = ", ".join(name for _, name in socket.if_nameindex())
-        return Finding(
-            "interface",
-            f"none has {address}",
-            "one",
-            "fail",
+        advice = (
             f"set `link.address` to an address of this computer, or give the network card this one: "
-            f"sudo ip address add {address}/24 dev CARD (CARD of {known})",
-            NetworkError,
+            f"sudo ip address add {address}/24 dev CARD (CARD of {known})"
         )
+        return Finding("interface", f"none has {address}", "one", "fail", advice, NetworkError)
     state, errors = found.read("operstate"), int(found.read("statistics/rx_errors") or 0)
     speed = found.read("speed")
     shown = f"{address} on {found.name}, {state}" + (f", {speed} Mbit/s" if speed.isdigit() else "")
@@ -199,12 +203,10 @@ def _rights(*, needed: bool) -> list[Finding]:
     ]
     if rights.ok:
         found.append(Finding("real-time rights", "SCHED_FIFO and locked memory granted", "granted", "ok"))
-    kernel = [advice for advice in rights.advice if advice.what.startswith("kernel")]
-    if kernel:
-        found.append(Finding("kernel", kernel[0].what, "PREEMPT_RT for 1 ms", "advice", kernel[0].remedy))
-    else:
-        found.append(Finding("kernel", f"{platform.release()}, PREEMPT_RT", "PREEMPT_RT for 1 ms", "ok"))
-    return found
+    kernel = next((advice for advice in rights.advice if advice.what.startswith("kernel")), None)
+    value = kernel.what if kernel else f"{platform.release()}, PREEMPT_RT"
+    lacking = (kernel is not None, kernel.remedy if kernel else "")
+    return [*found, graded("kernel", value, "PREEMPT_RT for 1 ms", shortcoming=lacking)]
 
 
 def _processors() -> Finding:
@@ -214,13 +216,11 @@ def _processors() -> Finding:
         with contextlib.suppress(OSError):
             governors.add(path.read_text().strip())
     value = f"{count}" + (f", governor {'/'.join(sorted(governors))}" if governors else "")
-    if count < 2:
-        return Finding("processors", value, "2", "advice", "the loop shares it with all other processes")
-    if governors - {"performance"}:
-        return Finding(
-            "processors", value, "performance", "advice", "sudo cpupower frequency-set -g performance"
-        )
-    return Finding("processors", value, "2", "ok")
+    if count >= 2 and governors - {"performance"}:
+        advice = "sudo cpupower frequency-set -g performance"
+        return Finding("processors", value, "performance", "advice", advice)
+    alone = (count < 2, "the loop shares it with all other processes")
+    return graded("processors", value, "2", shortcoming=alone)
 
 
 def _clock_source() -> Finding:
@@ -247,19 +247,21 @@ def _clock_time() -> Finding:
 
 
 def _disk(folder: Path) -> Finding:
-    place = folder.resolve()
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free / 1e6
-    if free < LEAST_DISK_MB:
+    place, free = free_disk(folder.resolve())
+    if free < 1e6 * LEAST_DISK_MB:
         return Finding(
-            "disk", f"{free:.0f} MB free at {place}", f"{LEAST_DISK_MB:.0f} MB", "fail", "make room"
+            "disk", f"{free / 1e6:.0f} MB free at {place}", f"{LEAST_DISK_MB:.0f} MB", "fail", "make room"
         )
-    return Finding("disk", f"{free / 1000:.0f} GB free at {place}", f"{LEAST_DISK_MB / 1000:.0f} GB", "ok")
+    return Finding("disk", f"{free / 1e9:.0f} GB free at {place}", f"{LEAST_DISK_MB / 1000:.0f} GB", "ok")
+
+
+def free_disk(folder: Path) -> tuple[Path, float]:
+    """The existing folder nearest above `folder`, and the free space of its disk [bytes]."""
+    place = next(place for place in (folder, *folder.parents) if place.exists())
+    return place, float(shutil.disk_usage(place).free)
 
 
 def _versions() -> Finding:
     found = versions()
-    names = ("python", "numpy", "pin")
-    text = ", ".join([found["software"], *(f"{name} {found[name]}" for name in names)])
+    text = ", ".join([found["software"], *(f"{name} {found[name]}" for name in ("python", "numpy", "pin"))])
     return Finding("versions", text, "", "ok")

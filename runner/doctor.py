@@ -24,12 +24,9 @@ from fri.states import ALL_DRIVES
 from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings, LinkState
 from lwr_driver.link import advise_quality
-from runner.computer import Finding, Verdict, examine_computer, find_interface
+from runner.computer import Finding, examine_computer, find_interface, graded
 
-__all__ = [
-    "Examination", "Heard", "LinkTest", "Patient", "examine", "exercise", "judge_heard", "judge_link",
-    "listen",
-]  # fmt: skip
+__all__ = ["Examination", "Heard", "LinkTest", "Patient", "examine", "judge_heard", "judge_link", "listen"]
 
 _HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
 _LARGEST = 65535
@@ -63,11 +60,10 @@ class Heard:
     def __str__(self) -> str:
         if not self.kinds:
             return "nothing"
-        parts = []
-        for (source, size, number), count in self.kinds.most_common(4):
-            name = f"id 0x{number:04x}" if number >= 0 else "no id"
-            parts.append(f"{count} datagrams of {size} bytes with {name} from {source}")
-        return ", ".join(parts)
+        return ", ".join(
+            f"{count} datagrams of {size} bytes with {f'id 0x{number:04x}' if number >= 0 else 'no id'} from {source}"
+            for (source, size, number), count in self.kinds.most_common(4)
+        )
 
 
 def listen(
@@ -99,9 +95,8 @@ def listen(
                 datagram, source = end.recvfrom(_LARGEST)
             except TimeoutError:
                 continue
-            number = -1
-            if len(datagram) >= _HEADER.itemsize:
-                number = int(np.frombuffer(datagram, _HEADER, 1)[0]["datagram_id"])
+            whole = len(datagram) >= _HEADER.itemsize
+            number = int(np.frombuffer(datagram, _HEADER, 1)[0]["datagram_id"]) if whole else -1
             kinds[(source[0], len(datagram), number)] += 1
 
 
@@ -157,8 +152,7 @@ def exercise(
     # The controller rates the last hundred packets, so the beginning is left out.
     settle = max(100, round(0.5 / first.period_s))
     trouble: LwrError | None = None
-    worst, count_before = len(_RANKS) - 1, 0
-    start = first
+    worst, count_before, start = len(_RANKS) - 1, 0, first
     _, counts_before = driver.latency_histogram()
     began = time.monotonic()
     try:
@@ -227,7 +221,7 @@ class Examination:
         noted = [f.subject for f in self.findings if f.verdict == "advice"]
         if failed:
             return f"Not ready: {', '.join(failed)}."
-        return "Ready." if not noted else f"Ready. Better with: {', '.join(noted)}."
+        return f"Ready. Better with: {', '.join(noted)}." if noted else "Ready."
 
     def __str__(self) -> str:
         lines = [str(finding) for finding in self.findings]
@@ -317,20 +311,21 @@ def judge_heard(patient: Patient, heard: Heard, traffic: int) -> list[Finding]:
     if not heard.kinds:
         seen = f"none on {place} in {heard.waited_s:.1f} s"
         return [Finding("packets", seen, wanted, "fail", _start_advice(patient, traffic), NetworkError)]
+    value, advice = f"FRI from {', '.join(heard.fri)}", ""
     if not heard.fri:
+        value = str(heard)
         advice = (
             "the sender does not speak FRI 1.0 of a KR C2 lr (an LBR iiwa has another protocol); check the "
             "controller's software, and for other programs at the port"
         )
-        return [Finding("packets", str(heard), wanted, "fail", advice, NetworkError)]
-    if patient.controller is not None and patient.controller not in heard.fri:
+    elif patient.controller is not None and patient.controller not in heard.fri:
+        wanted = f"from {patient.controller}"
         advice = f"set `link.controller` to {heard.fri[0]}, or stop that sender"
-        value = f"FRI from {', '.join(heard.fri)}"
-        return [Finding("packets", value, f"from {patient.controller}", "fail", advice, NetworkError)]
-    if patient.controller is None and len(heard.fri) > 1:
-        advice = "name the controller in `link.controller`"
-        return [Finding("packets", f"FRI from {', '.join(heard.fri)}", "one", "fail", advice, NetworkError)]
-    return [Finding("packets", f"{MSR_SIZE} bytes, id 0x{MSR_ID:04x} from {heard.fri[0]}", wanted, "ok")]
+    elif patient.controller is None and len(heard.fri) > 1:
+        wanted, advice = "one", "name the controller in `link.controller`"
+    else:
+        value = f"{wanted} from {heard.fri[0]}"
+    return [graded("packets", value, wanted, (bool(advice), advice))]
 
 
 def _start_advice(patient: Patient, traffic: int) -> str:
@@ -367,23 +362,19 @@ def judge_link(patient: Patient, link: LinkTest) -> list[Finding]:
 def _rate(link: LinkTest) -> Finding:
     expected = 1.0 / link.end.period_s
     value = f"{link.rate_hz:.1f} packets/s at a cycle of {1000 * link.end.period_s:g} ms"
-    if abs(link.rate_hz - expected) > 0.05 * expected:
-        advice = "packets are lost, or the controller does not keep its cycle; check cable and network card"
-        return Finding("rate", value, f"{expected:.1f} ± 5 %", "fail", advice, NetworkError)
-    return Finding("rate", value, f"{expected:.1f} ± 5 %", "ok")
+    off = abs(link.rate_hz - expected) > 0.05 * expected
+    advice = "packets are lost, or the controller does not keep its cycle; check cable and network card"
+    return graded("rate", value, f"{expected:.1f} ± 5 %", (off, advice))
 
 
 def _losses(link: LinkTest) -> Finding:
     names = ("lost", "repeated", "reordered", "malformed", "foreign")
     counts = {name: link.between(name) for name in names}
     value = ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "none"
-    limit = "none lost or damaged"
-    if counts["lost"] > (1.0 - _GOOD_SHARE) * link.packets or counts["malformed"]:
-        advice = "change the cable, use a network card of its own and no switch in between"
-        return Finding("losses", value, limit, "fail", advice, NetworkError)
-    if any(counts.values()):
-        return Finding("losses", value, limit, "advice", "one cable, no switch, nothing else on the card")
-    return Finding("losses", value, limit, "ok")
+    bad = counts["lost"] > (1.0 - _GOOD_SHARE) * link.packets or counts["malformed"] > 0
+    change = "change the cable, use a network card of its own and no switch in between"
+    advice = "one cable, no switch, nothing else on the card"
+    return graded("losses", value, "none lost or damaged", (bad, change), (any(counts.values()), advice))
 
 
 def _quantiles(link: LinkTest) -> dict[float, float]:
@@ -408,23 +399,18 @@ def _replies(link: LinkTest) -> Finding:
     shown = ", ".join(f"p{100 * q:g} {words[q]}" for q in _QUANTILES) + f", longest {words[1.0]} µs"
     limit = f"p99 below {1e6 * half:.0f} µs"
     advice = "close other programs, see the real-time rights and the kernel, or choose a longer cycle"
-    if np.isinf(found[0.99]) and half > float(link.edges[-1]):
-        return Finding("reply", shown, limit, "advice", advice)
-    if found[0.99] > half:
-        return Finding("reply", shown, limit, "fail", advice, NetworkError)
-    return Finding("reply", shown, limit, "ok")
+    unknown = bool(np.isinf(found[0.99])) and half > float(link.edges[-1])
+    slow = found[0.99] > half
+    return graded("reply", shown, limit, (slow and not unknown, advice), (slow, advice))
 
 
 def _in_time(link: LinkTest) -> Finding:
     value = f"{100 * link.in_time:.3f} % of {link.packets} cycles"
+    poor = "this set-up is not sufficient for command mode; see reply and losses"
+    weak = "command mode would be lost now and then; take a longer cycle or a real-time kernel"
     limit = f"{100 * _GOOD_SHARE:g} %"
-    if link.in_time < _POOR_SHARE:
-        advice = "this set-up is not sufficient for command mode; see reply and losses"
-        return Finding("answered in time", value, limit, "fail", advice, NetworkError)
-    if link.in_time < _GOOD_SHARE:
-        advice = "command mode would be lost now and then; take a longer cycle or a real-time kernel"
-        return Finding("answered in time", value, limit, "advice", advice)
-    return Finding("answered in time", value, limit, "ok")
+    share = link.in_time
+    return graded("answered in time", value, limit, (share < _POOR_SHARE, poor), (share < _GOOD_SHARE, weak))
 
 
 def _quality(link: LinkTest) -> Finding:
@@ -433,48 +419,46 @@ def _quality(link: LinkTest) -> Finding:
         f"{end.quality}, worst {link.worst_quality}, answer rate {end.answer_rate:.3f}, latency "
         f"{1000 * end.controller_latency_s:.2f} ms, jitter {1000 * end.jitter_s:.2f} ms"
     )
-    if _RANKS.index(end.quality) < _RANKS.index("OK"):
-        return Finding("quality", value, "OK", "fail", advise_quality(end), NetworkError)
-    if _RANKS.index(link.worst_quality) < _RANKS.index("OK"):
-        advice = "command mode needs it without interruption; see reply and losses"
-        return Finding("quality", value, "OK throughout", "advice", advice)
-    return Finding("quality", value, "OK", "ok")
+    bad, dips = (_RANKS.index(name) < _RANKS.index("OK") for name in (end.quality, link.worst_quality))
+    limit = "OK throughout" if dips and not bad else "OK"
+    advice = "command mode needs it without interruption; see reply and losses"
+    return graded("quality", value, limit, (bad, advise_quality(end) if bad else ""), (dips, advice))
 
 
 def _robot(state: LinkState) -> list[Finding]:
-    found = [Finding("state", f"{state.state}, control {state.control}", "MON", "ok")]
-    if state.control != "POSITION":
-        advice = "$STIFFNESS.STRATEGY=10; the KRL programs do so when command mode is asked for"
-        found[0] = Finding("state", f"{state.state}, control {state.control}", "POSITION", "advice", advice)
+    stiff = state.control != "POSITION"
+    strategy = "$STIFFNESS.STRATEGY=10; the KRL programs do so when command mode is asked for"
     bits = f"power 0x{state.power:02x}, error 0x{state.error:02x}, warning 0x{state.warning:02x}"
-    if state.error:
-        advice = "acknowledge the messages at the pendant"
-        found.append(Finding("drives", bits, "no error", "fail", advice, RobotError))
-    elif state.power != ALL_DRIVES:
-        found.append(
-            Finding("drives", bits, "0x7f to move", "advice", "switch the drives on before a motion")
-        )
-    else:
-        found.append(Finding("drives", bits, "0x7f to move", "ok"))
+    error = (state.error != 0, "acknowledge the messages at the pendant")
+    off = (state.power != ALL_DRIVES, "switch the drives on before a motion")
     hottest = float(np.max(state.temperature))
-    verdict: Verdict = "advice" if hottest > _WARM else "ok"
-    advice = "friction changes with temperature; let the arm rest, or warm it up to the same point each time"
-    found.append(Finding("temperature", f"at most {hottest:.0f} °C", f"{_WARM:.0f} °C", verdict, advice))
-    return found
+    warm = "friction changes with temperature; let the arm rest, or warm it up to the same point each time"
+    value, limit = f"{state.state}, control {state.control}", "POSITION" if stiff else "MON"
+    return [
+        graded("state", value, limit, shortcoming=(stiff, strategy)),
+        graded("drives", bits, "no error" if state.error else "0x7f to move", error, off, RobotError),
+        Finding(
+            "temperature",
+            f"at most {hottest:.0f} °C",
+            f"{_WARM:.0f} °C",
+            "advice" if hottest > _WARM else "ok",
+            warm,
+        ),
+    ]
 
 
 def _program(patient: Patient, link: LinkTest) -> list[Finding]:
     """The KRL program: its name, its load data, its motor torques."""
     handshake = find_handshake(patient.handshake)
-    found = [Finding("KRL program", f"{handshake.name} takes requests", handshake.name, "ok")]
-    if not handshake.opened(link.msr):
-        advice = (
-            "another program runs, or it waits at a message: look at the pendant, and set `link.handshake` "
-            "to the program"
-        )
-        value = f"$FRI_TO_INT = {np.trim_zeros(link.msr['krl_int'], 'b').tolist()}"
-        found[0] = Finding("KRL program", value, handshake.name, "fail", advice, RobotError)
-    elif isinstance(handshake, IdentificationHandshake):
+    opened = handshake.opened(link.msr)
+    integers = np.trim_zeros(link.msr["krl_int"], "b").tolist()
+    value = f"{handshake.name} takes requests" if opened else f"$FRI_TO_INT = {integers}"
+    other = (
+        "another program runs, or it waits at a message: look at the pendant, and set `link.handshake` "
+        "to the program"
+    )
+    found = [graded("KRL program", value, handshake.name, (not opened, other), who=RobotError)]
+    if opened and isinstance(handshake, IdentificationHandshake):
         mass, *centre = handshake.load(link.msr).tolist()
         place = ", ".join(f"{value:.0f}" for value in centre)
         text = f"{mass:.3f} kg at ({place}) mm from the flange" if mass else "none: the empty flange"
@@ -482,19 +466,13 @@ def _program(patient: Patient, link: LinkTest) -> list[Finding]:
     if link.fresh is None:
         return found
     rate = link.fresh / link.seconds if link.seconds > 0.0 else 0.0
-    value = f"{rate:.1f} new values/s"
-    if link.fresh <= 0:
-        advice = (
-            "the KRL program does not count them; check `motor_torque.krl.counter_int`, or set "
-            "`motor_torque.source` to none (Model 1)"
-        )
-        found.append(Finding("motor torques", value, "above 20/s", "fail", advice, RobotError))
-    elif rate < 20.0:
-        advice = "they will bound the bandwidth of Models 2 and 3; shorten the loop of the KRL program"
-        found.append(Finding("motor torques", value, "above 20/s", "advice", advice))
-    else:
-        found.append(Finding("motor torques", value, "above 20/s", "ok"))
-    return found
+    silent = (
+        "the KRL program does not count them; check `motor_torque.krl.counter_int`, or set "
+        "`motor_torque.source` to none (Model 1)"
+    )
+    slow = "they will bound the bandwidth of Models 2 and 3; shorten the loop of the KRL program"
+    cases = ((link.fresh <= 0, silent), (rate < 20.0, slow))
+    return [*found, graded("motor torques", f"{rate:.1f} new values/s", "above 20/s", *cases, RobotError)]
 
 
 def _histogram(link: LinkTest) -> list[str]:

@@ -19,7 +19,7 @@ from ident.rows.filters import SignalSettings
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session import Session
 
-__all__ = ["KEYS", "EstimatorOptions", "IdentifySettings", "Key", "announced", "couplings"]
+__all__ = ["KEYS", "IdentifySettings", "Key", "announced", "couplings"]
 
 
 @dataclass(frozen=True)
@@ -154,9 +154,7 @@ def _words(hint: Any) -> Iterator[str]:
         yield from typing.get_args(hint)
     elif hint is bool:
         yield from ("true", "false")
-    elif hint is float:
-        return
-    else:
+    elif hint is not float:
         for part in typing.get_args(hint):
             yield from _words(part)
 
@@ -247,13 +245,11 @@ def announced(sessions: Sequence[Session], payloads: Sequence[str]) -> list[Sess
             )
         session = corrected[places[0]]
         metadata = {key: value for key, value in session.metadata.items() if key != "payload_mass"}
-        metadata |= {"payload": name} | ({"payload_mass": str(_mass(text, mass))} if mass else {})
+        metadata["payload"] = name
+        if mass:
+            try:
+                metadata["payload_mass"] = str(float(mass))
+            except ValueError:
+                raise ConfigurationError(f"--payload {text!r}: {mass!r} is no mass in kg") from None
         corrected[places[0]] = dataclasses.replace(session, metadata=metadata)
     return corrected
-
-
-def _mass(option: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ConfigurationError(f"--payload {option!r}: {text!r} is no mass in kg") from None

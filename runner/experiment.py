@@ -40,7 +40,7 @@ from runner.preflight import (
 )
 from runner.terminal import Interrupts, StatusLine
 
-__all__ = ["Bench", "LinkReport", "Operator", "Progress", "Record", "Run"]
+__all__ = ["Bench", "Operator", "Progress", "Record", "Run"]
 
 Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]
@@ -124,8 +124,8 @@ class Progress:
 class LinkReport:
     """The link during a session: counts of cycles, reply latency of the loop, tracking.
 
-    missed : late answers by the controller's count. latency_s : quantiles since the connection.
-    worst_tracking_error : (n,) [rad].
+    missed : late answers by the controller's count. latency_s : quantiles since the connection, by name (p99).
+    worst_tracking_error_rad : by joint.
     """
 
     cycles: int
@@ -133,8 +133,8 @@ class LinkReport:
     lost: int
     late: int
     period_s: float
-    latency_s: dict[float, float]
-    worst_tracking_error: Vector
+    latency_s: dict[str, float]
+    worst_tracking_error_rad: list[float]
 
     @classmethod
     def between(cls, start: LinkState, end: LinkState) -> LinkReport:
@@ -145,8 +145,8 @@ class LinkReport:
             end.lost - start.lost,
             end.late - start.late,
             end.period_s,
-            end.latency_s,
-            end.tracking_error,
+            {f"p{100 * quantile:g}": value for quantile, value in end.latency_s.items()},
+            end.tracking_error.tolist(),
         )
 
 
@@ -209,10 +209,7 @@ class Run:
         bench: Bench,
         excite: Callable[[SessionPlan, float], Motion],
     ) -> None:
-        self.experiment = experiment
-        self.folder = folder
-        self.bench = bench
-        self.excite = excite
+        self.experiment, self.folder, self.bench, self.excite = experiment, folder, bench, excite
         self._progress = Progress.load(folder)
         self._mounted: Payload | None = None
         self._rest: Rest | None = None
@@ -311,14 +308,9 @@ class Run:
     def _prepare(self, plan: SessionPlan, here: Rest) -> tuple[Motion, Preflight]:
         """The motion of a session from the present posture. RefusedError after a failed check."""
         bench, state = self.bench, self.bench.driver.state()
+        rows = self.excite(plan, state.period_s)
         motion, preflight = session_motion(
-            self.experiment,
-            bench.arm,
-            bench.cell,
-            plan,
-            self.excite(plan, state.period_s),
-            state.q_command,
-            self.folder,
+            self.experiment, bench.arm, bench.cell, plan, rows, state.q_command, self.folder
         )
         preflight += (
             check_link(state),
@@ -330,10 +322,11 @@ class Run:
 
     def _swap(self, plan: SessionPlan) -> None:
         """Have the payload of the session mounted, and check it by the torques at rest."""
-        bench = self.bench
-        before = self._rest
+        bench, before = self.bench, self._rest
         if plan.payload != self._mounted or before is None:
-            bench.status.say(f"payload for session {plan.name}: {_payload_name(plan.payload)}")
+            load = plan.payload
+            name = "none" if load is None else f"{load.name}, {load.mass:g} kg"
+            bench.status.say(f"payload for session {plan.name}: {name}")
             bench.operator.swap(self._mounted, plan.payload)
             if bench.driver.sets_load:
                 bench.driver.set_load(*load_data(bench.arm, plan.payload))
@@ -369,13 +362,13 @@ class Run:
     def _import_trace(self, path: Path) -> None:
         """Add the motor torques of the controller's trace, if present, to the log."""
         trace = path.with_suffix(".trace.csv")
+        text = (
+            f"{trace.name} is not there: {path.name} has no motor torques and serves Model 1; "
+            f"`lwr-run attach {path} TRACE` adds them later"
+        )
         if self.bench.operator.save_trace(trace):
-            self.bench.status.say(str(import_trace(path, trace)))
-        else:
-            self.bench.status.say(
-                f"{trace.name} is not there: {path.name} has no motor torques and serves Model 1; "
-                f"`lwr-run attach {path} TRACE` adds them later"
-            )
+            text = str(import_trace(path, trace))
+        self.bench.status.say(text)
 
     def _cycles(self, seconds: float) -> int:
         return max(10, round(seconds / self.bench.driver.state().period_s))
@@ -384,6 +377,7 @@ class Run:
         experiment = self.experiment
         payload = plan.payload
         source = experiment.motor_torque.source
+        epoch = datetime.fromtimestamp(LOCK_STEP_EPOCH_NS * 1e-9, UTC)
         return session_metadata(
             robot=self.bench.arm.name,
             serial=experiment.serial,
@@ -395,13 +389,12 @@ class Run:
             motor_torque_source="krl_reals" if source == "krl_reals" else "none",
             software=software(),
             git_commit=git_commit(),
-            utc_start=_utc(LOCK_STEP_EPOCH_NS) if experiment.lock_step else None,
+            utc_start=epoch.isoformat() if experiment.lock_step else None,
         )
 
     def _attachments(self, motion: Motion, preflight: Preflight) -> dict[str, bytes]:
-        time = np.arange(len(motion)) * motion.period_s
+        buffer, time = io.BytesIO(), np.arange(len(motion)) * motion.period_s
         qd = np.gradient(motion.q, motion.period_s, axis=0)
-        buffer = io.BytesIO()
         qdd = np.gradient(qd, motion.period_s, axis=0)
         np.savez_compressed(buffer, time=time, q=motion.q, qd=qd, qdd=qdd)
         return {
@@ -410,11 +403,3 @@ class Run:
             "plan.npz": buffer.getvalue(),
             "preflight.json": preflight.to_json(),
         }
-
-
-def _utc(nanoseconds: int) -> str:
-    return datetime.fromtimestamp(nanoseconds * 1e-9, UTC).isoformat()
-
-
-def _payload_name(payload: Payload | None) -> str:
-    return "none" if payload is None else f"{payload.name}, {payload.mass:g} kg"

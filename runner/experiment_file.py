@@ -18,12 +18,18 @@ from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session.motor_torque import KrlMotorTorque
 
-__all__ = [
-    "DiagnosisPlan", "Excitation", "Experiment", "Identification", "Link", "MotorTorque", "Moves",
-    "Payload", "Replan", "SessionPlan",
-]  # fmt: skip
+__all__ = ["Experiment", "Payload", "SessionPlan"]
 
 DEFAULT = "experiments/default.yaml"
+
+
+def _require(condition: object, message: str) -> None:
+    if not condition:
+        raise ConfigurationError(message)
+
+
+def _require_word(name: str, message: str) -> None:
+    _require(name.replace("-", "").replace("_", "").isalnum(), message)
 
 
 @dataclass(frozen=True)
@@ -42,14 +48,10 @@ class Payload:
     shape: PayloadShape | None = None
 
     def __post_init__(self) -> None:
-        if not self.name or "/" in self.name or self.name.startswith("."):
-            raise ConfigurationError(
-                f"payload name {self.name!r}: use a plain word, it becomes part of names"
-            )
-        if self.name == "none":
-            raise ConfigurationError("payload name 'none' means the empty flange; leave the key out instead")
-        if not 0 < self.mass <= 50:
-            raise ConfigurationError(f"payload {self.name}: mass {self.mass} kg is outside 0 to 50 kg")
+        plain = self.name and "/" not in self.name and not self.name.startswith(".")
+        _require(plain, f"payload name {self.name!r}: use a plain word, it becomes part of names")
+        _require(self.name != "none", "payload name 'none' means the empty flange; leave the key out instead")
+        _require(0 < self.mass <= 50, f"payload {self.name}: mass {self.mass} kg is outside 0 to 50 kg")
 
     def body(self) -> pin.Inertia:
         """The payload as a rigid body in the frame of link 7."""
@@ -71,10 +73,9 @@ class SessionPlan:
     validation: bool = False
 
     def __post_init__(self) -> None:
-        if not self.name.replace("-", "").replace("_", "").isalnum():
-            raise ConfigurationError(
-                f"session name {self.name!r}: letters, digits, - and _ only, it names a file"
-            )
+        _require_word(
+            self.name, f"session name {self.name!r}: letters, digits, - and _ only, it names a file"
+        )
 
 
 @dataclass(frozen=True)
@@ -89,15 +90,17 @@ class Excitation:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        _positive("period_s", self.period_s, "s")
-        if self.harmonics < 2:
-            raise ConfigurationError(f"harmonics {self.harmonics} is below 2; rest at both ends needs two")
-        if self.periods < 1:
-            raise ConfigurationError(
-                f"periods {self.periods} is below 1; at least one whole period is recorded"
-            )
-        if not 0 < self.speed_scale <= 1:
-            raise ConfigurationError(f"speed_scale {self.speed_scale} is outside 0 to 1")
+        _require(self.period_s > 0, f"period_s {self.period_s} s is not positive")
+        _require(self.harmonics >= 2, f"harmonics {self.harmonics} is below 2; rest at both ends needs two")
+        _require(
+            self.periods >= 1, f"periods {self.periods} is below 1; at least one whole period is recorded"
+        )
+        _require(0 < self.speed_scale <= 1, f"speed_scale {self.speed_scale} is outside 0 to 1")
+        _require(
+            self.plan is None or self.speed_scale == 1,
+            f"excitation.speed_scale {self.speed_scale} does not apply to the motion of excitation.plan "
+            f"{self.plan}; leave speed_scale out, or plan a slower motion with `lwr-run plan`",
+        )
 
 
 @dataclass(frozen=True)
@@ -112,12 +115,11 @@ class Moves:
     max_start_distance_rad: float = 3.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.speed_scale <= 1:
-            raise ConfigurationError(f"speed_scale {self.speed_scale} is outside 0 to 1")
-        if self.settle_s < 0.5:
-            raise ConfigurationError(f"settle_s {self.settle_s} s is below 0.5 s; the arm must come to rest")
-        if self.clearance_m < 0:
-            raise ConfigurationError(f"clearance_m {self.clearance_m} m is negative")
+        _require(0 < self.speed_scale <= 1, f"speed_scale {self.speed_scale} is outside 0 to 1")
+        _require(
+            self.settle_s >= 0.5, f"settle_s {self.settle_s} s is below 0.5 s; the arm must come to rest"
+        )
+        _require(self.clearance_m >= 0, f"clearance_m {self.clearance_m} m is negative")
 
 
 @dataclass(frozen=True)
@@ -132,8 +134,7 @@ class Link:
 
     def __post_init__(self) -> None:
         find_handshake(self.handshake)
-        if not 0 <= self.port <= 65535:
-            raise ConfigurationError(f"port {self.port} is outside 0 to 65535")
+        _require(0 <= self.port <= 65535, f"port {self.port} is outside 0 to 65535")
 
 
 @dataclass(frozen=True)
@@ -172,8 +173,7 @@ class DiagnosisPlan:
     sure: float = 0.8
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.sure < 1.0:
-            raise ConfigurationError(f"sure {self.sure} is outside 0.5 to 1; 0.8 is usual")
+        _require(0.5 <= self.sure < 1.0, f"sure {self.sure} is outside 0.5 to 1; 0.8 is usual")
 
 
 @dataclass(frozen=True)
@@ -188,8 +188,7 @@ class Replan:
     problem: str = "plans/replan.yaml"
 
     def __post_init__(self) -> None:
-        if self.rounds < 0:
-            raise ConfigurationError(f"replan.rounds {self.rounds} is negative")
+        _require(self.rounds >= 0, f"replan.rounds {self.rounds} is negative")
 
 
 @dataclass(frozen=True)
@@ -217,27 +216,24 @@ class Experiment:
     text: str = field(default="", init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not self.name or not self.name.replace("-", "").replace("_", "").isalnum():
-            raise ConfigurationError(f"name {self.name!r}: letters, digits, - and _ only, it names a folder")
+        _require_word(self.name, f"name {self.name!r}: letters, digits, - and _ only, it names a folder")
         names = [session.name for session in self.sessions]
-        if not names:
-            raise ConfigurationError("sessions is empty; list at least one motion")
+        _require(names, "sessions is empty; list at least one motion")
         for name in names:
-            if names.count(name) > 1:
-                raise ConfigurationError(
-                    f"session name {name!r} is used {names.count(name)} times; names must differ"
-                )
-        if all(session.validation for session in self.sessions):
-            raise ConfigurationError("every session is for validation; an estimate needs another one")
+            count = names.count(name)
+            _require(count == 1, f"session name {name!r} is used {count} times; names must differ")
         known = {session.payload for session in self.sessions if not session.validation}
+        _require(known, "every session is for validation; an estimate needs another one")
         for session in self.sessions:
-            if session.validation and session.payload is not None and session.payload not in known:
-                raise ConfigurationError(
-                    f"session {session.name!r} validates with the payload {session.payload.name!r}, not "
-                    "identified by another session; give the payload a session without `validation`"
-                )
-        if self.lock_step and self.backend == "fri":
-            raise ConfigurationError("lock_step is for the emulator; set `lock_step: false` with backend fri")
+            _require(
+                session.payload is None or session.payload in known,
+                f"session {session.name!r} validates with the payload {getattr(session.payload, 'name', '')!r}, not "
+                "identified by another session; give the payload a session without `validation`",
+            )
+        _require(
+            self.backend != "fri" or not self.lock_step,
+            "lock_step is for the emulator; set `lock_step: false` with backend fri",
+        )
 
     @classmethod
     def load(cls, name: str | Path = DEFAULT, *, beside: Path | None = None) -> Experiment:
@@ -247,16 +243,14 @@ class Experiment:
         """
         path = find(name)
         experiment = parse(cls, read_mapping(path), str(path))
-        object.__setattr__(experiment, "source", path)
-        object.__setattr__(experiment, "folder", path.parent if beside is None else beside)
-        object.__setattr__(experiment, "text", path.read_text(encoding="utf-8"))
+        folder = path.parent if beside is None else beside
+        vars(experiment).update(source=path, folder=folder, text=path.read_text(encoding="utf-8"))
         return experiment
 
     def changed(self, **values: Any) -> Experiment:
         """The same experiment and file with other values of some keys."""
         other = dataclasses.replace(self, **values)
-        for name in ("source", "folder", "text"):
-            object.__setattr__(other, name, getattr(self, name))
+        vars(other).update(source=self.source, folder=self.folder, text=self.text)
         return other
 
     @property
@@ -284,10 +278,4 @@ class Experiment:
     @property
     def heaviest(self) -> Payload | None:
         """The announced payload with the largest mass, or None."""
-        payloads = sorted(self.payloads().values(), key=lambda payload: payload.mass)
-        return payloads[-1] if payloads else None
-
-
-def _positive(name: str, value: float, unit: str) -> None:
-    if value <= 0:
-        raise ConfigurationError(f"{name} {value} {unit} is not positive")
+        return max(reversed(self.payloads().values()), key=lambda payload: payload.mass, default=None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 
 import click
 
@@ -14,7 +13,6 @@ from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.driver import Driver, LinkSettings, Waiting
-from lwr_driver.session.motor_torque import KrlMotorTorque
 from runner.experiment import Bench, Operator
 from runner.experiment_file import Experiment, Payload
 from runner.terminal import StatusLine
@@ -23,7 +21,7 @@ from sim_backend.pendant import Pendant
 from sim_backend.process import EmulatorProcess
 from sim_backend.robot import robot_file
 
-__all__ = ["EmulatedOperator", "Laboratory", "Operator", "Person"]
+__all__ = ["Laboratory", "Person"]
 
 
 class Person:
@@ -34,8 +32,7 @@ class Person:
     """
 
     def __init__(self, assume_yes: bool, *, enters_load: bool = True) -> None:
-        self._assume_yes = assume_yes
-        self._enters_load = enters_load
+        self._assume_yes, self._enters_load = assume_yes, enters_load
 
     def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
         """Ask for the swap and wait for the confirmation."""
@@ -59,15 +56,11 @@ class Person:
 
     def save_trace(self, path: Path) -> bool:
         """Ask for the trace file."""
-        if self._assume_yes:
-            return path.exists()
         self._confirm(f"Stop the trace and copy its file to {path}. Done?")
         return path.exists()
 
     def _confirm(self, question: str) -> None:
-        if self._assume_yes:
-            return
-        if not click.confirm(question, default=False, err=True):
+        if not self._assume_yes and not click.confirm(question, default=False, err=True):
             raise OperatorError(f"not confirmed: {question.rsplit('. ', 1)[0]}; nothing moved")
 
 
@@ -79,22 +72,19 @@ class EmulatedOperator:
     """
 
     def __init__(self, pendant: Pendant, known: frozenset[str], *, enters_load: bool = True) -> None:
-        self._pendant = pendant
-        self._known = known
-        self._enters_load = enters_load
+        self._pendant, self._known, self._enters_load = pendant, known, enters_load
 
     def swap(self, mounted: Payload | None, wanted: Payload | None) -> None:
         """Mount or unmount, and enter the announced load data."""
         if wanted is None:
             self._pendant.unmount()
-            if self._enters_load:
-                self._pendant.set_load(0.0)
-            return
-        if wanted.name in self._known:
+        elif wanted.name in self._known:
             self._pendant.mount(wanted.name)
         else:
             self._pendant.mount(mass=wanted.mass, com=wanted.com, inertia=wanted.inertia)
-        if self._enters_load:
+        if self._enters_load and wanted is None:
+            self._pendant.set_load(0.0)
+        elif self._enters_load and wanted is not None:
             self._pendant.set_load(wanted.mass, wanted.com, wanted.inertia)
 
     def start_trace(self) -> None:
@@ -135,9 +125,7 @@ class Laboratory:
             self._stack = stack.pop_all()
         return bench
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         self.status.clear()
         if error is not None and self.emulator is not None and not self.emulator.running:
             said = self.emulator.messages().strip().splitlines()
@@ -146,9 +134,8 @@ class Laboratory:
 
     def _set_up(self, stack: ExitStack) -> Bench:
         experiment = self.experiment
-        beside = experiment.folder
-        arm = Arm.load(experiment.arm, beside=beside)
-        cell = Cell.load(experiment.cell, beside=beside)
+        arm = Arm.load(experiment.arm, beside=experiment.folder)
+        cell = Cell.load(experiment.cell, beside=experiment.folder)
         port = experiment.link.port
         enters_load = experiment.link.handshake != IdentificationHandshake.name
         operator: Operator = Person(self._assume_yes, enters_load=enters_load)
@@ -164,9 +151,10 @@ class Laboratory:
             self.emulator = stack.enter_context(emulator)
             known = robot_file(load_configuration(experiment.emulator_path)).payloads
             operator = EmulatedOperator(emulator.pendant, frozenset(known), enters_load=enters_load)
-        driver = stack.enter_context(
-            Driver(arm, self._link(port), notify=self._notify, motor_torque=self._krl())
-        )
+        torque = experiment.motor_torque
+        krl = torque.krl if torque.source == "krl_reals" else None
+        driver = Driver(arm, self._link(port), notify=self._notify, motor_torque=krl)
+        stack.enter_context(driver)
         driver.connect()
         return Bench(arm, cell, driver, operator, self.status)
 
@@ -184,10 +172,6 @@ class Laboratory:
             lock_step_patience_s=60.0,
         )
 
-    def _krl(self) -> KrlMotorTorque | None:
-        settings = self.experiment.motor_torque
-        return settings.krl if settings.source == "krl_reals" else None
-
     def _notify(self, waiting: Waiting) -> None:
         self.status.show(
             f"waiting for {waiting.awaited}",
@@ -200,5 +184,4 @@ def free_port(address: str) -> int:
     """An unused UDP port of `address`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((address, 0))
-        port: int = probe.getsockname()[1]
-    return port
+        return int(probe.getsockname()[1])

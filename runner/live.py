@@ -15,10 +15,9 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
@@ -32,7 +31,7 @@ from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
 from runner.experiment_file import Experiment, Payload
 
-__all__ = ["Dashboard", "LiveView", "Sample", "main"]
+__all__ = ["LiveView", "Sample"]
 
 Floats = NDArray[np.float64]
 
@@ -105,9 +104,7 @@ class LiveView:
     def __enter__(self) -> LiveView:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _send(self, message: Mapping[str, Any]) -> None:
@@ -180,20 +177,13 @@ class Dashboard:
         self._link = gui.add_markdown("")
         self._table = gui.add_markdown("")
         empty = tuple(np.zeros(1) for _ in range(len(arm.joint_names) + 1))
-        series = (
-            {"label": "t"},
-            *(
-                {"label": name, "stroke": colour, "width": 1.5}
-                for name, colour in zip(arm.joint_names, _COLOURS, strict=False)
-            ),
-        )
-        axes = ({"label": "time [s]"}, {"size": 56})
-        scales = {"x": {"time": False}}
-        self._errors = gui.add_uplot(
-            empty, series, title="tracking error [mrad]", axes=axes, scales=scales, height=230
-        )
-        self._torques = gui.add_uplot(
-            empty, series, title="joint torque, % of its limit", axes=axes, scales=scales, height=230
+        coloured = zip(arm.joint_names, _COLOURS, strict=False)
+        lines = ({"label": name, "stroke": colour, "width": 1.5} for name, colour in coloured)
+        series = ({"label": "t"}, *lines)
+        axes, scales = ({"label": "time [s]"}, {"size": 56}), {"x": {"time": False}}
+        self._errors, self._torques = (
+            gui.add_uplot(empty, series, title=title, axes=axes, scales=scales, height=230)
+            for title in ("tracking error [mrad]", "joint torque, % of its limit")
         )
 
     def announce(self, session: Mapping[str, Any]) -> None:
@@ -223,13 +213,12 @@ class Dashboard:
         if sample.row >= 0 and rows > 1:
             done, total = sample.row * period, (rows - 1) * period
             self._bar.value = 100.0 * sample.row / (rows - 1)
-            text = f"{self._session['session']}: {phase_at(self._session, sample.row)}"
+            text = f"{self._session['session']}: {phase_at(self._session.get('phases', []), sample.row)}"
             self._title.content = f"## {text}\n{done:.1f} of {total:.1f} s, **{total - done:.1f} s left**"
         else:
             self._title.content = f"## {self._session.get('session', 'waiting')}\nno motion now"
         self._link.content = (
-            f"**{sample.state}**, quality **{sample.quality}**, answer rate {100 * sample.answer_rate:.1f} "
-            "%, "
+            f"**{sample.state}**, quality **{sample.quality}**, answer rate {100 * sample.answer_rate:.1f} %, "
             f"latency {1e3 * sample.latency_s:.2f} ms, jitter {1e3 * sample.jitter_s:.2f} ms, "
             f"**{sample.missed}** missed, **{self._lost}** lost"
         )
@@ -261,13 +250,10 @@ class Dashboard:
         )
 
 
-def phase_at(session: Mapping[str, Any], row: int) -> str:
-    """Name of the phase at a row of the announced motion."""
-    name = ""
-    for first, phase in session.get("phases", []):
-        if first <= row:
-            name = str(phase)
-    return name.replace("_", " ")
+def phase_at(phases: Iterable[Sequence[Any]], row: int) -> str:
+    """Name of the phase at a row of a motion. phases : first row and name of each, in order."""
+    names = [str(name) for first, name in phases if first <= row]
+    return names[-1].replace("_", " ") if names else ""
 
 
 def _payload(content: Any) -> Payload | None:

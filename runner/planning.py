@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +29,7 @@ from runner.preflight import (
     check_torque,
 )
 
-__all__ = [
-    "PLAN", "VALIDATION_PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation",
-    "route", "session_motion", "way",
-]  # fmt: skip
+__all__ = ["PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation", "session_motion"]
 
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"
@@ -54,18 +52,14 @@ class Excitations:
     def of(cls, experiment: Experiment, arm: Arm, cell: Cell, folder: Path | None = None) -> Excitations:
         """The motions stored in `folder`, the results of the experiment; missing ones are planned now."""
 
-        def stored(name: str, make: Callable[[Experiment, Arm, Cell], ExcitationPlan]) -> ExcitationPlan:
-            path = None if folder is None else folder / name
-            if path is not None and path.is_file():
-                return ExcitationPlan.load(path)
+        def motion(name: str, make: Callable[[Experiment, Arm, Cell], ExcitationPlan]) -> ExcitationPlan:
+            if folder is not None and (folder / name).is_file():
+                return ExcitationPlan.load(folder / name)
             return make(experiment, arm, cell)
 
         validated = any(session.validation for session in experiment.sessions)
-        return cls(
-            stored(PLAN, plan_excitation),
-            experiment.excitation.periods,
-            stored(VALIDATION_PLAN, _plan_unseen) if validated else None,
-        )
+        unseen = motion(VALIDATION_PLAN, _plan_unseen) if validated else None
+        return cls(motion(PLAN, plan_excitation), experiment.excitation.periods, unseen)
 
     def save(self, folder: Path) -> None:
         """Write missing plan files into the folder of the results."""
@@ -164,13 +158,15 @@ def route(
     row to the resting posture. speed_scale : of the velocity limits, for both. settle_s, brake_s : rest before
     and after the excitation [s].
     """
-    period = excitation.period_s
-    first, last = excitation.q[0], excitation.q[-1]
-    motion = way(arm, [*approach, first], period, speed_scale, "move_to_start")
-    motion = motion.join(dwell(first, settle_s, period, "settle"))
-    motion = motion.join(excitation)
-    motion = motion.join(dwell(last, brake_s, period, "brake"))
-    return motion.join(way(arm, [last, *retreat], period, speed_scale, "return"))
+    period, first, last = excitation.period_s, excitation.q[0], excitation.q[-1]
+    parts = (
+        way(arm, [*approach, first], period, speed_scale, "move_to_start"),
+        dwell(first, settle_s, period, "settle"),
+        excitation,
+        dwell(last, brake_s, period, "brake"),
+        way(arm, [last, *retreat], period, speed_scale, "return"),
+    )
+    return reduce(Motion.join, parts)
 
 
 def session_motion(

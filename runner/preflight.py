@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,12 +27,12 @@ from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.link import LinkState
 from lwr_driver.motion import Motion, extremes
 from lwr_driver.realtime import Rights
+from runner.computer import free_disk
 from runner.experiment_file import Payload
 
 __all__ = [
-    "Item", "PayloadCheck", "Preflight", "Rest", "check_disk", "check_gravity", "check_link",
-    "check_motion_limits", "check_path", "check_payload", "check_rights", "check_start", "check_torque",
-    "gravity_torque", "load_data",
+    "Item", "Preflight", "Rest", "check_disk", "check_gravity", "check_link", "check_motion_limits",
+    "check_path", "check_payload", "check_rights", "check_start", "check_torque", "load_data",
 ]  # fmt: skip
 
 Vector = npt.NDArray[np.float64]
@@ -79,7 +78,7 @@ class PayloadCheck:
         """The result in one line."""
         error = float(np.max(np.abs(self.measured - self.predicted)))
         weighs = (
-            "" if not np.isfinite(self.mass) else f", like {self.mass:.2f} kg at the announced centre of mass"
+            f", like {self.mass:.2f} kg at the announced centre of mass" if np.isfinite(self.mass) else ""
         )
         return f"static check of the payload: torques changed as announced within {error:.2f} Nm{weighs}"
 
@@ -145,14 +144,9 @@ def load_data(arm: Arm, payload: Payload | None) -> tuple[float, Triple, Triple]
         return 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     model = pin.buildModelFromXML(arm.urdf)
     flange = model.frames[model.getFrameId("flange")].placement
-    com = flange.actInv(np.asarray(payload.com))
-    tensor = flange.rotation.T @ payload.body().inertia @ flange.rotation
-    return payload.mass, _triple(com), _triple(np.diag(tensor))
-
-
-def _triple(values: Vector) -> Triple:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+    x, y, z = flange.actInv(np.asarray(payload.com)).tolist()
+    xx, yy, zz = np.diag(flange.rotation.T @ payload.body().inertia @ flange.rotation).tolist()
+    return payload.mass, (x, y, z), (xx, yy, zz)
 
 
 @dataclass(frozen=True)
@@ -192,10 +186,8 @@ class Preflight:
         """Raise RefusedError with every failed condition; nothing may move then."""
         failed = [item for item in self.items if not item.ok]
         if failed:
-            lines = "; ".join(
-                f"{item.subject}: {item.value}, limit {item.limit}. {item.advice}" for item in failed
-            )
-            raise RefusedError(f"preflight refuses the motion. {lines}")
+            lines = [f"{item.subject}: {item.value}, limit {item.limit}. {item.advice}" for item in failed]
+            raise RefusedError(f"preflight refuses the motion. {'; '.join(lines)}")
 
     def to_json(self) -> bytes:
         """The list as JSON, for the session log."""
@@ -204,18 +196,16 @@ class Preflight:
 
 def check_motion_limits(arm: Arm, motion: Motion) -> list[Item]:
     """Position, velocity, acceleration and jerk of every row as sent, against the arm's limits."""
-    items = []
-    for worst in extremes(arm, motion):
-        items.append(
-            Item(
-                f"{worst.quantity}",
-                f"{worst.joint} {worst.value:.4g} {worst.unit} at t = {worst.time_s:.3f} s",
-                f"{worst.limit:.4g} {worst.unit}",
-                worst.ok,
-                "lower `speed_scale`, or lengthen `period_s` of the excitation in the experiment file",
-            )
+    return [
+        Item(
+            f"{worst.quantity}",
+            f"{worst.joint} {worst.value:.4g} {worst.unit} at t = {worst.time_s:.3f} s",
+            f"{worst.limit:.4g} {worst.unit}",
+            worst.ok,
+            "lower `speed_scale`, or lengthen `period_s` of the excitation in the experiment file",
         )
-    return items
+        for worst in extremes(arm, motion)
+    ]
 
 
 def check_path(checker: CollisionChecker, motion: Motion, margin: float) -> Item:
@@ -235,8 +225,7 @@ def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
     model = _loaded(arm, payload)
     data = model.createData()
     step = max(1, math.ceil(0.01 / motion.period_s))
-    time = motion.period_s * step
-    q = motion.q[::step]
+    time, q = motion.period_s * step, motion.q[::step]
     if len(q) < 3:
         q = np.repeat(motion.q[:1], 3, axis=0)
     qd = np.gradient(q, time, axis=0)
@@ -310,10 +299,7 @@ def check_gravity(arm: Arm, rest: Rest) -> Item:
 def check_disk(folder: Path, cycles: int) -> Item:
     """Free disk space against the size of the log."""
     needed = 2.0 * _BYTES_PER_CYCLE * cycles + 50e6
-    place = folder
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
+    _, free = free_disk(folder)
     return Item(
         "free disk space",
         "enough" if free >= needed else f"{free / 1e6:.0f} MB",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -17,11 +18,12 @@ from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
-from lwr_driver.arm.collision import Clearance
+from lwr_driver.arm.collision import Clearance, CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.motion import Motion
 from runner.experiment import Progress
 from runner.experiment_file import Experiment, Payload
+from runner.live import phase_at
 from runner.planning import Excitations, checker, excitation_rows, session_motion
 from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
 from runner.report.markup import conditions_table
@@ -29,7 +31,7 @@ from runner.report.plot import STYLES, Line, Panel, Points
 from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
 
-__all__ = ["Planned", "planned_motion", "preview_html", "serve"]
+__all__ = ["planned_motion", "preview_html", "serve"]
 
 Floats = NDArray[np.float64]
 
@@ -45,8 +47,7 @@ _NEAR: Colour = (230, 159, 0)
 class Planned:
     """A planned motion with its checks.
 
-    tightest : moment of the smallest clearance. margin : least clearance allowed [m].
-    time (k,) [s], distance (k,) [m] : clearance along the motion.
+    margin : least clearance allowed [m].
     """
 
     title: str
@@ -55,10 +56,31 @@ class Planned:
     payload: Payload | None
     motion: Motion
     preflight: Preflight
-    tightest: Clearance
     margin: float
-    time: Floats
-    distance: Floats
+
+    @cached_property
+    def _checker(self) -> CollisionChecker:
+        return checker(self.arm, self.cell, self.payload)
+
+    @cached_property
+    def tightest(self) -> Clearance:
+        """The moment of the smallest clearance."""
+        return self._checker.check_path(self.motion.q, period_s=self.motion.period_s)
+
+    @cached_property
+    def rows(self) -> NDArray[np.int64]:
+        """(k,) rows of the motion at even distances."""
+        return _even_rows(self.motion, _CLEARANCES)
+
+    @cached_property
+    def time(self) -> Floats:
+        """(k,) times of `rows` [s]."""
+        return np.asarray(self.rows * self.motion.period_s, dtype=np.float64)
+
+    @cached_property
+    def distance(self) -> Floats:
+        """(k,) clearances at `rows` [m]."""
+        return np.array([self._checker.clearance(self.motion.q[row]).distance for row in self.rows])
 
     def facts(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -117,7 +139,7 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     motion, preflight = session_motion(experiment, arm, cell, plan, rows, home)
     margin = max(experiment.moves.clearance_m, cell.margin_m)
     title = f"{experiment.name}, session {plan.name}"
-    return _planned(title, arm, cell, plan.payload, motion, preflight, margin)
+    return Planned(title, arm, cell, plan.payload, motion, preflight, margin)
 
 
 def _of_plan(path: Path, period_s: float) -> Planned:
@@ -134,34 +156,11 @@ def _of_plan(path: Path, period_s: float) -> Planned:
         check_torque(arm, motion, None),
         check_path(checker(arm, cell, None), motion, cell.margin_m),
     ]
-    return _planned(f"plan {path.name}", arm, cell, None, motion, Preflight(tuple(items)), cell.margin_m)
+    return Planned(f"plan {path.name}", arm, cell, None, motion, Preflight(tuple(items)), cell.margin_m)
 
 
-def _planned(
-    title: str,
-    arm: Arm,
-    cell: Cell,
-    payload: Payload | None,
-    motion: Motion,
-    preflight: Preflight,
-    margin: float,
-) -> Planned:
-    watch = checker(arm, cell, payload)
-    rows = np.unique(np.linspace(0, len(motion) - 1, _CLEARANCES).astype(np.int64))
-    distance = np.array([watch.clearance(motion.q[row]).distance for row in rows])
-    tightest = watch.check_path(motion.q, period_s=motion.period_s)
-    return Planned(
-        title,
-        arm,
-        cell,
-        payload,
-        motion,
-        preflight,
-        tightest,
-        margin,
-        np.asarray(rows * motion.period_s, dtype=np.float64),
-        distance,
-    )
+def _even_rows(motion: Motion, count: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, len(motion) - 1, count).astype(np.int64))
 
 
 def build_scene(server: Any, planned: Planned) -> ArmShape:
@@ -170,11 +169,9 @@ def build_scene(server: Any, planned: Planned) -> ArmShape:
     add_cell(scene, planned.cell)
     arm = ArmShape(scene, planned.arm, "/arm", payload=planned.payload)
     motion = planned.motion
-    rows = np.round(planned.time / motion.period_s).astype(np.int64)
-    path = np.array([arm.tip(motion.q[row]) for row in rows])
+    path = np.array([arm.tip(motion.q[row]) for row in planned.rows])
     near = np.minimum(planned.distance[1:], planned.distance[:-1])
-    shown = [line_colour(_colour(float(value), planned.margin)) for value in near]
-    colours = np.array(shown, dtype=np.uint8)
+    colours = np.array([line_colour(_colour(float(value), planned.margin)) for value in near], dtype=np.uint8)
     if len(path) > 1:
         segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
         doubled = np.repeat(colours[:, None, :], 2, axis=1)
@@ -220,14 +217,13 @@ def preview_html(planned: Planned) -> str:
         f"<style>{style}</style></head><body><main>"
         "<section class=view><iframe title='The planned motion in 3D, with time slider' "
         f"srcdoc='{_quoted(scene)}'></iframe><p class=key><span class=free></span>path of the flange, free "
-        "<span class=near></span>near "
-        "<span class=alarm></span>tightest moment</p></section>"
+        "<span class=near></span>near <span class=alarm></span>tightest moment</p></section>"
         f"<section class=facts><h1>Preview of {escape(planned.title)}</h1>"
         f"<p class='verdict {'good' if ok else 'bad'}'>{mark} {verdict}</p>"
         f"<p>{planned.motion.duration_s:.1f} s. Tightest moment: <b>{1000 * tight.distance:.0f} mm</b>, "
         f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; "
-        f"{1000 * planned.margin:.0f} mm must be "
-        f"kept.</p>{conditions}<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
+        f"{1000 * planned.margin:.0f} mm must be kept.</p>{conditions}"
+        f"<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
         f"<h2>Joints within their limits</h2><div class=joints>{joints}</div>"
         "</section></main></body></html>\n"
     )
@@ -255,7 +251,6 @@ def serve(planned: Planned, port: int, tell: Callable[[str], None]) -> None:
             f"Tightest moment: **{1000 * tight.distance:.0f} mm**, {' to '.join(tight.pair)}, at t = "
             f"{tight.time_s:.2f} s; {1000 * planned.margin:.0f} mm must be kept."
         )
-        span = np.array([0.0, duration])
         gui.add_uplot(
             (planned.time, 1000.0 * planned.distance, np.full(len(planned.time), 1000.0 * planned.margin)),
             (
@@ -264,7 +259,7 @@ def serve(planned: Planned, port: int, tell: Callable[[str], None]) -> None:
                 {"label": "must be kept", "stroke": STYLES["computed"].colour, "dash": (4, 4)},
             ),
             title="clearance [mm] over time [s]",
-            scales={"x": {"time": False, "range": tuple(span)}},
+            scales={"x": {"time": False, "range": (0.0, duration)}},
             height=200,
         )
         lines = [
@@ -284,7 +279,7 @@ def serve(planned: Planned, port: int, tell: Callable[[str], None]) -> None:
                 at.value = round((at.value + 1.0 / _FRAMES_PER_S) % duration, 2)
             row = min(round(at.value / planned.motion.period_s), len(planned.motion) - 1)
             arm.pose(planned.motion.q[row])
-            now.content = f"phase **{_phase(planned.motion, row)}**, {planned.at(row)}"
+            now.content = f"phase **{phase_at(planned.motion.phases, row)}**, {planned.at(row)}"
             tightest.visible = show.value
             time.sleep(1.0 / _FRAMES_PER_S)
     except KeyboardInterrupt:
@@ -297,14 +292,6 @@ def _frames(motion: Motion) -> tuple[list[int], float]:
     count = int(min(max(2, motion.duration_s * _FRAMES_PER_S), _MOST_FRAMES))
     rows = np.linspace(0, len(motion) - 1, count).astype(np.int64)
     return rows.tolist(), motion.duration_s / count
-
-
-def _phase(motion: Motion, row: int) -> str:
-    name = ""
-    for first, phase in motion.phases:
-        if first <= row:
-            name = phase
-    return name.replace("_", " ")
 
 
 def _colour(distance: float, margin: float) -> Colour:
@@ -333,7 +320,7 @@ def _clearance_panel(planned: Planned) -> Panel:
 
 def _joint_panels(planned: Planned) -> Sequence[Panel]:
     motion, limits = planned.motion, planned.arm.limits
-    rows = np.unique(np.linspace(0, len(motion) - 1, _POINTS).astype(np.int64))
+    rows = _even_rows(motion, _POINTS)
     time_s, span = np.asarray(rows * motion.period_s, dtype=np.float64), np.array([0.0, motion.duration_s])
     panels = []
     for k, joint in enumerate(planned.arm.joint_names):

@@ -11,7 +11,7 @@ from typing import Any
 
 from ident.estimation.identify import Identification
 
-__all__ = ["SOURCE", "TABLE_1", "TABLE_2", "PublishedMotion", "PublishedParameter", "characteristics"]
+__all__ = ["SOURCE", "TABLE_1", "TABLE_2", "characteristics"]
 
 SOURCE = (
     "Kolyubin, Shiriaev, Jubien: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
@@ -57,15 +57,10 @@ M8 3.34 0.09
 """
 
 
-def _entries(text: str) -> tuple[PublishedParameter, ...]:
-    words = text.split()
-    return tuple(
-        PublishedParameter(name, float(value), float(rsd))
-        for name, value, rsd in zip(words[::3], words[1::3], words[2::3], strict=True)
-    )
-
-
-TABLE_2 = _entries(_TABLE_2)
+_words = iter(_TABLE_2.split())
+TABLE_2 = tuple(
+    PublishedParameter(name, float(value), float(rsd)) for name, value, rsd in zip(*[_words] * 3, strict=True)
+)
 """The 49 essential base parameters of Model 2, in the order of the paper."""
 
 
@@ -84,12 +79,9 @@ def characteristics(found: Identification) -> dict[str, Any]:
         condition["essential"] = found.problem.select(found.essential.columns).condition
     if set(wanted) <= set(names):
         condition["paper"] = found.problem.select([names.index(name) for name in wanted]).condition
-    return {"condition": condition, "mean_torque_nm": _mean_torque(found)}
-
-
-def _mean_torque(found: Identification) -> dict[str, dict[str, float]]:
-    return {
+    torque = {
         session.name: dict(zip(session.joint_names, session.mean_torque, strict=True))
         for session in found.prepared
         if session.mean_torque
     }
+    return {"condition": condition, "mean_torque_nm": torque}

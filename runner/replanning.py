@@ -7,6 +7,7 @@ checks as any other motion.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,10 +30,10 @@ from runner.experiment import Record, Run
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import excitation_rows
 from runner.preflight import check_start
-from runner.results import estimate, named_model, summarise, write_results
+from runner.results import estimate, named_model, summarise, unseen_sessions, write_results
 from runner.terminal import StatusLine
 
-__all__ = ["Rounds", "next_problem", "planned_near_home", "rounds_begun", "show_search"]
+__all__ = ["Rounds", "planned_near_home", "rounds_begun", "show_search"]
 
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"
@@ -42,10 +43,7 @@ _SEARCHES, _ROW_S = 4, 0.01
 
 def rounds_begun(folder: Path) -> int:
     """Number of further rounds with a plan in `folder`."""
-    count = 0
-    while (folder / PLAN.format(count + 2)).is_file():
-        count += 1
-    return count
+    return next(k for k in itertools.count() if not (folder / PLAN.format(k + 2)).is_file())
 
 
 def show_search(status: StatusLine, now: SearchProgress) -> None:
@@ -98,9 +96,8 @@ class Rounds:
         model = self.folder / MODEL.format(number - 1)
         write_model(named_model(found.model, self.arm.name), model)
         problem = next_problem(self.experiment, self.cell, records, found, model)
-        status.show(
-            f"planning round {number}", 0.0, "Ctrl-C ends the search and keeps the best motion so far"
-        )
+        hint = "Ctrl-C ends the search and keeps the best motion so far"
+        status.show(f"planning round {number}", 0.0, hint)
         motion = planned_near_home(self.experiment, self.arm, problem, lambda now: show_search(status, now))
         motion.save(path)
         status.clear()
@@ -141,11 +138,12 @@ def next_problem(
     """
     wanted = PlanProblem.load(find(experiment.replan.problem, beside=experiment.folder))
     payload = experiment.heaviest
-    sessions = [session for session in experiment.sessions if not session.validation]
     loads: list[Literal["unloaded", "loaded"]] = [
-        "unloaded" if session.payload is None else "loaded" for session in sessions
+        "unloaded" if session.payload is None else "loaded"
+        for session in experiment.sessions
+        if not session.validation
     ]
-    unseen = {session.name for session in experiment.sessions if session.validation}
+    unseen = unseen_sessions(experiment)
     prior = tuple(Prior(session=str(r.path.resolve())) for r in records if r.name not in unseen)
     clearance = 0.0 if wanted.clearance_m is None else wanted.clearance_m
     return replace(

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +23,13 @@ from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 from runner.computer import software, versions
-from runner.experiment import LinkReport, Record
+from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
-from runner.terminal import plain
+from runner.terminal import to_json
 from sim_backend.robot import truth
 
-__all__ = [
-    "agreement", "estimate", "named_model", "new_folder", "summarise", "true_base",
-    "write_log_results", "write_results",
-]  # fmt: skip
+__all__ = ["estimate", "named_model", "new_folder", "summarise", "write_log_results", "write_results"]
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
@@ -45,11 +42,8 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
         resonance_hz=arm.resonance_hz,
     )
     unseen = unseen_sessions(experiment)
-    sessions = [
-        read_session(record.path, status=False)
-        for record in records
-        if record.status == "success" and record.name not in unseen
-    ]
+    kept = [r.path for r in records if r.status == "success" and r.name not in unseen]
+    sessions = [read_session(path, status=False) for path in kept]
     return identify(sessions, Chain.from_urdf(arm.urdf), settings)
 
 
@@ -71,10 +65,8 @@ def true_base(experiment: Experiment, found: Identification) -> dict[str, float]
 def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> float:
     """Share of the estimates within `sigmas` standard deviations of the truth."""
     known = [entry for entry in parameters if "truth" in entry]
-    if not known:
-        return math.nan
     inside = [abs(entry["estimate"] - entry["truth"]) <= sigmas * entry["std"] for entry in known]
-    return sum(inside) / len(inside)
+    return sum(inside) / len(inside) if inside else math.nan
 
 
 def summarise(
@@ -89,17 +81,11 @@ def summarise(
         "exit_status": last.status,
         "reason": last.reason if last.status != "success" else "",
         "sessions": [
-            {
-                "name": record.name,
-                "file": record.path.name,
-                "exit_status": record.status,
-                "reason": record.reason,
-                "validation": record.name in unseen,
-                "warnings": list(record.warnings),
-            }
-            for record in records
+            _entry(r.name, r.path.name, r.name in unseen, r.status, r.reason, r.warnings) for r in records
         ],
-        "link": {record.name: _link(record.link) for record in records if record.link is not None},
+        "link": {
+            record.name: dataclasses.asdict(record.link) for record in records if record.link is not None
+        },
         "versions": versions(),
     }
     if found is None:
@@ -163,29 +149,14 @@ def named_model(model: DynamicModel, robot: str) -> DynamicModel:
 
 
 def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
-    columns = zip(
-        estimate.names,
-        estimate.units or [""] * len(estimate.names),
-        estimate.values.tolist(),
-        estimate.std.tolist(),
-        estimate.rsd_percent.tolist(),
-        strict=True,
-    )
-    return [
-        dict(zip(("name", "unit", "estimate", "std", "rsd_percent"), row, strict=True)) for row in columns
-    ]
-
-
-def _link(link: LinkReport) -> dict[str, Any]:
-    return {
-        "cycles": link.cycles,
-        "missed": link.missed,
-        "lost": link.lost,
-        "late": link.late,
-        "period_s": link.period_s,
-        "latency_s": {f"p{100 * quantile:g}": value for quantile, value in link.latency_s.items()},
-        "worst_tracking_error_rad": link.worst_tracking_error.tolist(),
+    columns = {
+        "name": estimate.names,
+        "unit": estimate.units or [""] * len(estimate.names),
+        "estimate": estimate.values.tolist(),
+        "std": estimate.std.tolist(),
+        "rsd_percent": estimate.rsd_percent.tolist(),
     }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _report(experiment: Experiment, summary: dict[str, Any], found: Identification | None) -> str:
@@ -218,7 +189,7 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
 _ANNOUNCED = ("payload", "payload_mass")
 
 
-def new_folder(folder: Path) -> Path:
+def new_folder(folder: Path) -> None:
     """Make an empty folder for results. ConfigurationError if this is impossible."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigurationError(f"{folder} is not an empty folder; choose another --results")
@@ -228,7 +199,6 @@ def new_folder(folder: Path) -> Path:
         raise ConfigurationError(
             f"{folder} cannot be made: {error.strerror}; choose another --results"
         ) from error
-    return folder
 
 
 def write_log_results(
@@ -244,11 +214,12 @@ def write_log_results(
 
     sessions : of the estimate. tested : held-out sessions. The logs are not copied; the summary has their paths.
     """
-    names = _names([*sessions, *tested])
-    entries = [
-        _entry(session, name, folder, index >= len(sessions))
-        for index, (session, name) in enumerate(zip([*sessions, *tested], names, strict=True))
-    ]
+    entries = []
+    for index, (session, name) in enumerate(_named([*sessions, *tested])):
+        file = os.path.relpath(session.path.resolve(), folder.resolve())
+        # The command line may correct the payload of the log.
+        announced = {key: session.metadata[key] for key in _ANNOUNCED if key in session.metadata}
+        entries.append({**_entry(name, file, index >= len(sessions)), "metadata": announced})
     summary = {
         "schema_version": 1,
         "experiment": folder.resolve().name,
@@ -262,29 +233,34 @@ def write_log_results(
     }
     write_model(model, folder / "model.yaml")
     (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(plain(summary), indent=1) + "\n", encoding="utf-8")
+    (folder / "summary.json").write_text(to_json(summary) + "\n", encoding="utf-8")
     from runner.report.page import write_report
 
     return write_report(folder)
 
 
-def _entry(session: Session, name: str, folder: Path, unseen: bool) -> Mapping[str, Any]:
+def _entry(
+    name: str,
+    file: str,
+    unseen: bool,
+    status: str = "success",
+    reason: str = "",
+    warnings: Sequence[str] = (),
+) -> dict[str, Any]:
     return {
         "name": name,
-        "file": os.path.relpath(session.path.resolve(), folder.resolve()),
-        "exit_status": "success",
-        "reason": "",
+        "file": file,
+        "exit_status": status,
+        "reason": reason,
         "validation": unseen,
-        "warnings": [],
-        # The command line may correct the payload of the log.
-        "metadata": {key: session.metadata[key] for key in _ANNOUNCED if key in session.metadata},
+        "warnings": list(warnings),
     }
 
 
-def _names(sessions: Sequence[Session]) -> list[str]:
-    """Names of the sessions: their file names, with the folder for equal names."""
+def _named(sessions: Sequence[Session]) -> list[tuple[Session, str]]:
+    """The sessions with their names: the file names, with the folder for equal names."""
     stems = [session.path.stem for session in sessions]
     return [
-        stem if stems.count(stem) == 1 else f"{session.path.resolve().parent.name}-{stem}"
+        (session, stem if stems.count(stem) == 1 else f"{session.path.resolve().parent.name}-{stem}")
         for session, stem in zip(sessions, stems, strict=True)
     ]

@@ -21,10 +21,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell, PayloadShape
 from runner.experiment_file import Payload
 
-__all__ = [
-    "ALARM", "BODY", "GHOST", "ArmShape", "Colour", "add_cell", "line_colour", "start_server",
-    "stop_server",
-]  # fmt: skip
+__all__ = ["ALARM", "GHOST", "ArmShape", "Colour", "add_cell", "line_colour", "start_server", "stop_server"]
 
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -51,9 +48,9 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
     # viser reports connections on its own loggers and on standard output.
     logging.getLogger("websockets").setLevel(logging.ERROR)
     # viser would silently take the next free port.
-    _check_free(host, port)
+    port = _free_port(host, port)
     with redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port or _free_port(host), verbose=False)
+        server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=False)
     server.initial_camera.position = (1.45, -1.35, 1.05)
@@ -73,7 +70,8 @@ def line_colour(colour: Colour) -> Colour:
     return red, green, blue
 
 
-def _check_free(host: str, port: int) -> None:
+def _free_port(host: str, port: int) -> int:
+    """The port, or any free one for 0. ConfigurationError for a port in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -82,11 +80,6 @@ def _check_free(host: str, port: int) -> None:
             raise ConfigurationError(
                 f"port {port} of {host} is in use ({error.strerror}); choose another one"
             ) from error
-
-
-def _free_port(host: str) -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.bind((host, 0))
         return int(probe.getsockname()[1])
 
 
@@ -123,14 +116,8 @@ class ArmShape:
             joint = int(shape.parentJoint)
             parent = name if joint == 0 else self._frames[joint - 1][2]
             ball = isinstance(shape.geometry, coal.Sphere)
-            _add_shape(
-                scene,
-                f"{parent}/shape_{index}",
-                shape.geometry,
-                shape.placement,
-                colour or (JOINT if ball else BODY),
-                opacity,
-            )
+            shade = colour or (JOINT if ball else BODY)
+            _add_shape(scene, f"{parent}/shape_{index}", shape.geometry, shape.placement, shade, opacity)
         if payload is not None:
             tip = self._frames[-1][2]
             geometry, placement = _payload_shape(payload)

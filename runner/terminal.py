@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, Self, TextIO, TypeVar
+from types import FrameType
+from typing import Any, Self, TextIO
 
 import click
 import numpy as np
@@ -22,31 +22,19 @@ __all__ = [
     "plain", "to_json",
 ]  # fmt: skip
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
-
 PATH = click.Path(path_type=Path)
 _BAR = 24
 
 
-def json_option(command: Decorated) -> Decorated:
-    """The option --json of every command with a result."""
-    return click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")(command)
-
-
-def coupling_option(command: Decorated) -> Decorated:
-    """The option --coupling."""
-    return click.option(
-        "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
-    )(command)
-
-
-def gear_ratio_option(command: Decorated) -> Decorated:
-    """The option --gear-ratio, for arms without an arm file."""
-    return click.option(
-        "--gear-ratio",
-        metavar="N[,N...]",
-        help="Motor turns per turn of the joint, one for all or one per joint; default: from the arm file.",
-    )(command)
+json_option = click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
+coupling_option = click.option(
+    "--coupling", multiple=True, metavar="A:B", help="Two joints with coupled drives, such as A5:A6."
+)
+gear_ratio_option = click.option(
+    "--gear-ratio",
+    metavar="N[,N...]",
+    help="Motor turns per turn of the joint, one for all or one per joint; default: from the arm file.",
+)
 
 
 class GroupedCommand(click.Command):
@@ -79,12 +67,10 @@ def plain(value: Any) -> Any:
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
     if isinstance(value, Enum):
         return value.name
     if isinstance(value, float):
@@ -118,28 +104,27 @@ class StatusLine:
             filled = round(_BAR * min(max(fraction, 0.0), 1.0))
             bar = "█" * filled + "░" * (_BAR - filled)
             text = f"{heading:<26} {bar} {100 * fraction:3.0f} %  {detail}"
-            self._stream.write("\r" + text.ljust(self._width))
-            self._stream.flush()
+            self._write("\r" + text.ljust(self._width))
             self._width = len(text)
             self._next = now + self._interval
         elif not self._live and heading != self._heading:
-            self._stream.write(f"{heading}  {detail}\n")
-            self._stream.flush()
+            self._write(f"{heading}  {detail}\n")
         self._heading = heading
 
     def say(self, text: str) -> None:
         """Print a permanent line above the status line."""
         self.clear()
-        self._stream.write(text + "\n")
-        self._stream.flush()
+        self._write(text + "\n")
 
     def clear(self) -> None:
         """Remove the status line."""
         if self._live and self._width:
-            self._stream.write("\r" + " " * self._width + "\r")
-            self._stream.flush()
-        self._width = 0
-        self._heading = ""
+            self._write("\r" + " " * self._width + "\r")
+        self._width, self._heading = 0, ""
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
 
 
 class Interrupts:
@@ -151,7 +136,7 @@ class Interrupts:
 
     def __init__(self, on_first: Callable[[], None], on_second: Callable[[], None]) -> None:
         self._actions = (on_first, on_second)
-        self._previous: dict[int, object] = {}
+        self._previous: dict[int, Any] = {}
         self.count = 0
 
     def __enter__(self) -> Self:
@@ -159,11 +144,9 @@ class Interrupts:
             self._previous[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, previous in self._previous.items():
-            signal.signal(number, previous)  # type: ignore[arg-type]
+            signal.signal(number, previous)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.count += 1

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import click
@@ -78,9 +79,13 @@ def command(
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     status = StatusLine()
-    motions = _motions(experiment, arm, cell, folder, status)
-    laboratory = Laboratory(experiment, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
-    with laboratory as bench, _watched(bench, experiment, live_port if live else None) as watched:
+    if not (folder / PLAN).is_file():
+        status.show("planning the excitation", 0.0, "")
+    motions = Excitations.of(experiment, arm, cell, folder)
+    status.clear()
+    motions.save(folder)
+    laboratory = partial(Laboratory, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
+    with laboratory(experiment) as bench, _watched(bench, experiment, live_port if live else None) as watched:
         first = Run(experiment, folder, watched, motions.rows)
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
@@ -91,21 +96,17 @@ def command(
     if done and experiment.diagnosis.run and not no_diagnosis:
         status.show("diagnosis", 0.0, "")
         concluded = conclude_run(
-            experiment,
-            arm,
-            cell,
-            motions,
-            folder,
-            records,
-            laboratory=lambda other: Laboratory(
-                other, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status
-            ),
-            decide=decide,
+            experiment, arm, cell, motions, folder, records, laboratory=laboratory, decide=decide
         )
         status.clear()
         summary |= concluded.to_dict()
         text = f"{text}\n{concluded.text(folder)}"
-    _report(folder, aside=as_json)
+    from runner.report.page import write_report
+
+    try:
+        click.echo(str(write_report(folder)), err=as_json)
+    except LwrError as error:
+        click.echo(f"no report.html: {error}", err=True)
     click.echo(to_json({**summary, "folder": str(folder)}) if as_json else f"{text}\n{folder}")
     if not done:
         raise _failure(records[-1], folder)
@@ -148,26 +149,6 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
             f"{folder} cannot be written: {error.strerror}; choose another --out"
         ) from error
     return experiment, folder
-
-
-def _motions(experiment: Experiment, arm: Arm, cell: Cell, folder: Path, status: StatusLine) -> Excitations:
-    """The motions stored in the folder; missing ones are planned and stored."""
-    if not (folder / PLAN).is_file():
-        status.show("planning the excitation", 0.0, "")
-    motions = Excitations.of(experiment, arm, cell, folder)
-    status.clear()
-    motions.save(folder)
-    return motions
-
-
-def _report(folder: Path, *, aside: bool) -> None:
-    """Write report.html; a failure is only a message. aside : its path goes to standard error."""
-    from runner.report.page import write_report
-
-    try:
-        click.echo(str(write_report(folder)), err=aside)
-    except LwrError as error:
-        click.echo(f"no report.html: {error}", err=True)
 
 
 def _failure(record: Record, folder: Path) -> LwrError:

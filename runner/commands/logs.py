@@ -9,8 +9,6 @@ import click
 from fri.errors import ConfigurationError
 from runner.terminal import PATH, json_option, to_json
 
-__all__ = ["attach_command", "import_command", "info_command", "recover_command", "report_command"]
-
 
 @click.command("info")
 @click.argument("session", type=PATH)

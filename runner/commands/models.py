@@ -11,8 +11,6 @@ import click
 from fri.errors import ConfigurationError
 from runner.terminal import PATH, json_option, to_json
 
-__all__ = ["compare_command", "export_command", "payload_command", "validate_command"]
-
 _FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
 
 
@@ -64,12 +62,8 @@ def validate_command(
         texts += [str(run) for run in runs]
     if cross:
         structure = tested.structure
-        wanted = IdentificationSettings(
-            model=structure.model,
-            without=structure.without,
-            couplings=structure.couplings,
-            coulomb=structure.coulomb,
-        )
+        keys = ("model", "without", "couplings", "coulomb")
+        wanted = IdentificationSettings(**{key: getattr(structure, key) for key in keys})
         folds = cross_validate(logs, structure.chain, wanted)
         content["cross_validation"] = folds.to_dict()
         texts.append(str(folds))

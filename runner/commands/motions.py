@@ -9,8 +9,6 @@ import click
 from fri.errors import ConfigurationError
 from runner.terminal import PATH, StatusLine, json_option, to_json
 
-__all__ = ["check_command", "plan_command", "preview_command"]
-
 _EXPERIMENT = "experiments/default.yaml"
 
 

@@ -12,8 +12,6 @@ from click.shell_completion import get_completion_class
 from fri.errors import ConfigurationError, LwrError
 from runner.terminal import StatusLine, json_option, to_json
 
-__all__ = ["completion_command", "doctor_command", "emulator_command"]
-
 
 @click.command("doctor")
 @click.argument("file", default="experiments/default.yaml")
@@ -67,25 +65,23 @@ def doctor_command(
     if period_ms is not None and not emulated:
         raise ConfigurationError("--period-ms is for the emulator; a controller chooses its cycle in friOpen")
     here = address if address is not None else experiment.link.address
+    place = port or (free_port(here) if emulated else experiment.link.port)
+    torque = experiment.motor_torque
+    patient = Patient(
+        arm=Arm.load(experiment.arm, beside=experiment.folder),
+        address=here,
+        port=place,
+        controller=experiment.link.controller,
+        handshake=experiment.link.handshake,
+        counter_int=torque.krl.counter_int if torque.source == "krl_reals" else None,
+        realtime=not emulated,
+    )
     status = StatusLine()
     with ExitStack() as stack:
         # The findings include the driver's warnings.
         driver_log = logging.getLogger("lwr_driver.driver")
         driver_log.addFilter(_is_error)
         stack.callback(driver_log.removeFilter, _is_error)
-        place = port if port is not None else experiment.link.port
-        if emulated:
-            place = free_port(here) if port is None else port
-        torque = experiment.motor_torque
-        patient = Patient(
-            arm=Arm.load(experiment.arm, beside=experiment.folder),
-            address=here,
-            port=place,
-            controller=experiment.link.controller,
-            handshake=experiment.link.handshake,
-            counter_int=torque.krl.counter_int if torque.source == "krl_reals" else None,
-            realtime=not emulated,
-        )
         if emulated and link:
             emulator = EmulatorProcess(
                 experiment.emulator_path,

@@ -12,9 +12,10 @@ Every function takes a folder of results, or a `ResultFolder` to share the work 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,8 @@ from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
 from runner.report.svg import Figure
 
 __all__ = [
-    "STRONG", "MatrixFigure", "bin_means", "correlation_figure", "every_figure", "motion_figure",
-    "parameter_figure", "residual_figure", "torque_figure", "velocity_figure",
+    "STRONG", "bin_means", "correlation_figure", "every_figure", "motion_figure", "parameter_figure",
+    "residual_figure", "torque_figure", "velocity_figure",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -323,7 +324,37 @@ class MatrixFigure:
 
     def svg(self, *, columns: int = 1, width: float = 720.0) -> str:
         """The matrix as a stand-alone SVG text, `width` px wide; `columns` has no effect."""
-        return _svg(self, width)
+        count = max(len(self.names), 1)
+        size = min(9.0, max(2.0, 0.85 * width / (count + 8)))
+        margin = 0.62 * size * max((len(name) for name in self.names), default=1) + 8.0
+        side = max((width - margin - _SCALE_WIDTH) / count, 0.1)
+        span = side * count
+        height = margin + span + 8.0
+        level = np.rint(_LEVELS * np.clip(self.values, -1.0, 1.0)).astype(np.int64)
+        cells: dict[int, list[str]] = {}
+        for row, values in enumerate(level):
+            for start, end, value in _runs(values):
+                if value:
+                    box = f"M{margin + start * side:.2f} {margin + row * side:.2f}h{(end - start) * side:.2f}"
+                    cells.setdefault(value, []).append(f"{box}v{side:.2f}h{-(end - start) * side:.2f}z")
+        parts = [
+            f"<svg xmlns='http://www.w3.org/2000/svg' width='{width:g}' height='{height:.1f}' "
+            f"viewBox='0 0 {width:g} {height:.1f}' role='img'>",
+            f"<title>{escape(self.caption)}</title><desc>{escape(self.alt)}</desc>",
+            "<rect width='100%' height='100%' fill='#ffffff'/>",
+            *(f"<path fill='{_colour(v / _LEVELS)}' d='{''.join(b)}'/>" for v, b in sorted(cells.items())),
+            f"<rect x='{margin:.2f}' y='{margin:.2f}' width='{span:.2f}' height='{span:.2f}' fill='none' "
+            "stroke='#8c8c8c' stroke-width='0.8'/>",
+        ]
+        text = f"{_FONT} font-size='{size:.2f}' fill='{_INK}'"
+        for place, name in enumerate(self.names):
+            at, label = margin + (place + 0.5) * side, escape(name)
+            parts.append(
+                f"<text x='{margin - 4:.2f}' y='{at + 0.35 * size:.2f}' {text} text-anchor='end'>{label}</text>"
+                f"<text transform='translate({at + 0.35 * size:.2f},{margin - 4:.2f}) rotate(-90)' {text}>"
+                f"{label}</text>"
+            )
+        return "".join([*parts, *_scale(margin + span + 14.0, margin, min(span, 240.0)), "</svg>\n"])
 
     def save(self, path: str | Path, *, columns: int = 1, width: float = 720.0) -> Path:
         """Write the SVG to a file."""
@@ -339,12 +370,12 @@ class MatrixFigure:
         return self.svg()
 
 
-def correlation_figure(results: ResultFolder | str | Path) -> MatrixFigure:
+def correlation_figure(results: Results) -> MatrixFigure:
     """Correlation of the base parameters of a folder of results, from the covariance of its model.
 
     ConfigurationError without a model with covariance.
     """
-    folder = results if isinstance(results, ResultFolder) else ResultFolder.load(results)
+    folder = _folder(results)
     model = folder.model
     if model is None or model.covariance is None or model.std is None:
         raise ConfigurationError(f"{folder.path}: holds no model with a covariance; nothing is correlated")
@@ -354,44 +385,6 @@ def correlation_figure(results: ResultFolder | str | Path) -> MatrixFigure:
     alt = f"Correlation matrix of {len(matrix)} parameters. {strong} pairs are correlated by more than {STRONG}."
     caption = "Correlation of the base parameters"
     return MatrixFigure("correlation", caption, tuple(model.names), np.asarray(matrix), alt)
-
-
-def _svg(figure: MatrixFigure, width: float) -> str:
-    count = max(len(figure.names), 1)
-    size = min(9.0, max(2.0, 0.85 * width / (count + 8)))
-    margin = 0.62 * size * max((len(name) for name in figure.names), default=1) + 8.0
-    side = max((width - margin - _SCALE_WIDTH) / count, 0.1)
-    span = side * count
-    height = margin + span + 8.0
-    level = np.rint(_LEVELS * np.clip(figure.values, -1.0, 1.0)).astype(np.int64)
-    cells: dict[int, list[str]] = {}
-    for row, values in enumerate(level):
-        for start, end, value in _runs(values):
-            if value:
-                box = f"M{margin + start * side:.2f} {margin + row * side:.2f}h{(end - start) * side:.2f}"
-                cells.setdefault(value, []).append(f"{box}v{side:.2f}h{-(end - start) * side:.2f}z")
-    parts = [
-        f"<svg xmlns='http://www.w3.org/2000/svg' width='{width:g}' height='{height:.1f}' "
-        f"viewBox='0 0 {width:g} {height:.1f}' role='img'>",
-        f"<title>{escape(figure.caption)}</title><desc>{escape(figure.alt)}</desc>",
-        "<rect width='100%' height='100%' fill='#ffffff'/>",
-        *(
-            f"<path fill='{_colour(v / _LEVELS)}' d='{''.join(boxes)}'/>"
-            for v, boxes in sorted(cells.items())
-        ),
-        f"<rect x='{margin:.2f}' y='{margin:.2f}' width='{span:.2f}' height='{span:.2f}' fill='none' "
-        "stroke='#8c8c8c' stroke-width='0.8'/>",
-    ]
-    for place, name in enumerate(figure.names):
-        at = margin + (place + 0.5) * side
-        text = f"{_FONT} font-size='{size:.2f}' fill='{_INK}'"
-        label = escape(name)
-        parts.append(
-            f"<text x='{margin - 4:.2f}' y='{at + 0.35 * size:.2f}' {text} text-anchor='end'>{label}</text>"
-            f"<text transform='translate({at + 0.35 * size:.2f},{margin - 4:.2f}) rotate(-90)' {text}>"
-            f"{label}</text>"
-        )
-    return "".join([*parts, *_scale(margin + span + 14.0, margin, min(span, 240.0)), "</svg>\n"])
 
 
 def _scale(x: float, y: float, length: float) -> list[str]:
@@ -405,24 +398,15 @@ def _scale(x: float, y: float, length: float) -> list[str]:
     ticks = [
         f"<text x='{x + 14:.2f}' y='{y + (1 - value) / 2 * length + 3.5:.2f}' {_FONT} font-size='10' "
         f"fill='{_INK}'>{text}</text>"
-        for value, text in (
-            (1, "1"),
-            (0.5, "0.5"),
-            (0, "0"),
-            (-0.5, "\N{MINUS SIGN}0.5"),
-            (-1, "\N{MINUS SIGN}1"),
-        )
+        for value, text in zip((1, 0.5, 0, -0.5, -1), ("1", "0.5", "0", "−0.5", "−1"), strict=True)
     ]
     return [*boxes, *ticks]
 
 
-def _runs(values: Sequence[int] | NDArray[np.int64]) -> list[tuple[int, int, int]]:
+def _runs(row: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     """Stretches of equal values: begin, end (exclusive), value."""
-    row = np.asarray(values)
-    edges = np.flatnonzero(np.diff(row)) + 1
-    begins = np.concatenate([[0], edges])
-    ends = np.concatenate([edges, [len(row)]])
-    return [(int(a), int(b), int(row[a])) for a, b in zip(begins, ends, strict=True)]
+    edges = [0, *(np.flatnonzero(np.diff(row)) + 1).tolist(), len(row)]
+    return [(begin, end, int(row[begin])) for begin, end in pairwise(edges)]
 
 
 def _colour(value: float) -> str:

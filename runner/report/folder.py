@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -100,8 +100,8 @@ def curves(
         ]
         if not parts:
             continue
-        stacked = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        time = stacked[0]
+        columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        time = columns["time"]
         found.append(
             Curves(
                 session=name,
@@ -110,18 +110,11 @@ def curves(
                 payload=payload,
                 joint_names=prepared.joint_names,
                 cutoff_hz=prepared.cutoff_hz,
-                time=time,
-                torque=stacked[1],
-                error=stacked[2],
-                q=stacked[3],
-                qd=stacked[4],
                 raw_velocity=_velocity(chosen, time) if side == "joint" else np.empty((len(time), 0)),
-                grid=stacked[5],
-                measured=stacked[6],
-                computed=stacked[7],
                 scores=tuple(score for score in scored.scores if score.side == side),
                 relative=float(scored.relative[side]),
                 unseen=unseen,
+                **columns,
             )
         )
     return found
@@ -129,10 +122,10 @@ def curves(
 
 def _part(
     passage: Passage, side: Side, model: DynamicModel, payload: str | None, prepared: PreparedSession
-) -> Sequence[Floats]:
+) -> dict[str, Floats]:
     channel = passage.joint if side == "joint" else passage.motor
     if channel is None or not len(passage.rows) or not channel.torque.shape[1]:
-        return ()
+        return {}
     computed = predictor(model, payload)(channel, side)
     # At rest the Coulomb torque is unknown.
     settings = prepared.settings
@@ -145,16 +138,16 @@ def _part(
     low_pass = ParallelFilter(channel.times, grid, cutoff, _ATTENUATION_DB)
     filtered = low_pass.apply(computed)
     filtered[low_pass.share(resting) > settings.standstill_share] = np.nan
-    return (
-        channel.times[inside],
-        channel.torque[inside],
-        np.where(resting, np.nan, channel.torque - computed)[inside],
-        channel.q[inside],
-        channel.qd[inside],
-        grid,
-        low_pass.apply(channel.torque),
-        filtered,
-    )
+    return {
+        "time": channel.times[inside],
+        "torque": channel.torque[inside],
+        "error": np.where(resting, np.nan, channel.torque - computed)[inside],
+        "q": channel.q[inside],
+        "qd": channel.qd[inside],
+        "grid": grid,
+        "measured": low_pass.apply(channel.torque),
+        "computed": filtered,
+    }
 
 
 def _velocity(session: Session, time: Floats) -> Floats:
@@ -284,8 +277,8 @@ class ResultFolder:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Joints of the arm in kinematic order."""
-        for session in self.sessions.values():
-            return session.joint_names
+        if self.sessions:
+            return next(iter(self.sessions.values())).joint_names
         return tuple(next(iter(self.summary.get("torque_rms", {}).values()), ()))
 
     def text(self, name: str) -> str | None:

@@ -21,12 +21,10 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 INSTALL = "the extra `view` is not installed; run `pip install 'lwr-identification[view]'`"
-FONT = {
-    "family": "system-ui, -apple-system, 'Segoe UI', Helvetica, Arial, sans-serif",
-    "size": 11,
-    "color": "#1a1a1a",
-}
+_FAMILY = "system-ui, -apple-system, 'Segoe UI', Helvetica, Arial, sans-serif"
+FONT = {"family": _FAMILY, "size": 11, "color": "#1a1a1a"}
 _SYMBOLS = {"circle": "circle", "cross": "x-thin-open", "diamond": "diamond-open"}
+_BACKGROUND = {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "#ffffff"}
 _GRID = "#e3e3e3"
 _SPLIT = 0.32
 DIVERGING: tuple[tuple[float, str], ...] = (
@@ -54,8 +52,7 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
         "showlegend": False,
         "hovermode": "x unified" if not panel.x_names else "closest",
         "hoverlabel": {"font": {"size": 11}, "namelength": -1},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "#ffffff",
+        **_BACKGROUND,
         "xaxis": {
             **_axis(panel.x_label),
             "range": list(span),
@@ -65,10 +62,8 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
         "yaxis": {**_axis(panel.y_label), "domain": [_SPLIT + 0.05, 1.0] if panel.split else [0.0, 1.0]},
     }
     if panel.x_names:
-        layout["xaxis"] |= {
-            "tickvals": list(range(1, len(panel.x_names) + 1)),
-            "ticktext": list(panel.x_names),
-        }
+        places = list(range(1, len(panel.x_names) + 1))
+        layout["xaxis"] |= {"tickvals": places, "ticktext": list(panel.x_names)}
         layout["yaxis"]["automargin"] = True
     if panel.split:
         # The x axis belongs to the lower part, so the frame of the upper one is drawn.
@@ -89,34 +84,25 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
 def heatmap_chart(names: tuple[str, ...], matrix: Floats) -> dict[str, Any]:
     """A square matrix of values from -1 to 1 as plotly `data` and `layout`."""
     values = np.asarray(matrix, dtype=np.float64)
-    return {
-        "data": [
-            {
-                "type": "heatmap",
-                "x": list(names),
-                "y": list(names),
-                "z": {**_packed(values.ravel()), "shape": f"{values.shape[0]}, {values.shape[1]}"},
-                "zmin": -1,
-                "zmax": 1,
-                "colorscale": [list(stop) for stop in DIVERGING],
-                "colorbar": {
-                    "thickness": 10,
-                    "len": 0.8,
-                    "outlinewidth": 0,
-                    "tickvals": [-1, -0.5, 0, 0.5, 1],
-                },
-                "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
-            }
-        ],
-        "layout": {
-            "margin": {"l": 52, "r": 10, "t": 6, "b": 52},
-            "font": {**FONT, "size": 9},
-            "paper_bgcolor": "rgba(0,0,0,0)",
-            "plot_bgcolor": "#ffffff",
-            "xaxis": {"tickangle": -90, "showgrid": False, "constrain": "domain"},
-            "yaxis": {"autorange": "reversed", "showgrid": False, "scaleanchor": "x", "constrain": "domain"},
-        },
+    trace = {
+        "type": "heatmap",
+        "x": list(names),
+        "y": list(names),
+        "z": {**_packed(values.ravel()), "shape": f"{values.shape[0]}, {values.shape[1]}"},
+        "zmin": -1,
+        "zmax": 1,
+        "colorscale": [list(stop) for stop in DIVERGING],
+        "colorbar": {"thickness": 10, "len": 0.8, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+        "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
     }
+    layout = {
+        "margin": {"l": 52, "r": 10, "t": 6, "b": 52},
+        "font": {**FONT, "size": 9},
+        **_BACKGROUND,
+        "xaxis": {"tickangle": -90, "showgrid": False, "constrain": "domain"},
+        "yaxis": {"autorange": "reversed", "showgrid": False, "scaleanchor": "x", "constrain": "domain"},
+    }
+    return {"data": [trace], "layout": layout}
 
 
 def heatmap_figure(chart: dict[str, Any], caption: str) -> Any:
@@ -140,10 +126,8 @@ def plotly_figure(panels: Sequence[Panel], *, columns: int = 2) -> Any:
     except ImportError as error:
         raise ConfigurationError(f"plotly figure: {INSTALL}") from error
     rows = math.ceil(len(panels) / columns)
-    heights: list[float] = []
     split = any(panel.split for panel in panels)
-    for _ in range(rows):
-        heights += [0.7, 0.3] if split else [1.0]
+    heights = ([0.7, 0.3] if split else [1.0]) * rows
     titles: list[str] = []
     for row in range(rows):
         names = [panel.title for panel in panels[row * columns : (row + 1) * columns]]
@@ -161,27 +145,17 @@ def plotly_figure(panels: Sequence[Panel], *, columns: int = 2) -> Any:
         row, column = (index // columns) * (2 if split else 1) + 1, index % columns + 1
         for mark in panel.marks:
             for trace in _traces(mark):
-                trace.pop("yaxis", None)
-                plain = {key: _unpacked(value) for key, value in trace.items()}
-                name = str(plain.get("name", ""))
-                plain["showlegend"] = bool(name) and name not in known and plain.pop("keyed", True)
-                plain["legendgroup"] = name
+                plain = {k: _unpacked(value) for k, value in trace.items() if k not in ("type", "yaxis")}
+                name = str(plain["name"])
+                shown = bool(name) and name not in known
                 known.add(name)
-                plain.pop("keyed", None)
-                whole.add_trace(
-                    go.Scatter(**{k: v for k, v in plain.items() if k != "type"}),
-                    row=row + (1 if mark.lower else 0),
-                    col=column,
-                )
+                drawn = go.Scatter(**plain, showlegend=shown, legendgroup=name)
+                whole.add_trace(drawn, row=row + (1 if mark.lower else 0), col=column)
         whole.update_yaxes(title_text=panel.y_label, row=row, col=column)
         if panel.split:
             whole.update_yaxes(title_text=panel.lower_label, row=row + 1, col=column)
-    whole.update_layout(
-        template="plotly_white",
-        font=FONT,
-        height=170 * len(heights) + 120,
-        legend={"orientation": "h", "y": 1.06},
-    )
+    legend = {"orientation": "h", "y": 1.06}
+    whole.update_layout(template="plotly_white", font=FONT, height=170 * len(heights) + 120, legend=legend)
     return whole
 
 
@@ -203,18 +177,14 @@ def _traces(mark: Mark) -> list[dict[str, Any]]:
             }
         ]
     if isinstance(mark, Band):
-        plain = {
-            "type": "scatter",
-            "mode": "lines",
-            "line": {"width": 0},
-            "hoverinfo": "skip",
-            "x": _column(mark.x),
-        }
+        line = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
+        plain = {**line, "x": _column(mark.x)}
         fill = {"fill": "tonexty", "fillcolor": _transparent(style.colour), "name": mark.label}
         return [
             {**plain, "y": _column(mark.low), "name": "", **axis},
             {**plain, "y": _column(mark.high), **fill, **axis},
         ]
+    outline = {"width": 1.4, "color": style.colour}
     trace: dict[str, Any] = {
         "type": "scatter",
         "mode": "markers",
@@ -222,12 +192,7 @@ def _traces(mark: Mark) -> list[dict[str, Any]]:
         "x": _column(mark.x),
         "y": _column(mark.y),
         "text": list(mark.texts),
-        "marker": {
-            "color": style.colour,
-            "size": 7,
-            "symbol": _SYMBOLS[style.symbol],
-            "line": {"width": 1.4, "color": style.colour},
-        },
+        "marker": {"color": style.colour, "size": 7, "symbol": _SYMBOLS[style.symbol], "line": outline},
         "hovertemplate": "%{text}<extra>" + mark.label + "</extra>" if mark.texts else "%{y:.4g}",
         **axis,
     }

@@ -7,27 +7,29 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
+from runner.report import sections
 from runner.report.diagnosis import diagnosis_section
 from runner.report.folder import ResultFolder
 from runner.report.interactive import plotly_script
-from runner.report.sections import (
-    assumption_section,
-    motion_section,
-    parameter_section,
-    provenance_section,
-    residual_section,
-    session_section,
-    table_1_section,
-    table_2_section,
-    torque_section,
-)
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 
-__all__ = ["REPORT", "page_html", "report_html", "write_page", "write_report"]
+__all__ = ["page_html", "report_html", "write_page", "write_report"]
 
 REPORT = "report.html"
 
 _MARKS = {"good": "\N{CHECK MARK} good", "look": "! look", "bad": "\N{MULTIPLICATION X} bad"}
+_SECTIONS = (
+    sections.session_section,
+    sections.table_1_section,
+    sections.table_2_section,
+    sections.motion_section,
+    sections.torque_section,
+    sections.residual_section,
+    sections.assumption_section,
+    diagnosis_section,
+    sections.parameter_section,
+    sections.provenance_section,
+)
 _PARTS = (
     ("sessions", "Sessions"),
     ("table-1", "Table 1"),
@@ -64,25 +66,12 @@ def write_page(text: str, folder: Path) -> Path:
 def report_html(results: ResultFolder) -> str:
     """The text of the report."""
     lines = verdicts(results)
-    body = [session_section(results)]
-    if results.summary.get("parameters"):
-        body += [table_1_section(results), table_2_section(results)]
-    body += [
-        motion_section(results),
-        torque_section(results),
-        residual_section(results),
-        assumption_section(results),
-        diagnosis_section(results),
-        parameter_section(results),
-        provenance_section(results),
-    ]
-    level, sentence = headline(lines)
     return page_html(
         str(results.summary["experiment"]),
         _subtitle(results),
-        (level, sentence),
+        headline(lines),
         lines,
-        "".join(body),
+        "".join(part(results) for part in _SECTIONS),
         _PARTS,
         str(results.summary.get("versions", {}).get("software", "")),
     )
@@ -123,12 +112,10 @@ def page_html(
 
 def _subtitle(results: ResultFolder) -> str:
     summary = results.summary
-    logs = list(results.sessions.values())
-    robot = (
-        f"{logs[0].metadata.get('robot', '')} {logs[0].metadata.get('serial', '')}".strip() if logs else ""
-    )
+    meta = next((log.metadata for log in results.sessions.values()), {})
+    robot = f"{meta.get('robot', '')} {meta.get('serial', '')}".strip()
     emulated = " (emulated)" if results.emulated else ""
-    started = logs[0].metadata.get("utc_start", "")[:10] if logs and not emulated else ""
+    started = "" if emulated else meta.get("utc_start", "")[:10]
     # A recording without date starts at the epoch.
     started = "" if started.startswith("1970") else started
     parts = [

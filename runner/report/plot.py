@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STYLES", "Band", "Line", "Mark", "Panel", "Points", "Role", "Style", "limits", "thin"]
+__all__ = ["STYLES", "Band", "Line", "Mark", "Panel", "Points", "Role", "limits", "thin"]
 
 Floats = NDArray[np.float64]
 Role = Literal[

@@ -46,12 +46,9 @@ def session_section(results: ResultFolder) -> str:
     for entry in results.summary["sessions"]:
         name = entry["name"]
         log, link = results.sessions.get(name), links.get(name, {})
-        payload = (
-            "–"
-            if log is None
-            else _payload(log.metadata.get("payload", ""), log.metadata.get("payload_mass"))
-        )
-        key = f"link.{name}"
+        payload = "–" if log is None else log.metadata.get("payload", "")
+        if log is not None and payload != "none" and log.metadata.get("payload_mass"):
+            payload += f", {log.metadata['payload_mass']} kg"
         latency = link.get("latency_s", {})
         rows.append(
             [
@@ -61,8 +58,8 @@ def session_section(results: ResultFolder) -> str:
                 payload,
                 Number(None if log is None else log.duration_s, ".1f"),
                 *(
-                    Number(link.get(what), "d", f"{key}.{what}")
-                    for what in ("cycles", "missed", "lost", "late")
+                    Number(link.get(key), "d", f"link.{name}.{key}")
+                    for key in ("cycles", "missed", "lost", "late")
                 ),
                 *(_micro(latency.get(quantile)) for quantile in ("p50", "p99", "p100")),
                 Number(1000 * max(link["worst_tracking_error_rad"]) if link else None, ".1f"),
@@ -87,19 +84,16 @@ def session_section(results: ResultFolder) -> str:
 
 def table_1_section(results: ResultFolder) -> str:
     """The paper's Table 1 with this run in it."""
+    if not results.summary.get("parameters"):
+        return ""
     excitation = results.summary.get("excitation", {})
     condition, torque = excitation.get("condition", {}), excitation.get("mean_torque_nm", {})
     joints = results.joint_names
     names = {session.path.name: name for name, session in results.sessions.items()}
     kept = {name: all(item["ok"] for item in items) for name, items in results.preflights.items()}
     rows: list[list[Cell]] = [
-        [
-            entry.name,
-            entry.constraints,
-            Number(entry.condition, ".2f"),
-            *(Number(v, ".2f") for v in entry.mean_torque),
-        ]
-        for entry in TABLE_1
+        [one.name, one.constraints, *(Number(v, ".2f") for v in (one.condition, *one.mean_torque))]
+        for one in TABLE_1
     ]
     payloads = {s.path.name: s.metadata.get("payload", "none") for s in results.sessions.values()}
     for file, means in sorted(torque.items(), key=lambda item: payloads.get(item[0], "none") == "none"):
@@ -111,25 +105,17 @@ def table_1_section(results: ResultFolder) -> str:
                 *(Number(means.get(j), ".2f", f"excitation.mean_torque_nm.{file}.{j}") for j in joints),
             ]
         )
-    head = (
-        "motion",
-        "constraints kept",
-        "condition number",
-        *(f"|τ{k + 1}| [Nm]" for k in range(len(joints) or 7)),
-    )
+    torques = (f"|τ{k + 1}| [Nm]" for k in range(len(joints) or 7))
+    head = ("motion", "constraints kept", "condition number", *torques)
     strong = range(len(TABLE_1), len(rows))
     note = (
         "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number belongs "
         "to the unscaled observation matrix of all sessions over the 49 parameters of Table 2, in agreement with "
         "the published numbers; "
     )
-    others = [
-        f"over all base parameters it is {condition['base']:.1f}" if condition.get("base") else "",
-        f"over the essential ones of this run {condition['essential']:.1f}"
-        if condition.get("essential")
-        else "",
-    ]
-    note += ", ".join(text for text in others if text) + "." if any(others) else ""
+    sets = {"base": "all base parameters it is", "essential": "the essential ones of this run"}
+    others = [f"over {of} {condition[key]:.1f}" for key, of in sets.items() if condition.get(key)]
+    note += ", ".join(others) + "." if others else ""
     return section(
         "table-1",
         "Table 1: the exciting motion",
@@ -140,6 +126,8 @@ def table_1_section(results: ResultFolder) -> str:
 
 def table_2_section(results: ResultFolder) -> str:
     """The paper's Table 2 beside the estimates of this run."""
+    if not results.summary.get("parameters"):
+        return ""
     essential = (results.summary.get("essential") or {}).get("parameters", [])
     kept = {entry["name"]: (entry, f"essential.parameters.{i}") for i, entry in enumerate(essential)}
     base = {e["name"]: (e, f"parameters.{i}") for i, e in enumerate(results.summary.get("parameters", []))}
@@ -147,12 +135,10 @@ def table_2_section(results: ResultFolder) -> str:
     for printed in TABLE_2:
         entry, key = kept.get(printed.name) or base.get(printed.name) or (None, "")
         truth = base.get(printed.name, ({}, ""))[0].get("truth")
-        name = (
-            f"{printed.name} *" if kept and entry is not None and printed.name not in kept else printed.name
-        )
+        mark = " *" if kept and entry is not None and printed.name not in kept else ""
         rows.append(
             [
-                name,
+                printed.name + mark,
                 pretty_unit(entry["unit"]) if entry else "",
                 Number(entry["estimate"] if entry else None, ".4f", f"{key}.estimate"),
                 Number(entry["rsd_percent"] if entry else None, ".2f", f"{key}.rsd_percent"),
@@ -167,8 +153,13 @@ def table_2_section(results: ResultFolder) -> str:
     half = math.ceil(len(rows) / 2)
     label = "Table 2, estimates of this run and published ones"
     printed_names = {entry.name for entry in TABLE_2}
+    forms = {"estimate": ".4g", "std": ".3g", "rsd_percent": ".2f"}
     others = [
-        [e["name"], pretty_unit(e["unit"]), *_estimate(e, k)]
+        [
+            e["name"],
+            pretty_unit(e["unit"]),
+            *(Number(e[what], form, f"{k}.{what}") for what, form in forms.items()),
+        ]
         for n, (e, k) in kept.items()
         if n not in printed_names
     ]
@@ -189,20 +180,14 @@ def table_2_section(results: ResultFolder) -> str:
     eliminated = (results.summary.get("essential") or {}).get("eliminated", [])
     if eliminated:
         title = f"{len(eliminated)} parameters eliminated, in this order"
-        lines: list[list[Cell]] = [
-            [
-                e["name"],
-                Number(e["estimate"]),
-                Number(e["rsd_percent"], ".1f"),
-                Number(e["f"], ".2f"),
-                e["reason"],
-            ]
+        forms = {"estimate": ".4g", "rsd_percent": ".1f", "f": ".2f"}
+        lines = [
+            [e["name"], *(Number(e[what], form) for what, form in forms.items()), e["reason"]]
             for e in eliminated
         ]
         parts.append(fold(title, table(("parameter", "estimate", "RSD %", "F", "reason"), lines, title)))
-    parts.append(
-        paragraph(f"Published: {SOURCE}; the arm and the payload were others than those of this run.", "soft")
-    )
+    source = f"Published: {SOURCE}; the arm and the payload were others than those of this run."
+    parts.append(paragraph(source, "soft"))
     return section("table-2", "Table 2: essential base parameters", *parts)
 
 
@@ -211,11 +196,8 @@ def _why_absent(results: ResultFolder, absent: list[str]) -> str:
     reasons = []
     if any(name.endswith("8") for name in absent):
         carried = {s.metadata.get("payload", "none") for s in results.sessions.values()} - {"none"}
-        reasons.append(
-            "no session without the payload, so it is part of link 7 and its regrouped parameters"
-            if carried
-            else "no session with a payload"
-        )
+        regrouped = "no session without the payload, so it is part of link 7 and its regrouped parameters"
+        reasons.append(regrouped if carried else "no session with a payload")
     if any("m" in name for name in absent) or "Ia1" in absent:
         reasons.append("no motor torques in the estimate")
     rest = "; ".join(reasons) or "the motion or the model does not show them"
@@ -298,25 +280,21 @@ def assumption_section(results: ResultFolder) -> str:
     rows: list[list[Cell]] = [
         [
             name,
-            {"VIOLATED": "violated"}.get(check["verdict"], check["verdict"]),
+            check["verdict"].replace("VIOLATED", "violated"),
             check["finding"],
             Number(check["p_value"], ".2g", f"assumptions.{name}.p_value"),
         ]
         for name, check in checks.items()
     ]
-    textbook = str(results.summary["covariance"]).startswith("textbook")
     covered = (
-        "They need every assumption above."
-        if textbook
-        else "They hold for correlated, non-normal residuals of unequal variance, but do not cover a lack of fit "
-        "or of exogeneity."
+        "They hold for correlated, non-normal residuals of unequal variance, but do not cover a lack of fit or of "
+        "exogeneity."
     )
+    if str(results.summary["covariance"]).startswith("textbook"):
+        covered = "They need every assumption above."
     parts = [
         table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
-        paragraph(
-            f"Standard deviations: {results.summary['covariance']}. {covered}",
-            "soft",
-        ),
+        paragraph(f"Standard deviations: {results.summary['covariance']}. {covered}", "soft"),
     ]
     if checks.get("lack of fit", {}).get("verdict") == "VIOLATED":
         parts.append(
@@ -378,18 +356,16 @@ def _correlation(results: ResultFolder) -> str:
     rows: list[list[Cell]] = [
         [f"{first} and {second}", Number(value, ".3f")] for first, second, value in figure.strongest(_PAIRS)
     ]
+    text = (
+        f"{figure.alt} The sum or difference of a strongly correlated pair is more precise than either one."
+    )
+    pairs = table(("pair", "correlation"), rows, "Strongest correlations")
     return section(
         "correlation",
         "Correlation of the parameters",
-        paragraph(
-            f"{figure.alt} The sum or difference of a strongly correlated pair is more precise than either one."
-        ),
+        paragraph(text),
         chart_html(figure.chart(), figure.alt, "square"),
-        fold(
-            "The strongest pairs",
-            table(("pair", "correlation"), rows, "Strongest correlations"),
-            is_open=True,
-        ),
+        fold("The strongest pairs", pairs, is_open=True),
     )
 
 
@@ -397,14 +373,13 @@ def provenance_section(results: ResultFolder) -> str:
     """Versions, logs and files of the run."""
     versions = results.summary.get("versions", {})
     rows: list[list[Cell]] = [[name.replace("_", " "), str(value)] for name, value in versions.items()]
-    logs: list[list[Cell]] = []
+    logs = []
     for name, session in results.sessions.items():
         meta = session.metadata
         robot = f"{meta.get('robot', '')} {meta.get('serial', '')}".strip()
-        logs.append(
-            [name, robot, meta.get("uid", ""), meta.get("parent_uid", "") or "–", meta.get("utc_start", ""),
-             meta.get("motor_torque_source", ""), str(session.missing)]
-        )  # fmt: skip
+        given = [meta.get(key, "") for key in ("uid", "parent_uid", "utc_start", "motor_torque_source")]
+        given[1] = given[1] or "–"
+        logs.append([name, robot, *given, str(session.missing)])
     head = ("session", "robot", "uid", "goes on from", "started", "motor torque", "missing")
     parts = ["<div class=halves>", table(("", "version"), rows, "Versions")]
     files: list[list[Cell]] = [
@@ -414,10 +389,8 @@ def provenance_section(results: ResultFolder) -> str:
     ]
     parts += [table(("file", "kB"), files, "Files of this run"), "</div>"]
     parts.append(table(head, logs, "Session logs"))
-    for name, title in (
-        ("experiment.yaml", "The experiment file"),
-        ("plan.yaml", "The plan of the motion, with its seed"),
-    ):
+    titles = {"experiment.yaml": "The experiment file", "plan.yaml": "The plan of the motion, with its seed"}
+    for name, title in titles.items():
         text = results.text(name)
         if text is not None:
             parts.append(fold(f"{title}, {name}", f"<pre tabindex=0>{escape(text)}</pre>"))
@@ -426,18 +399,6 @@ def provenance_section(results: ResultFolder) -> str:
         "Lichtblick open them as they are.</p>"
     )
     return section("provenance", "Provenance", *parts)
-
-
-def _estimate(entry: dict[str, float], key: str) -> list[Cell]:
-    return [
-        Number(entry["estimate"], ".4g", f"{key}.estimate"),
-        Number(entry["std"], ".3g", f"{key}.std"),
-        Number(entry["rsd_percent"], ".2f", f"{key}.rsd_percent"),
-    ]
-
-
-def _payload(name: str, mass: str | None) -> str:
-    return name + (f", {mass} kg" if mass and name != "none" else "")
 
 
 def _micro(seconds: float | None) -> Cell:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 from runner.report.interactive import plotly_figure
 from runner.report.plot import STYLES, Band, Line, Mark, Panel, Points, Role, Symbol, limits
 
-__all__ = ["Figure", "figure_svg", "legend_key", "panel_svg", "ticks"]
+__all__ = ["Figure", "legend_key", "panel_svg", "ticks"]
 
 Floats = NDArray[np.float64]
+Box = tuple[float, float, float, float]
 
 _FONT = "font-family='Helvetica,Arial,sans-serif'"
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 10.0, 24.0, 36.0
 _LEGEND_LINE = 18.0
 _LOWER_SHARE = 0.3
+_PANEL_HEIGHT = 190.0
 _GREY = "#595959"
 
 
@@ -40,16 +42,27 @@ class Figure:
     @property
     def legend(self) -> tuple[tuple[Role, str, str], ...]:
         """Role, label and kind (`Line`, `Band`, `Points`) of all marks, each once."""
-        seen: dict[tuple[Role, str, str], None] = {}
-        for panel in self.panels:
-            for mark in panel.marks:
-                if mark.label:
-                    seen[mark.role, mark.label, type(mark).__name__] = None
-        return tuple(seen)
+        marks = (mark for panel in self.panels for mark in panel.marks if mark.label)
+        return tuple(dict.fromkeys((mark.role, mark.label, type(mark).__name__) for mark in marks))
 
     def svg(self, *, columns: int = 2, width: float = 720.0) -> str:
-        """The figure as a stand-alone SVG text, `width` px wide; needs no other package."""
-        return figure_svg(self, columns=columns, width=width)
+        """The figure as a stand-alone SVG text, `width` px wide: legend, then panels in rows of `columns`."""
+        columns = max(1, min(columns, len(self.panels)))
+        legend, top = _legend(self, width)
+        each = width / columns
+        height = top + math.ceil(len(self.panels) / columns) * _PANEL_HEIGHT
+        parts = [
+            f"<svg xmlns='http://www.w3.org/2000/svg' width='{width:g}' height='{height:g}' "
+            f"viewBox='0 0 {width:g} {height:g}' role='img'>",
+            f"<title>{escape(self.caption)}</title>",
+            f"<desc>{escape(' '.join(panel.alt for panel in self.panels))}</desc>",
+            "<rect width='100%' height='100%' fill='#ffffff'/>",
+            *legend,
+        ]
+        for index, panel in enumerate(self.panels):
+            x, y = (index % columns) * each, top + (index // columns) * _PANEL_HEIGHT
+            parts.append(f"<g transform='translate({x:g},{y:g})'>{_panel(panel, each, _PANEL_HEIGHT)}</g>")
+        return "".join([*parts, "</svg>\n"])
 
     def save(self, path: str | Path, *, columns: int = 2, width: float = 720.0) -> Path:
         """Write the SVG to a file."""
@@ -63,27 +76,6 @@ class Figure:
 
     def _repr_svg_(self) -> str:
         return self.svg()
-
-
-def figure_svg(figure: Figure, *, columns: int = 2, width: float = 720.0, panel_height: float = 190.0) -> str:
-    """The whole figure: legend, then its panels in rows of `columns`."""
-    columns = max(1, min(columns, len(figure.panels)))
-    legend, top = _legend(figure, width)
-    each = width / columns
-    rows = math.ceil(len(figure.panels) / columns)
-    height = top + rows * panel_height
-    parts = [
-        f"<svg xmlns='http://www.w3.org/2000/svg' width='{width:g}' height='{height:g}' "
-        f"viewBox='0 0 {width:g} {height:g}' role='img'>",
-        f"<title>{escape(figure.caption)}</title>",
-        f"<desc>{escape(' '.join(panel.alt for panel in figure.panels))}</desc>",
-        "<rect width='100%' height='100%' fill='#ffffff'/>",
-        *legend,
-    ]
-    for index, panel in enumerate(figure.panels):
-        x, y = (index % columns) * each, top + (index // columns) * panel_height
-        parts.append(f"<g transform='translate({x:g},{y:g})'>{_panel(panel, each, panel_height)}</g>")
-    return "".join([*parts, "</svg>\n"])
 
 
 def panel_svg(panel: Panel, *, width: float = 560.0, height: float = 200.0) -> str:
@@ -127,12 +119,7 @@ def _panel(panel: Panel, width: float, height: float) -> str:
     return "".join(parts)
 
 
-def _axes(
-    marks: Sequence[Mark],
-    span: tuple[float, float],
-    box: tuple[float, float, float, float],
-    label: str,
-) -> str:
+def _axes(marks: Sequence[Mark], span: tuple[float, float], box: Box, label: str) -> str:
     x0, y0, width, height = box
     low, high = limits([column for mark in marks for column in _columns(mark)])
 
@@ -147,8 +134,7 @@ def _axes(
         heavy = 1.4 if value == 0 else 0.8
         y = y0 + height - (value - low) / (high - low) * height
         parts.append(
-            f"<path d='M{x0:g} {y:.1f}h{width:g}' stroke='#e3e3e3' "
-            f"stroke-width='{heavy}'/>"
+            f"<path d='M{x0:g} {y:.1f}h{width:g}' stroke='#e3e3e3' stroke-width='{heavy}'/>"
             f"<text x='{x0 - 5:g}' y='{y + 3.5:.1f}' {_FONT} font-size='10' fill='{_GREY}' text-anchor='end'>"
             f"{_number(value)}</text>"
         )
@@ -172,9 +158,7 @@ def _columns(mark: Mark) -> list[Floats]:
     return [mark.y]
 
 
-def _mark(mark: Mark, at: object) -> str:
-    place = at if callable(at) else None
-    assert place is not None
+def _mark(mark: Mark, place: Callable[[Floats, Floats], Floats]) -> str:
     style = STYLES[mark.role]
     if isinstance(mark, Band):
         outline = np.vstack([place(mark.x, mark.low), place(mark.x, mark.high)[::-1]])
@@ -207,7 +191,7 @@ def _path(points: Floats) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) if len(points) else ""
 
 
-def _x_ticks(panel: Panel, span: tuple[float, float], box: tuple[float, float, float, float]) -> str:
+def _x_ticks(panel: Panel, span: tuple[float, float], box: Box) -> str:
     x0, y0, width, height = box
     if panel.x_names:
         marks = [(float(k + 1), name) for k, name in enumerate(panel.x_names)]

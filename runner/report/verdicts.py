@@ -6,11 +6,12 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
-from runner.report.folder import Curves, ResultFolder
+from runner.report.folder import ResultFolder
 
 __all__ = ["Level", "Verdict", "error_change", "extension_gain", "headline", "largest_gain", "verdicts"]
 
@@ -120,18 +121,10 @@ def _tracking(results: ResultFolder) -> Verdict | None:
     return Verdict("tracking error", f"at most {1000 * worst:.1f} mrad ({where})", wanted, level, "sessions")
 
 
-def _residual(results: ResultFolder) -> Verdict | None:
-    seen = [one for one in results.curves if not one.unseen]
-    return _share("unexplained torque", seen)
-
-
-def _unseen(results: ResultFolder) -> Verdict | None:
-    return _share("held-out motion", [one for one in results.curves if one.unseen])
-
-
-def _share(subject: str, shown: Sequence[Curves]) -> Verdict | None:
-    """How much of the measured torque is not computed, by side."""
+def _share(subject: str, unseen: bool, results: ResultFolder) -> Verdict | None:
+    """How much of the measured torque is not computed, by side. unseen : of the held-out motions."""
     parts, worst = [], 0.0
+    shown = [one for one in results.curves if one.unseen == unseen]
     for side in dict.fromkeys(one.side for one in shown):
         mine = [one for one in shown if one.side == side]
         squares = np.array([[score.band_rms**2 for score in one.scores] for one in mine])
@@ -178,11 +171,7 @@ def _essential(results: ResultFolder) -> Verdict | None:
 
 
 def _payload(results: ResultFolder) -> Verdict | None:
-    masses = {
-        entry["name"]: entry
-        for entry in results.summary.get("parameters", [])
-        if re.fullmatch(r"M\d+", entry["name"])
-    }
+    masses = [e for e in results.summary.get("parameters", []) if re.fullmatch(r"M\d+", e["name"])]
     announced = {
         session.metadata.get("payload", "none"): session.metadata.get("payload_mass")
         for session in results.sessions.values()
@@ -190,7 +179,7 @@ def _payload(results: ResultFolder) -> Verdict | None:
     weighed = [float(mass) for name, mass in announced.items() if name != "none" and mass]
     if len(weighed) != 1 or not masses:
         return None
-    entry = max(masses.values(), key=lambda one: int(one["name"][1:]))
+    entry = max(masses, key=lambda one: int(one["name"][1:]))
     gap = entry["estimate"] - weighed[0]
     ok = abs(gap) <= max(3.0 * entry["std"], _MASS_TOLERANCE * weighed[0])
     digits = max(0, -math.floor(math.log10(entry["std"]))) if entry["std"] > 0 else 4
@@ -235,28 +224,27 @@ def error_change(gain: float) -> str:
 
 def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
     """Share of the held-out error removed by the extended model, mean over joints and sides."""
-    gain = diagnosis.get("gain") or {}
-    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
-    ratios = [
-        after / before
-        for side in base
-        for before, after in zip(base[side] or (), extended.get(side) or (), strict=False)
-        if before and after is not None
-    ]
+    ratios = [ratio for ratio, _, _ in _error_ratios(diagnosis)]
     return 1.0 - float(np.mean(ratios)) if ratios and diagnosis.get("findings") else None
 
 
 def largest_gain(diagnosis: Mapping[str, Any], names: Sequence[str]) -> tuple[str, float]:
     """Joint and side with the largest gain by the extended model, and the removed share of its error."""
-    base, extended = diagnosis["gain"]["test_rms_base"], diagnosis["gain"]["test_rms_extended"]
-    found = [
-        (1.0 - after / before, f"{names[k] if k < len(names) else k + 1} {side}")
+    found = _error_ratios(diagnosis)
+    share, place = max((1.0 - r, f"{names[k] if k < len(names) else k + 1} {side}") for r, k, side in found)
+    return place, share
+
+
+def _error_ratios(diagnosis: Mapping[str, Any]) -> list[tuple[float, int, str]]:
+    """Held-out error of the extended model over the base model's, with the place of the joint and the side."""
+    gain = diagnosis.get("gain") or {}
+    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
+    return [
+        (after / before, k, side)
         for side in base
         for k, (before, after) in enumerate(zip(base[side] or (), extended.get(side) or (), strict=False))
         if before and after is not None
     ]
-    share, place = max(found)
-    return place, share
 
 
 _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
@@ -264,8 +252,8 @@ _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
     _link,
     _limits,
     _tracking,
-    _residual,
-    _unseen,
+    partial(_share, "unexplained torque", False),
+    partial(_share, "held-out motion", True),
     _assumptions,
     _essential,
     _payload,

@@ -35,6 +35,14 @@ def test_a_misspelt_key_is_named_with_the_nearest_known_one(tmp_path: Path) -> N
     assert "unknown key `excitaton`; did you mean `excitation`?" in done.text
 
 
+def test_speed_scale_beside_a_plan_is_refused(tmp_path: Path) -> None:
+    file = experiment_file(tmp_path, excitation={"plan": "plans/default.plan.yaml", "speed_scale": 0.2})
+    done = run("check", str(file))
+    assert done.code == 2
+    for word in ("speed_scale 0.2", "plans/default.plan.yaml", "lwr-run plan"):
+        assert word in done.text
+
+
 def test_a_folder_that_is_not_empty_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old.txt").write_text("old")

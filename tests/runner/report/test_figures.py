@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 from runner.report.markup import Number, paragraph, table
 from runner.report.plot import STYLES, Band, Line, Panel, Points, thin
-from runner.report.svg import Figure, figure_svg, ticks
+from runner.report.svg import Figure, ticks
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -64,7 +64,7 @@ def panel(**changes: object) -> Panel:
 
 
 def test_svg_holds_every_mark_and_escapes_texts() -> None:
-    root = ElementTree.fromstring(figure_svg(Figure("f", "caption & more", (panel(), panel()))))
+    root = ElementTree.fromstring(Figure("f", "caption & more", (panel(), panel())).svg())
     assert root.findtext(f"{SVG}title") == "caption & more"
     assert root.findtext(f"{SVG}desc") == "A & B A & B"
     colours = [node.get("stroke") or node.get("fill") for node in root.iter(f"{SVG}path")]
@@ -79,7 +79,7 @@ def test_svg_holds_every_mark_and_escapes_texts() -> None:
 def test_lines_stay_inside_their_frame() -> None:
     x = np.linspace(3.0, 9.0, 40)
     one = panel(marks=(Line("measured", "m", x, 1e3 * np.cos(x)),))
-    root = ElementTree.fromstring(figure_svg(Figure("f", "c", (one,)), columns=1, width=400.0))
+    root = ElementTree.fromstring(Figure("f", "c", (one,)).svg(columns=1, width=400.0))
     frame = next(node for node in root.iter(f"{SVG}rect") if node.get("fill") == "none")
     left, top, width, height = (float(frame.get(key, "")) for key in ("x", "y", "width", "height"))
     line = next(

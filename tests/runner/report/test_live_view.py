@@ -93,7 +93,7 @@ def test_before_command_mode_the_controllers_set_point_is_shown(ring: Ring) -> N
 
 @pytest.mark.parametrize(("row", "phase"), [(0, "move to start"), (9, "move to start"), (10, "period 1")])
 def test_the_phase_is_the_last_one_that_began(row: int, phase: str) -> None:
-    assert phase_at({"phases": [[0, "move_to_start"], [10, "period 1"]]}, row) == phase
+    assert phase_at([[0, "move_to_start"], [10, "period 1"]], row) == phase
 
 
 def test_the_page_shows_arm_progress_and_link(ring: Ring, chrome: Browser) -> None:
