@@ -16,8 +16,6 @@ import yaml
 
 from fri.errors import ConfigurationError
 
-__all__ = ["CONFIGS", "as_path", "expect", "find", "parse", "read_mapping", "read_yaml"]
-
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 _LONGEST_SHOWN = 80

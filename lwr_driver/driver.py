@@ -61,8 +61,6 @@ from lwr_driver.ring import Ring
 from lwr_driver.session.motor_torque import KrlMotorTorque
 from lwr_driver.session.writer import ExitStatus
 
-__all__ = ["Driver", "LinkSettings", "LinkState", "Measured", "Outcome", "Progress", "Waiting"]
-
 log = logging.getLogger(__name__)
 
 LOCK_STEP_EPOCH_NS = 1_577_836_800 * 10**9

@@ -32,8 +32,6 @@ from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.realtime import Rights, Shortage
 from lwr_driver.ring import Ring
 
-__all__ = ["LoopProcess", "Scheduling"]
-
 _ROOT = Path(__file__).resolve().parents[1]
 _BOOT = "import sys; from lwr_driver.loop_process import main; main(sys.argv[1:])"
 _START_TIMEOUT_S = 60.0

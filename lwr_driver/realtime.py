@@ -22,8 +22,6 @@ from types import FrameType
 
 from fri.errors import NetworkError
 
-__all__ = ["Rights", "Shortage", "assess", "set_up", "undisturbed"]
-
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4

@@ -26,8 +26,6 @@ from lwr_driver.ring import Ring
 from lwr_driver.session.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.session.writer import ExitStatus
 
-__all__ = ["Recorded", "Recorder", "SessionRequest"]
-
 _PAUSE_S = 0.02
 _BUSY_ROWS = 1000
 _START_TIMEOUT_S = 60.0

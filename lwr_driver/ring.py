@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from fri.packets import CMD, MSR
 
-__all__ = ["CAPACITY", "NO_PHASE", "ROW", "Ring"]
-
 CAPACITY = 8192
 """Default number of rows: 8 s at 1 kHz, 11 MB."""
 

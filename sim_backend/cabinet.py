@@ -26,8 +26,6 @@ from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
 from sim_backend.robot import chain, robot_file, robot_model, true_arm
 from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
-__all__ = ["Cabinet"]
-
 log = logging.getLogger(__name__)
 
 FLANGE_MM = (0.0, 0.0, 78.0)

@@ -23,8 +23,6 @@ from sim_backend.configuration import ControllerConfig, LoadData
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Payload, with_payload
 
-__all__ = ["ControllerModel", "PositionController"]
-
 
 @njit(cache=True)
 def _feedback(

@@ -17,8 +17,6 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 
-__all__ = ["FaultyWire", "Incoming", "Parcel", "WireFault"]
-
 Kind = Literal["loss", "burst", "delay", "jitter", "duplicate", "reorder", "truncate", "corrupt", "foreign"]
 
 

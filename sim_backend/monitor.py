@@ -14,8 +14,6 @@ from numba import njit
 
 from lwr_driver.arm import Arm
 
-__all__ = ["QUANTITIES", "CommandMonitor"]
-
 QUANTITIES = ("position", "velocity", "acceleration", "jerk")
 
 

@@ -24,8 +24,6 @@ from sim_backend.faults import FaultyWire, WireFault
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Payload
 
-__all__ = ["COMMANDS", "Operator", "ScheduleEntry"]
-
 log = logging.getLogger(__name__)
 
 Moment = Literal["now", "start", "monitor", "command", "moving"]

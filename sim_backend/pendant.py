@@ -21,8 +21,6 @@ from typing import Any
 
 from fri.errors import ConfigurationError, NetworkError, RobotError
 
-__all__ = ["Pendant", "PendantServer"]
-
 MAX_DATAGRAM = 65_000
 _REMEMBERED = 64
 _TRACE_S = 120.0

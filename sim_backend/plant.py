@@ -17,8 +17,6 @@ from numba import njit
 from sim_backend.robot import Drive, Payload, with_payload
 from sim_backend.stiction import advance
 
-__all__ = ["CYCLE_S", "Effect", "ElasticArm", "Loads", "Plant", "Reading"]
-
 CYCLE_S = 1e-3
 
 

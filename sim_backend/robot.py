@@ -23,20 +23,6 @@ from sim_backend.configuration import JOINTS, EmulatorConfig, RobotConfig, load_
 if TYPE_CHECKING:
     from ident.model import DynamicModel
 
-__all__ = [
-    "DRIVE_PARAMETERS",
-    "Drive",
-    "Payload",
-    "RobotFile",
-    "chain",
-    "robot_file",
-    "robot_model",
-    "true_arm",
-    "truth",
-    "with_inertias",
-    "with_payload",
-]
-
 _POSES = 50
 BODY_PARAMETERS = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
 DRIVE_PARAMETERS = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")

@@ -16,8 +16,6 @@ from numba import njit
 from sim_backend.configuration import KrlRealsConfig, SensorConfig, TraceConfig
 from sim_backend.plant import CYCLE_S, Plant, Reading
 
-__all__ = ["ControllerTrace", "KrlReals", "Sensors", "trace_columns"]
-
 _BLOCK = 1000
 
 

@@ -19,8 +19,6 @@ from sim_backend.operator import Operator
 from sim_backend.pendant import PendantServer
 from sim_backend.plant import CYCLE_S
 
-__all__ = ["Service"]
-
 log = logging.getLogger(__name__)
 
 _RESEND_S = 0.2

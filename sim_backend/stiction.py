@@ -19,8 +19,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["advance"]
-
 _ACTIVE_SET_TRIES = 40
 _DESCENT_SWEEPS = 20_000
 

@@ -30,19 +30,6 @@ from ident.excitation.sweep import forward
 from ident.model import DynamicModel
 from lwr_driver.configuration import read_mapping
 
-__all__ = [
-    "BODY",
-    "ArmEstimate",
-    "Mechanism",
-    "Noise",
-    "TorqueBounds",
-    "rigid_torque",
-    "split_name",
-    "tip_path",
-    "torque_bounds",
-    "torque_deviation",
-]
-
 BODY = INERTIAL
 _NO_COLUMNS = np.zeros(0, dtype=np.int64)
 # drive parameters: place of the signal among qdd, qd, sign(qd), 1; members of the joint row; columns of `drives`

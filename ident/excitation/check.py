@@ -30,20 +30,6 @@ from ident.excitation.clearance import space_of
 from ident.excitation.motions import Array, ParametricMotion, Samples
 from lwr_driver.arm.collision import CollisionChecker
 
-__all__ = [
-    "Check",
-    "Limits",
-    "Margin",
-    "Proof",
-    "Workspace",
-    "check_motion",
-    "flange_bounds",
-    "prove",
-    "speed_bound",
-    "swept_radius",
-    "torque_rate",
-]
-
 _ROUNDING = 1e-12
 _Measure = Callable[[Array], Array]
 KINEMATIC = (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"), ("jerk", "rad/s³"))

@@ -21,8 +21,6 @@ from fri.errors import ConfigurationError
 from ident.excitation.arm_model import Mechanism
 from ident.excitation.motions import Array
 
-__all__ = ["Space", "distances", "enclose", "row_gradient", "space_of"]
-
 _FAR = 0.15
 _RIM = 0.4  # distance of the segment's end from the flat end of a cylinder, as a share of the radius
 

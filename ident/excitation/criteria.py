@@ -24,23 +24,6 @@ from fri.errors import ConfigurationError
 from ident.excitation.information import Assembly, View
 from ident.excitation.motions import Array
 
-__all__ = [
-    "ConditionNumber",
-    "Criterion",
-    "DOptimality",
-    "GoalAttainment",
-    "MeanTorque",
-    "Pullback",
-    "RelativeDeviation",
-    "TorqueLevel",
-    "d_optimality",
-    "log_condition",
-    "relative_deviations",
-    "rsd_mean",
-    "rsd_worst",
-    "scaled",
-]
-
 _HUGE = 50.0
 _LEAST_EIGENVALUE = 1e-13
 Pullback = Callable[[float], None]

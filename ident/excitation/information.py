@@ -32,8 +32,6 @@ from ident.excitation.arm_model import (
 from ident.excitation.motions import Array, Basis, ParametricMotion, Samples
 from ident.excitation.sweep import backward, forward
 
-__all__ = ["Assembly", "Columns", "ConstantBasis", "Evaluator", "Rows", "View", "motion_view", "samples_view"]
-
 
 @dataclass(frozen=True, eq=False)
 class Columns:

@@ -28,19 +28,6 @@ from scipy.linalg import null_space
 
 from fri.errors import ConfigurationError
 
-__all__ = [
-    "Array",
-    "Basis",
-    "Extrema",
-    "FourierBasis",
-    "FourierSeries",
-    "ParametricMotion",
-    "PointToPoint",
-    "Samples",
-    "SplineBasis",
-    "SplineMotion",
-]
-
 Array = npt.NDArray[np.float64]
 _REST_TOLERANCE = 1e-9
 DEGREE = 5

@@ -44,8 +44,6 @@ from ident.excitation.sqp import minimise
 from lwr_driver.arm import Arm
 from lwr_driver.arm.collision import CollisionChecker
 
-__all__ = ["Progress", "explain", "feasible_fourier", "plan", "refuse_impossible", "search_candidates"]
-
 _log = logging.getLogger(__name__)
 _HOPS_PER_TASK = 5
 _STATIC_STARTS = 12

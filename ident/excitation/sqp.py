@@ -16,8 +16,6 @@ from scipy.optimize import nnls
 
 from ident.excitation.motions import Array
 
-__all__ = ["SmoothProblem", "Solution", "minimise"]
-
 _ELASTIC = 1e6
 _ARMIJO = 1e-4
 _LONGEST_STEP = 0.3

@@ -19,8 +19,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["backward", "forward"]
-
 
 @njit(cache=True, error_model="numpy")
 def _kinematics(rot0, trans, gravity, q, qd, qdd, cs, w, wd, vd, lin, ang):  # type: ignore[no-untyped-def]

@@ -21,8 +21,6 @@ from ident.import_log.mapping import Floats, LogMapping, Signal, TimeBase
 from lwr_driver.configuration import find
 from lwr_driver.session import SessionWriter, session_metadata
 
-__all__ = ["ImportReport", "Recording", "import_log"]
-
 
 @dataclass
 class Recording:

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = ["Coupling", "LogMapping", "Signal", "TimeBase", "Transmission"]
-
 Floats = NDArray[np.float64]
 
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
