@@ -18,17 +18,7 @@ QUANTITIES = ("position", "velocity", "acceleration", "jerk")
 
 
 @njit(cache=True)
-def _judge(
-    command: np.ndarray,
-    time_s: float,
-    times: np.ndarray,
-    values: np.ndarray,
-    middle: np.ndarray,
-    limits: np.ndarray,
-    worst: np.ndarray,
-    ratio: np.ndarray,
-    violations: np.ndarray,
-) -> int:
+def _judge(command, time_s, times, values, middle, limits, worst, ratio, violations):  # type: ignore[no-untyped-def]
     """Number of violations of `command` (n,) at `time_s` after the last `values` (4, n) at `times` (4,) [s].
 
     middle : (n,) of the position range. limits : (4, n) half the range, velocity, acceleration, jerk

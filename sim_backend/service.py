@@ -105,9 +105,8 @@ class Service:
             if self._follow is not None and os.getppid() != self._parent:
                 self._ended = True
             return False
-        for descriptor, _ in ready:
-            if descriptor == self._fri:
-                return True
+        if any(descriptor == self._fri for descriptor, _ in ready):
+            return True
         for descriptor, _ in ready:
             if descriptor != self._follow:
                 self.pendant.serve()

@@ -318,10 +318,6 @@ class ConstantBasis:
         """ConfigurationError: a posture is not a motion."""
         raise ConfigurationError("a posture is no motion")
 
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """The posture at the start, (joints, free)."""
-        return motion.sample(0.0).q.T[:, : self.free]
-
     def grid_factor(self, n: int, derivative: int) -> float:
         """One: the extremum of a constant is everywhere."""
         return 1.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+import json
 import logging
 import time
 from collections import Counter
@@ -226,7 +227,7 @@ def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> Exci
     settings.pop("source")
     provenance = {
         "method": "plan",
-        "problem": _plain(settings),
+        "problem": json.loads(json.dumps(settings, default=np.generic.item)),
         "arm": assembled.arm_name,
         "evaluations": int(tracker.evaluations),
         "interrupted": bool(tracker.interrupted),
@@ -245,16 +246,6 @@ def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> Exci
         check=outcome.check,
         provenance=provenance,
     )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
 
 
 def refuse_impossible(assembled: Assembled) -> None:

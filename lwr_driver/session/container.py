@@ -6,6 +6,7 @@ After a failed write (disk full) the broken record is cut off again.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import zlib
@@ -289,7 +290,7 @@ class Container:
         body = summary + offsets + footer
         end = _record(Opcode.DATA_END, struct.pack("<I", 0))
         self._write(end + body + struct.pack("<I", zlib.crc32(body)) + MAGIC)
-        self._sync()
+        os.fsync(self._file.fileno())
         self._file.close()
 
     def abandon(self) -> None:
@@ -301,7 +302,8 @@ class Container:
         try:
             while left:
                 left = left[self._file.write(left) :]
-            self._sync(only_if_asked=True)
+            if self._fsync:
+                os.fsync(self._file.fileno())
         except OSError as error:
             self._cut()
             raise DataError(
@@ -310,13 +312,7 @@ class Container:
             ) from error
         self.offset += len(data)
 
-    def _sync(self, *, only_if_asked: bool = False) -> None:
-        if self._fsync or not only_if_asked:
-            os.fsync(self._file.fileno())
-
     def _cut(self) -> None:
-        try:
+        with contextlib.suppress(OSError):
             self._file.truncate(self.offset)
             self._file.seek(self.offset)
-        except OSError:
-            return
