@@ -136,12 +136,8 @@ class Cabinet:
     def cold_start(self) -> None:
         """A new session with its counters at zero, as after switching the cabinet on; no program runs."""
         fri = self.config.fri
-        limits = KrcLimits(
-            np.array(fri.position_min),
-            np.array(fri.position_max),
-            np.array(fri.velocity),
-            np.array(fri.acceleration),
-        )
+        rows = (fri.position_min, fri.position_max, fri.velocity, fri.acceleration)
+        limits = KrcLimits(*(np.array(row) for row in rows))
         self.session = KrcSession(
             limits,
             self._last_setpoint,
@@ -282,10 +278,9 @@ class Cabinet:
         for effect in self.effects:
             effect.sense(time_s, plant, reading)
         gravity = self.model.update_gravity(setpoint)
+        torque = self._zero
         if self.powered:
             torque = self.controller.cycle(setpoint, gravity, reading.motor_position, reading.joint_torque)
-        else:
-            torque = self._zero
         self.sensors.read_motor(plant.motor_torque, torque)
         for effect in self.effects:
             effect.sense_motor(time_s, plant, reading)

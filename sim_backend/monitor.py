@@ -82,8 +82,7 @@ class CommandMonitor:
         self.worst = np.zeros((4, joints))
         self.ratio = np.zeros((4, joints))
         self.violations = np.zeros((4, joints), dtype=np.int64)
-        self.commands = 0
-        self.first_violation: str | None = None
+        self.reset()
         self._values = np.zeros((4, joints))
         self._times = np.zeros(4)
         self._begun = False
@@ -94,7 +93,7 @@ class CommandMonitor:
         self.ratio[:] = 0.0
         self.violations[:] = 0
         self.commands = 0
-        self.first_violation = None
+        self.first_violation: str | None = None
 
     def rest(self, position: np.ndarray, cycle: int) -> None:
         """Command mode begins at `cycle` from the setpoint `position` (7,), at rest."""

@@ -409,13 +409,9 @@ def _from_start(
             x = solution.x
             near = float(solution.constraints.min()) > -_NEAR
             motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
-            steps = (
-                {"step_s": 1e-3, "collision_step_s": 1e-2}
-                if near
-                else {"step_s": 0.05, "collision_step_s": 0.1}
-            )
-            check = against(motion, **steps, continuous=near)
-            if (check.ok and near) or not near:
+            step_s, collision_step_s = (1e-3, 1e-2) if near else (0.05, 0.1)
+            check = against(motion, step_s=step_s, collision_step_s=collision_step_s, continuous=near)
+            if check.ok or not near:
                 break
             tighten(program.constraints, check, setup.mechanism.joint_names)
         return (motion if check.ok and near else None), check

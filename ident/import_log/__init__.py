@@ -7,7 +7,7 @@ with an error.
 
 from __future__ import annotations
 
-from ident.import_log.conversion import ImportReport, import_log
-from ident.import_log.mapping import Coupling, LogMapping, Signal, TimeBase, Transmission
+from ident.import_log.conversion import import_log
+from ident.import_log.mapping import LogMapping
 
-__all__ = ["Coupling", "ImportReport", "LogMapping", "Signal", "TimeBase", "Transmission", "import_log"]
+__all__ = ["LogMapping", "import_log"]
