@@ -47,9 +47,8 @@ class _Failure:
         return cls(type(error).__name__, str(error) or repr(error))
 
     def error(self) -> LwrError:
-        return (
-            ConfigurationError(self.message) if self.kind == "ConfigurationError" else DataError(self.message)
-        )
+        kind = ConfigurationError if self.kind == "ConfigurationError" else DataError
+        return kind(self.message)
 
 
 @dataclass(frozen=True)
@@ -204,18 +203,11 @@ class Recorder:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         code = self._process.returncode
-        how = (
-            "is gone"
-            if code is None
-            else f"was killed by signal {-code}"
-            if code < 0
-            else f"ended with code {code}"
-        )
-        where = (
-            f"; {self._path} is readable up to its last chunk, `lwr-run recover` makes it whole"
-            if self._path
-            else ""
-        )
+        how, where = "is gone", ""
+        if code is not None:
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        if self._path:
+            where = f"; {self._path} is readable up to its last chunk, `lwr-run recover` makes it whole"
         return DataError(f"the recorder process {self._process.pid} {how}{where}")
 
 

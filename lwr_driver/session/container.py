@@ -259,15 +259,9 @@ class Container:
         """Write the end of the data, the summary and the footer, and close."""
         written = [channel for channel in self._channels.values() if channel.written]
         schemas = list(dict.fromkeys(channel.schema_record for channel in written))
-        numbers = (
-            len(schemas),
-            len(self._counts),
-            len(self._attachments),
-            len(self._metadata),
-            len(self._chunks),
-        )
+        counted = (schemas, self._counts, self._attachments, self._metadata, self._chunks)
         times = self._times or (0, 0)
-        head = struct.pack("<QHIIIIQQ", sum(self._counts.values()), *numbers, *times)
+        head = struct.pack("<QHIIIIQQ", sum(self._counts.values()), *map(len, counted), *times)
         counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
         statistics = _record(Opcode.STATISTICS, head, struct.pack("<I", len(counts)), counts)
         summary_start = self.offset + 9 + 4

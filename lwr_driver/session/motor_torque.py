@@ -213,16 +213,9 @@ def match_torques(joint: JointColumns, motor: JointColumns) -> tuple[TorqueMatch
     for place, name in enumerate(motor.names):
         best = int(np.argmax(explained[:, place]))
         mine = float(explained[joint.names.index(name), place]) if name in joint.names else 0.0
-        matches.append(
-            TorqueMatch(
-                name,
-                mine,
-                float(gains[place]),
-                float(loads[place]),
-                joint.names[best],
-                float(explained[best, place]),
-            )
-        )
+        gain, load = float(gains[place]), float(loads[place])
+        follows = joint.names[best], float(explained[best, place])
+        matches.append(TorqueMatch(name, mine, gain, load, *follows))
     return tuple(matches)
 
 

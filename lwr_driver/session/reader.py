@@ -145,13 +145,8 @@ def _session(
     joint = columns["/joint_states"]
     if joint is None:
         topics = sorted({channel.topic for channel in scan.channels.values()})
-        cut = (
-            ""
-            if scan.whole
-            else "; the file was cut before its first whole chunk"
-            if not topics
-            else "; it was cut"
-        )
+        cut = "; it was cut" if topics else "; the file was cut before its first whole chunk"
+        cut = "" if scan.whole else cut
         raise DataError(f"{source}: no message on /joint_states; topics: {', '.join(topics) or 'none'}{cut}")
     for topic, other in columns.items():
         if other is not None and topic != "/joint_states":
