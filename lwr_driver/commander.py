@@ -19,8 +19,6 @@ from lwr_driver.control import Control, Mode, Result, Text, Word
 from lwr_driver.guard import Guard, Stop, Violation
 from lwr_driver.ring import NO_PHASE
 
-__all__ = ["BRAKE", "HOLD", "Commander", "Foreseen"]
-
 HOLD, BRAKE = 0, 1
 """Phase numbers given by the loop itself: holding, and stopping before the end of a motion."""
 

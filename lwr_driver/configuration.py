@@ -16,8 +16,6 @@ import yaml
 
 from fri.errors import ConfigurationError
 
-__all__ = ["CONFIGS", "as_path", "expect", "find", "parse", "read_mapping", "read_yaml"]
-
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 _LONGEST_SHOWN = 80
@@ -51,11 +49,8 @@ def find(name: str | Path, *, beside: Path | None = None) -> Path:
         wanted = as_path(name, "configuration file").expanduser()
     except RuntimeError as error:
         raise ConfigurationError(f"file {_shown(name)!r} cannot be looked for: {error}") from error
-    places = [wanted] if wanted.is_absolute() else [Path.cwd() / wanted]
-    if not wanted.is_absolute():
-        if beside is not None:
-            places.append(beside / wanted)
-        places.append(CONFIGS / wanted)
+    folders = [Path.cwd(), *([] if beside is None else [beside]), CONFIGS]
+    places = [wanted] if wanted.is_absolute() else [folder / wanted for folder in folders]
     for place in places:
         try:
             if place.is_file():

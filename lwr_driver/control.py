@@ -20,8 +20,6 @@ from fri.errors import ConfigurationError
 from lwr_driver.arm import JOINTS
 from lwr_driver.ring import ROW
 
-__all__ = ["BIN_NS", "HISTORY", "Control", "Job", "Mode", "Result", "Text", "Word"]
-
 HISTORY = 128
 """Rows kept for an exception or a snapshot, newest last."""
 

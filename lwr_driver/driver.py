@@ -61,8 +61,6 @@ from lwr_driver.ring import Ring
 from lwr_driver.session.motor_torque import KrlMotorTorque
 from lwr_driver.session.writer import ExitStatus
 
-__all__ = ["Driver", "LinkSettings", "LinkState", "Measured", "Outcome", "Progress", "Waiting"]
-
 log = logging.getLogger(__name__)
 
 LOCK_STEP_EPOCH_NS = 1_577_836_800 * 10**9
@@ -177,8 +175,7 @@ class Driver:
     @property
     def ring_name(self) -> str:
         """Name of the shared memory with every cycle, for observers (`Ring.attach`, `Ring.peek`)."""
-        name: str = self._need(self._ring).name
-        return name
+        return str(self._need(self._ring).name)
 
     def close(self) -> None:
         """Stop, leave command mode, end the session and both processes. Safe at any time and repeatedly."""
@@ -292,7 +289,9 @@ class Driver:
         control, state = self._need(self._control), self.state()
         if int(control.words[Word.STOP]) != self._stops_seen:
             self._stops_seen = int(control.words[Word.STOP])
-            return Outcome("abort", "stop requested before the motion began", self._rows(), -1, len(motion))
+            return Outcome(
+                "abort", "stop requested before the motion began", self.last_rows(), -1, len(motion)
+            )
         self._check_executable(motion, state)
         control.put_motion(motion.q, self._number_phases(motion))
         self._need(self._control).post(Job.MOTION, a=len(motion), b=self._stops_seen)
@@ -364,7 +363,8 @@ class Driver:
 
     def last_rows(self, count: int = ROWS_KEPT) -> NDArray[Any]:
         """Copy of the last cycles, at most `count` and 64, oldest first, dtype `lwr_driver.ring.ROW`."""
-        return self._rows(count)
+        rows: NDArray[Any] = self._need(self._control).last_rows(count)
+        return rows
 
     def latency_histogram(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Reply latencies since `connect`: upper edges of the bins [s] and counts; the last bin is open."""
@@ -439,31 +439,28 @@ class Driver:
             if stoppable:
                 self._obey(awaited)
             now = time.monotonic()
-            waiting = Waiting(awaited, "", now - began, "")
             if now - notified >= _NOTIFY_S:
                 notified = now
                 self._report_notes()
                 if self._notify is not None:
-                    self._notify(self._describe(waiting, advice))
+                    self._notify(self._waiting(awaited, now - began, advice))
             wall = timeout_s if state.sequence < 0 or not self.link.lock_step else np.inf
-            if waiting.since_s > wall:
-                raise self._with_rows(failure(str(self._describe(waiting, advice))))
+            if now - began > wall:
+                raise self._with_rows(failure(str(self._waiting(awaited, now - began, advice))))
         self._report_notes()
         result = self._need(self._control).result
         if result is Result.DONE:
             return
-        waiting = Waiting(awaited, "", time.monotonic() - began, "")
         if result is Result.TIMEOUT:
-            waiting = Waiting(awaited, "", timeout_s, "")
-            raise self._with_rows(failure(str(self._describe(waiting, advice))))
+            raise self._with_rows(failure(str(self._waiting(awaited, timeout_s, advice))))
         reason = self._need(self._control).text(Text.REASON)
         if result is Result.ABORTED:
             raise self._with_rows(OperatorError(reason))
         raise self._with_rows(_ERRORS.get(result, failure)(f"{awaited}: {reason}"))
 
-    def _describe(self, waiting: Waiting, advice: Callable[[LinkState], str]) -> Waiting:
+    def _waiting(self, awaited: str, since_s: float, advice: Callable[[LinkState], str]) -> Waiting:
         state = self.state()
-        return Waiting(waiting.awaited, state.summary, waiting.since_s, advice(state))
+        return Waiting(awaited, state.summary, since_s, advice(state))
 
     def _obey(self, awaited: str) -> None:
         stops = int(self._need(self._control).words[Word.STOP])
@@ -502,7 +499,7 @@ class Driver:
         return [(row, first + place) for place, (row, _) in enumerate(motion.phases)]
 
     def _phase_name(self, names: Mapping[int, str]) -> str:
-        rows = self._rows(1)
+        rows = self.last_rows(1)
         number = int(rows[0]["phase"]) if len(rows) else -1
         return _PHASES.get(number) or names.get(number, "")
 
@@ -525,13 +522,13 @@ class Driver:
 
     def _failed(self, motion: Motion, error: LwrError) -> Outcome:
         row = int(self._need(self._control).words[Word.ROW])
-        return Outcome("fail", str(error), self._rows(), row, len(motion), self._with_rows(error))
+        return Outcome("fail", str(error), self.last_rows(), row, len(motion), self._with_rows(error))
 
     def _outcome(self, motion: Motion, trouble: LwrError | None) -> Outcome:
         control = self._need(self._control)
         result = control.result
         reason = control.text(Text.REASON)
-        rows, row = self._rows(), int(control.words[Word.ROW])
+        rows, row = self.last_rows(), int(control.words[Word.ROW])
         self._report_notes()
         if result is Result.ABORTED:
             self._stops_seen = int(control.words[Word.STOP])
@@ -543,13 +540,9 @@ class Driver:
             return Outcome("abort", reason, rows, row, len(motion))
         return self._failed(motion, _ERRORS.get(result, RobotError)(reason))
 
-    def _rows(self, count: int = ROWS_KEPT) -> NDArray[Any]:
-        rows: NDArray[Any] = self._need(self._control).last_rows(count)
-        return rows
-
     def _with_rows(self, error: LwrError) -> LwrError:
         if self._control is not None:
-            error.rows = self._rows()
+            error.rows = self.last_rows()
         return error
 
     def _report_notes(self) -> None:

@@ -39,8 +39,6 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 
 from lwr_driver.arm import JOINTS, Limits
 
-__all__ = ["ROUNDING", "Guard", "Stop", "Violation", "stop_extent"]
-
 # Half the spacing of float32 numbers between 2 and 4 rad; joint positions of the arm are below 3 rad.
 ROUNDING = 2.0**-23
 

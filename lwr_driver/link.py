@@ -15,24 +15,6 @@ from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS
 from lwr_driver.control import BIN_NS, Control, Mode, Text, Word
 
-__all__ = [
-    "LinkSettings",
-    "LinkState",
-    "Measured",
-    "Outcome",
-    "Progress",
-    "Waiting",
-    "advise_command",
-    "advise_connect",
-    "advise_leave",
-    "advise_load",
-    "advise_monitor",
-    "advise_quality",
-    "advise_rest",
-    "silence_in_lock_step",
-    "snapshot",
-]
-
 _COUNTERS = (
     "received",
     "answered",

@@ -29,8 +29,6 @@ from lwr_driver.ring import ROW, Ring
 if TYPE_CHECKING:
     from lwr_driver.turnaround import Turnaround
 
-__all__ = ["Loop", "LoopSettings", "Rest"]
-
 _IDLE_S = 0.0005  # pause of an idle loop in lock step
 _SLICE_S = 0.02  # longest wait for a packet between checks of requests and silence
 _FEWEST_CYCLES = 10  # silence of so many cycles is always tolerated

@@ -32,8 +32,6 @@ from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.realtime import Rights, Shortage
 from lwr_driver.ring import Ring
 
-__all__ = ["LoopProcess", "Scheduling"]
-
 _ROOT = Path(__file__).resolve().parents[1]
 _BOOT = "import sys; from lwr_driver.loop_process import main; main(sys.argv[1:])"
 _START_TIMEOUT_S = 60.0
@@ -98,8 +96,8 @@ class LoopProcess:
             raise
         self.port = int(answer["port"])
         self.rights = Rights(
-            tuple(Shortage(*shortage) for shortage in answer["missing"]),
-            tuple(Shortage(*shortage) for shortage in answer["advice"]),
+            tuple(Shortage(**shortage) for shortage in answer["missing"]),
+            tuple(Shortage(**shortage) for shortage in answer["advice"]),
             answer["processor"],
         )
 
@@ -177,14 +175,7 @@ def main(arguments: Sequence[str]) -> None:
         control.words[Word.QUIT] = 1
 
     signal.signal(signal.SIGTERM, end)
-    _say(
-        {
-            "port": loop.remote.address[1],
-            "missing": [[shortage.what, shortage.remedy] for shortage in rights.missing],
-            "advice": [[shortage.what, shortage.remedy] for shortage in rights.advice],
-            "processor": rights.processor,
-        }
-    )
+    _say({"port": loop.remote.address[1], **asdict(rights)})
     loop.run(order["parent"])
 
 

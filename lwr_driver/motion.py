@@ -20,8 +20,6 @@ from lwr_driver.arm import JOINTS, Arm
 from lwr_driver.configuration import expect
 from lwr_driver.guard import ROUNDING, stop_extent
 
-__all__ = ["Extreme", "Motion", "check_motion", "check_start", "extremes", "move_to"]
-
 Rows = NDArray[np.float64]
 
 

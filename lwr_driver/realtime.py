@@ -22,8 +22,6 @@ from types import FrameType
 
 from fri.errors import NetworkError
 
-__all__ = ["Rights", "Shortage", "assess", "set_up", "undisturbed"]
-
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
@@ -75,7 +73,7 @@ class Rights:
 
 def assess(priority: int = 80) -> Rights:
     """Rights of a real-time process started by this user; changes nothing."""
-    missing, advice = [], []
+    missing, advice = [], _kernel_advice()
     capabilities = _capabilities()
     ceiling = resource.getrlimit(resource.RLIMIT_RTPRIO)[1]
     if not capabilities >> _CAP_SYS_NICE & 1 and 0 <= ceiling < priority:
@@ -83,9 +81,6 @@ def assess(priority: int = 80) -> Rights:
     lockable = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
     if not capabilities >> _CAP_IPC_LOCK & 1 and 0 <= lockable < _LOCK_BYTES:
         missing.append(_no_memory(lockable))
-    kernel = _kernel_advice()
-    if kernel is not None:
-        advice.append(kernel)
     if _processors() < 2:
         advice.append(
             Shortage("a single processor", "the loop shares it with everything else; use two or more")
@@ -98,10 +93,7 @@ def set_up(priority: int = 80, processor: int | None = None) -> Rights:
 
     priority : of SCHED_FIFO, 1 to 99; processor : to bind to, None for an isolated one, else the last
     """
-    missing, advice = [], []
-    kernel = _kernel_advice()
-    if kernel is not None:
-        advice.append(kernel)
+    missing, advice = [], _kernel_advice()
     chosen = _choose(processor)
     if chosen is not None:
         try:
@@ -145,19 +137,18 @@ def _no_memory(limit: int) -> Shortage:
     )
 
 
-def _kernel_advice() -> Shortage | None:
+def _kernel_advice() -> list[Shortage]:
     with contextlib.suppress(OSError):
         if Path("/sys/kernel/realtime").read_text().strip() == "1":
-            return None
-    version = platform.version()
-    if "PREEMPT_RT" in version:
-        return None
-    return Shortage(
-        f"kernel {platform.release()} is not PREEMPT_RT",
+            return []
+    if "PREEMPT_RT" in platform.version():
+        return []
+    remedy = (
         "stalls of some ms are possible at 1 kHz; install the distribution's real-time kernel "
         "(Debian: linux-image-rt-amd64, Ubuntu: `sudo pro enable realtime-kernel`) or use a cycle of 5 ms "
-        "or more",
+        "or more"
     )
+    return [Shortage(f"kernel {platform.release()} is not PREEMPT_RT", remedy)]
 
 
 def _capabilities() -> int:

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
@@ -26,8 +26,6 @@ from lwr_driver.ring import Ring
 from lwr_driver.session.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.session.writer import ExitStatus
 
-__all__ = ["Recorded", "Recorder", "SessionRequest"]
-
 _PAUSE_S = 0.02
 _BUSY_ROWS = 1000
 _START_TIMEOUT_S = 60.0
@@ -35,28 +33,6 @@ _REPLY_TIMEOUT_S = 60.0
 _NICE = 5
 _ROOT = Path(__file__).resolve().parents[1]
 _BOOT = "import sys; from lwr_driver.recorder import main; main(sys.argv[1:])"
-
-
-@dataclass(frozen=True)
-class _Open:
-    request: SessionRequest
-
-
-@dataclass(frozen=True)
-class _Close:
-    exit_status: ExitStatus
-    reason: str
-    upto: int
-
-
-@dataclass(frozen=True)
-class _Phases:
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _Stop:
-    pass
 
 
 @dataclass(frozen=True)
@@ -71,9 +47,8 @@ class _Failure:
         return cls(type(error).__name__, str(error) or repr(error))
 
     def error(self) -> LwrError:
-        return (
-            ConfigurationError(self.message) if self.kind == "ConfigurationError" else DataError(self.message)
-        )
+        kind = ConfigurationError if self.kind == "ConfigurationError" else DataError
+        return kind(self.message)
 
 
 @dataclass(frozen=True)
@@ -140,7 +115,7 @@ class Recorder:
         Raises ConfigurationError if the file cannot be created (it exists, the folder is read-only).
         """
         self._events.clear()
-        self._ask(_Open(request))
+        self._ask("open", request)
         self._path = request.path
 
     def add_phases(self, names: Sequence[str]) -> int:
@@ -149,11 +124,10 @@ class Recorder:
         Raises the failure that ended the session, if any.
         """
         try:
-            first: int = self._ask(_Phases(tuple(names)))
+            return int(self._ask("phases", tuple(names)))
         except LwrError:
             self.check()
             raise
-        return first
 
     def close(
         self, exit_status: ExitStatus = "success", reason: str = "", *, upto: int | None = None
@@ -162,7 +136,7 @@ class Recorder:
 
         For a session already ended by a failure (disk full, loop dead), that end is returned.
         """
-        answer: Recorded = self._ask(_Close(exit_status, reason, self.ring.head if upto is None else upto))
+        answer: Recorded = self._ask("close", exit_status, reason, self.ring.head if upto is None else upto)
         self._path = None
         return answer
 
@@ -179,7 +153,7 @@ class Recorder:
         if self._connection.closed:
             return
         with contextlib.suppress(OSError, DataError):
-            self._connection.send(_Stop())
+            self._connection.send(("stop",))
         self._connection.close()
         try:
             self._process.wait(timeout_s)
@@ -193,9 +167,9 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _ask(self, message: object) -> Any:
+    def _ask(self, *request: object) -> Any:
         try:
-            self._connection.send(message)
+            self._connection.send(request)
         except (OSError, ValueError) as error:
             raise self._died() from error
         return self._receive(self._reply_timeout_s)
@@ -229,18 +203,11 @@ class Recorder:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
         code = self._process.returncode
-        how = (
-            "is gone"
-            if code is None
-            else f"was killed by signal {-code}"
-            if code < 0
-            else f"ended with code {code}"
-        )
-        where = (
-            f"; {self._path} is readable up to its last chunk, `lwr-run recover` makes it whole"
-            if self._path
-            else ""
-        )
+        how, where = "is gone", ""
+        if code is not None:
+            how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        if self._path:
+            where = f"; {self._path} is readable up to its last chunk, `lwr-run recover` makes it whole"
         return DataError(f"the recorder process {self._process.pid} {how}{where}")
 
 
@@ -267,7 +234,7 @@ class _Server:
                 return
             try:
                 if self._connection.poll(0 if busy else _PAUSE_S) and not self._answer(
-                    self._connection.recv()
+                    *self._connection.recv()
                 ):
                     return
             except (EOFError, OSError):
@@ -277,20 +244,18 @@ class _Server:
             busy = self._drain(None) >= _BUSY_ROWS
             self._watch_writer()
 
-    def _answer(self, request: object) -> bool:
+    def _answer(self, name: str, *arguments: Any) -> bool:
         try:
-            if isinstance(request, _Open):
-                self._connection.send(self._open(request.request))
-            elif isinstance(request, _Phases):
-                if self._recording is None:
-                    raise DataError("no session is open, so phases have no place")
-                self._connection.send(self._recording.add_phases(request.names))
-            elif isinstance(request, _Close):
-                self._connection.send(self._close(request))
-            else:
+            if name == "stop":
                 self._drain(None)
                 self._end_by_failure("the recorder was stopped before the session was closed")
                 return False
+            answers: dict[str, Callable[..., Any]] = {
+                "open": self._open,
+                "phases": self._add_phases,
+                "close": self._close,
+            }
+            self._connection.send(answers[name](*arguments))
         except Exception as error:  # the recorder goes on after any failed request
             self._connection.send(_Failure.of(error))
         return True
@@ -304,12 +269,17 @@ class _Server:
         self._recording = Recording(request, self._utc_offset)
         return "open"
 
-    def _close(self, request: _Close) -> Recorded:
+    def _add_phases(self, names: tuple[str, ...]) -> int:
+        if self._recording is None:
+            raise DataError("no session is open, so phases have no place")
+        return self._recording.add_phases(names)
+
+    def _close(self, exit_status: ExitStatus, reason: str, upto: int) -> Recorded:
         if self._recording is not None:
-            self._drain(request.upto)
+            self._drain(upto)
             self._watch_writer()
         if self._recording is not None:
-            recorded = self._recording.close(request.exit_status, request.reason, self._lost_rows())
+            recorded = self._recording.close(exit_status, reason, self._lost_rows())
             self._recording = None
             return recorded
         if self._ended is None:

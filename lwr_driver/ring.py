@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from fri.packets import CMD, MSR
 
-__all__ = ["CAPACITY", "NO_PHASE", "ROW", "Ring"]
-
 CAPACITY = 8192
 """Default number of rows: 8 s at 1 kHz, 11 MB."""
 
@@ -50,7 +48,7 @@ ROW = np.dtype(
 _MAGIC = 0x4C57525F52494E47
 _LINE = 8  # words of a cache line
 _MAGIC_AT, _CAPACITY_AT, _ITEM_AT = 0, 1, 2
-_HEAD, _TAIL, _BEAT, _OVERRUNS, _WRITER, _LINES = 1, 2, 3, 4, 5, 6
+_LINES = 6  # the head line, then one for each counter
 _HEADER_BYTES = _LINES * _LINE * 8
 
 _attach_lock = threading.Lock()
@@ -76,11 +74,9 @@ class Ring:
             )
         self.capacity = int(words[_CAPACITY_AT])
         self._words = words
-        self._head = words[_HEAD * _LINE : _HEAD * _LINE + 1]
-        self._tail = words[_TAIL * _LINE : _TAIL * _LINE + 1]
-        self._beat = words[_BEAT * _LINE : _BEAT * _LINE + 1]
-        self._overruns = words[_OVERRUNS * _LINE : _OVERRUNS * _LINE + 1]
-        self._writer = words[_WRITER * _LINE : _WRITER * _LINE + 1]
+        self._head, self._tail, self._beat, self._overruns, self._writer = (
+            words[line * _LINE : line * _LINE + 1] for line in range(1, _LINES)
+        )
         self._rows = np.ndarray((self.capacity,), dtype=ROW, buffer=buffer, offset=_HEADER_BYTES)
         self._bytes: memoryview = buffer[_HEADER_BYTES : _HEADER_BYTES + self.capacity * ROW.itemsize]
         self._published = int(self._head[0])

@@ -34,8 +34,6 @@ from fri.packets import CMD_SIZE, JOINTS, MSR_ID, MSR_OFFSETS, MSR_SIZE
 from fri.states import ALL_DRIVES, Control, Quality, State
 from lwr_driver.control import Word
 
-__all__ = ["Turnaround"]
-
 # A power of two, since counters wrap at 65536.
 _MOST = 16
 

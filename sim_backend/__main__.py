@@ -15,8 +15,6 @@ from fri.errors import ConfigurationError, LwrError
 from sim_backend.configuration import load_configuration
 from sim_backend.service import Service
 
-__all__ = ["main"]
-
 
 @click.command()
 @click.argument("config", default="emulator/default.yaml")

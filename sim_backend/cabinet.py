@@ -26,8 +26,6 @@ from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
 from sim_backend.robot import chain, robot_file, robot_model, true_arm
 from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
-__all__ = ["Cabinet"]
-
 log = logging.getLogger(__name__)
 
 FLANGE_MM = (0.0, 0.0, 78.0)
@@ -138,12 +136,8 @@ class Cabinet:
     def cold_start(self) -> None:
         """A new session with its counters at zero, as after switching the cabinet on; no program runs."""
         fri = self.config.fri
-        limits = KrcLimits(
-            np.array(fri.position_min),
-            np.array(fri.position_max),
-            np.array(fri.velocity),
-            np.array(fri.acceleration),
-        )
+        rows = (fri.position_min, fri.position_max, fri.velocity, fri.acceleration)
+        limits = KrcLimits(*(np.array(row) for row in rows))
         self.session = KrcSession(
             limits,
             self._last_setpoint,
@@ -284,10 +278,9 @@ class Cabinet:
         for effect in self.effects:
             effect.sense(time_s, plant, reading)
         gravity = self.model.update_gravity(setpoint)
+        torque = self._zero
         if self.powered:
             torque = self.controller.cycle(setpoint, gravity, reading.motor_position, reading.joint_torque)
-        else:
-            torque = self._zero
         self.sensors.read_motor(plant.motor_torque, torque)
         for effect in self.effects:
             effect.sense_motor(time_s, plant, reading)

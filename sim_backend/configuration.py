@@ -16,20 +16,6 @@ from fri.krl import KrlProgram, Machinery
 from fri.policy import KrcPolicy
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = [
-    "OWN_PROGRAM",
-    "ControllerConfig",
-    "EmulatorConfig",
-    "FriConfig",
-    "KrlRealsConfig",
-    "Plugin",
-    "RobotConfig",
-    "SensorConfig",
-    "TraceConfig",
-    "krl_program",
-    "load_configuration",
-]
-
 OWN_PROGRAM = "lwr_identification"
 """The KRL program of this project."""
 

@@ -23,20 +23,9 @@ from sim_backend.configuration import ControllerConfig, LoadData
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Payload, with_payload
 
-__all__ = ["ControllerModel", "PositionController"]
-
 
 @njit(cache=True)
-def _feedback(
-    setpoint: np.ndarray,
-    gravity: np.ndarray,
-    motor_position: np.ndarray,
-    joint_torque: np.ndarray,
-    gains: np.ndarray,
-    memory: np.ndarray,
-    settings: np.ndarray,
-    out: np.ndarray,
-) -> None:
+def _feedback(setpoint, gravity, motor_position, joint_torque, gains, memory, settings, out):  # type: ignore[no-untyped-def]
     """One cycle of the law above.
 
     gains : rows K, Kp, Kd, Kt, viscous, Coulomb, limit. memory : rows theta_d, theta, theta_d' and theta'
@@ -65,14 +54,7 @@ def _feedback(
 
 
 @njit(cache=True)
-def _external(
-    joint_torque: np.ndarray,
-    bias: np.ndarray,
-    mass: np.ndarray,
-    change: np.ndarray,
-    keep: float,
-    estimate: np.ndarray,
-) -> None:
+def _external(joint_torque, bias, mass, change, keep, estimate):  # type: ignore[no-untyped-def]
     """Low-pass of `joint_torque - mass @ change - bias` into `estimate`."""
     for i in range(estimate.shape[0]):
         modelled = bias[i]
@@ -91,9 +73,9 @@ def _difference(position: np.ndarray, period: float, keep: float, memory: np.nda
         memory[0, i] = position[i]
 
 
-def _keep(cutoff_hz: float) -> float:
+def _keep(cutoff_hz: float, period_s: float = CYCLE_S) -> float:
     """Weight of the old value in a first-order low-pass, per cycle."""
-    return math.exp(-2.0 * math.pi * cutoff_hz * CYCLE_S)
+    return math.exp(-2.0 * math.pi * cutoff_hz * period_s)
 
 
 class PositionController:
@@ -161,7 +143,6 @@ class ControllerModel:
         self.external_torque = np.zeros(n)
         self._cutoff_hz = external_cutoff_hz
         self._memory = np.zeros((3, n))
-        self._keep: tuple[float, float] = (0.0, 0.0)
         self._begun = False
         self.set_load(load)
 
@@ -191,10 +172,7 @@ class ControllerModel:
         if not self._begun:
             self._memory[0] = position
             self._begun = True
-        if self._keep[0] != period_s:
-            self._keep = (period_s, math.exp(-2.0 * math.pi * self._cutoff_hz * period_s))
-        keep = self._keep[1]
-        memory = self._memory
+        keep, memory = _keep(self._cutoff_hz, period_s), self._memory
         _difference(position, period_s, keep, memory)
         bias = pin.nonLinearEffects(self.model, self._data, position, memory[1])
         _external(joint_torque, bias, self.mass_matrix, memory[2], keep, self.external_torque)

@@ -17,8 +17,6 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 
-__all__ = ["FaultyWire", "Incoming", "Parcel", "WireFault"]
-
 Kind = Literal["loss", "burst", "delay", "jitter", "duplicate", "reorder", "truncate", "corrupt", "foreign"]
 
 
@@ -191,7 +189,7 @@ class FaultyWire:
         """(lateness in cycles, clean copy) of the datagram, and (host, datagram) of foreign and damaged ones."""
         late: float | None = 0.0
         clean = True
-        copies = 1
+        repeats = [0.0]
         beside: list[tuple[str | None, bytes]] = []
         for active in self._faults(direction, cycle):
             fault, random = active.fault, active.random
@@ -219,7 +217,8 @@ class FaultyWire:
                     # Own datagrams come first in their cycle: the overtaken one must be two cycles late to the PC.
                     late = None if late is None else late + (2.0 if direction == "to_pc" else 1.0)
                 case "duplicate":
-                    copies = 2
+                    # To the PC the copy must arrive between the original and the next one.
+                    repeats = [0.0, 1.0 if direction == "to_pc" else 0.0]
                 case "truncate":
                     datagram, clean = datagram[: int(random.random() * len(datagram))], False
                 case "corrupt":
@@ -232,12 +231,7 @@ class FaultyWire:
         if not clean:
             beside.append((None, datagram))
             return [], beside
-        if copies == 2:
-            if direction == "to_pc":
-                # The copy must arrive between the original and the next one.
-                return [(late, datagram), (late + 1.0, datagram)], beside
-            return [(late, datagram), (late, datagram)], beside
-        return [(late, datagram)], beside
+        return [(late + repeat, datagram) for repeat in repeats], beside
 
 
 def _flip(datagram: bytes, bits: int, random: np.random.Generator) -> bytes:

@@ -25,16 +25,6 @@ from ident.model import DynamicModel
 from sim_backend.plant import Effect
 from sim_backend.robot import Drive, with_inertias
 
-__all__ = [
-    "Cause",
-    "ModelEffect",
-    "arm_of",
-    "is_possible",
-    "model_effects",
-    "model_parameters",
-    "model_payloads",
-]
-
 Floats = NDArray[np.float64]
 
 _DRIVE = PER_LINK[len(INERTIAL) :]

@@ -14,23 +14,11 @@ from numba import njit
 
 from lwr_driver.arm import Arm
 
-__all__ = ["QUANTITIES", "CommandMonitor"]
-
 QUANTITIES = ("position", "velocity", "acceleration", "jerk")
 
 
 @njit(cache=True)
-def _judge(
-    command: np.ndarray,
-    time_s: float,
-    times: np.ndarray,
-    values: np.ndarray,
-    middle: np.ndarray,
-    limits: np.ndarray,
-    worst: np.ndarray,
-    ratio: np.ndarray,
-    violations: np.ndarray,
-) -> int:
+def _judge(command, time_s, times, values, middle, limits, worst, ratio, violations):  # type: ignore[no-untyped-def]
     """Number of violations of `command` (n,) at `time_s` after the last `values` (4, n) at `times` (4,) [s].
 
     middle : (n,) of the position range. limits : (4, n) half the range, velocity, acceleration, jerk
@@ -94,8 +82,7 @@ class CommandMonitor:
         self.worst = np.zeros((4, joints))
         self.ratio = np.zeros((4, joints))
         self.violations = np.zeros((4, joints), dtype=np.int64)
-        self.commands = 0
-        self.first_violation: str | None = None
+        self.reset()
         self._values = np.zeros((4, joints))
         self._times = np.zeros(4)
         self._begun = False
@@ -106,7 +93,7 @@ class CommandMonitor:
         self.ratio[:] = 0.0
         self.violations[:] = 0
         self.commands = 0
-        self.first_violation = None
+        self.first_violation: str | None = None
 
     def rest(self, position: np.ndarray, cycle: int) -> None:
         """Command mode begins at `cycle` from the setpoint `position` (7,), at rest."""

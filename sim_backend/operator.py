@@ -24,8 +24,6 @@ from sim_backend.faults import FaultyWire, WireFault
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Payload
 
-__all__ = ["COMMANDS", "Operator", "ScheduleEntry"]
-
 log = logging.getLogger(__name__)
 
 Moment = Literal["now", "start", "monitor", "command", "moving"]
@@ -338,17 +336,17 @@ class Operator:
         cabinet = self.cabinet
         if cabinet.powered:
             raise RobotError("the arm cannot be moved by hand while the drives are on; switch them off")
-        change = np.asarray(offset, dtype=float)
-        if change.shape != (cabinet.joints,) or not np.isfinite(change).all():
-            raise ConfigurationError(f"offset must be {cabinet.joints} finite numbers, found {offset}")
-        cabinet.plant.reset(cabinet.plant.position + change)
+        cabinet.plant.reset(cabinet.plant.position + self._joint_values("offset", offset))
 
     def push(self, torque: list[float]) -> None:
         """External torque on the links."""
-        values = np.asarray(torque, dtype=float)
+        self.cabinet.plant.push(self._joint_values("torque", torque))
+
+    def _joint_values(self, name: str, given: list[float]) -> np.ndarray:
+        values = np.asarray(given, dtype=float)
         if values.shape != (self.cabinet.joints,) or not np.isfinite(values).all():
-            raise ConfigurationError(f"torque must be {self.cabinet.joints} finite numbers, found {torque}")
-        self.cabinet.plant.push(values)
+            raise ConfigurationError(f"{name} must be {self.cabinet.joints} finite numbers, found {given}")
+        return values
 
     def start_trace(self) -> None:
         """Begin a controller trace."""

@@ -9,6 +9,7 @@ repeated request (late reply) is answered again but carried out once.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -20,8 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import ConfigurationError, NetworkError, RobotError
-
-__all__ = ["Pendant", "PendantServer"]
 
 MAX_DATAGRAM = 65_000
 _REMEMBERED = 64
@@ -245,13 +244,8 @@ class PendantServer:
                 return
             reply = self._answer(datagram, sender)
             if reply is not None:
-                self._send(reply, sender)
-
-    def _send(self, reply: bytes, sender: Any) -> None:
-        try:
-            self.socket.sendto(reply, sender)
-        except OSError:
-            return  # the client is gone
+                with contextlib.suppress(OSError):  # the client is gone
+                    self.socket.sendto(reply, sender)
 
     def _answer(self, datagram: bytes, sender: Any) -> bytes | None:
         try:

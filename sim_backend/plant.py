@@ -17,8 +17,6 @@ from numba import njit
 from sim_backend.robot import Drive, Payload, with_payload
 from sim_backend.stiction import advance
 
-__all__ = ["CYCLE_S", "Effect", "ElasticArm", "Loads", "Plant", "Reading"]
-
 CYCLE_S = 1e-3
 
 
@@ -103,9 +101,7 @@ class Effect:
 
 
 @njit(cache=True)
-def _predict(
-    position: np.ndarray, velocity: np.ndarray, before: np.ndarray, half: float, middle: np.ndarray
-) -> None:
+def _predict(position, velocity, before, half, middle):  # type: ignore[no-untyped-def]
     """Position and velocity after `half` a cycle [s], from the velocities now and a cycle before.
 
     Evaluating the link equations there makes them second order. `before` takes the velocity of now.
@@ -155,8 +151,6 @@ class ElasticArm:
         self._friction = self._nominal.copy()
         self._push = np.zeros(n)
         self._pushed = False
-        self._bias = np.zeros(n)
-        self._drive_torque = np.zeros(n)
         self._last_velocity = np.zeros(n)
         self._middle = np.zeros((2, n))
         self.loads = Loads(np.zeros(n), np.zeros(n), *self._friction)
@@ -236,12 +230,3 @@ class ElasticArm:
             self.energy,
         )
         self.cycles += 1
-
-    def stored_energy(self) -> float:
-        """Kinetic energy of links and motors, potential energy, energy in the elastic joints [J]."""
-        links = pin.computeKineticEnergy(self.model, self._data, self.position, self.velocity)
-        height = pin.computePotentialEnergy(self.model, self._data, self.position)
-        inertia, stiffness = self._joint[0], self._joint[1]
-        motors = 0.5 * float(inertia @ self.motor_velocity**2)
-        torsion = 0.5 * float(stiffness @ (self.motor_position - self.position) ** 2)
-        return float(links) + float(height) + motors + torsion

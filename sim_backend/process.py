@@ -22,8 +22,6 @@ from lwr_driver.configuration import find
 from lwr_driver.realtime import undisturbed
 from sim_backend.pendant import Pendant
 
-__all__ = ["Emulator", "EmulatorProcess"]
-
 log = logging.getLogger(__name__)
 
 _STOP_S = 5.0

@@ -23,20 +23,6 @@ from sim_backend.configuration import JOINTS, EmulatorConfig, RobotConfig, load_
 if TYPE_CHECKING:
     from ident.model import DynamicModel
 
-__all__ = [
-    "DRIVE_PARAMETERS",
-    "Drive",
-    "Payload",
-    "RobotFile",
-    "chain",
-    "robot_file",
-    "robot_model",
-    "true_arm",
-    "truth",
-    "with_inertias",
-    "with_payload",
-]
-
 _POSES = 50
 BODY_PARAMETERS = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
 DRIVE_PARAMETERS = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")
@@ -247,15 +233,10 @@ def truth(config: EmulatorConfig | str | Path, payload: str | None = None) -> di
         config = load_configuration(config)
     content = robot_file(config)
     load = content.payload(config.robot.payload if payload is None else payload) or Payload(0.0)
-    values = {}
-    for link in range(1, JOINTS + 1):
-        for name in (*BODY_PARAMETERS, *DRIVE_PARAMETERS):
-            values[f"{name}{link}"] = float(content.parameters[f"{name}{link}"])
-    for name in BODY_PARAMETERS:
-        values[f"{name}{JOINTS + 1}"] = float(getattr(load, name))
-    for name in DRIVE_PARAMETERS:
-        values[f"{name}{JOINTS + 1}"] = 0.0
-    return values
+    names = (*BODY_PARAMETERS, *DRIVE_PARAMETERS)
+    own = [f"{name}{link}" for link in range(1, JOINTS + 1) for name in names]
+    values = {name: float(content.parameters[name]) for name in own}
+    return values | {f"{name}{JOINTS + 1}": float(getattr(load, name, 0.0)) for name in names}
 
 
 def true_arm(config: EmulatorConfig, content: RobotFile) -> tuple[pin.Model, Drive]:

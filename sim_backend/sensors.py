@@ -16,8 +16,6 @@ from numba import njit
 from sim_backend.configuration import KrlRealsConfig, SensorConfig, TraceConfig
 from sim_backend.plant import CYCLE_S, Plant, Reading
 
-__all__ = ["ControllerTrace", "KrlReals", "Sensors", "trace_columns"]
-
 _BLOCK = 1000
 
 
@@ -27,14 +25,7 @@ def _quantise(value: float, step: float) -> float:
 
 
 @njit(cache=True)
-def _read(
-    position: np.ndarray,
-    motor_position: np.ndarray,
-    joint_torque: np.ndarray,
-    settings: np.ndarray,
-    noise: np.ndarray,
-    reading: np.ndarray,
-) -> None:
+def _read(position, motor_position, joint_torque, settings, noise, reading):  # type: ignore[no-untyped-def]
     """Rows of `reading`: position, motor position, joint torque."""
     for i in range(position.shape[0]):
         reading[0, i] = _quantise(position[i] + settings[1, i] * noise[0, i], settings[0, i])
@@ -44,9 +35,7 @@ def _read(
 
 
 @njit(cache=True)
-def _read_motor(
-    before: np.ndarray, after: np.ndarray, settings: np.ndarray, noise: np.ndarray, reading: np.ndarray
-) -> None:
+def _read_motor(before, after, settings, noise, reading):  # type: ignore[no-untyped-def]
     """Row 3 of `reading`: motor torque at the instant between the milliseconds of `before` and `after`."""
     for i in range(before.shape[0]):
         torque = 0.5 * (before[i] + after[i]) + settings[6, i] * noise[2, i]

@@ -19,8 +19,6 @@ from sim_backend.operator import Operator
 from sim_backend.pendant import PendantServer
 from sim_backend.plant import CYCLE_S
 
-__all__ = ["Service"]
-
 log = logging.getLogger(__name__)
 
 _RESEND_S = 0.2
@@ -107,9 +105,8 @@ class Service:
             if self._follow is not None and os.getppid() != self._parent:
                 self._ended = True
             return False
-        for descriptor, _ in ready:
-            if descriptor == self._fri:
-                return True
+        if any(descriptor == self._fri for descriptor, _ in ready):
+            return True
         for descriptor, _ in ready:
             if descriptor != self._follow:
                 self.pendant.serve()

@@ -19,8 +19,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["advance"]
-
 _ACTIVE_SET_TRIES = 40
 _DESCENT_SWEEPS = 20_000
 
@@ -53,14 +51,7 @@ def _solve(matrix: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def _try_modes(
-    mass: np.ndarray,
-    terms: np.ndarray,
-    modes: np.ndarray,
-    matrix: np.ndarray,
-    right: np.ndarray,
-    speeds: np.ndarray,
-) -> bool:
+def _try_modes(mass, terms, modes, matrix, right, speeds):  # type: ignore[no-untyped-def]
     """End speeds under the assumed modes (-1, 0, +1); corrects the modes and returns whether they held.
 
     terms : rows of `advance`: diagonals, coupling, right sides, friction bounds. modes, speeds : rows motor, link

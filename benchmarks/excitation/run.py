@@ -19,7 +19,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +47,8 @@ from ident.excitation import (
     trade_off,
 )
 from ident.excitation.check import Limits
-from ident.excitation.criteria import TorqueLevel
-from ident.excitation.information import samples_view
+from ident.excitation.criteria import Criterion, Pullback, torque_magnitude
+from ident.excitation.information import View, samples_view
 from ident.excitation.motions import Samples
 from ident.excitation.search import begin, random_start
 from lwr_driver.arm import Arm
@@ -200,6 +200,37 @@ def deviation(seeds: int, budget: float) -> dict[str, Any]:
         results[label] = figures
         click.echo(f"  {label:40s} {figures[0]:6.2f} {figures[1]:6.2f} | {figures[2]:6.2f} {figures[3]:6.2f}")
     return results
+
+
+@dataclass(frozen=True)
+class TorqueLevel(Criterion):
+    """-sum of weighted logs of the mean |joint torque| of some joints: raises all of them, the low ones first."""
+
+    joints: tuple[int, ...]
+    weights: tuple[float, ...]
+    joint_names: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Joints and weights."""
+        parts = ", ".join(f"{w:g} log {name}" for w, name in zip(self.weights, self.joint_names, strict=True))
+        return f"- level of mean |joint torque| ({parts})"
+
+    def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
+        """The weighted sum."""
+        value, slopes = 0.0, []
+        for joint, weight in zip(self.joints, self.weights, strict=True):
+            torque = view.torque[:, joint]
+            magnitude = torque_magnitude(torque, sharpness)
+            level = float(magnitude.mean())
+            value -= weight * float(np.log(level))
+            slopes.append((joint, -weight / level * torque / np.maximum(magnitude, 1e-300) / torque.size))
+
+        def pull(scale: float) -> None:
+            for joint, slope in slopes:
+                view.torque_bar[:, joint] += scale * slope
+
+        return value, pull
 
 
 def front(seeds: int, budget: float) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise
 from ident.excitation.assembly import Assembled, arm_limits, assemble
 from ident.excitation.check import Check, Limits, Margin, Workspace, check_motion
 from ident.excitation.comparison import (
-    FrontPoint,
     TableRow,
     hypervolume,
     not_dominated,
@@ -42,7 +41,6 @@ __all__ = [
     "ExcitationPlan",
     "FourierBasis",
     "FourierSeries",
-    "FrontPoint",
     "Knowledge",
     "Limits",
     "Margin",

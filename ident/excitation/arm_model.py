@@ -30,19 +30,6 @@ from ident.excitation.sweep import forward
 from ident.model import DynamicModel
 from lwr_driver.configuration import read_mapping
 
-__all__ = [
-    "BODY",
-    "ArmEstimate",
-    "Mechanism",
-    "Noise",
-    "TorqueBounds",
-    "rigid_torque",
-    "split_name",
-    "tip_path",
-    "torque_bounds",
-    "torque_deviation",
-]
-
 BODY = INERTIAL
 _NO_COLUMNS = np.zeros(0, dtype=np.int64)
 # drive parameters: place of the signal among qdd, qd, sign(qd), 1; members of the joint row; columns of `drives`
@@ -257,19 +244,15 @@ class ArmEstimate:
         """The same values with independent standard deviations, each a fraction of its parameter."""
         if not 0.0 <= fraction < 1.0:
             raise ConfigurationError(f"relative uncertainty {fraction} is outside 0 to 1")
-        names = self.standard_names()
+        links = self.joints + (self.payload is not None)
+        names = [f"{kind}{link}" for link in range(1, links + 1) for kind in BODY]
+        names += [f"{kind}{link}" for link in range(1, self.joints + 1) for kind in DRIVE]
         sigma = fraction * np.array([self.value(name) for name in names])
         keep = np.abs(sigma) > 0.0
         kept = tuple(name for name, use in zip(names, keep, strict=True) if use)
         if not kept:
             return replace(self, covariance_names=(), covariance=None)
         return replace(self, covariance_names=kept, covariance=np.diag(sigma[keep] ** 2))
-
-    def standard_names(self) -> tuple[str, ...]:
-        """Names of all standard parameters with a value in this estimate."""
-        links = self.joints + (self.payload is not None)
-        body = [f"{kind}{link}" for link in range(1, links + 1) for kind in BODY]
-        return tuple(body + [f"{kind}{link}" for link in range(1, self.joints + 1) for kind in DRIVE])
 
     @classmethod
     def nominal(cls, mechanism: Mechanism, payload: Array | None = None) -> ArmEstimate:

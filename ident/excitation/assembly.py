@@ -39,17 +39,6 @@ from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.session import read_session
 
-__all__ = [
-    "Assembled",
-    "Criteria",
-    "arm_limits",
-    "assemble",
-    "prior_information",
-    "reported_criteria",
-    "sampling",
-    "target_and_bounds",
-]
-
 _FLANGE_RESERVE = 2e-3
 _CLEARANCE_RESERVE = 3e-3
 _PAYLOAD_NAME = "load"

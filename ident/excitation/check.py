@@ -30,20 +30,6 @@ from ident.excitation.clearance import space_of
 from ident.excitation.motions import Array, ParametricMotion, Samples
 from lwr_driver.arm.collision import CollisionChecker
 
-__all__ = [
-    "Check",
-    "Limits",
-    "Margin",
-    "Proof",
-    "Workspace",
-    "check_motion",
-    "flange_bounds",
-    "prove",
-    "speed_bound",
-    "swept_radius",
-    "torque_rate",
-]
-
 _ROUNDING = 1e-12
 _Measure = Callable[[Array], Array]
 KINEMATIC = (("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"), ("jerk", "rad/s³"))
@@ -417,18 +403,8 @@ def _snap(motion: ParametricMotion) -> Array:
     return 2.0 * np.max(np.abs(np.diff(jerk, axis=0)), axis=0) / (times[1] - times[0])
 
 
-@dataclass(frozen=True, eq=False)
-class _Sizes:
-    """Norms of mass, first moment and inertia of each body (n,), and drive terms (n,)."""
-
-    mass: Array
-    moment: Array
-    inertia: Array
-    drive_inertia: Array
-    viscous: Array
-
-
-def _sizes(mechanism: Mechanism, estimate: ArmEstimate, coverage: float) -> _Sizes:
+def _sizes(mechanism: Mechanism, estimate: ArmEstimate, coverage: float) -> tuple[Array, ...]:
+    """Norms of mass, first moment and inertia of each body, inertia and viscous friction of each drive; (n,)."""
     bodies = estimate.loads
     mass = np.abs(bodies[:, :, 9]).max(axis=0)
     moment = np.linalg.norm(bodies[:, :, 6:9], axis=2).max(axis=0)
@@ -451,10 +427,11 @@ def _sizes(mechanism: Mechanism, estimate: ArmEstimate, coverage: float) -> _Siz
                 drive_inertia[body] += sigma
             elif kind in ("Fvl", "Fvm"):
                 viscous[body] += sigma
-    return _Sizes(mass, moment, inertia, drive_inertia, viscous)
+    return mass, moment, inertia, drive_inertia, viscous
 
 
-def _wrench_rate(mechanism: Mechanism, sizes: _Sizes, v: Array, a: Array, j: Array) -> Array:
+def _wrench_rate(mechanism: Mechanism, sizes: tuple[Array, ...], v: Array, a: Array, j: Array) -> Array:
+    masses, moments, inertias, drive_inertia, viscous = sizes
     n = mechanism.joints
     lengths = np.linalg.norm(mechanism.translation, axis=1)
     zero = np.zeros(v.shape[0])
@@ -468,7 +445,7 @@ def _wrench_rate(mechanism: Mechanism, sizes: _Sizes, v: Array, a: Array, j: Arr
         ddw = ddw + j[:, b] + 2.0 * a[:, b] * w + v[:, b] * (dw + w**2)
         dw = dw + w * v[:, b] + a[:, b]
         w = w + v[:, b]
-        mass, moment, inertia = sizes.mass[b], sizes.moment[b], sizes.inertia[b]
+        mass, moment, inertia = masses[b], moments[b], inertias[b]
         force.append(mass * acceleration + moment * (dw + w**2))
         force_rate.append(mass * jolt + moment * (ddw + 3.0 * dw * w + w**3))
         couple.append(inertia * (dw + w**2) + moment * acceleration)
@@ -482,5 +459,5 @@ def _wrench_rate(mechanism: Mechanism, sizes: _Sizes, v: Array, a: Array, j: Arr
                 lever_arm += lengths[b]
             total = total + couple_rate[b] + spin[b] * couple[b]
             total = total + lever_arm * (force_rate[b] + 2.0 * spin[b] * force[b])
-        out[:, joint] = total + sizes.drive_inertia[joint] * j[:, joint] + sizes.viscous[joint] * a[:, joint]
+        out[:, joint] = total + drive_inertia[joint] * j[:, joint] + viscous[joint] * a[:, joint]
     return out

@@ -21,8 +21,6 @@ from fri.errors import ConfigurationError
 from ident.excitation.arm_model import Mechanism
 from ident.excitation.motions import Array
 
-__all__ = ["Space", "distances", "enclose", "row_gradient", "space_of"]
-
 _FAR = 0.15
 _RIM = 0.4  # distance of the segment's end from the flat end of a cylinder, as a share of the radius
 
@@ -156,16 +154,14 @@ def _frames(rotation, translation, q, turn, origin):  # type: ignore[no-untyped-
         if b == 0:
             origin[0, 0] = origin[0, 1] = origin[0, 2] = 0.0
         else:
+            r = turn[b - 1]
+            x, y, z = translation[b, 0], translation[b, 1], translation[b, 2]
             for k in range(3):
-                origin[b, k] = origin[b - 1, k] + (
-                    turn[b - 1, k, 0] * translation[b, 0]
-                    + turn[b - 1, k, 1] * translation[b, 1]
-                    + turn[b - 1, k, 2] * translation[b, 2]
-                )
+                origin[b, k] = origin[b - 1, k] + (r[k, 0] * x + r[k, 1] * y + r[k, 2] * z)
             for column in range(3):
                 x, y, z = turn[b, 0, column], turn[b, 1, column], turn[b, 2, column]
                 for k in range(3):
-                    turn[b, k, column] = turn[b - 1, k, 0] * x + turn[b - 1, k, 1] * y + turn[b - 1, k, 2] * z
+                    turn[b, k, column] = r[k, 0] * x + r[k, 1] * y + r[k, 2] * z
 
 
 @njit(cache=True, error_model="numpy")
@@ -193,14 +189,10 @@ def _place(rotation, translation, tip, q, body, ends, turn, origin, world, point
                 x, y, z = ends[c, e, 0], ends[c, e, 1], ends[c, e, 2]
                 for k in range(3):
                     world[c, e, k] = origin[b, k] + turn[b, k, 0] * x + turn[b, k, 1] * y + turn[b, k, 2] * z
-    last = q.shape[0] - 1
+    last = turn[q.shape[0] - 1]
     for k in range(3):
-        point[k] = (
-            origin[last, k]
-            + turn[last, k, 0] * tip[0]
-            + turn[last, k, 1] * tip[1]
-            + turn[last, k, 2] * tip[2]
-        )
+        x, y, z = last[k, 0] * tip[0], last[k, 1] * tip[1], last[k, 2] * tip[2]
+        point[k] = origin[q.shape[0] - 1, k] + x + y + z
 
 
 @njit(cache=True, error_model="numpy")
@@ -303,11 +295,8 @@ def row_gradient(arm, q, row, weight, qbar, shapes):  # type: ignore[no-untyped-
             first, second = pairs[row - 2, 0], pairs[row - 2, 1]
             gap = _segments(world[first, 0], world[first, 1], world[second, 0], world[second, 1], near)
             scale = force / max(gap, 1e-9)
-            fx, fy, fz = (
-                scale * (near[0, 0] - near[1, 0]),
-                scale * (near[0, 1] - near[1, 1]),
-                scale * (near[0, 2] - near[1, 2]),
-            )
+            dx, dy, dz = near[0, 0] - near[1, 0], near[0, 1] - near[1, 1], near[0, 2] - near[1, 2]
+            fx, fy, fz = scale * dx, scale * dy, scale * dz
             _push(wrench, body[first], near[0, 0], near[0, 1], near[0, 2], fx, fy, fz)
             _push(wrench, body[second], near[1, 0], near[1, 1], near[1, 2], -fx, -fy, -fz)
         elif row < 2 + pairs.shape[0] + grounded.shape[0]:
@@ -382,13 +371,11 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
     to_zero[:3, 3] -= mechanism.translation[0]
     capsules: dict[int, tuple[int, Array, float]] = {}  # joint frame, segment, radius by shape
     boxes: dict[int, tuple[Array, Array]] = {}  # half sides, pose by shape
-    pairs: list[tuple[int, int]] = []
-    grounded: list[int] = []
-    boxed: list[tuple[int, int]] = []
+    # capsules and boxes of each row, and its name
+    pairs: list[tuple[tuple[int, int], str]] = []
+    grounded: list[tuple[int, str]] = []
+    boxed: list[tuple[tuple[int, int], str]] = []
     ground = -np.inf
-    pair_names: list[str] = []
-    ground_names: list[str] = []
-    box_names: list[str] = []
 
     def capsule(index: int) -> int:
         if index not in capsules:
@@ -412,27 +399,25 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
             if not np.allclose(half.n, [0.0, 0.0, 1.0]):
                 raise ConfigurationError(f"{shapes[flat[0]].name}: only a level ground is supported")
             ground = float((to_zero @ np.array([0.0, 0.0, half.d, 1.0]))[2])
-            grounded.append(capsule(indices[1 - flat[0]]))
-            ground_names.append(label)
+            grounded.append((capsule(indices[1 - flat[0]]), label))
         elif solid:
             box = shapes[solid[0]]
             pose = to_zero @ np.array(box.placement.homogeneous)
             boxes[indices[solid[0]]] = (np.array(box.geometry.halfSide), pose)
-            boxed.append((capsule(indices[1 - solid[0]]), list(boxes).index(indices[solid[0]])))
-            box_names.append(label)
+            place = list(boxes).index(indices[solid[0]])
+            boxed.append(((capsule(indices[1 - solid[0]]), place), label))
         else:
-            pairs.append((capsule(indices[0]), capsule(indices[1])))
-            pair_names.append(label)
+            pairs.append(((capsule(indices[0]), capsule(indices[1])), label))
     space = Space(
         body=np.array([body for body, _, _ in capsules.values()], dtype=np.int64),
         ends=np.array([ends for _, ends, _ in capsules.values()]).reshape(-1, 2, 3),
         thickness=np.array([radius for _, _, radius in capsules.values()], dtype=np.float64),
-        pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
+        pairs=np.array([row for row, _ in pairs], dtype=np.int64).reshape(-1, 2),
         ground=ground,
-        grounded=np.array(grounded, dtype=np.int64),
+        grounded=np.array([row for row, _ in grounded], dtype=np.int64),
         box_size=np.array([size for size, _ in boxes.values()]).reshape(-1, 3),
         box_rotation=np.ascontiguousarray([pose[:3, :3] for _, pose in boxes.values()]).reshape(-1, 3, 3),
         box_centre=np.array([pose[:3, 3] for _, pose in boxes.values()]).reshape(-1, 3),
-        boxed=np.array(boxed, dtype=np.int64).reshape(-1, 2),
+        boxed=np.array([row for row, _ in boxed], dtype=np.int64).reshape(-1, 2),
     )
-    return space, tuple(names + pair_names + ground_names + box_names)
+    return space, (*names, *(label for _, label in (*pairs, *grounded, *boxed)))

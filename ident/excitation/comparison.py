@@ -23,17 +23,6 @@ from ident.excitation.program import Bound, Setup
 from ident.excitation.search import Candidate, begin, hop, judge, polish
 from lwr_driver.arm.collision import CollisionChecker
 
-__all__ = [
-    "FrontPoint",
-    "TableRow",
-    "hypervolume",
-    "not_dominated",
-    "random_points",
-    "table",
-    "table_row",
-    "trade_off",
-]
-
 _LINE = 60
 _TRIES = 400
 

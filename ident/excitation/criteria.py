@@ -24,23 +24,6 @@ from fri.errors import ConfigurationError
 from ident.excitation.information import Assembly, View
 from ident.excitation.motions import Array
 
-__all__ = [
-    "ConditionNumber",
-    "Criterion",
-    "DOptimality",
-    "GoalAttainment",
-    "MeanTorque",
-    "Pullback",
-    "RelativeDeviation",
-    "TorqueLevel",
-    "d_optimality",
-    "log_condition",
-    "relative_deviations",
-    "rsd_mean",
-    "rsd_worst",
-    "scaled",
-]
-
 _HUGE = 50.0
 _LEAST_EIGENVALUE = 1e-13
 Pullback = Callable[[float], None]
@@ -341,7 +324,7 @@ class MeanTorque(Criterion):
     def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
         """tau_max - mean |tau|."""
         torque = view.torque[:, self.joint]
-        magnitude = _magnitude(torque, sharpness)
+        magnitude = torque_magnitude(torque, sharpness)
         slope = -torque / np.maximum(magnitude, 1e-300) / torque.size
 
         def pull(weight: float) -> None:
@@ -350,38 +333,7 @@ class MeanTorque(Criterion):
         return self.tau_max - float(magnitude.mean()), pull
 
 
-@dataclass(frozen=True)
-class TorqueLevel(Criterion):
-    """-sum of weighted logs of the mean |joint torque| of some joints: raises all of them, the low ones first."""
-
-    joints: tuple[int, ...]
-    weights: tuple[float, ...]
-    joint_names: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """Joints and weights."""
-        parts = ", ".join(f"{w:g} log {name}" for w, name in zip(self.weights, self.joint_names, strict=True))
-        return f"- level of mean |joint torque| ({parts})"
-
-    def evaluate(self, view: View, sharpness: float) -> tuple[float, Pullback]:
-        """The weighted sum."""
-        value, slopes = 0.0, []
-        for joint, weight in zip(self.joints, self.weights, strict=True):
-            torque = view.torque[:, joint]
-            magnitude = _magnitude(torque, sharpness)
-            level = float(magnitude.mean())
-            value -= weight * float(np.log(level))
-            slopes.append((joint, -weight / level * torque / np.maximum(magnitude, 1e-300) / torque.size))
-
-        def pull(scale: float) -> None:
-            for joint, slope in slopes:
-                view.torque_bar[:, joint] += scale * slope
-
-        return value, pull
-
-
-def _magnitude(torque: Array, sharpness: float) -> Array:
+def torque_magnitude(torque: Array, sharpness: float) -> Array:
     """|tau|, rounded off near zero unless exact (infinite sharpness)."""
     return np.sqrt(torque**2 + (0.0 if np.isinf(sharpness) else _SOFTNESS) ** 2)
 
@@ -409,10 +361,6 @@ class GoalAttainment(Criterion):
         return "goal attainment gamma: " + "; ".join(
             f"{criterion.name} -> {goal:g}" for criterion, goal in pairs
         )
-
-    def attainment(self, view: View) -> Array:
-        """(F_i - goal_i) / |goal_i| of each criterion, exact, (k,)."""
-        return np.array([value for value, _ in self._parts(view, np.inf)])
 
     def log_ratios(self, view: View, sharpness: float) -> tuple[Array, list[Pullback]]:
         """log(F_i / goal_i) of each criterion, (k,), with its pullback; the largest is log(1 + gamma)."""

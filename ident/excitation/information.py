@@ -32,8 +32,6 @@ from ident.excitation.arm_model import (
 from ident.excitation.motions import Array, Basis, ParametricMotion, Samples
 from ident.excitation.sweep import backward, forward
 
-__all__ = ["Assembly", "Columns", "ConstantBasis", "Evaluator", "Rows", "View", "motion_view", "samples_view"]
-
 
 @dataclass(frozen=True, eq=False)
 class Columns:
@@ -319,10 +317,6 @@ class ConstantBasis:
     def motion(self, x: Array) -> ParametricMotion:
         """ConfigurationError: a posture is not a motion."""
         raise ConfigurationError("a posture is no motion")
-
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """The posture at the start, (joints, free)."""
-        return motion.sample(0.0).q.T[:, : self.free]
 
     def grid_factor(self, n: int, derivative: int) -> float:
         """One: the extremum of a constant is everywhere."""

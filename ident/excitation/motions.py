@@ -28,19 +28,6 @@ from scipy.linalg import null_space
 
 from fri.errors import ConfigurationError
 
-__all__ = [
-    "Array",
-    "Basis",
-    "Extrema",
-    "FourierBasis",
-    "FourierSeries",
-    "ParametricMotion",
-    "PointToPoint",
-    "Samples",
-    "SplineBasis",
-    "SplineMotion",
-]
-
 Array = npt.NDArray[np.float64]
 _REST_TOLERANCE = 1e-9
 DEGREE = 5
@@ -107,9 +94,6 @@ class Basis(Protocol):
 
     def motion(self, x: Array) -> ParametricMotion:
         """The motion with the free coefficients x (joints, free)."""
-
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """Free coefficients (joints, free) of a motion of this form; ConfigurationError for any other motion."""
 
     def grid_factor(self, n: int, derivative: int) -> float:
         """Upper bound of (true maximum) / (maximum on n equidistant samples), centred signals."""
@@ -263,19 +247,6 @@ class FourierBasis:
             self.period_s, x[:, 0], x[:, 1:split] @ self._null[0].T, x[:, split:] @ self._null[1].T
         )
 
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """Free coefficients of a series; ConfigurationError for another period or order, or without rest."""
-        if not isinstance(motion, FourierSeries):
-            raise ConfigurationError(f"a {type(motion).__name__} is not a Fourier series")
-        if motion.harmonics != self.harmonics or not np.isclose(motion.period_s, self.period_s, rtol=1e-12):
-            raise ConfigurationError(
-                f"series with n_f = {motion.harmonics}, T0 = {motion.period_s} s does not fit a basis with "
-                f"n_f = {self.harmonics}, T0 = {self.period_s} s"
-            )
-        if not motion.at_rest:
-            raise ConfigurationError("the series does not start at rest, so this basis cannot represent it")
-        return np.hstack([motion.bias[:, None], motion.a @ self._null[0], motion.b @ self._null[1]])
-
     def grid_factor(self, n: int, derivative: int) -> float:
         """Upper bound of (true maximum) / (grid maximum) of |q - bias| or a derivative."""
         return _ehlich_zeller(self.harmonics, n)
@@ -402,16 +373,6 @@ class SplineBasis:
                 f"free control points of shape {x.shape}; expected (joints, {self.free})"
             )
         return SplineMotion(self.duration_s, x @ self._expand.T)
-
-    def coefficients(self, motion: ParametricMotion) -> Array:
-        """Free control points of a spline of this size; ConfigurationError for anything else."""
-        if not isinstance(motion, SplineMotion) or motion.points.shape[1] != self._expand.shape[0]:
-            raise ConfigurationError("the motion is no spline of this basis")
-        if not np.isclose(motion.duration_s, self.duration_s, rtol=1e-12):
-            raise ConfigurationError(
-                f"spline of {motion.duration_s} s does not fit a basis of {self.duration_s} s"
-            )
-        return np.asarray(np.linalg.lstsq(self._expand, motion.points.T, rcond=None)[0].T)
 
     def grid_factor(self, n: int, derivative: int) -> float:
         """A small reserve instead of a bound, for lack of one; the exact extrema decide in the final check."""

@@ -24,8 +24,6 @@ from ident.excitation.motions import (
 )
 from lwr_driver.configuration import read_mapping
 
-__all__ = ["ExcitationPlan", "plan_report"]
-
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
 

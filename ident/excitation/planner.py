@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+import json
 import logging
 import time
 from collections import Counter
@@ -43,8 +44,6 @@ from ident.excitation.search import (
 from ident.excitation.sqp import minimise
 from lwr_driver.arm import Arm
 from lwr_driver.arm.collision import CollisionChecker
-
-__all__ = ["Progress", "explain", "feasible_fourier", "plan", "refuse_impossible", "search_candidates"]
 
 _log = logging.getLogger(__name__)
 _HOPS_PER_TASK = 5
@@ -228,7 +227,7 @@ def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> Exci
     settings.pop("source")
     provenance = {
         "method": "plan",
-        "problem": _plain(settings),
+        "problem": json.loads(json.dumps(settings, default=np.generic.item)),
         "arm": assembled.arm_name,
         "evaluations": int(tracker.evaluations),
         "interrupted": bool(tracker.interrupted),
@@ -247,16 +246,6 @@ def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> Exci
         check=outcome.check,
         provenance=provenance,
     )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
 
 
 def refuse_impossible(assembled: Assembled) -> None:
@@ -420,13 +409,9 @@ def _from_start(
             x = solution.x
             near = float(solution.constraints.min()) > -_NEAR
             motion = setup.basis.motion(x.reshape(setup.mechanism.joints, -1))
-            steps = (
-                {"step_s": 1e-3, "collision_step_s": 1e-2}
-                if near
-                else {"step_s": 0.05, "collision_step_s": 0.1}
-            )
-            check = against(motion, **steps, continuous=near)
-            if (check.ok and near) or not near:
+            step_s, collision_step_s = (1e-3, 1e-2) if near else (0.05, 0.1)
+            check = against(motion, step_s=step_s, collision_step_s=collision_step_s, continuous=near)
+            if check.ok or not near:
                 break
             tighten(program.constraints, check, setup.mechanism.joint_names)
         return (motion if check.ok and near else None), check

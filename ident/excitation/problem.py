@@ -11,8 +11,6 @@ from ident.excitation.check import Workspace
 from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = ["Knowledge", "MotionForm", "Objective", "PlanProblem", "Prior", "Search"]
-
 
 @dataclass(frozen=True)
 class MotionForm:

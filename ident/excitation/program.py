@@ -42,8 +42,6 @@ from ident.excitation.criteria import Criterion, GoalAttainment, Pullback
 from ident.excitation.information import Columns, Evaluator, View
 from ident.excitation.motions import Array, Basis, Samples
 
-__all__ = ["Bound", "Constraints", "Program", "Row", "Setup"]
-
 _FAR = 0.6
 _FAR_TORQUE = 0.2
 _SPACE_SCALE = 0.1

@@ -21,8 +21,6 @@ from ident.excitation.motions import Array, ParametricMotion
 from ident.excitation.program import Constraints, Program, Setup
 from ident.excitation.sqp import minimise
 
-__all__ = ["Candidate", "Outcome", "begin", "hop", "judge", "polish", "random_start", "restore", "shortfall"]
-
 _FEASIBLE = 3e-3
 _FIRST = ((50, 8.0, 50.0), (60, 32.0, 150.0))
 _SHORT = ((40, 16.0, 100.0), (40, 64.0, 300.0))

@@ -16,8 +16,6 @@ from scipy.optimize import nnls
 
 from ident.excitation.motions import Array
 
-__all__ = ["SmoothProblem", "Solution", "minimise"]
-
 _ELASTIC = 1e6
 _ARMIJO = 1e-4
 _LONGEST_STEP = 0.3
@@ -43,9 +41,6 @@ class Solution:
     constraints: Array
     multipliers: Array
     hessian: Array
-    iterations: int
-    evaluations: int
-    converged: bool
 
 
 def minimise(
@@ -63,9 +58,8 @@ def minimise(
     gradient, jacobian = problem.derivatives()
     b = np.eye(n) * max(float(np.linalg.norm(gradient)), 1e-3) if hessian is None else hessian.copy()
     multipliers = np.zeros(c.size)
-    price, evaluations, converged, count = 0.0, 1, False, 0
-    while count < iterations:
-        count += 1
+    price = 0.0
+    for _ in range(iterations):
         step, multipliers = _subproblem(b, gradient, jacobian, c)
         longest = float(np.max(np.abs(step)))
         if longest > _LONGEST_STEP:
@@ -74,14 +68,12 @@ def minimise(
         price = max(1.5 * float(multipliers.max(initial=0.0)), 0.9 * price)
         promised = float(gradient @ step) - price * violation
         if promised > -tolerance * 1e-3 and violation < 1e-9:
-            converged = True
             break
         merit = value + price * violation
         share = 1.0
         for _ in range(_BACKTRACKS):
             trial = x + share * step
             trial_value, trial_c = problem.values(trial)
-            evaluations += 1
             trial_merit = trial_value + price * float(np.sum(np.maximum(0.0, -trial_c)))
             if trial_merit <= merit + _ARMIJO * share * promised:
                 break
@@ -95,9 +87,8 @@ def minimise(
         gained = merit - trial_merit
         x, value, c, gradient, jacobian = trial, trial_value, trial_c, new_gradient, new_jacobian
         if abs(gained) < tolerance * 0.1 and violation < 1e-4:
-            converged = True
             break
-    return Solution(x, value, c, multipliers, b, count, evaluations, converged)
+    return Solution(x, value, c, multipliers, b)
 
 
 def _subproblem(b: Array, gradient: Array, jacobian: Array, c: Array) -> tuple[Array, Array]:

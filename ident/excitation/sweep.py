@@ -19,7 +19,24 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["backward", "forward"]
+
+@njit(cache=True, error_model="numpy")
+def _into(r, c, s, x, y, z):  # type: ignore[no-untyped-def]
+    """A vector of the frame before, in the frame placed by r and turned about z (cosine c, sine s)."""
+    u = r[0, 0] * x + r[1, 0] * y + r[2, 0] * z
+    v = r[0, 1] * x + r[1, 1] * y + r[2, 1] * z
+    return c * u + s * v, c * v - s * u, r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
+
+
+@njit(cache=True, error_model="numpy")
+def _out(r, c, s, x, y, z):  # type: ignore[no-untyped-def]
+    """The way back."""
+    u, v = c * x - s * y, s * x + c * y
+    return (
+        r[0, 0] * u + r[0, 1] * v + r[0, 2] * z,
+        r[1, 0] * u + r[1, 1] * v + r[1, 2] * z,
+        r[2, 0] * u + r[2, 1] * v + r[2, 2] * z,
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -27,10 +44,8 @@ def _kinematics(rot0, trans, gravity, q, qd, qdd, cs, w, wd, vd, lin, ang):  # t
     """Fill cos/sin (n, 2), w, wd, vd (n, 3) and lin, ang (b, j, 3) of one sample."""
     n = q.shape[0]
     for b in range(n):
-        c = np.cos(q[b])
-        s = np.sin(q[b])
-        cs[b, 0] = c
-        cs[b, 1] = s
+        c, s = np.cos(q[b]), np.sin(q[b])
+        cs[b, 0], cs[b, 1] = c, s
         px, py, pz = trans[b, 0], trans[b, 1], trans[b, 2]
         r = rot0[b]
         if b == 0:
@@ -45,49 +60,20 @@ def _kinematics(rot0, trans, gravity, q, qd, qdd, cs, w, wd, vd, lin, ang):  # t
             ax = vd[b - 1, 0] + dy * pz - dz * py + wx * wp - ww * px
             ay = vd[b - 1, 1] + dz * px - dx * pz + wy * wp - ww * py
             az = vd[b - 1, 2] + dx * py - dy * px + wz * wp - ww * pz
-        ux = r[0, 0] * wx + r[1, 0] * wy + r[2, 0] * wz
-        uy = r[0, 1] * wx + r[1, 1] * wy + r[2, 1] * wz
-        uz = r[0, 2] * wx + r[1, 2] * wy + r[2, 2] * wz
-        tx = c * ux + s * uy
-        ty = c * uy - s * ux
-        w[b, 0] = tx
-        w[b, 1] = ty
-        w[b, 2] = uz + qd[b]
-        ux = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
-        uy = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz
-        uz = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
-        vx = c * ux + s * uy
-        vy = c * uy - s * ux
-        wd[b, 0] = vx + ty * qd[b]
-        wd[b, 1] = vy - tx * qd[b]
-        wd[b, 2] = uz + qdd[b]
-        ux = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
-        uy = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
-        uz = r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az
-        vd[b, 0] = c * ux + s * uy
-        vd[b, 1] = c * uy - s * ux
-        vd[b, 2] = uz
+        tx, ty, tz = _into(r, c, s, wx, wy, wz)
+        w[b, 0], w[b, 1], w[b, 2] = tx, ty, tz + qd[b]
+        vx, vy, vz = _into(r, c, s, dx, dy, dz)
+        wd[b, 0], wd[b, 1], wd[b, 2] = vx + ty * qd[b], vy - tx * qd[b], vz + qdd[b]
+        vd[b, 0], vd[b, 1], vd[b, 2] = _into(r, c, s, ax, ay, az)
         for j in range(b):
             ax, ay, az = ang[b - 1, j, 0], ang[b - 1, j, 1], ang[b - 1, j, 2]
             lx = lin[b - 1, j, 0] + ay * pz - az * py
             ly = lin[b - 1, j, 1] + az * px - ax * pz
             lz = lin[b - 1, j, 2] + ax * py - ay * px
-            ux = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
-            uy = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
-            ang[b, j, 0] = c * ux + s * uy
-            ang[b, j, 1] = c * uy - s * ux
-            ang[b, j, 2] = r[0, 2] * ax + r[1, 2] * ay + r[2, 2] * az
-            ux = r[0, 0] * lx + r[1, 0] * ly + r[2, 0] * lz
-            uy = r[0, 1] * lx + r[1, 1] * ly + r[2, 1] * lz
-            lin[b, j, 0] = c * ux + s * uy
-            lin[b, j, 1] = c * uy - s * ux
-            lin[b, j, 2] = r[0, 2] * lx + r[1, 2] * ly + r[2, 2] * lz
-        ang[b, b, 0] = 0.0
-        ang[b, b, 1] = 0.0
-        ang[b, b, 2] = 1.0
-        lin[b, b, 0] = 0.0
-        lin[b, b, 1] = 0.0
-        lin[b, b, 2] = 0.0
+            ang[b, j, 0], ang[b, j, 1], ang[b, j, 2] = _into(r, c, s, ax, ay, az)
+            lin[b, j, 0], lin[b, j, 1], lin[b, j, 2] = _into(r, c, s, lx, ly, lz)
+        ang[b, b, 0], ang[b, b, 1], ang[b, b, 2] = 0.0, 0.0, 1.0
+        lin[b, b, :] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -244,44 +230,32 @@ def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignor
             angle += dbx * (wd[b, 1] + tx * rate) - dby * (wd[b, 0] - ty * rate)
             angle += vbx * vd[b, 1] - vby * vd[b, 0]
             if b > 0:
-                ux, uy = cb * vbx - sb * vby, sb * vbx + cb * vby
-                gx = r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * vbz
-                gy = r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * vbz
-                gz = r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * vbz
+                gx, gy, gz = _out(r, cb, sb, vbx, vby, vbz)
                 vb[b - 1, 0] += gx
                 vb[b - 1, 1] += gy
                 vb[b - 1, 2] += gz
-                ux, uy = cb * dbx - sb * dby, sb * dbx + cb * dby
-                db[b - 1, 0] += r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * dbz + py * gz - pz * gy
-                db[b - 1, 1] += r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * dbz + pz * gx - px * gz
-                db[b - 1, 2] += r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * dbz + px * gy - py * gx
+                ux, uy, uz = _out(r, cb, sb, dbx, dby, dbz)
+                db[b - 1, 0] += ux + py * gz - pz * gy
+                db[b - 1, 1] += uy + pz * gx - px * gz
+                db[b - 1, 2] += uz + px * gy - py * gx
                 wx, wy, wz = w[b - 1, 0], w[b - 1, 1], w[b - 1, 2]
                 gw = gx * wx + gy * wy + gz * wz
                 wp = wx * px + wy * py + wz * pz
                 gp = gx * px + gy * py + gz * pz
-                ux, uy = cb * wbx - sb * wby, sb * wbx + cb * wby
-                wb[b - 1, 0] += (
-                    r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * wbz + gw * px + wp * gx - 2.0 * gp * wx
-                )
-                wb[b - 1, 1] += (
-                    r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * wbz + gw * py + wp * gy - 2.0 * gp * wy
-                )
-                wb[b - 1, 2] += (
-                    r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * wbz + gw * pz + wp * gz - 2.0 * gp * wz
-                )
+                ux, uy, uz = _out(r, cb, sb, wbx, wby, wbz)
+                wb[b - 1, 0] += ux + gw * px + wp * gx - 2.0 * gp * wx
+                wb[b - 1, 1] += uy + gw * py + wp * gy - 2.0 * gp * wy
+                wb[b - 1, 2] += uz + gw * pz + wp * gz - 2.0 * gp * wz
                 for j in range(b):
                     ax, ay, az = ab[b, j, 0], ab[b, j, 1], ab[b, j, 2]
                     lx, ly, lz = lb[b, j, 0], lb[b, j, 1], lb[b, j, 2]
                     angle += ax * ang[b, j, 1] - ay * ang[b, j, 0] + lx * lin[b, j, 1] - ly * lin[b, j, 0]
-                    ux, uy = cb * lx - sb * ly, sb * lx + cb * ly
-                    gx = r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * lz
-                    gy = r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * lz
-                    gz = r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * lz
+                    gx, gy, gz = _out(r, cb, sb, lx, ly, lz)
                     lb[b - 1, j, 0] += gx
                     lb[b - 1, j, 1] += gy
                     lb[b - 1, j, 2] += gz
-                    ux, uy = cb * ax - sb * ay, sb * ax + cb * ay
-                    ab[b - 1, j, 0] += r[0, 0] * ux + r[0, 1] * uy + r[0, 2] * az + py * gz - pz * gy
-                    ab[b - 1, j, 1] += r[1, 0] * ux + r[1, 1] * uy + r[1, 2] * az + pz * gx - px * gz
-                    ab[b - 1, j, 2] += r[2, 0] * ux + r[2, 1] * uy + r[2, 2] * az + px * gy - py * gx
+                    ux, uy, uz = _out(r, cb, sb, ax, ay, az)
+                    ab[b - 1, j, 0] += ux + py * gz - pz * gy
+                    ab[b - 1, j, 1] += uy + pz * gx - px * gz
+                    ab[b - 1, j, 2] += uz + px * gy - py * gx
             qbar[i, b] += angle

@@ -21,8 +21,6 @@ from ident.import_log.mapping import Floats, LogMapping, Signal, TimeBase
 from lwr_driver.configuration import find
 from lwr_driver.session import SessionWriter, session_metadata
 
-__all__ = ["ImportReport", "Recording", "import_log"]
-
 
 @dataclass
 class Recording:
@@ -153,11 +151,9 @@ def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[st
     if len(rows) < 1 + header:
         raise DataError(f"{path}: holds no rows of numbers")
     first = rows[0][1]
-    mark = (
-        delimiter
-        if delimiter is not None
-        else next((m for m in (",", ";", "\t") if m in first.strip()), None)
-    )
+    mark = delimiter
+    if mark is None:
+        mark = next((m for m in (",", ";", "\t") if m in first.strip()), None)
     names: tuple[str, ...] = ()
     if header:
         names = tuple(_split(first, mark))
@@ -243,16 +239,13 @@ class ImportReport:
     def __str__(self) -> str:
         written = ", ".join(f"{topic} {count}" for topic, count in self.rows.items())
         jitter = "regular" if self.longest_s - self.shortest_s < 1e-6 else "kept as recorded"
+        lost = [f"  holes     {self.holes} intervals longer than 1.75 periods: lost samples"]
         lines = [
             f"{self.robot}: {len(self.joints)} joints, {self.duration_s:.3f} s",
             f"  rows      {written} (recording: {self.rows_in_source})",
             f"  period    median {self.period_s * 1e3:.4g} ms, {self.shortest_s * 1e3:.4g} to "
             f"{self.longest_s * 1e3:.4g} ms, {jitter}",
-            *(
-                [f"  holes     {self.holes} intervals longer than 1.75 periods: lost samples"]
-                if self.holes
-                else []
-            ),
+            *(lost if self.holes else ()),
             *(f"  {line}" for line in self.conversions),
             *(f"  read      {name}  sha256 {digest[:16]}" for name, digest in self.digests.items()),
             f"  written   {self.path}  uid {self.uid}",

@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping
 
-__all__ = ["Coupling", "LogMapping", "Signal", "TimeBase", "Transmission"]
-
 Floats = NDArray[np.float64]
 
 # fmt: off

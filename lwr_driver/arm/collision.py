@@ -142,9 +142,8 @@ class CollisionChecker:
             raise ConfigurationError(
                 f"{name!r} names a link of the arm; choose another name in the cell file"
             )
-        index = int(
-            self._geometry.addGeometryObject(pin.GeometryObject(name, joint, frame, placement, shape))
-        )
+        body = pin.GeometryObject(name, joint, frame, placement, shape)
+        index = int(self._geometry.addGeometryObject(body))
         self._links.append(joint)
         self._names.append(name)
         return index

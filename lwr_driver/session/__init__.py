@@ -8,31 +8,22 @@ from __future__ import annotations
 
 from lwr_driver.arm import LinkFrames
 from lwr_driver.session.reader import as_sessions, describe, read_session
-from lwr_driver.session.recovery import Recovery, recover
+from lwr_driver.session.recovery import recover
 from lwr_driver.session.session import (
-    ControllerModelColumns,
-    Gap,
     JointColumns,
     Missing,
     Phase,
     Session,
-    SessionSummary,
-    StatusColumns,
 )
 from lwr_driver.session.writer import SessionWriter, session_metadata
 
 __all__ = [
-    "ControllerModelColumns",
-    "Gap",
     "JointColumns",
     "LinkFrames",
     "Missing",
     "Phase",
-    "Recovery",
     "Session",
-    "SessionSummary",
     "SessionWriter",
-    "StatusColumns",
     "as_sessions",
     "describe",
     "read_session",

@@ -6,6 +6,7 @@ After a failed write (disk full) the broken record is cut off again.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import zlib
@@ -258,15 +259,9 @@ class Container:
         """Write the end of the data, the summary and the footer, and close."""
         written = [channel for channel in self._channels.values() if channel.written]
         schemas = list(dict.fromkeys(channel.schema_record for channel in written))
-        numbers = (
-            len(schemas),
-            len(self._counts),
-            len(self._attachments),
-            len(self._metadata),
-            len(self._chunks),
-        )
+        counted = (schemas, self._counts, self._attachments, self._metadata, self._chunks)
         times = self._times or (0, 0)
-        head = struct.pack("<QHIIIIQQ", sum(self._counts.values()), *numbers, *times)
+        head = struct.pack("<QHIIIIQQ", sum(self._counts.values()), *map(len, counted), *times)
         counts = b"".join(struct.pack("<HQ", *item) for item in self._counts.items())
         statistics = _record(Opcode.STATISTICS, head, struct.pack("<I", len(counts)), counts)
         summary_start = self.offset + 9 + 4
@@ -289,7 +284,7 @@ class Container:
         body = summary + offsets + footer
         end = _record(Opcode.DATA_END, struct.pack("<I", 0))
         self._write(end + body + struct.pack("<I", zlib.crc32(body)) + MAGIC)
-        self._sync()
+        os.fsync(self._file.fileno())
         self._file.close()
 
     def abandon(self) -> None:
@@ -301,7 +296,8 @@ class Container:
         try:
             while left:
                 left = left[self._file.write(left) :]
-            self._sync(only_if_asked=True)
+            if self._fsync:
+                os.fsync(self._file.fileno())
         except OSError as error:
             self._cut()
             raise DataError(
@@ -310,13 +306,7 @@ class Container:
             ) from error
         self.offset += len(data)
 
-    def _sync(self, *, only_if_asked: bool = False) -> None:
-        if self._fsync or not only_if_asked:
-            os.fsync(self._file.fileno())
-
     def _cut(self) -> None:
-        try:
+        with contextlib.suppress(OSError):
             self._file.truncate(self.offset)
             self._file.seek(self.offset)
-        except OSError:
-            return

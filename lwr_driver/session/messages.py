@@ -31,6 +31,7 @@ class Schema:
 
 
 _RULE = "=" * 80
+_CODES = {"uint16": "<u2", "uint32": "<u4", "float32": "<f4", "float64": "<f8"}
 
 _TIME = f"""{_RULE}
 MSG: builtin_interfaces/Time
@@ -265,24 +266,14 @@ def joint_state_layout(names: Sequence[str], *, position: bool, velocity: bool, 
     return builder.layout()
 
 
-def fri_status_layout() -> Layout:
-    """Layout of `lwr_msgs/msg/FriStatus`."""
-    builder = (
-        LayoutBuilder().header().numbers("state", "<u2").numbers("quality", "<u2").numbers("sequence", "<u4")
-    )
-    builder.numbers("sample_time", "<f8")
-    for name in ("answer_rate", "latency", "jitter", "miss_rate"):
-        builder.numbers(name, "<f4")
-    builder.numbers("miss_counter", "<u4")
-    for name in ("power", "control", "error", "warning"):
-        builder.numbers(name, "<u2")
-    return builder.numbers("temperature", "<f4", (7,)).layout()
-
-
-def controller_model_layout() -> Layout:
-    """Layout of `lwr_msgs/msg/ControllerModel`."""
-    builder = LayoutBuilder().header().numbers("mass_matrix", "<f4", (49,)).numbers("gravity", "<f4", (7,))
-    builder.numbers("jacobian", "<f4", (42,)).numbers("estimated_external_torque", "<f4", (7,))
+def fixed_layout(schema: Schema) -> Layout:
+    """Layout of a definition with a header first, then numbers and arrays of fixed length."""
+    builder = LayoutBuilder().header()
+    for line in schema.text.partition(_RULE)[0].splitlines():
+        words = line.partition("#")[0].split()
+        if words and words[0] != "std_msgs/Header":
+            kind, _, length = words[0].partition("[")
+            builder.numbers(words[1], _CODES[kind], (int(length[:-1]),) if length else ())
     return builder.layout()
 
 

@@ -109,9 +109,7 @@ class KrlTorqueDecoder:
         modulus = self.config.counter_modulus
         counter = krl_int[:, self.config.counter_int - 1].astype(np.int64)
         values = np.ascontiguousarray(krl_real[:, self._columns])
-        if not len(counter):
-            return self._pick(log_time, publish_time, values, np.zeros(0, dtype=np.int64), [])
-        before = counter[0] if self._counter is None else self._counter
+        before = counter[:1] if self._counter is None else self._counter
         steps = np.diff(counter, prepend=before)
         # Comparison by bits: NaN equals itself.
         bits = values.view(np.uint32)
@@ -131,19 +129,9 @@ class KrlTorqueDecoder:
                 self.lost += advance - 1
                 self._number += advance
             numbers.append(self._number)
-        self._counter = int(counter[-1])
-        self._values = values[-1:].copy()
+        if len(counter):
+            self._counter, self._values = int(counter[-1]), values[-1:].copy()
         self.fresh += len(rows)
-        return self._pick(log_time, publish_time, values, rows, numbers)
-
-    def _pick(
-        self,
-        log_time: NDArray[np.int64],
-        publish_time: NDArray[np.int64],
-        values: NDArray[np.float32],
-        rows: NDArray[np.int64],
-        numbers: list[int],
-    ) -> FreshTorques:
         return FreshTorques(
             log_time[rows],
             publish_time[rows],
@@ -225,16 +213,9 @@ def match_torques(joint: JointColumns, motor: JointColumns) -> tuple[TorqueMatch
     for place, name in enumerate(motor.names):
         best = int(np.argmax(explained[:, place]))
         mine = float(explained[joint.names.index(name), place]) if name in joint.names else 0.0
-        matches.append(
-            TorqueMatch(
-                name,
-                mine,
-                float(gains[place]),
-                float(loads[place]),
-                joint.names[best],
-                float(explained[best, place]),
-            )
-        )
+        gain, load = float(gains[place]), float(loads[place])
+        follows = joint.names[best], float(explained[best, place])
+        matches.append(TorqueMatch(name, mine, gain, load, *follows))
     return tuple(matches)
 
 

@@ -22,8 +22,7 @@ from lwr_driver.session.messages import (
     CdrError,
     CdrReader,
     Layout,
-    controller_model_layout,
-    fri_status_layout,
+    fixed_layout,
     read_joint_state_layout,
 )
 from lwr_driver.session.scan import Block, ChannelRecord, Scan
@@ -65,8 +64,7 @@ def read_session(
     joints = {topic: _JointTopic(source, topic) for topic in _NEEDED}
     texts: dict[str, list[tuple[int, str]]] = {topic: [] for topic in _TEXT_TOPICS}
     notes: list[str] = []
-    layouts = {"/fri/status": fri_status_layout(), "/fri/controller_model": controller_model_layout()}
-    fixed = {topic: _FixedTopic(topic, layout, notes) for topic, layout in layouts.items()}
+    fixed = {topic: _FixedTopic(topic, fixed_layout(TOPICS[topic]), notes) for topic in _FIXED_TOPICS}
     readable: dict[int, bool] = {}
     for block in scan.blocks():
         for number in np.unique(block.channel).tolist():
@@ -147,13 +145,8 @@ def _session(
     joint = columns["/joint_states"]
     if joint is None:
         topics = sorted({channel.topic for channel in scan.channels.values()})
-        cut = (
-            ""
-            if scan.whole
-            else "; the file was cut before its first whole chunk"
-            if not topics
-            else "; it was cut"
-        )
+        cut = "; it was cut" if topics else "; the file was cut before its first whole chunk"
+        cut = "" if scan.whole else cut
         raise DataError(f"{source}: no message on /joint_states; topics: {', '.join(topics) or 'none'}{cut}")
     for topic, other in columns.items():
         if other is not None and topic != "/joint_states":
@@ -458,12 +451,12 @@ class _FixedTopic:
         if not self.rows:
             return None
         columns = self._columns()
-        count = len(columns["log_time"])
-        return ControllerModelColumns(
-            log_time=columns["log_time"],
-            publish_time=columns["publish_time"],
-            mass_matrix=columns["mass_matrix"].reshape(count, 7, 7).astype(np.float64),
-            gravity=columns["gravity"].astype(np.float64),
-            jacobian=columns["jacobian"].reshape(count, 6, 7).astype(np.float64),
-            estimated_external_torque=columns["estimated_external_torque"].astype(np.float64),
-        )
+        shapes = {
+            "mass_matrix": (7, 7),
+            "gravity": (7,),
+            "jacobian": (6, 7),
+            "estimated_external_torque": (7,),
+        }
+        for name, shape in shapes.items():
+            columns[name] = columns[name].reshape(-1, *shape).astype(np.float64)
+        return ControllerModelColumns(**columns)

@@ -14,24 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fri.packets import MSR
 from lwr_driver.ring import NO_PHASE
+from lwr_driver.session.messages import FRI_STATUS, fixed_layout
 from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
 from lwr_driver.session.writer import ExitStatus, SessionWriter
 
-_STATUS_FIELDS = (
-    "state",
-    "quality",
-    "answer_rate",
-    "latency",
-    "jitter",
-    "miss_rate",
-    "miss_counter",
-    "power",
-    "control",
-    "error",
-    "warning",
-    "temperature",
-)
+_STATUS_FIELDS = tuple(name for name in fixed_layout(FRI_STATUS).fields if name in (MSR.names or ()))
 NO_PHASE_NAME = "monitor"
 """Phase of cycles without one, after another phase."""
 

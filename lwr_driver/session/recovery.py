@@ -57,7 +57,7 @@ def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
         raise ConfigurationError(f"{out} exists already; name another file or remove it")
     scan = Scan(path, skip_damage=True)
     with replacing(out) as partial:
-        container = Container(partial, library=_library(path))
+        container = Container(partial, library=f"lwr-identification recover of {path.name}")
         try:
             counts = copy_messages(scan, container)
             if not counts:
@@ -182,10 +182,6 @@ def _lost(scan: Scan) -> tuple[str, ...]:
     if not any(name == "session_end" for name, _ in scan.metadata):
         lost.append("what the recorder had not yet written when it died, 0.5 s at most")
     return tuple(lost)
-
-
-def _library(path: Path) -> str:
-    return f"lwr-identification recover of {path.name}"
 
 
 def _verify(path: Path, counts: Mapping[str, int]) -> None:

@@ -184,7 +184,11 @@ def import_trace(
     if (np.diff(motor.log_time) <= 0).any():
         raise DataError(f"{trace.path}: samples closer than a nanosecond at {stamp(motor.log_time)}")
     torques = match_torques(joint, motor) if joint.effort.shape[1] else ()
-    _check_torques(trace.path, torques)
+    wrong = [str(match) for match in torques if match.swapped]
+    if wrong:
+        raise DataError(
+            f"{trace.path}: torque columns in another order: {'; '.join(wrong)}; correct the header"
+        )
     metadata = {
         **session.metadata,
         "motor_torque_source": "trace_file",
@@ -236,14 +240,6 @@ def _clock(source: NDArray[np.float64], log_time: NDArray[np.int64]) -> tuple[fl
             break
         kept = now
     return float(slope), int(log_time[0]) + round(float(start) * 1e9), spread
-
-
-def _check_torques(path: Path, torques: Sequence[TorqueMatch]) -> None:
-    wrong = [match for match in torques if match.swapped]
-    if wrong:
-        raise DataError(
-            f"{path}: torque columns in another order: {'; '.join(map(str, wrong))}; correct the header"
-        )
 
 
 def _write(session_path: Path, out: Path, metadata: dict[str, str], motor: JointColumns) -> None:

@@ -12,7 +12,6 @@ import uuid
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -26,8 +25,7 @@ from lwr_driver.session.messages import (
     TOPICS,
     Layout,
     LayoutBuilder,
-    controller_model_layout,
-    fri_status_layout,
+    fixed_layout,
     joint_state_layout,
     tf_layout,
 )
@@ -214,7 +212,7 @@ class SessionWriter:
         sequence: ArrayLike | None = None,
     ) -> None:
         """State and statistics of the FRI session; `columns` are the fields of `FriStatus`, n rows each."""
-        self._add("/fri/status", "status", fri_status_layout, log_time, columns, publish_time, sequence)
+        self._add_fixed("/fri/status", log_time, columns, publish_time, sequence)
 
     def write_controller_model(
         self,
@@ -235,9 +233,7 @@ class SessionWriter:
             "jacobian": np.asarray(jacobian).reshape(len(times), 42),
             "estimated_external_torque": estimated_external_torque,
         }
-        self._add(
-            "/fri/controller_model", "model", controller_model_layout, times, columns, publish_time, sequence
-        )
+        self._add_fixed("/fri/controller_model", times, columns, publish_time, sequence)
 
     def write_link_frames(
         self, log_time: ArrayLike, position: ArrayLike, *, publish_time: ArrayLike | None = None
@@ -316,9 +312,7 @@ class SessionWriter:
     def __enter__(self) -> SessionWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is None:
             self.close()
         else:
@@ -359,6 +353,9 @@ class SessionWriter:
         self._add(
             topic, value, lambda: LayoutBuilder().text(value).layout(), log_time, {}, publish_time, None
         )
+
+    def _add_fixed(self, topic: str, *arguments: Any) -> None:
+        self._add(topic, topic, lambda: fixed_layout(TOPICS[topic]), *arguments)
 
     def _add(
         self,

@@ -42,3 +42,13 @@ def lwr(payload=None, frictionless=False, **settings):
     arm = ElasticArm(model, drives, **settings)
     arm.mount(content.payload(payload or "none"))
     return arm
+
+
+def stored_energy(arm):
+    """Kinetic energy of links and motors, potential energy, energy in the elastic joints [J]."""
+    data = arm.model.createData()
+    links = pin.computeKineticEnergy(arm.model, data, arm.position, arm.velocity)
+    height = pin.computePotentialEnergy(arm.model, data, arm.position)
+    motors = 0.5 * arm.drive.Ia @ arm.motor_velocity**2
+    torsion = 0.5 * arm.drive.stiffness @ (arm.motor_position - arm.position) ** 2
+    return links + height + motors + torsion

@@ -18,12 +18,12 @@ def _energy_error(cycle_s, frictionless):
     arm = arms.lwr("paper_load", frictionless=frictionless, cycle_s=cycle_s)
     arm.reset(POSE)
     arm.energy[:] = 0.0
-    start, worst = arm.stored_energy(), 0.0
+    start, worst = arms.stored_energy(arm), 0.0
     for k in range(round(1.0 / cycle_s)):
         drive = np.zeros(7) if frictionless else PUSH * np.sin(4 * np.pi * (k + 0.5) * cycle_s)
         arm.step(drive)
         put_in, dissipated, offset = arm.energy
-        worst = max(worst, abs(arm.stored_energy() - start - (put_in - dissipated - offset)))
+        worst = max(worst, abs(arms.stored_energy(arm) - start - (put_in - dissipated - offset)))
     return worst
 
 

@@ -52,14 +52,14 @@ def test_damping_of_the_free_mode_is_where_theory_puts_it():
     )
     arm.motor_position[0] = 0.01
     reduced = 1 / (1 / motor + 1 / link)
-    start = arm.stored_energy()
+    start = arms.stored_energy(arm)
     for _ in range(1000):
         arm.step(np.zeros(1))
     # Energy decays by exp(-D/J_reduced t), half of it in the spring at any time on average.
     rest = (
         0.5 * (motor + link) * ((motor * arm.motor_velocity + link * arm.velocity) / (motor + link))[0] ** 2
     )
-    assert arm.stored_energy() - rest == pytest.approx(start * np.exp(-damping / reduced * 1.0), rel=0.05)
+    assert arms.stored_energy(arm) - rest == pytest.approx(start * np.exp(-damping / reduced * 1.0), rel=0.05)
 
 
 def test_rest_stays_at_rest_bit_for_bit():
