@@ -203,8 +203,8 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
 
 
 def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
-    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The
-    description's stiffness, known to a factor of about two, decides for joints hardly bent alone."""
+    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The description's
+    stiffness, known to a factor of about two, decides only where a joint hardly bends."""
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
     dictionary = Dictionary(nominal, evidence, [e.cause for e in (ELASTICITY, *DELAYS.values())])
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
