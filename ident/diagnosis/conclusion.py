@@ -430,7 +430,7 @@ def _notes(bench: Bench, reference: Reference | None) -> list[str]:
     still = np.flatnonzero(~nominal.moving)
     if len(still):
         names = ", ".join(nominal.arm.chain.joint_names[j] for j in still)
-        notes.append(f"{names}: motion below {TRAVEL_RAD} rad, too little for a diagnosis")
+        notes.append(f"{names}: no motion of {TRAVEL_RAD} rad or more, so no diagnosis there")
     if not bench.repeatable:
         notes.append(
             "no motion repeats within a session: the residual of the model is the only measure of noise, so only "

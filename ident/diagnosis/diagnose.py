@@ -210,9 +210,9 @@ def _unknown_delay(task: Task, claim: Claim) -> float:
 
 def _own_delay(claim: Claim, limit: float) -> str:
     return (
-        f"motor torques come {1e3 * _made(claim):.1f} ms after the positions; this delay was corrected. Without a "
-        f"reference the healthy delay is unknown, so a delay below {1e3 * limit:.0f} ms (one sample of each channel) "
-        "is not reported as a finding"
+        f"motor torques come {1e3 * _made(claim):.1f} ms after the positions; this delay was corrected. The healthy "
+        f"delay is unknown without a reference, so a delay below {1e3 * limit:.0f} ms (one sample of each channel) is "
+        "not reported as a finding"
     )
 
 
