@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from fri.errors import ConfigurationError
 from fri.handshake import find_handshake
+from ident.diagnosis.statements import SURE
 from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session.motor_torque import KrlMotorTorque
@@ -172,16 +173,16 @@ class DiagnosisPlan:
     """What the experiment ends with.
 
     run : look for what the model lacks. reference : model file of `lwr-run commission`, the healthy arm.
-    sure : confidence below which a finding with look-alikes asks for a motion that decides.
+    sure : confidence below which a finding with look-alikes is open and asks for a discriminating experiment.
     """
 
     run: bool = True
     reference: str | None = None
-    sure: float = 0.8
+    sure: float = SURE
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.sure < 1.0:
-            raise ConfigurationError(f"sure {self.sure} is outside 0.5 to 1; 0.8 is usual")
+            raise ConfigurationError(f"sure {self.sure} is outside 0.5 to 1; {SURE} is usual")
 
 
 @dataclass(frozen=True)

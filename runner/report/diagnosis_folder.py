@@ -1,9 +1,8 @@
-"""The files of a diagnosis as the report sees them."""
+"""The files of a diagnosis."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,23 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError
-from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
-from runner.diagnosis.look_alikes import LookAlikes, read_look_alikes
-from runner.diagnosis.replayed import FILE as REPLAYED
-from runner.diagnosis.replayed import ReplayErrors
-from runner.diagnosis.residuals import FILE as RESIDUALS
-from runner.diagnosis.residuals import Residuals
+from ident.diagnosis.look_alikes import LookAlikes
+from ident.diagnosis.statements import Statements, statements
+from runner.diagnosis.records import LOOK_ALIKES, REPLAY, RESIDUALS, ReplayErrors, Residuals, read_look_alikes
 from runner.report.folder import ResultFolder
 
-__all__ = ["DiagnosisFolder", "values_of"]
+__all__ = ["DiagnosisFolder"]
 
 
 @dataclass(frozen=True)
 class DiagnosisFolder:
-    """A folder with diagnosis.json; what else there is, is shown.
+    """A folder with diagnosis.json; every other file of a diagnosis may be missing.
 
-    content : of diagnosis.json. joint_names : of the arm. experiment : folder of the experiment that it ends, None
-    for a diagnosis of logs.
+    content : of diagnosis.json. joint_names : of the arm. experiment : folder of its experiment, None for a diagnosis
+    of logs.
     """
 
     path: Path
@@ -37,7 +33,7 @@ class DiagnosisFolder:
 
     @classmethod
     def load(cls, path: str | Path) -> DiagnosisFolder:
-        """Of a folder that `lwr-run diagnose` wrote. ConfigurationError if it is none, DataError if it is broken."""
+        """Of a folder by `lwr-run diagnose`. Raises ConfigurationError for another one, DataError for a broken one."""
         folder = Path(path)
         file = folder / "diagnosis.json"
         if not file.is_file():
@@ -53,7 +49,7 @@ class DiagnosisFolder:
 
     @classmethod
     def of(cls, results: ResultFolder) -> DiagnosisFolder | None:
-        """The diagnosis in the folder of an experiment; None where there is none."""
+        """The diagnosis in the folder of an experiment, if any."""
         if results.diagnosis is None:
             return None
         experiment = None if results.summary.get("from_logs") else results.path
@@ -61,26 +57,20 @@ class DiagnosisFolder:
 
     @property
     def findings(self) -> Sequence[Mapping[str, Any]]:
-        """What was found, the one that matters most first."""
+        """The findings, the largest effect first."""
         found: Sequence[Mapping[str, Any]] = self.content.get("findings", [])
         return found
 
-    @property
-    def unexplained(self) -> Sequence[Mapping[str, Any]]:
-        """What is there but has no name."""
-        found: Sequence[Mapping[str, Any]] = self.content.get("unexplained", [])
-        return found
+    @cached_property
+    def statements(self) -> Statements:
+        """The diagnosis in words."""
+        answers = _json(self.path / "decision.json").get("answers", [])
+        return statements(self.content, self.details, self.joint_names, answers)
 
     @cached_property
     def details(self) -> Mapping[str, Any]:
         """Content of details.json."""
         return _json(self.path / "details.json")
-
-    @cached_property
-    def answers(self) -> Sequence[Mapping[str, Any]]:
-        """What deciding motions said."""
-        found: Sequence[Mapping[str, Any]] = _json(self.path / "decision.json").get("answers", [])
-        return found
 
     @cached_property
     def residuals(self) -> Residuals | None:
@@ -90,27 +80,19 @@ class DiagnosisFolder:
 
     @cached_property
     def replayed(self) -> ReplayErrors | None:
-        """Errors of the simulation over time, None without their file."""
-        file = self.path / REPLAYED
+        """Errors of the replay over time, None without their file."""
+        file = self.path / REPLAY
         return ReplayErrors.load(file) if file.is_file() else None
 
     @cached_property
     def look_alikes(self) -> tuple[LookAlikes, ...]:
-        """Causes side by side."""
+        """Look-alikes, empty without their file."""
         entries, file = self.details.get("look_alikes") or [], self.path / LOOK_ALIKES
         return read_look_alikes(file, entries) if entries and file.is_file() else ()
 
 
-def values_of(finding: Mapping[str, Any]) -> dict[str, tuple[float, float, str]]:
-    """Value, standard deviation and unit by parameter of a finding's plain content."""
-    return {
-        name: (float(one.get("value", math.nan)), float(one.get("std") or 0.0), str(one.get("unit", "1")))
-        for name, one in (finding.get("parameters") or {}).items()
-    }
-
-
 def _json(path: Path) -> Mapping[str, Any]:
-    """Content of a file that may be missing."""
+    """Content of a file, empty for a missing one."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -10,10 +10,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ident.diagnosis.statements import in_short
 from runner.report.curves import Curves
 from runner.report.folder import ResultFolder
 
-__all__ = ["Level", "Verdict", "error_change", "extension_gain", "headline", "largest_gain", "verdicts"]
+__all__ = ["Level", "Verdict", "headline", "verdicts"]
 
 Level = Literal["good", "look", "bad"]
 
@@ -215,49 +216,8 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
     diagnosis = results.diagnosis
     if diagnosis is None:
         return None
-    causes = [str(finding["cause"]).replace("_", " ") for finding in diagnosis.get("findings", [])]
-    unexplained = len(diagnosis.get("unexplained", []))
-    text = f"found: {_listed(causes)}" if causes else "nothing found"
-    if unexplained:
-        text += f"; {unexplained} unexplained"
-    gain = extension_gain(diagnosis)
-    if gain is not None:
-        place, best = largest_gain(diagnosis, results.joint_names)
-        change = f"{error_change(best)} error on unseen motions, {error_change(gain)} on average"
-        text += f"; the extended model: {place} {change}"
-    return Verdict("diagnosis", text, "", "look" if causes or unexplained else "good", "diagnosis")
-
-
-def error_change(gain: float) -> str:
-    """A share of the error that goes, as the change of the error; small ones with a decimal, none without a sign."""
-    percent = round(-100.0 * gain, 0 if abs(gain) >= 0.01 else 1)
-    return f"{percent:+g} %" if percent else "0 %"
-
-
-def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
-    """Share of the error on unseen motions that the extended model removes, mean over joints and sides."""
-    gain = diagnosis.get("gain") or {}
-    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
-    ratios = [
-        after / before
-        for side in base
-        for before, after in zip(base[side] or (), extended.get(side) or (), strict=False)
-        if before and after is not None
-    ]
-    return 1.0 - float(np.mean(ratios)) if ratios and diagnosis.get("findings") else None
-
-
-def largest_gain(diagnosis: Mapping[str, Any], names: Sequence[str]) -> tuple[str, float]:
-    """Joint and side that the extended model helps most, and the share of its error that it removes."""
-    base, extended = diagnosis["gain"]["test_rms_base"], diagnosis["gain"]["test_rms_extended"]
-    found = [
-        (1.0 - after / before, f"{names[k] if k < len(names) else k + 1} {side}")
-        for side in base
-        for k, (before, after) in enumerate(zip(base[side] or (), extended.get(side) or (), strict=False))
-        if before and after is not None
-    ]
-    share, place = max(found)
-    return place, share
+    level, text = in_short(diagnosis, results.joint_names)
+    return Verdict("diagnosis", text, "", level, "diagnosis")
 
 
 _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (

@@ -21,13 +21,14 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 from view_rig import CONTRAST, NARROW, WIDE, Seen, opened
 
+from ident.diagnosis.statements import error_change
 from lwr_driver.session import Session
 from runner.cli import main
 from runner.published import TABLE_1, TABLE_2
 from runner.report.figures import torque_figure
 from runner.report.folder import ResultFolder
 from runner.report.page import write_report
-from runner.report.verdicts import error_change, headline, verdicts
+from runner.report.verdicts import headline, verdicts
 
 pytestmark = pytest.mark.slow
 
