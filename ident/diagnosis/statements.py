@@ -24,7 +24,6 @@ __all__ = [
     "Number",
     "Part",
     "Statements",
-    "Table",
     "answer_statement",
     "comparison",
     "error_change",
@@ -71,13 +70,8 @@ class Number:
         return "–" if self.value is None or math.isnan(self.value) else format(self.value, self.form)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table; the first cell of a row is its heading."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str | Number, ...], ...]
+Row = Sequence[str | Number]
+Level = Literal["good", "look"]
 
 
 @dataclass(frozen=True)
@@ -87,7 +81,7 @@ class Line:
     subject: str
     found: str
     wanted: str
-    level: Literal["good", "look"]
+    level: Level
     anchor: str
 
 
@@ -132,12 +126,13 @@ class FindingStatement:
 
 @dataclass(frozen=True)
 class Part:
-    """Sentences and a table under a title."""
+    """Sentences and a table under a title. rows : of the table, each with its heading first."""
 
     anchor: str
     title: str
-    sentences: tuple[str, ...] = ()
-    table: Table | None = None
+    sentences: Sequence[str] = ()
+    head: Sequence[str] = ()
+    rows: Sequence[Row] = ()
 
     def lines(self) -> list[str]:
         """For the terminal."""
@@ -146,15 +141,15 @@ class Part:
         found = [self.title]
         for sentence in self.sentences:
             found += _wrapped(sentence, "  ", "    ")
-        if self.table is None:
+        if not self.rows:
             return found
-        most = _MOST_ROWS.get(self.anchor, len(self.table.rows))
-        rows = [self.table.head, *([str(cell) for cell in row] for row in self.table.rows[:most])]
+        most = _MOST_ROWS.get(self.anchor, len(self.rows))
+        rows = [self.head, *([str(cell) for cell in row] for row in self.rows[:most])]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         for first, *rest in rows:
             cells = (f"{cell:>{width}}" for cell, width in zip(rest, widths[1:], strict=True))
             found.append(f"  {first:<{widths[0]}}  {'  '.join(cells)}".rstrip())
-        more = len(self.table.rows) - most
+        more = len(self.rows) - most
         return [*found, f"  ... and {more} more"] if more > 0 else found
 
 
@@ -167,7 +162,7 @@ class Statements:
     """
 
     about: str
-    level: Literal["good", "look"]
+    level: Level
     headline: str
     lines: tuple[Line, ...]
     answers: tuple[str, ...]
@@ -205,14 +200,13 @@ def statements(
         for number, finding in enumerate(content.get("findings", []), start=1)
     ]
     level, headline = _headline(content, details, findings)
-    pairs = enumerate(details.get("look_alikes") or [])
     parts = (
         _experiments(details, names),
         _unexplained(content, names),
         _gain(content, details, names),
         _replay(content, names),
         _absorbed(details),
-        Part("limits", "Limits of these data", tuple(map(str, details.get("notes", [])))),
+        Part("limits", "Limits of these data", details.get("notes", ())),
     )
     return Statements(
         f"Diagnosis of {', '.join((content.get('sessions') or {}).get('train', []))}",
@@ -221,8 +215,8 @@ def statements(
         tuple(_lines(content, details, findings, names)),
         tuple(answer_statement(answer, names) for answer in answers),
         tuple(findings),
-        tuple(comparison(entry, names, place) for place, entry in pairs),
-        tuple(part for part in parts if part.sentences or part.table),
+        tuple(comparison(one, names, k) for k, one in enumerate(details.get("look_alikes") or [])),
+        tuple(part for part in parts if part.sentences or part.rows),
     )
 
 
@@ -348,7 +342,7 @@ def extension_gain(content: Plain) -> float | None:
     return sum(shares) / len(shares) if shares and content.get("findings") else None
 
 
-def in_short(content: Plain, names: Sequence[str]) -> tuple[Literal["good", "look"], str]:
+def in_short(content: Plain, names: Sequence[str]) -> tuple[Level, str]:
     """The whole diagnosis in one line of a run's summary."""
     causes = [spoken(str(finding["cause"])) for finding in content.get("findings", [])]
     unexplained = len(content.get("unexplained", []))
@@ -376,9 +370,7 @@ def _shares(content: Plain, names: Sequence[str]) -> list[tuple[float, str]]:
     ]
 
 
-def _headline(
-    content: Plain, details: Plain, findings: Sequence[FindingStatement]
-) -> tuple[Literal["good", "look"], str]:
+def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatement]) -> tuple[Level, str]:
     doubtful, count = sum(finding.is_open for finding in findings), len(findings)
     if count == 1:
         return "look", "One cause found" + (", open between look-alikes" if doubtful else "")
@@ -408,7 +400,7 @@ def _lines(
     if not findings:
         found.append(Line("causes", "none supported by the data", "none", "good", "findings"))
     rest = ", ".join(f"{_name(u['joint'], names)} {u['side']}" for u in content.get("unexplained", []))
-    level: Literal["good", "look"] = "look" if rest else "good"
+    level: Level = "look" if rest else "good"
     found.append(Line("unexplained residuals", rest or "none", "none", level, "unexplained"))
     gain = extension_gain(content)
     if gain is not None:
@@ -472,11 +464,11 @@ def _experiments(details: Plain, names: Sequence[str]) -> Part:
         sentences.append(
             f"{_capital(offer['kind'])}{where}, {offer['duration_s']:.0f} s, {loads}, for {causes}: `{offer['file']}`"
         )
-    return Part("deciding", "Discriminating experiments", tuple(sentences))
+    return Part("deciding", "Discriminating experiments", sentences)
 
 
 def _unexplained(content: Plain, names: Sequence[str]) -> Part:
-    rows = tuple(
+    rows = [
         (
             f"{_name(entry['joint'], names)} {entry['side']}",
             ", ".join(entry.get("depends_on", [])),
@@ -484,10 +476,9 @@ def _unexplained(content: Plain, names: Sequence[str]) -> Part:
             Number(entry.get("noise_floor"), ".3g"),
         )
         for entry in content.get("unexplained", [])
-    )
+    ]
     head = ("torque", "depends on", "error on held-out data [Nm]", "noise floor [Nm]")
-    table = Table("Unexplained residuals", head, rows) if rows else None
-    return Part("unexplained", "Unexplained residuals", (), table)
+    return Part("unexplained", "Unexplained residuals", (), head, rows)
 
 
 def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
@@ -496,7 +487,7 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
     floor = (content.get("baseline") or {}).get("noise_floor") or {}
     measured = {(row["side"], row["joint"]): row for row in details.get("rows", [])}
     is_named = bool(content.get("findings"))
-    rows: list[tuple[str | Number, ...]] = []
+    rows: list[Row] = []
     for side in base:
         for k, before in enumerate(base[side] or ()):
             after = (extended.get(side) or [])[k] if extended.get(side) else None
@@ -529,8 +520,7 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
         sentences.append(f"Worse than the base model by more than chance: {', '.join(worse)}.")
     middle = ("extended [Nm]", "change %", "gain [Nm], 95 %") if is_named else ()
     head = ("torque", "noise [Nm]", "base model [Nm]", *middle, "avoidable %")
-    title = "Gain of the extended model on held-out data" if is_named else "Error on held-out data"
-    return Part("gain", "Gain", tuple(sentences), Table(title, head, tuple(rows)))
+    return Part("gain", "Gain" if is_named else "Error on held-out data", sentences, head, rows)
 
 
 def _simulated(content: Plain) -> tuple[Plain, Plain]:
@@ -541,23 +531,19 @@ def _simulated(content: Plain) -> tuple[Plain, Plain]:
 def _replay(content: Plain, names: Sequence[str]) -> Part:
     """Error of the replay with the same commands, without and with the extension."""
     before, after = _simulated(content)
-    rows: list[tuple[str | Number, ...]] = []
+    rows: list[Row] = []
     for key, label, unit, scale in _REPLAYED:
         for model, errors in (("base model", before), ("extended", after)):
             if errors.get(key) and (model == "base model" or (content.get("findings") and before.get(key))):
                 cells = [Number(None if v is None else scale * v, ".3f") for v in errors[key]]
                 rows.append((f"{label} [{unit}], {model}", *cells))
-    if not rows:
-        return Part("replay", "Replay in simulation")
     sentence = "The same commands to the simulated arm: measured minus simulated, root mean square."
-    table = Table("Replay in simulation", ("", *names), tuple(rows))
-    return Part("replay", "Replay in simulation", (sentence,), table)
+    return Part("replay", "Replay in simulation", [sentence] * bool(rows), ("", *names), rows)
 
 
 def _absorbed(details: Plain) -> Part:
     """Base parameters with errors in the base model, for they had absorbed the findings."""
-    title = "Base parameters affected by the findings"
-    rows = tuple(
+    rows = [
         (
             str(entry["name"]),
             Number(entry["base"]),
@@ -567,12 +553,10 @@ def _absorbed(details: Plain) -> Part:
             str(entry["unit"]),
         )
         for entry in details.get("base_parameters") or []
-    )
-    if not rows:
-        return Part("absorbed", title)
+    ]
     head = ("parameter", "base model", "extended", "std", "change [std]", "unit")
     sentence = "Wrong in the base model: they had absorbed the causes now in the extended model."
-    return Part("absorbed", title, (sentence,), Table(title, head, rows))
+    return Part("absorbed", "Base parameters affected by the findings", [sentence] * bool(rows), head, rows)
 
 
 def _beside(one: Comparison) -> list[str]:

@@ -1,23 +1,119 @@
-"""The layout of a diagnosis in HTML, as a part of the report of a run or as the parts of a page of its own."""
+"""The layout of a diagnosis in HTML: a section of the report of a run, or the parts of a page of its own."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from html import escape
+from pathlib import Path
+from typing import Any
 
-from ident.diagnosis.statements import Comparison, FindingStatement, Part, Table, run_advice
-from ident.diagnosis.statements import Number as Quantity
+from fri.errors import ConfigurationError, DataError
+from ident.diagnosis.look_alikes import LookAlikes
+from ident.diagnosis.statements import (
+    Comparison,
+    FindingStatement,
+    Number,
+    Part,
+    Statements,
+    run_advice,
+    statements,
+)
+from runner.diagnosis.records import (
+    LOOK_ALIKES,
+    REPLAY,
+    RESIDUALS,
+    ReplayErrors,
+    Residuals,
+    read_look_alikes,
+)
 from runner.report.diagnosis_figures import (
     finding_figure,
     look_alike_figure,
     replay_figures,
     residual_figures,
 )
-from runner.report.diagnosis_folder import DiagnosisFolder
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
+from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
+from runner.report.markup import Number as Shown
 
-__all__ = ["diagnosis_parts", "diagnosis_section"]
+__all__ = ["DiagnosisFolder", "diagnosis_parts", "diagnosis_section"]
+
+
+@dataclass(frozen=True)
+class DiagnosisFolder:
+    """A folder with diagnosis.json; every other file of a diagnosis may be missing.
+
+    content : of diagnosis.json. joint_names : of the arm. experiment : folder of its experiment, None for a diagnosis
+    of logs.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+    joint_names: tuple[str, ...]
+    experiment: Path | None = None
+
+    @classmethod
+    def load(cls, path: str | Path) -> DiagnosisFolder:
+        """Of a folder by `lwr-run diagnose`. Raises ConfigurationError for another one, DataError for a broken one."""
+        folder = Path(path)
+        file = folder / "diagnosis.json"
+        if not file.is_file():
+            raise ConfigurationError(
+                f"{folder}: holds no diagnosis.json; name the folder of `lwr-run diagnose --out`"
+            )
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            found = cls(folder, content, tuple(_json(folder / "details.json").get("joints", ())))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{file}: cannot be read: {error}; run `lwr-run diagnose` again") from error
+        return found
+
+    @classmethod
+    def of(cls, results: ResultFolder) -> DiagnosisFolder | None:
+        """The diagnosis in the folder of an experiment, if any."""
+        if results.diagnosis is None:
+            return None
+        experiment = None if results.summary.get("from_logs") else results.path
+        return cls(results.diagnosis_folder, results.diagnosis, results.joint_names, experiment)
+
+    @property
+    def findings(self) -> Sequence[Mapping[str, Any]]:
+        """The findings, the largest effect first."""
+        found: Sequence[Mapping[str, Any]] = self.content.get("findings", [])
+        return found
+
+    @cached_property
+    def statements(self) -> Statements:
+        """The diagnosis in words."""
+        answers = _json(self.path / "decision.json").get("answers", [])
+        return statements(self.content, self.details, self.joint_names, answers)
+
+    @cached_property
+    def details(self) -> Mapping[str, Any]:
+        """Content of details.json."""
+        return _json(self.path / "details.json")
+
+    @cached_property
+    def residuals(self) -> Residuals | None:
+        """Held-out residuals, None without their file."""
+        file = self.path / RESIDUALS
+        return Residuals.load(file) if file.is_file() else None
+
+    @cached_property
+    def replayed(self) -> ReplayErrors | None:
+        """Errors of the replay over time, None without their file."""
+        file = self.path / REPLAY
+        return ReplayErrors.load(file) if file.is_file() else None
+
+    @cached_property
+    def look_alikes(self) -> tuple[LookAlikes, ...]:
+        """Look-alikes, empty without their file."""
+        entries, file = self.details.get("look_alikes") or [], self.path / LOOK_ALIKES
+        return read_look_alikes(file, entries) if entries and file.is_file() else ()
 
 
 def diagnosis_section(results: ResultFolder) -> str:
@@ -83,7 +179,7 @@ def _beside(diagnosis: DiagnosisFolder, said: Comparison) -> str:
 def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
     if said.anchor == "limits":
         return f"<ul>{''.join(f'<li>{escape(_capital(note))}.</li>' for note in said.sentences)}</ul>"
-    html = "".join(map(paragraph, said.sentences)) + ("" if said.table is None else _table(said.table))
+    html = "".join(map(paragraph, said.sentences)) + (_table(said) if said.rows else "")
     if said.anchor == "deciding":
         html += paragraph(run_advice(None if diagnosis.experiment is None else diagnosis.experiment.name))
     if said.anchor == "replay" and diagnosis.replayed is not None:
@@ -92,20 +188,15 @@ def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
     return html
 
 
-def _table(said: Table) -> str:
+def _table(said: Part) -> str:
     units = said.head.index("unit") if "unit" in said.head else -1
-    rows: list[list[Cell]] = [
-        [
-            Number(cell.value, cell.form, cell.key)
-            if isinstance(cell, Quantity)
-            else pretty_unit(cell)
-            if place == units
-            else cell
-            for place, cell in enumerate(row)
-        ]
-        for row in said.rows
-    ]
-    return table(said.head, rows, said.title)
+
+    def shown(place: int, cell: str | Number) -> Cell:
+        if isinstance(cell, Number):
+            return Shown(cell.value, cell.form, cell.key)
+        return pretty_unit(cell) if place == units else cell
+
+    return table(said.head, [[shown(*one) for one in enumerate(row)] for row in said.rows], said.title)
 
 
 def _residuals(diagnosis: DiagnosisFolder) -> str:
@@ -119,3 +210,12 @@ def _residuals(diagnosis: DiagnosisFolder) -> str:
 
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
+
+
+def _json(path: Path) -> Mapping[str, Any]:
+    """Content of a file, empty for a missing one."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

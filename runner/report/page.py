@@ -7,8 +7,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
-from runner.report.diagnosis import diagnosis_parts, diagnosis_section
-from runner.report.diagnosis_folder import DiagnosisFolder
+from runner.report.diagnosis import DiagnosisFolder, diagnosis_parts, diagnosis_section
 from runner.report.folder import ResultFolder
 from runner.report.interactive import plotly_script
 from runner.report.markup import section

@@ -22,8 +22,8 @@ from runner.diagnosis import Study, asked, study
 from runner.diagnosis.discriminating import Discriminating
 from runner.diagnosis.records import LOOK_ALIKES, read_look_alikes
 from runner.diagnosis.study import replaceable
+from runner.report.diagnosis import DiagnosisFolder
 from runner.report.diagnosis_figures import look_alike_figure
-from runner.report.diagnosis_folder import DiagnosisFolder
 from runner.report.page import diagnosis_html
 
 Make = Callable[..., Session]
