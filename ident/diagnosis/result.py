@@ -1,4 +1,4 @@
-"""The diagnosis as a value: findings, what is unexplained, what was gained; as text and as plain content."""
+"""The diagnosis as a value: findings, unexplained residuals, gains; in words and as plain content."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Evident:
-    """Evidence of a finding. test_rms [Nm] over the rows that it acts on; interval of their difference."""
+    """Evidence of a finding. test_rms [Nm] over its rows; interval of their difference."""
 
     delta_bic: float
     p_value: float
@@ -50,8 +50,7 @@ class Evident:
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions,
-    where it says so.
+    """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions, if any.
     alternatives : (cause, joints, delta_bic). gain : fall of the held-back chi-square."""
 
     cause: str
@@ -106,7 +105,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is there but has no name, in the rows of a joint (from 1) and side."""
+    """A residual without a cause, in the rows of a joint (from 1) and side."""
 
     side: str
     joint: int
@@ -130,10 +129,10 @@ class SimulationError:
 
 @dataclass(frozen=True, eq=False)
 class RowStates:
-    """Where the arm was in the m rows of a side: what residuals can be held against.
+    """States of the arm in the m rows of a side.
 
     time : (m,) [s] in the session. session : (m,) number in the order of the sessions, from 0. block : (m,) of
-    rows that are taken to depend on each other. position, speed, load : (m, n) [rad, rad/s, Nm] of each joint,
+    rows taken as dependent. position, speed, load : (m, n) [rad, rad/s, Nm] of each joint,
     the load as the model predicts it.
     """
 
@@ -151,9 +150,9 @@ class Diagnosis:
 
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
-    notes : sentences on what could not be seen or used.
-    residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN where a row is not
-    used. states : where the arm was in these rows, by side.
+    notes : sentences on the limits of the data.
+    residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused
+    rows. states : of the arm in these rows, by side.
     """
 
     train: tuple[str, ...]
@@ -176,7 +175,7 @@ class Diagnosis:
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Content of `diagnosis.json`. Errors of a simulation that was not made are null."""
+        """Content of `diagnosis.json`. Errors of a missing simulation are null."""
         none = {"motor": None, "joint": None, "position": None}
         base = self.simulation_base.to_dict() if self.simulation_base else none
         extended = self.simulation_extended.to_dict() if self.simulation_extended else none

@@ -17,6 +17,7 @@ from ident.effects import EFFECTS, described, summary_of
 from ident.effects.words import joints_text, named, quantity_text, spoken
 
 __all__ = [
+    "REPLAYED",
     "SURE",
     "Comparison",
     "FindingStatement",
@@ -51,11 +52,12 @@ _SEEN = {
     "joint": "Acts on the links, so both torques see it.",
     "sensor": "An error of the joint torque sensor.",
 }
-_REPLAYED = (
+REPLAYED = (
     ("position", "position", "mrad", 1e3),
     ("motor", "motor torque", "Nm", 1.0),
     ("joint", "joint torque", "Nm", 1.0),
 )
+"""Replayed quantities: key, words, unit, scale from SI."""
 
 
 @dataclass(frozen=True)
@@ -421,7 +423,7 @@ def _replay_line(content: Plain) -> list[Line]:
     """The replay over all joints together."""
     before, after = _simulated(content)
     parts, worse = [], False
-    for key, label, unit, scale in _REPLAYED:
+    for key, label, unit, scale in REPLAYED:
         if not before.get(key) or not after.get(key):
             continue
         sizes = [math.hypot(*(v for v in side[key] if v is not None)) * scale for side in (before, after)]
@@ -532,7 +534,7 @@ def _replay(content: Plain, names: Sequence[str]) -> Part:
     """Error of the replay with the same commands, without and with the extension."""
     before, after = _simulated(content)
     rows: list[Row] = []
-    for key, label, unit, scale in _REPLAYED:
+    for key, label, unit, scale in REPLAYED:
         for model, errors in (("base model", before), ("extended", after)):
             if errors.get(key) and (model == "base model" or (content.get("findings") and before.get(key))):
                 cells = [Number(None if v is None else scale * v, ".3f") for v in errors[key]]

@@ -145,7 +145,6 @@ def foresee(
     sessions: Sequence[Session],
     chain: Chain,
     experiments: Sequence[Discriminating],
-    *,
     arm: ArmData | None = None,
     reference: Reference | None = None,
 ) -> tuple[LookAlikes, ...]:

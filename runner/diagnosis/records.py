@@ -16,6 +16,7 @@ from fri.errors import DataError
 from ident.diagnosis import Diagnosis
 from ident.diagnosis.gain import HeldOut, interval
 from ident.diagnosis.look_alikes import LookAlikes, Trace
+from ident.diagnosis.result import RowStates
 from runner.replay import Replayed
 
 __all__ = [
@@ -23,10 +24,8 @@ __all__ = [
     "QUANTITIES",
     "REPLAY",
     "RESIDUALS",
-    "Moved",
     "ReplayErrors",
     "Residuals",
-    "RowGain",
     "SideResiduals",
     "moved_parameters",
     "read_look_alikes",
@@ -45,76 +44,12 @@ _ROWS = ("time", "session", "block", "position", "speed", "load", "base", "exten
 _TRACE = ("time", "session", "position", "velocity", "load", "motor_angle", "first", "second", "measured")
 
 
-@dataclass(frozen=True)
-class RowGain:
-    """Held-out torque error of a joint (from 1) and side [Nm], without and with the extension.
+def row_gains(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Held-out torque error of each joint (from 1) and side [Nm], as plain content of details.json.
 
-    noise : floor of the error of any model. gain : base minus extended, with its 95 % interval from blocks drawn with
-    replacement.
+    noise_floor : of the error of any model. gain : base minus extended, with its 95 % interval from blocks drawn with
+    replacement. avoidable : the part of the base model's error above the noise, its share as a share of power.
     """
-
-    side: str
-    joint: int
-    noise: float
-    base: float
-    extended: float
-    gain: float
-    interval_95: tuple[float, float]
-
-    @property
-    def avoidable(self) -> float:
-        """The part of the base model's error above the noise [Nm]."""
-        return math.sqrt(max(0.0, self.base**2 - self.noise**2))
-
-    @property
-    def avoidable_share(self) -> float:
-        """Share of the error's power above the noise."""
-        return self.avoidable**2 / self.base**2 if self.base > 0.0 else 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain content."""
-        return {
-            "side": self.side,
-            "joint": self.joint,
-            "noise_floor": self.noise,
-            "test_rms_base": self.base,
-            "test_rms_extended": self.extended,
-            "gain": self.gain,
-            "gain_interval_95": list(self.interval_95),
-            "avoidable": self.avoidable,
-            "avoidable_share": self.avoidable_share,
-        }
-
-
-@dataclass(frozen=True)
-class Moved:
-    """A base parameter with an error in the base model: it had absorbed a finding."""
-
-    name: str
-    unit: str
-    base: float
-    extended: float
-    std: float
-
-    @property
-    def sigmas(self) -> float:
-        """The change in standard deviations of the extended estimate."""
-        return (self.extended - self.base) / self.std if self.std > 0.0 else 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain content."""
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "base": self.base,
-            "extended": self.extended,
-            "std": self.std,
-            "change_in_std": self.sigmas,
-        }
-
-
-def row_gains(diagnosis: Diagnosis) -> tuple[RowGain, ...]:
-    """One for each joint and side with held-out rows."""
     found = []
     for side, base in diagnosis.residuals.get("base", {}).items():
         block = {side: diagnosis.states[side].block}
@@ -125,38 +60,46 @@ def row_gains(diagnosis: Diagnosis) -> tuple[RowGain, ...]:
         for joint in np.flatnonzero(np.isfinite(base).any(axis=0)).tolist():
             rms_base, rms_extended, low, high = interval(before, after, [(side, joint)], _SEED)
             noise = float(diagnosis.noise_floor[side][joint])
-            gain = rms_base - rms_extended
-            found.append(RowGain(side, joint + 1, noise, rms_base, rms_extended, gain, (low, high)))
-    return tuple(found)
+            avoidable = math.sqrt(max(0.0, rms_base**2 - noise**2))
+            found.append(
+                {
+                    "side": side,
+                    "joint": joint + 1,
+                    "noise_floor": noise,
+                    "test_rms_base": rms_base,
+                    "test_rms_extended": rms_extended,
+                    "gain": rms_base - rms_extended,
+                    "gain_interval_95": [low, high],
+                    "avoidable": avoidable,
+                    "avoidable_share": avoidable**2 / rms_base**2 if rms_base > 0.0 else 0.0,
+                }
+            )
+    return found
 
 
-def moved_parameters(diagnosis: Diagnosis) -> tuple[Moved, ...]:
-    """Base parameters moved by more than two standard deviations by the extension, the furthest first."""
+def moved_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Base parameters moved by the extension by more than two standard deviations, the furthest first: plain content.
+
+    They had absorbed the findings. change_in_std : in standard deviations of the extended estimate.
+    """
     base, extended = diagnosis.base_model, diagnosis.extended_model
     std = extended.std
     if std is None or not diagnosis.findings:
-        return ()
+        return []
     units = dict(zip(extended.names, extended.units, strict=True))
-    spread = dict(zip(extended.names, std, strict=True))
-    found = [
-        Moved(name, units[name], base.value(name), extended.value(name), float(spread[name]))
-        for name in diagnosis.changes
-    ]
-    return tuple(sorted(found, key=lambda moved: -abs(moved.sigmas)))
+    spread = dict(zip(extended.names, map(float, std), strict=True))
+    found: list[dict[str, Any]] = []
+    for name in diagnosis.changes:
+        before, after, deviation = base.value(name), extended.value(name), spread[name]
+        entry = {"name": name, "unit": units[name], "base": before, "extended": after, "std": deviation}
+        found.append({**entry, "change_in_std": (after - before) / deviation if deviation > 0.0 else 0.0})
+    return sorted(found, key=lambda entry: -abs(entry["change_in_std"]))
 
 
 @dataclass(frozen=True, eq=False)
-class SideResiduals:
-    """Rows of one side, (m,) or (m, n): time in the session [s], number of the session, block, joints' position
-    [rad], speed [rad/s] and load [Nm], residual of base and extended model [Nm], NaN in unused rows.
-    """
+class SideResiduals(RowStates):
+    """Rows of one side with the residual (m, n) of base and extended model [Nm], NaN in unused rows."""
 
-    time: Floats
-    session: Floats
-    block: Floats
-    position: Floats
-    speed: Floats
-    load: Floats
     base: Floats
     extended: Floats
 
@@ -179,14 +122,7 @@ class Residuals:
         for side, base in diagnosis.residuals.get("base", {}).items():
             state, extended = diagnosis.states[side], diagnosis.residuals["extended"][side]
             sides[side] = SideResiduals(
-                state.time,
-                state.session.astype(float),
-                state.block,
-                state.position,
-                state.speed,
-                state.load,
-                base,
-                extended if extended.shape == base.shape else base,
+                **vars(state), base=base, extended=extended if extended.shape == base.shape else base
             )
         ratio = np.ones(len(names)) if gear_ratio is None else np.asarray(gear_ratio, dtype=float)
         return cls(names, tuple(sessions), ratio, sides, bool(diagnosis.findings))

@@ -6,11 +6,11 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,23 +25,19 @@ from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from lwr_driver.arm import JOINTS, Arm
 from lwr_driver.session import Session
+from runner.diagnosis.discriminating import Discriminating, foresee
 from runner.diagnosis.records import (
     LOOK_ALIKES,
     REPLAY,
     RESIDUALS,
-    Moved,
     ReplayErrors,
     Residuals,
-    RowGain,
     moved_parameters,
     row_gains,
     write_look_alikes,
 )
 from runner.estimation import couplings
 from runner.replay import Replay
-
-if TYPE_CHECKING:
-    from runner.diagnosis.discriminating import Discriminating
 
 __all__ = [
     "DETAILS",
@@ -85,8 +81,8 @@ class Study:
     """
 
     diagnosis: Diagnosis
-    gains: tuple[RowGain, ...]
-    moved: tuple[Moved, ...]
+    gains: Sequence[Mapping[str, Any]]
+    moved: Sequence[Mapping[str, Any]]
     notes: tuple[str, ...]
     residuals: Residuals
     sessions: tuple[str, ...]
@@ -103,19 +99,10 @@ class Study:
 
     def with_offers(self, offers: Sequence[Discriminating]) -> Study:
         """The same with discriminating experiments and their expected effect."""
-        from runner.diagnosis.discriminating import foresee
-
         pairs, given = self.pairs, self.material
         if offers and pairs and given is not None:
-            pairs = foresee(
-                pairs,
-                self.diagnosis,
-                given.sessions,
-                given.chain,
-                offers,
-                arm=given.arm,
-                reference=given.reference,
-            )
+            inputs = (given.sessions, given.chain, offers, given.arm, given.reference)
+            pairs = foresee(pairs, self.diagnosis, *inputs)
         return replace(self, offers=tuple(offers), pairs=pairs)
 
     def details(self) -> dict[str, Any]:
@@ -126,8 +113,8 @@ class Study:
             "joints": list(self.residuals.joint_names),
             "reference": self.referenced,
             "sure": self.sure,
-            "rows": [gain.to_dict() for gain in self.gains],
-            "base_parameters": [moved.to_dict() for moved in self.moved],
+            "rows": list(self.gains),
+            "base_parameters": list(self.moved),
             "notes": list(self.notes),
             "look_alikes": [pair.to_dict() for pair in self.pairs],
             "deciding_motions": [offer.to_dict() for offer in self.offers],
@@ -196,15 +183,10 @@ def study(
     replay = None
     if simulate and arm is not None:
         replay = Replay(_as_stiff(arm, healthy), everything)
+    logs, held_out = list(sessions), list(test)
     with _unadvised():
         found = diagnose(
-            list(sessions),
-            chain,
-            test=list(test),
-            arm=data,
-            model=model,
-            reference=healthy,
-            simulate=replay,
+            logs, chain, test=held_out, arm=data, model=model, reference=healthy, simulate=replay
         )
         pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
     notes = [*found.notes, *_little(found, everything)]

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from ident.diagnosis.look_alikes import LookAlikes, Trace
+from ident.diagnosis.statements import REPLAYED
 from ident.effects import Parameters, find_effect
 from ident.effects.words import joints_text, spoken
-from runner.diagnosis.records import QUANTITIES, ReplayErrors, Residuals, SideResiduals
+from runner.diagnosis.records import ReplayErrors, Residuals, SideResiduals
 from runner.report.figures import bin_means
-from runner.report.plot import Band, Figure, Line, Mark, Panel, Points
+from runner.report.plot import Band, Figure, Line, Mark, Panel, Points, Role
 from runner.report.thinning import thin
 
 __all__ = ["AGAINST", "finding_figure", "look_alike_figure", "replay_figures", "residual_figures"]
@@ -37,18 +38,20 @@ _WINDOW_S = 8.0
 _MEAN_S = 0.25
 _FEW = 60
 _BOTH_WAYS = 0.15
-_NEITHER = "measured minus the model without either"
-_REPLAYED = {
-    "position": ("position", "mrad", 1e3),
-    "motor": ("motor torque", "Nm", 1.0),
-    "joint": ("joint torque", "Nm", 1.0),
-}
+_MODELS: tuple[tuple[Role, str], ...] = (("backward", "base model"), ("forward", "extended model"))
 
 
 def residual_figures(residuals: Residuals, side: str) -> list[Figure]:
     """One figure a quantity, one panel a joint."""
-    rows = residuals.sides[side]
-    return [_figure(residuals, rows, side, against) for against in AGAINST]
+    joints = np.flatnonzero(np.isfinite(residuals.sides[side].base).any(axis=0)).tolist()
+    return [
+        Figure(
+            f"residual-{side}-{against.replace(' ', '-')}",
+            f"Held-out residual of the {side} torque against {against}",
+            tuple(_panel(residuals, side, joint, against) for joint in joints),
+        )
+        for against in AGAINST
+    ]
 
 
 def finding_figure(
@@ -64,44 +67,32 @@ def finding_figure(
     joints : from 1, none for the whole arm. parameters : of the finding. others : joints of other findings, unclear
     about a cause of the whole arm. None without residuals to show.
     """
-    seen = {"motor": ("motor",), "sensor": ("joint",)}.get(side, ("motor", "joint"))
     effect = find_effect(cause)
+    seen = {"motor": ("motor",), "sensor": ("joint",)}.get(side, ("motor", "joint"))
     if effect.channel == "motor":
         seen = ("motor",)
     fall: dict[tuple[str, int], float] = {}
-    for name in seen:
-        rows = residuals.sides.get(name)
-        for joint in range(len(residuals.joint_names)) if rows is not None else ():
-            assert rows is not None
-            base, extended = rows.base[:, joint], rows.extended[:, joint]
-            if np.isfinite(base).any() and (not joints or joint + 1 in joints):
-                fall[name, joint] = 1.0 - float(np.nanmean(extended**2) / np.nanmean(base**2))
+    for name in (name for name in seen if name in residuals.sides):
+        rows = residuals.sides[name]
+        for joint in np.flatnonzero(np.isfinite(rows.base).any(axis=0)).tolist():
+            if not joints or joint + 1 in joints:
+                power = [np.nanmean(part[:, joint] ** 2) for part in (rows.extended, rows.base)]
+                fall[name, joint] = 1.0 - float(power[0] / power[1])
     clear = {key: value for key, value in fall.items() if key[1] + 1 not in others}
     if not joints and clear:
         fall = clear
-    panels = []
-    for name, joint in sorted(fall, key=lambda key: -fall[key])[:_PLACES]:
-        for against in dict.fromkeys((effect.variable(parameters), "time")):
-            panels.append(_panel(residuals, residuals.sides[name], name, joint, against, with_side=True))
+    panels = [
+        _panel(residuals, name, joint, against, with_side=True)
+        for name, joint in sorted(fall, key=lambda key: -fall[key])[:_PLACES]
+        for against in dict.fromkeys((effect.variable(parameters), "time"))
+    ]
     where = "-".join(map(str, joints)) or "arm"
     caption = f"Where {spoken(cause)} shows"
     return Figure(f"finding-{cause}-{where}", caption, tuple(panels)) if panels else None
 
 
-def _figure(residuals: Residuals, rows: SideResiduals, side: str, against: str) -> Figure:
-    panels = [
-        _panel(residuals, rows, side, joint, against)
-        for joint in range(len(residuals.joint_names))
-        if np.isfinite(rows.base[:, joint]).any()
-    ]
-    caption = f"Held-out residual of the {side} torque against {against}"
-    return Figure(f"residual-{side}-{against.replace(' ', '-')}", caption, tuple(panels))
-
-
-def _panel(
-    residuals: Residuals, rows: SideResiduals, side: str, joint: int, against: str, *, with_side: bool = False
-) -> Panel:
-    name = residuals.joint_names[joint]
+def _panel(residuals: Residuals, side: str, joint: int, against: str, *, with_side: bool = False) -> Panel:
+    name, rows = residuals.joint_names[joint], residuals.sides[side]
     used = np.isfinite(rows.base[:, joint])
     rms = [float(np.sqrt(np.nanmean(part[used, joint] ** 2))) for part in (rows.base, rows.extended)]
     note = f"{rms[0]:.3g} Nm rms" + (f", extended {rms[1]:.3g}" if residuals.named else "")
@@ -117,21 +108,23 @@ def _panel(
 
 
 def _abscissa(residuals: Residuals, rows: SideResiduals, joint: int, against: str) -> Floats:
-    if against == "position":
-        return rows.position[:, joint]
-    if against == "velocity":
-        return rows.speed[:, joint]
-    if against == "load":
-        return rows.load[:, joint]
+    if against in ("position", "velocity", "load"):
+        return {"position": rows.position, "velocity": rows.speed, "load": rows.load}[against][:, joint]
     turns = rows.position[:, joint] * residuals.gear_ratio[joint] / (2.0 * np.pi)
     return np.asarray(turns - np.floor(turns))
 
 
-def _models(residuals: Residuals, rows: SideResiduals, joint: int) -> list[tuple[str, str, Floats]]:
-    found = [("backward", "base model", rows.base[:, joint])]
-    if residuals.named:
-        found.append(("forward", "extended model", rows.extended[:, joint]))
-    return found
+def _models(residuals: Residuals, rows: SideResiduals, joint: int) -> list[tuple[Role, str, Floats]]:
+    shown = zip(_MODELS, (rows.base, rows.extended)[: 1 + residuals.named], strict=False)
+    return [(role, label, part[:, joint]) for (role, label), part in shown]
+
+
+def _means(role: Role, label: str, x: Floats, values: Floats) -> list[Mark]:
+    """Means in bins of x, with the spread of the base model."""
+    centre, mean, low, high = bin_means(x, values)
+    line = Line(role, f"{label}, mean", centre, mean)
+    spread = Band("spread", "5 to 95 % of the rows, base model", centre, low, high)
+    return [spread, line] if role == "backward" else [line]
 
 
 def _binned_marks(residuals: Residuals, rows: SideResiduals, joint: int, against: str) -> list[Mark]:
@@ -139,12 +132,8 @@ def _binned_marks(residuals: Residuals, rows: SideResiduals, joint: int, against
     x = _abscissa(residuals, rows, joint, against)
     for role, label, values in _models(residuals, rows, joint):
         good = np.isfinite(values) & np.isfinite(x)
-        if np.count_nonzero(good) < 10 or np.ptp(x[good]) <= 0.0:
-            continue
-        centre, mean, low, high = bin_means(x[good], values[good])
-        if role == "backward":
-            marks.append(Band("spread", "5 to 95 % of the rows, base model", centre, low, high))
-        marks.append(Line(role, f"{label}, mean", centre, mean))  # type: ignore[arg-type]
+        if np.count_nonzero(good) >= 10 and np.ptp(x[good]) > 0.0:
+            marks += _means(role, label, x[good], values[good])
     return marks
 
 
@@ -158,10 +147,7 @@ def _time_marks(residuals: Residuals, rows: SideResiduals, joint: int, against: 
             if np.count_nonzero(mine) < 10:
                 continue
             time = rows.time[mine]
-            centre, mean, low, high = bin_means(time - time[0] + offset, values[mine])
-            if role == "backward":
-                marks.append(Band("spread", "5 to 95 % of the rows, base model", centre, low, high))
-            marks.append(Line(role, f"{label}, mean", centre, mean))  # type: ignore[arg-type]
+            marks += _means(role, label, time - time[0] + offset, values[mine])
             offset += float(time[-1] - time[0]) + _GAP_S
     return marks
 
@@ -180,9 +166,8 @@ def _order_marks(residuals: Residuals, rows: SideResiduals, joint: int, against:
             means.append(float(np.mean(mine)))
             bars.append((means[-1] - spread, means[-1] + spread))
         if places:
-            marks.append(
-                Points(role, f"{label}, mean of a block", np.array(places), np.array(means), np.array(bars))  # type: ignore[arg-type]
-            )
+            x, y = np.array(places), np.array(means)
+            marks.append(Points(role, f"{label}, mean of a block", x, y, np.array(bars)))
     return marks
 
 
@@ -213,6 +198,14 @@ def _place(trace: Trace, names: Sequence[str]) -> str:
     return f"{names[trace.joint - 1]}, {trace.side} torque"
 
 
+def _lines(trace: Trace, labels: Sequence[str]) -> list[tuple[Role, str, Floats]]:
+    return [
+        ("error", "measured minus the model without either", trace.measured),
+        ("forward", labels[0], trace.first),
+        ("backward", labels[1], trace.second),
+    ]
+
+
 def _over_time(pair: LookAlikes, trace: Trace, labels: Sequence[str], names: Sequence[str]) -> Panel:
     """The seconds of the largest torques."""
     session, begin = _busiest(trace)
@@ -220,23 +213,15 @@ def _over_time(pair: LookAlikes, trace: Trace, labels: Sequence[str], names: Seq
     x = trace.time[inside]
     # Noise of single rows would hide the comparison.
     rows = max(1, round(_MEAN_S / float(np.median(np.diff(x))))) if len(x) > 2 else 1
-    smooth = uniform_filter1d(trace.measured[inside], rows)
-    marks: tuple[Mark, ...] = (
-        Line("error", _NEITHER, *thin(x, smooth, _POINTS)),
-        Line("forward", labels[0], *thin(x, trace.first[inside], _POINTS)),
-        Line("backward", labels[1], *thin(x, trace.second[inside], _POINTS)),
-    )
+    marks = []
+    for role, label, values in _lines(trace, labels):
+        shown = uniform_filter1d(values[inside], rows) if role == "error" else values[inside]
+        marks.append(Line(role, label, *thin(x, shown, _POINTS)))
     number = int(session)
     where = pair.sessions[number] if number < len(pair.sessions) else f"session {number + 1}"
     alt = f"{_shares(pair, trace, labels)} Over {_WINDOW_S:.0f} s of {where}, {_place(trace, names)}."
-    return Panel(
-        _place(trace, names),
-        "time [s]" if rows == 1 else f"time [s], measured as means of {_MEAN_S} s",
-        "left by each [Nm]",
-        marks,
-        alt,
-        where,
-    )
+    axis = "time [s]" if rows == 1 else f"time [s], measured as means of {_MEAN_S} s"
+    return Panel(_place(trace, names), axis, "left by each [Nm]", tuple(marks), alt, where)
 
 
 def _busiest(trace: Trace) -> tuple[float, float]:
@@ -256,38 +241,25 @@ def _against(
     pair: LookAlikes, trace: Trace, variable: str, labels: Sequence[str], names: Sequence[str]
 ) -> list[Panel]:
     """Means in bins of the variable, by direction of motion if the causes depend on it."""
-    x = {
-        "position": trace.position,
-        "velocity": trace.velocity,
-        "load": trace.load,
-        "motor angle": trace.motor_angle,
-    }[variable]
+    x = getattr(trace, variable.replace(" ", "_"))
     up = trace.velocity > 0.0
-    everywhere = np.ones(len(x), dtype=bool)
-    ways = [("", everywhere)]
+    ways = [("", np.ones(len(x), dtype=bool))]
     if variable != "velocity" and min(up.sum(), (~up).sum()) > _FEW and _differs(trace, x, up):
-        ways = [("moving up", up), ("moving down", ~up)]
+        ways = [(", moving up", up), (", moving down", ~up)]
+    axis, joints = _LABELS[variable], pair.first[1] or pair.second[1]
+    if joints:
+        axis = axis.replace("position", f"position of {names[joints[0] - 1]}")
     found = []
     for way, mine in ways:
         if np.count_nonzero(mine) < _FEW or np.ptp(x[mine]) <= 0.0:
             continue
-        marks: list[Mark] = []
-        for role, label, values in (
-            ("error", _NEITHER, trace.measured),
-            ("forward", labels[0], trace.first),
-            ("backward", labels[1], trace.second),
-        ):
-            centre, mean, _, _ = bin_means(x[mine], values[mine])
-            marks.append(Line(role, label, centre, mean))  # type: ignore[arg-type]
-        joints = pair.first[1] or pair.second[1]
-        label = (
-            _LABELS[variable].replace("position", f"position of {names[joints[0] - 1]}")
-            if joints
-            else _LABELS[variable]
-        )
-        alt = f"{_shares(pair, trace, labels)} Against {variable}, {_place(trace, names)}{', ' * bool(way)}{way}."
-        note = f"against {variable}{', ' * bool(way)}{way}"
-        found.append(Panel(_place(trace, names), label, "left by each [Nm]", tuple(marks), alt, note))
+        marks = [
+            Line(role, label, *bin_means(x[mine], values[mine])[:2])
+            for role, label, values in _lines(trace, labels)
+        ]
+        alt = f"{_shares(pair, trace, labels)} Against {variable}, {_place(trace, names)}{way}."
+        note = f"against {variable}{way}"
+        found.append(Panel(_place(trace, names), axis, "left by each [Nm]", tuple(marks), alt, note))
     return found
 
 
@@ -317,29 +289,24 @@ def _shares(pair: LookAlikes, trace: Trace, labels: Sequence[str]) -> str:
 def replay_figures(replayed: ReplayErrors, names: Sequence[str]) -> list[Figure]:
     """One figure for position, motor and joint torque, one panel a joint."""
     figures = []
-    for quantity in QUANTITIES:
-        base = replayed.errors.get(("base", quantity))
-        if base is None:
+    for quantity, label, unit, scale in REPLAYED:
+        errors = [
+            (role, said, scale * replayed.errors[model, quantity])
+            for model, (role, said) in zip(("base", "extended"), _MODELS, strict=True)
+            if (model, quantity) in replayed.errors
+        ]
+        if ("base", quantity) not in replayed.errors:
             continue
-        label, unit, scale = _REPLAYED[quantity]
         panels = []
         for joint, name in enumerate(names):
-            marks: list[Mark] = []
-            rms = []
-            for model, role, said in (
-                ("base", "backward", "base model"),
-                ("extended", "forward", "extended model"),
-            ):
-                error = replayed.errors.get((model, quantity))
-                if error is None:
-                    continue
-                values = scale * error[:, joint]
-                time = np.linspace(0.0, replayed.duration_s, len(values))
-                marks.append(Line(role, said, *thin(time, values, _POINTS)))  # type: ignore[arg-type]
-                rms.append(float(np.sqrt(np.nanmean(values**2))))
+            lines, rms = [], []
+            for role, said, error in errors:
+                time = np.linspace(0.0, replayed.duration_s, len(error))
+                lines.append(Line(role, said, *thin(time, error[:, joint], _POINTS)))
+                rms.append(float(np.sqrt(np.nanmean(error[:, joint] ** 2))))
             note = f"{rms[0]:.3g} {unit} rms" + (f", extended {rms[1]:.3g}" if len(rms) > 1 else "")
             alt = f"Measured minus simulated {label} of {name} over time, {replayed.session}: {note}."
-            panels.append(Panel(name, "time [s]", f"error [{unit}]", tuple(marks), alt, note))
+            panels.append(Panel(name, "time [s]", f"error [{unit}]", tuple(lines), alt, note))
         caption = f"Measured minus simulated {label}, {replayed.session}"
         figures.append(Figure(f"replay-{quantity}", caption, tuple(panels)))
     return figures

@@ -20,7 +20,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session
 from runner.cli import main
-from runner.commissioning import record_sets
+from runner.commands.commission import record_sets
 from runner.diagnosis import Study, after_run
 from runner.diagnosis.after_run import conclude_run
 from runner.diagnosis.records import QUANTITIES, ReplayErrors, Residuals
