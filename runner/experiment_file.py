@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from fri.errors import ConfigurationError
 from fri.handshake import find_handshake
+from ident.diagnosis.statements import SURE
 from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session.motor_torque import KrlMotorTorque
@@ -170,10 +171,10 @@ class DiagnosisPlan:
 
     run: bool = True
     reference: str | None = None
-    sure: float = 0.8
+    sure: float = SURE
 
     def __post_init__(self) -> None:
-        _require(0.5 <= self.sure < 1.0, f"sure {self.sure} is outside 0.5 to 1; 0.8 is usual")
+        _require(0.5 <= self.sure < 1.0, f"sure {self.sure} is outside 0.5 to 1; {SURE} is usual")
 
 
 @dataclass(frozen=True)

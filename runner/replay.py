@@ -1,9 +1,9 @@
-"""Simulation of a session with a model: the same commands to the emulated arm, measured against simulated.
+"""Replay of a session in simulation: the same commands to the emulated arm with a model, measured minus simulated.
 
-The arm is the emulator's plant with the model's links, drives and effects and with joints as stiff as the
-arm's description says, under the emulator's position controller, which is told the announced load; the sensors
-are without noise. It runs in this process, some ten times faster than the session did. The controller of a real
-arm is another one, so its error of position counts for comparing models, not by itself.
+The arm is the emulator's plant with the links, drives and effects of the model and the joint stiffness of the arm's
+description. The emulator's position controller gets the announced load; the sensors are without noise. The replay
+runs in this process, about ten times faster than the session. A real arm has another controller, so the position
+error serves only to compare models.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sim_backend.model_arm import arm_of, is_possible, model_effects
 from sim_backend.plant import CYCLE_S, ElasticArm, Reading
 from sim_backend.robot import chain, robot_file, true_arm
 
-__all__ = ["Replay", "Replayed", "replay"]
+__all__ = ["Replay", "Replayed", "attached_experiment", "replay"]
 
 Floats = NDArray[np.float64]
 
@@ -46,11 +46,11 @@ _LATEST_S = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """Measured less simulated, in means over 20 ms: position (m, n) [rad], motor and joint torque [Nm].
+    """Measured minus simulated, in means over 20 ms: position (m, n) [rad], motor and joint torque [Nm].
 
-    delay_s : how much later than logged the commands acted, as the positions tell.
-    commanded : whether the log has commands; otherwise the measured positions were commanded. exact : whether
-    the model itself was simulated, or the nearest one of an arm that can exist. duration_s : of what was simulated.
+    delay_s : of the commands against their log, estimated from the positions. commanded : whether the log has
+    commands; otherwise the measured positions were commanded. exact : whether the model itself was simulated, or the
+    nearest physically possible one. duration_s : of the simulation.
     """
 
     position: Floats
@@ -65,9 +65,9 @@ class Replayed:
 class Replay:
     """Replays sessions of `arm`; call it with a model and sessions.
 
-    sessions : all of the diagnosis, so that each has its number in their order. longest_s : of each session
-    that is simulated, where no effect belongs to a later moment. config : emulator whose controller holds the
-    arm. first : of each call, the first session that could be replayed, and its replay.
+    sessions : all of the diagnosis, for their numbers. longest_s : longest simulated part of a session, extended for
+    an effect at a later moment. config : emulator with the controller. first : by call, the first replayed session
+    and its replay.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Replay:
         self.first: list[tuple[str, Replayed]] = []
 
     def __call__(self, model: DynamicModel, sessions: Sequence[Session]) -> SimulationError | None:
-        """Error over all sessions; None where none can be simulated."""
+        """Error over all sessions; None if none can be simulated."""
         squares, count = np.zeros((3, len(self.arm.joint_names))), np.zeros(3)
         for session in sessions:
             name = session.path.name
@@ -126,18 +126,17 @@ class Replay:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What could not be simulated and why, and what was simulated otherwise, a sentence each."""
+        """Sessions left out and reasons, and other limits of the replay, a sentence each."""
         found = [f"no simulation of {', '.join(names)}: {reason}" for reason, names in self._failed.items()]
         if self._uncommanded:
             found.append(
                 f"{', '.join(self._uncommanded)}: no commands in the log, so the simulated arm followed the measured "
-                "positions; the simulated position says how well the controller holds a path, not how the arm "
-                "answered"
+                "positions; the position error shows the tracking of the controller, not the response of the arm"
             )
         if self._stood_in:
             found.append(
-                f"replay of {', '.join(self._stood_in)}: no arm that can exist has the estimated inertias, so the "
-                "nearest one was simulated; a motion that excites more would tell them better"
+                f"replay of {', '.join(self._stood_in)}: the estimated inertias are physically impossible, so the "
+                "nearest possible arm was simulated; a more exciting motion would improve the estimate"
             )
         return tuple(found)
 
@@ -154,8 +153,8 @@ def replay(
 ) -> Replayed:
     """Simulate a session from the beginning of its excitation.
 
-    number : of the session among those of the diagnosis, from 0. delay_s : of the commands; None: as the
-    positions of a first simulation tell. Raises DataError for a model that no arm can have.
+    number : of the session in the diagnosis, from 0. delay_s : of the commands; None: estimated from the positions of
+    a first simulation. Raises DataError for a model of no possible arm.
     """
     chosen = session.select(model.structure.chain.joint_names)
     source = chosen.command if chosen.command is not None and len(chosen.command) else None
@@ -170,7 +169,9 @@ def replay(
     stop = min(stop, start + int(max(longest_s, latest + longest_s / 2.0) * 1e9))
     grid = np.arange(start, stop, int(CYCLE_S * 1e9))
     if len(grid) < 2 * _BIN:
-        raise DataError("less than a moment of it has both commands and positions")
+        raise DataError(
+            f"commands and positions overlap for less than {2 * _BIN * CYCLE_S:g} s; record a longer session"
+        )
     bench = _Bench(model, chosen, arm, config, number, begin_s=(start - chosen.start) * 1e-9)
     measured = _resampled(joint.log_time, joint.position, grid)
     if source is None:
@@ -218,10 +219,8 @@ class _Bench:
     ) -> None:
         payload = session.metadata.get("payload", "none").strip()
         known = payload if payload in model.structure.payloads else None
-        stiffness, damping = (
-            np.asarray(arm.stiffness, dtype=float),
-            np.array(config.robot.damping, dtype=float),
-        )
+        stiffness = np.asarray(arm.stiffness, dtype=float)
+        damping = np.array(config.robot.damping, dtype=float)
         if len(stiffness) != model.structure.chain.n or len(damping) != len(stiffness):
             raise DataError(
                 f"the simulated arm has {len(damping)} joints, the model {model.structure.chain.n}; "
@@ -243,7 +242,7 @@ class _Bench:
         self.load = _announced_load(session)
 
     def run(self, wanted: Floats) -> tuple[Floats, Floats, Floats]:
-        """Position, motor and joint torque (N, n) as noiseless sensors report them, for set points (N, n)."""
+        """Noiseless position, motor and joint torque (N, n) for set points (N, n)."""
         config = self.config
         effects = model_effects(self.model, session=self.number, begin_s=self.begin_s)
         plant = ElasticArm(self.links, self.drive, substeps=config.robot.substeps, effects=effects)
@@ -273,12 +272,12 @@ class _Bench:
                 out[0, k], out[1, k], out[2, k] = reading.position, reading.motor_torque, reading.joint_torque
             plant.step(torque)
             if not np.all(np.isfinite(plant.position)):
-                raise DataError("the simulated arm became unstable; the parameters belong to no real arm")
+                raise DataError("the simulated arm became unstable; the parameters are physically impossible")
         return out[0], out[1], out[2]
 
 
 def _events(model: DynamicModel, number: int | None) -> list[dict[str, Any]]:
-    """Entries of effects that belong to a moment of this session."""
+    """Entries of effects at a moment of this session."""
     found = []
     for entry in model.effects:
         parameters = entry["parameters"]
@@ -289,21 +288,25 @@ def _events(model: DynamicModel, number: int | None) -> list[dict[str, Any]]:
     return found
 
 
+def attached_experiment(session: Session) -> Experiment | None:
+    """The experiment of a session, from the file in its log; None without a readable one."""
+    text = session.attachments.get("experiment.yaml")
+    try:
+        return None if text is None else parse(Experiment, yaml.safe_load(text), "experiment.yaml")
+    except (ConfigurationError, yaml.YAMLError) as error:
+        logging.getLogger(__name__).info("%s: %s", session.path.name, error)
+        return None
+
+
 def _announced_load(session: Session) -> LoadData:
-    """The load data that the controller was given, from the experiment file in the log; else the mass alone."""
+    """The load data given to the controller, from the experiment file in the log; else the mass alone."""
     payload = session.metadata.get("payload", "none").strip()
     if payload in ("", "none"):
         return LoadData()
-    text = session.attachments.get("experiment.yaml")
-    if text is not None:
-        try:
-            content = yaml.safe_load(text)
-            announced = parse(Experiment, content, "experiment.yaml").payloads().get(payload)
-        except (ConfigurationError, yaml.YAMLError) as error:
-            logging.getLogger(__name__).info("%s: %s", session.path.name, error)
-            announced = None
-        if announced is not None:
-            return LoadData(announced.mass, announced.com, announced.inertia)
+    experiment = attached_experiment(session)
+    announced = None if experiment is None else experiment.payloads().get(payload)
+    if announced is not None:
+        return LoadData(announced.mass, announced.com, announced.inertia)
     return LoadData(float(session.metadata.get("payload_mass", 0.0) or 0.0))
 
 
@@ -316,7 +319,7 @@ def _delay(measured: Floats, simulated: Floats) -> float:
 
 
 def _late(wanted: Floats, delay_s: float) -> Floats:
-    """Set points (N, n) that act `delay_s` later."""
+    """Set points (N, n), `delay_s` later."""
     if delay_s <= 0.0:
         return wanted
     at = np.arange(len(wanted)) * CYCLE_S
@@ -324,7 +327,7 @@ def _late(wanted: Floats, delay_s: float) -> Floats:
 
 
 def _smooth(times: NDArray[np.int64], position: Floats, grid: NDArray[np.int64]) -> Floats:
-    """Measured positions as a path (N, n) that a controller can follow."""
+    """Measured positions as a smooth path (N, n) for the controller."""
     here = (times - times[0]) * 1e-9
     step = float(np.median(np.diff(here)))
     even = np.arange(0.0, here[-1], step)

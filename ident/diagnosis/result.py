@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.diagnosis.evidence import Floats
+from ident.diagnosis.statements import Statements, finding_statement, statements
 from ident.model import DynamicModel
 
 __all__ = [
@@ -101,19 +102,7 @@ class Finding:
         return content
 
     def __str__(self) -> str:
-        where = f"joint {self.joints[0]}" if self.joints else "whole arm"
-        values = ", ".join(f"{name} {_short(v.value, v.std)} {v.unit}" for name, v in self.parameters.items())
-        e = self.evidence
-        doubt = ""
-        if self.alternatives:
-            other = self.alternatives[0]
-            place = f" joint {other[1][0]}" if other[1] else ""
-            doubt = f"\n      or {other[0]}{place}; to decide: {self.tell_apart}"
-        return (
-            f"  {self.cause} ({self.side} side, {where}), confidence {self.confidence:.2f}\n"
-            f"      {values}\n"
-            f"      error on held-out rows {e.test_rms_before:.4g} -> {e.test_rms_after:.4g} Nm{doubt}"
-        )
+        return "\n".join(finding_statement(1, self.to_dict(), ()).lines())
 
 
 @dataclass(frozen=True)
@@ -156,7 +145,7 @@ class RowStates:
     load: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
     """Result of a diagnosis; prints itself.
 
@@ -220,34 +209,16 @@ class Diagnosis:
             "model": "model_extended.yaml",
         }
 
+    def statements(self) -> Statements:
+        """The diagnosis in words."""
+        names = self.base_model.structure.chain.joint_names
+        return statements(self.to_dict(), {"notes": self.notes}, names)
+
     def __str__(self) -> str:
-        lines = [f"Diagnosis of {', '.join(self.train)}"]
-        lines.append("  held-out sessions: " + (", ".join(self.test) or "none, parts of the motion in turn"))
-        if not self.findings and not self.unexplained:
-            lines.append("Nothing is wrong that these data could show.")
-        if self.findings:
-            lines.append(f"{len(self.findings)} finding{'s' if len(self.findings) > 1 else ''}:")
-            lines += [str(finding) for finding in self.findings]
-        for u in self.unexplained[:6]:
-            lines.append(
-                f"  unexplained: {u.side} torque of joint {u.joint} depends on {', '.join(u.depends_on)} "
-                f"({u.test_rms:.4g} Nm, noise {u.noise_floor:.4g} Nm)"
-            )
-        lines.append("Error on held-out rows [Nm]: noise floor, base model, extended model")
-        for side, values in self.rms_base.items():
-            for label, row in (
-                ("noise", self.noise_floor.get(side)),
-                ("base", values),
-                ("extended", self.rms_extended.get(side)),
-            ):
-                if row is not None:
-                    lines.append(f"  {side:<6}{label:<10}" + "".join(f"{v:>9.4f}" for v in row))
-        for label, error in (("base", self.simulation_base), ("extended", self.simulation_extended)):
-            if error is not None:
-                cells = "".join(f"{1e3 * v:>9.3f}" for v in error.position)
-                lines.append(f"  simulated position {label:<9} mrad" + cells)
-        lines += [f"note: {note}" for note in self.notes]
-        return "\n".join(lines)
+        return self.statements().text()
+
+    def __repr__(self) -> str:
+        return self.statements().brief()
 
 
 def _sides(table: Mapping[str, Floats]) -> dict[str, Any]:
@@ -258,7 +229,3 @@ def _plain(values: Floats | None) -> list[float | None] | None:
     if values is None:
         return None
     return [float(v) if math.isfinite(v) else None for v in np.asarray(values, dtype=float)]
-
-
-def _short(value: float, std: float) -> str:
-    return f"{value:.4g}" + (f" ± {std:.2g}" if std > 0.0 else "")

@@ -1,4 +1,4 @@
-"""`lwr-run commission`: the healthy arm, for later diagnoses to be held against."""
+"""`lwr-run commission`: a healthy-arm baseline for later diagnoses."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from runner.terminal import coupling_option, gear_ratio_option, json_option, to_
 
 if TYPE_CHECKING:
     from ident.diagnosis import Reference
+    from runner.experiment_file import Experiment
 
-__all__ = ["command"]
+__all__ = ["command", "record_sets"]
 
 _RECORDED_SETS = 3
 _LOUDEST = 5
+_FIRST_SEED = 1001
+"""Seed of the emulator's noise in the first set; other runs begin at 1, so no noise comes twice."""
 
 
 @click.command("commission")
@@ -27,7 +30,7 @@ _LOUDEST = 5
 @click.option(
     "--sets",
     type=click.IntRange(1),
-    help="Number of sets: to record (default 3), or that SESSIONS are made of, in their order (default 1).",
+    help="Number of sets: to record (default 3), or in SESSIONS, set after set (default 1).",
 )
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Model file of the healthy arm.")
 @click.option("--arm", help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.")
@@ -54,10 +57,10 @@ def command(
     allow_non_realtime: bool,
     as_json: bool,
 ) -> None:
-    """Learn the healthy arm: its parameters, stiffness, delays, noise, and what chance looks like.
+    """Record a healthy-arm baseline: parameters, stiffness, delays, noise, and the gains of causes by chance.
 
-    Without SESSIONS an experiment is recorded first, set after set, beside the file of --out. Each set should be
-    what a later diagnosis will get, at best from another day. One set is a beginning, three tell chance from
+    Without SESSIONS an experiment is recorded first, set after set, beside the file of --out. Each set should equal
+    the input of a later diagnosis, at best from another day. One set is a beginning, three separate chance from
     causes, eight are good.
 
     \b
@@ -70,6 +73,7 @@ def command(
     from ident.model.model_file import write_model
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm
+    from runner.experiment_file import DEFAULT, Experiment
 
     if sessions and file is not None:
         raise ConfigurationError(
@@ -84,7 +88,9 @@ def command(
         size = len(sessions) // count
         paths = [list(sessions[k : k + size]) for k in range(0, len(sessions), size)]
     else:
-        paths = _recorded(file, out, sets or _RECORDED_SETS, yes, allow_non_realtime)
+        experiment = Experiment.load(file if file is not None else DEFAULT)
+        folder, count = out.with_name(f"{out.stem}_sessions"), sets or _RECORDED_SETS
+        paths = record_sets(experiment, folder, count, assume_yes=yes, allow_non_realtime=allow_non_realtime)
     parts = [[read_session(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
     found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
@@ -96,16 +102,59 @@ def command(
     click.echo(str(out), err=as_json)
 
 
-def _recorded(
-    file: str | None, out: Path, sets: int, yes: bool, allow_non_realtime: bool
+def record_sets(
+    experiment: Experiment,
+    folder: Path,
+    sets: int,
+    *,
+    assume_yes: bool = False,
+    allow_non_realtime: bool = False,
 ) -> list[list[Path]]:
-    """Logs of an experiment, recorded beside the model file."""
-    from runner.commissioning import record_sets
-    from runner.experiment_file import DEFAULT, Experiment
+    """Logs of `sets` sets in `folder/set_K`, each with all sessions of the experiment but those for validation.
 
-    experiment = Experiment.load(file if file is not None else DEFAULT)
-    folder = out.with_name(f"{out.stem}_sessions")
-    return record_sets(experiment, folder, sets, assume_yes=yes, allow_non_realtime=allow_non_realtime)
+    Finished sessions are not run again. Raises OperatorError for an abort, RobotError or the error of a failure.
+    """
+    from fri.errors import OperatorError, RobotError
+    from lwr_driver.arm import Arm
+    from lwr_driver.arm.cell import Cell
+    from runner.experiment import Progress, Run
+    from runner.laboratory import Laboratory
+    from runner.planning import Excitations
+    from runner.terminal import StatusLine
+
+    arm = Arm.load(experiment.arm, beside=experiment.folder)
+    cell = Cell.load(experiment.cell, beside=experiment.folder)
+    status = StatusLine()
+    motions = Excitations.of(experiment, arm, cell)
+    found = []
+    for number in range(sets):
+        place = folder / f"set_{number + 1}"
+        place.mkdir(parents=True, exist_ok=True)
+        if not (place / "progress.json").is_file():
+            Progress.create(place, experiment.folder)
+        status.say(f"set {number + 1} of {sets}")
+        one = _of_set(experiment, number)
+        laboratory = Laboratory(
+            one, assume_yes=assume_yes, allow_non_realtime=allow_non_realtime, status=status
+        )
+        with laboratory as bench:
+            records = Run(one, place, bench, motions.rows).sessions()
+        last = records[-1]
+        if last.status != "success":
+            text = f"set {number + 1}, session {last.name}: {last.reason}; the same command goes on from here"
+            if last.status == "abort":
+                raise OperatorError(text)
+            raise RobotError(text) if last.error is None else type(last.error)(text)
+        found.append([record.path for record in records])
+    return found
+
+
+def _of_set(experiment: Experiment, number: int) -> Experiment:
+    """The experiment with its own noise and without the sessions for validation."""
+    settings = dict(experiment.emulator_settings)
+    settings["seed"] = int(settings.get("seed", 0)) + _FIRST_SEED + number
+    sessions = tuple(session for session in experiment.sessions if not session.validation)
+    return experiment.changed(emulator_settings=settings, sessions=sessions)
 
 
 def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, Any]:
@@ -132,12 +181,10 @@ def _text(found: Reference, sets: int, sessions: int, names: tuple[str, ...]) ->
     listed = ", ".join(
         f"{cause}{f' {names[joint]}' if joint >= 0 else ''} {gain:.0f}" for (cause, joint), gain in loudest
     )
-    lines.append(
-        f"  what chance alone seems to explain, in the mean of the sets (fall of chi-square): {listed}"
-    )
+    lines.append(f"  largest gains of causes by chance, mean of the sets (fall of chi-square): {listed}")
     if sets < _RECORDED_SETS:
         lines.append(
-            f"  {sets} set{'s say' if sets > 1 else ' says'} little about what changes from day to day; with "
+            f"  {sets} set{'s say' if sets > 1 else ' says'} little about changes from day to day; with "
             f"{_RECORDED_SETS} or more a diagnosis claims more and errs less"
         )
     lines.append("A diagnosis uses it with `lwr-run diagnose ... --reference FILE`, an experiment with")

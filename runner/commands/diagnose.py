@@ -1,4 +1,4 @@
-"""`lwr-run diagnose`: what the simulation gets wrong, by cause and joint."""
+"""`lwr-run diagnose`: errors of the model by cause and joint."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _GROUPS = {
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="SESSION",
-    help="Session for measuring only, never fitted (repeatable).",
+    help="Held-out session, never fitted (repeatable).",
 )
 @click.option(
-    "--model", type=click.Path(path_type=Path), help="Present model, whose simulation is the baseline."
+    "--model", type=click.Path(path_type=Path), help="Present model, the baseline of the simulation."
 )
 @click.option(
     "--reference", type=click.Path(path_type=Path), help="Model of `lwr-run commission`, arm healthy."
@@ -45,7 +45,7 @@ _GROUPS = {
     nargs=2,
     multiple=True,
     metavar="CAUSE:JOINT CAUSE:JOINT",
-    help="Put two causes side by side, say how far they overlap and what would decide (repeatable).",
+    help="Put two causes side by side, with their overlap and the discriminating experiment (repeatable).",
 )
 @click.option("--no-simulation", is_flag=True, help="Leave out the replay of the sessions.")
 @json_option
@@ -63,14 +63,14 @@ def command(
     no_simulation: bool,
     as_json: bool,
 ) -> None:
-    """Show what the model gets wrong in SESSIONS, name the causes, and extend the model.
+    """Find errors of the model in SESSIONS, name the causes, and extend the model.
 
-    Writes report.html, diagnosis.json, model_extended.yaml, plots and, where causes look alike, plans of the motions
-    that would decide into the folder of --out. Finding nothing is a result as well.
+    Writes report.html, diagnosis.json, model_extended.yaml, plots and, for causes that look alike, plans of
+    discriminating experiments into the folder of --out. Finding nothing is a result as well.
 
-    One session is enough, but what repeats tells more: sessions without and with a payload, the same motion twice, a
-    --test session on another motion. Without a motor torque, without --reference, after somebody's low-pass less can
-    be claimed; the notes at the end say what.
+    One session is enough, but repetition supports more claims: sessions without and with a payload, the same motion
+    twice, a --test session on another motion. A missing motor torque, a missing --reference or an earlier low-pass
+    limits the claims; the notes at the end list the limits.
 
     \b
     lwr-run diagnose unloaded.mcap loaded.mcap --out diagnosis
@@ -80,13 +80,14 @@ def command(
     lwr-run diagnose a.mcap --no-simulation --json --out diagnosis    quicker, and for a program
     """
     from fri.errors import ConfigurationError
+    from ident.diagnosis.statements import SURE
     from ident.model.model_file import read_model
     from lwr_driver.session import read_session
-    from runner.diagnosis import arm_data, chain_of, known_arm, study
-    from runner.diagnosis.deciding import offers_of_sessions
-    from runner.diagnosis.look_alikes import asked
+    from runner.diagnosis import arm_data, asked, chain_of, known_arm, study
+    from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
-    from runner.report.diagnosis_page import write_diagnosis_report
+    from runner.replay import attached_experiment
+    from runner.report.page import write_diagnosis_report
 
     replaceable(out)
     logs = [read_session(path) for path in sessions]
@@ -94,6 +95,7 @@ def command(
     chain = chain_of(logs, urdf)
     known = known_arm(arm, chain)
     pairs = [(asked(a, chain.joint_names), asked(b, chain.joint_names)) for a, b in compare]
+    experiment = next((one for one in map(attached_experiment, logs) if one is not None), None)
     found = study(
         logs,
         chain,
@@ -104,8 +106,9 @@ def command(
         reference=None if reference is None else read_model(reference),
         simulate=not no_simulation,
         compare=pairs,
+        sure=SURE if experiment is None else experiment.diagnosis.sure,
     )
-    found = found.with_offers(offers_of_sessions(found.diagnosis, logs))
+    found = found.with_offers(offers_after_logs(found.diagnosis, experiment))
     found.write(out)
     content = {**found.diagnosis.to_dict(), "look_alikes": [pair.to_dict() for pair in found.pairs]}
     click.echo(json.dumps(content, indent=1, allow_nan=False) if as_json else str(found))

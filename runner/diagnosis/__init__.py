@@ -1,8 +1,7 @@
-"""The diagnosis as a person gets it: measured gains, plots, one screen of text, files, and what would decide."""
+"""The diagnosis of sessions and experiments: gains, files, plots, look-alikes, discriminating experiments."""
 
 from __future__ import annotations
 
-from runner.diagnosis.sources import arm_data, chain_of, known_arm
-from runner.diagnosis.study import Study, study
+from runner.diagnosis.study import Study, arm_data, asked, chain_of, known_arm, study
 
-__all__ = ["Study", "arm_data", "chain_of", "known_arm", "study"]
+__all__ = ["Study", "arm_data", "asked", "chain_of", "known_arm", "study"]

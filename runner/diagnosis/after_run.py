@@ -1,6 +1,6 @@
-"""The diagnosis at the end of an experiment, and the motions that decide what it leaves open.
+"""The diagnosis at the end of an experiment, and the discriminating experiments for its open findings.
 
-A failure of the diagnosis never spoils the experiment: it is said, and the results stand.
+A failure of the diagnosis is reported and leaves the results of the experiment alone.
 """
 
 from __future__ import annotations
@@ -12,9 +12,12 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from fri.errors import LwrError
+from ident.diagnosis import Diagnosis, Finding
+from ident.diagnosis.look_alikes import Place
+from ident.diagnosis.statements import SURE, answer_statement, run_advice
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
@@ -22,14 +25,13 @@ from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
-from runner.diagnosis.deciding import SURE, Deciding, offers, open_findings
-from runner.diagnosis.decision import Answer, decision_text, decisions
+from runner.diagnosis.discriminating import Discriminating, offers, open_findings
 from runner.diagnosis.study import DIAGNOSIS, Study, study
 from runner.experiment import Bench, Progress, Record, Run
 from runner.experiment_file import Experiment, SessionPlan
 from runner.planning import Excitations, excitation_rows
 
-__all__ = ["DECIDING", "DECISION", "FOLDER", "Conclusion", "conclude_run"]
+__all__ = ["DECIDING", "DECISION", "FOLDER", "Answer", "Conclusion", "conclude_run", "decisions"]
 
 log = logging.getLogger(__name__)
 
@@ -42,39 +44,84 @@ PAUSE_NS = 10_000_000_000
 Laboratory = Callable[[Experiment], AbstractContextManager[Bench]]
 
 
+@dataclass(frozen=True)
+class Answer:
+    """The second diagnosis on one open finding of the first.
+
+    rivals : the causes in question, the better one first. outcome : `decided` for one of them, still `open`, or
+    `neither`. named : the cause named by the second diagnosis.
+    """
+
+    rivals: tuple[Place, ...]
+    outcome: Literal["decided", "open", "neither"]
+    named: Place | None
+    confidence: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content."""
+        return {
+            "rivals": [{"cause": cause, "joints": list(joints)} for cause, joints in self.rivals],
+            "outcome": self.outcome,
+            "named": None if self.named is None else {"cause": self.named[0], "joints": list(self.named[1])},
+            "confidence": self.confidence,
+        }
+
+
+def decisions(before: Diagnosis, after: Diagnosis, sure: float = SURE) -> tuple[Answer, ...]:
+    """One answer for each finding open before. sure : lowest confidence of a decision."""
+    found = []
+    for finding in open_findings(before, sure):
+        rivals = (_place(finding), *((cause, joints) for cause, joints, _ in finding.alternatives))
+        rivals = tuple(dict.fromkeys(rivals))
+        mine = [f for f in after.findings if _place(f) in rivals]
+        certain = [f for f in mine if f.confidence >= sure]
+        if certain:
+            found.append(Answer(rivals, "decided", _place(certain[0]), certain[0].confidence))
+        elif mine:
+            found.append(Answer(rivals, "open", _place(mine[0]), mine[0].confidence))
+        else:
+            joints = {joint for _, places in rivals for joint in places}
+            other = next((f for f in after.findings if set(f.joints) & joints), None)
+            named = None if other is None else _place(other)
+            found.append(Answer(rivals, "neither", named, 0.0 if other is None else other.confidence))
+    return tuple(found)
+
+
+def _place(finding: Finding) -> Place:
+    return finding.cause, tuple(finding.joints)
+
+
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """How an experiment ends: the diagnosis or why there is none, and what the deciding motions said.
+    """The end of an experiment: the diagnosis or the reason for none, and the answers of discriminating experiments.
 
-    asked : whether deciding motions were wanted. sure : confidence below which a finding is open.
+    asked : whether discriminating experiments were wanted.
     """
 
     study: Study | None
     failure: str = ""
     answers: tuple[Answer, ...] = ()
     asked: bool = False
-    sure: float = SURE
 
     def text(self, folder: Path) -> str:
-        """For the screen. folder : of the experiment, for what can be run next."""
+        """For the screen. folder : of the experiment."""
         if self.study is None:
             return f"No diagnosis: {self.failure}. The results of the experiment stand."
-        lines = [str(self.study)]
-        if self.answers:
-            names = self.study.diagnosis.base_model.structure.chain.joint_names
-            lines.append(decision_text(self.answers, names))
+        names = self.study.diagnosis.base_model.structure.chain.joint_names
+        lines = [
+            str(self.study),
+            *(f"{answer_statement(answer.to_dict(), names)}." for answer in self.answers),
+        ]
         if self.failure:
-            lines.append(f"The deciding motions came to no end: {self.failure}. The diagnosis above stands.")
-        elif self.asked and not self.answers:
-            still = open_findings(self.study.diagnosis, self.sure)
-            reason = (
-                "no deciding motion passes every check" if still else "no finding is open between look-alikes"
-            )
-            lines.append(f"Nothing was run to decide: {reason}.")
-        elif self.study.offers and not self.answers:
             lines.append(
-                f"`lwr-run experiment --resume {folder} --decide` runs what would decide and concludes."
+                f"The discriminating experiments failed: {self.failure}. The diagnosis above stands."
             )
+        elif self.asked and not self.answers:
+            still = open_findings(self.study.diagnosis, self.study.sure)
+            reason = "no motion passes every check" if still else "no finding is open between look-alikes"
+            lines.append(f"No discriminating experiment was run: {reason}.")
+        elif self.study.offers and not self.answers:
+            lines.append(run_advice(str(folder)))
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,22 +146,22 @@ def conclude_run(
 ) -> Conclusion:
     """Diagnose the finished sessions of an experiment into `folder/diagnosis`.
 
-    motions : of the experiment. laboratory : gives a bench for an experiment, for the deciding motions. decide :
-    run the motions that would decide what is open, diagnose again with them, and say what was decided.
+    motions : of the experiment. laboratory : gives a bench for the discriminating experiments. decide : run the
+    discriminating experiments, diagnose again with them, and report the decisions.
     """
     target = folder / FOLDER
-    # What was decided once stays decided: its sessions are there and are not run again.
+    # A decision once made stands: its sessions exist and are not run again.
     decide = decide or (target / DECISION).is_file()
     (target / DECISION).unlink(missing_ok=True)
     try:
         first = _diagnosed(experiment, arm, folder, records)
         first = first.with_offers(offers(first.diagnosis, experiment, arm, cell, motions.exciting))
         first.write(target)
-    # Whatever goes wrong here must not take the experiment with it.
+    # No error here may take the experiment with it.
     except Exception as error:
         return Conclusion(None, _reason(error))
     if not decide or not first.offers:
-        return Conclusion(first, asked=decide, sure=experiment.diagnosis.sure)
+        return Conclusion(first, asked=decide)
     try:
         return _decided(experiment, arm, folder, records, first, laboratory)
     except Exception as error:
@@ -129,7 +176,7 @@ def _decided(
     first: Study,
     laboratory: Laboratory,
 ) -> Conclusion:
-    """Run the deciding motions, diagnose with them, and answer."""
+    """Run the discriminating experiments, diagnose with them, and answer."""
     place = folder / FOLDER / DECIDING
     place.mkdir(parents=True, exist_ok=True)
     deciding = _with_sessions(experiment, first.offers)
@@ -164,7 +211,7 @@ def _diagnosed(
     records: Sequence[Record],
     further: Sequence[Record] = (),
 ) -> Study:
-    """The diagnosis of all finished sessions; those for validation are only measured on."""
+    """The diagnosis of all finished sessions; the ones for validation are only measured on."""
     unseen = {session.name for session in experiment.sessions if session.validation}
     logs: dict[bool, list[Session]] = {False: [], True: []}
     for record in records:
@@ -172,17 +219,23 @@ def _diagnosed(
     last = max(log.joint.log_time[-1] for log in (*logs[False], *logs[True]))
     for record in further:
         log = read_session(record.path, status=False)
-        # The emulator's clock begins anew with it; what is run later is later.
+        # The clock of every emulator begins anew; further sessions come later.
         log = _later(log, max(0, int(last) + PAUSE_NS - log.start))
         last = log.joint.log_time[-1]
         logs[False].append(log)
     wanted = experiment.diagnosis.reference
-    reference = None if wanted is None else read_model(find(wanted, beside=experiment.folder))
-    return study(logs[False], Chain.from_urdf(arm.urdf), test=logs[True], arm=arm, reference=reference)
+    return study(
+        logs[False],
+        Chain.from_urdf(arm.urdf),
+        test=logs[True],
+        arm=arm,
+        reference=None if wanted is None else read_model(find(wanted, beside=experiment.folder)),
+        sure=experiment.diagnosis.sure,
+    )
 
 
 def _later(session: Session, shift_ns: int) -> Session:
-    """The session at a later time, without the channels that no diagnosis needs."""
+    """The session at a later time, without the channels unused by a diagnosis."""
 
     def shifted(columns: JointColumns) -> JointColumns:
         return dataclasses.replace(
@@ -200,10 +253,10 @@ def _later(session: Session, shift_ns: int) -> Session:
     )
 
 
-def _with_sessions(experiment: Experiment, motions: Sequence[Deciding]) -> Experiment:
-    """The experiment with the sessions of the deciding motions instead of its own."""
-    sessions = [session for motion in motions for session in motion.sessions]
-    # As few swaps of the payload as can be.
+def _with_sessions(experiment: Experiment, offered: Sequence[Discriminating]) -> Experiment:
+    """The experiment with the sessions of the discriminating experiments instead of its own."""
+    sessions = [session for one in offered for session in one.sessions]
+    # With as few payload swaps as possible.
     order = list(dict.fromkeys(session.payload for session in sessions))
     return experiment.changed(sessions=tuple(sorted(sessions, key=lambda one: order.index(one.payload))))
 

@@ -1,48 +1,69 @@
-"""A diagnosis with what surrounds it: replay in simulation, measured gains, plots, files, deciding motions."""
+"""A study: the diagnosis of sessions with replay in simulation, measured gains, look-alikes and its folder of files."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Sequence
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
+from ident.diagnosis.look_alikes import LookAlikes, Place, look_alikes
+from ident.diagnosis.statements import SURE, statements
 from ident.dynamics.kinematics import Chain
+from ident.effects import find_effect
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from lwr_driver.arm import JOINTS, Arm
 from lwr_driver.session import Session
-from runner.diagnosis.look_alikes import FILE as LOOK_ALIKES
-from runner.diagnosis.look_alikes import LookAlikes, Place, look_alikes, write_look_alikes
-from runner.diagnosis.measures import Moved, RowGain, moved_parameters, row_gains
-from runner.diagnosis.replayed import FILE as REPLAYED
-from runner.diagnosis.replayed import ReplayErrors
-from runner.diagnosis.residuals import FILE, Residuals
-from runner.diagnosis.sources import arm_data
-from runner.diagnosis.text import study_text
+from runner.diagnosis.discriminating import Discriminating, foresee
+from runner.diagnosis.records import (
+    LOOK_ALIKES,
+    REPLAY,
+    RESIDUALS,
+    ReplayErrors,
+    Residuals,
+    moved_parameters,
+    row_gains,
+    write_look_alikes,
+)
+from runner.estimation import couplings
 from runner.replay import Replay
 
-if TYPE_CHECKING:
-    from runner.diagnosis.deciding import Deciding
-
-__all__ = ["DETAILS", "DIAGNOSIS", "EXTENDED", "TEXT", "Study", "replaceable", "study"]
+__all__ = [
+    "DETAILS",
+    "DIAGNOSIS",
+    "EXTENDED",
+    "TEXT",
+    "Study",
+    "arm_data",
+    "asked",
+    "chain_of",
+    "known_arm",
+    "replaceable",
+    "study",
+]
 
 DIAGNOSIS = "diagnosis.json"
 DETAILS = "details.json"
 EXTENDED = "model_extended.yaml"
 TEXT = "diagnosis.txt"
 
+_DEFAULT_ARM = "lwr4plus.yaml"
+
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The sessions that were fitted, and what is known of the arm."""
+    """The fitted sessions, and the data of the arm."""
 
     sessions: tuple[Session, ...]
     chain: Chain
@@ -52,90 +73,81 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A diagnosis, what it gained, what could not be seen, and the motions that would decide what is open.
+    """A diagnosis with its gains, limits, look-alikes and discriminating experiments.
 
-    sessions : names in the order in which they were run. referenced : whether a healthy reference was at hand.
-    pairs : causes that look alike, side by side. replayed : errors of the simulation over time. material : what it
-    was made from.
+    sessions : names in their order. referenced : whether a healthy reference was at hand. pairs : look-alikes, side
+    by side. replayed : errors of the simulation over time. offers : discriminating experiments. material : the
+    inputs. sure : confidence below which a finding with alternatives is open.
     """
 
     diagnosis: Diagnosis
-    gains: tuple[RowGain, ...]
-    moved: tuple[Moved, ...]
+    gains: Sequence[Mapping[str, Any]]
+    moved: Sequence[Mapping[str, Any]]
     notes: tuple[str, ...]
     residuals: Residuals
     sessions: tuple[str, ...]
     referenced: bool
     pairs: tuple[LookAlikes, ...] = ()
     replayed: ReplayErrors | None = None
-    offers: tuple[Deciding, ...] = field(default=())
+    offers: tuple[Discriminating, ...] = field(default=())
     material: Material | None = field(default=None, repr=False)
+    sure: float = SURE
 
     def __str__(self) -> str:
-        return study_text(self)
+        content, details = self.diagnosis.to_dict(), self.details()
+        return statements(content, details, details["joints"]).text()
 
-    def with_offers(self, offers: Sequence[Deciding]) -> Study:
-        """The same with motions that would decide, and what is to be expected of them."""
-        from runner.diagnosis.foresight import foresee
-
+    def with_offers(self, offers: Sequence[Discriminating]) -> Study:
+        """The same with discriminating experiments and their expected effect."""
         pairs, given = self.pairs, self.material
         if offers and pairs and given is not None:
-            pairs = foresee(
-                pairs,
-                self.diagnosis,
-                given.sessions,
-                given.chain,
-                offers,
-                arm=given.arm,
-                reference=given.reference,
-            )
+            inputs = (given.sessions, given.chain, offers, given.arm, given.reference)
+            pairs = foresee(pairs, self.diagnosis, *inputs)
         return replace(self, offers=tuple(offers), pairs=pairs)
 
     def details(self) -> dict[str, Any]:
-        """What the contract of diagnosis.json has no place for."""
+        """Plain content of details.json: everything beside diagnosis.json."""
         return {
             "schema_version": 1,
             "sessions": list(self.sessions),
             "joints": list(self.residuals.joint_names),
             "reference": self.referenced,
-            "rows": [gain.to_dict() for gain in self.gains],
-            "base_parameters": [moved.to_dict() for moved in self.moved],
+            "sure": self.sure,
+            "rows": list(self.gains),
+            "base_parameters": list(self.moved),
             "notes": list(self.notes),
             "look_alikes": [pair.to_dict() for pair in self.pairs],
             "deciding_motions": [offer.to_dict() for offer in self.offers],
         }
 
     def write(self, folder: Path) -> None:
-        """Write everything into `folder`: numbers, model, text, plots, residuals, deciding motions."""
-        from runner.report.look_alike_figures import look_alike_figure
-        from runner.report.residual_figures import replay_figures, residual_figures
+        """Write everything into `folder`: numbers, model, text, plots, residuals, discriminating experiments."""
+        from runner.report.diagnosis_figures import look_alike_figure, replay_figures, residual_figures
 
         folder.mkdir(parents=True, exist_ok=True)
-        kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAYED)
+        kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAY)
         for stale in (path for kind in kinds for path in folder.glob(kind)):
             stale.unlink()
         _write_json(self.diagnosis.to_dict(), folder / DIAGNOSIS)
         _write_json(self.details(), folder / DETAILS)
         write_model(self.diagnosis.extended_model, folder / EXTENDED)
         (folder / TEXT).write_text(f"{self}\n", encoding="utf-8")
-        self.residuals.save(folder / FILE)
-        for side in self.residuals.sides:
-            for figure in residual_figures(self.residuals, side):
-                figure.save(folder / f"{figure.name}.svg")
+        self.residuals.save(folder / RESIDUALS)
+        names = self.residuals.joint_names
+        figures = [one for side in self.residuals.sides for one in residual_figures(self.residuals, side)]
+        figures += [look_alike_figure(pair, names) for pair in self.pairs]
         write_look_alikes(self.pairs, folder / LOOK_ALIKES)
-        for pair in self.pairs:
-            figure = look_alike_figure(pair, self.residuals.joint_names)
-            figure.save(folder / f"{figure.name}.svg")
         if self.replayed is not None:
-            self.replayed.save(folder / REPLAYED)
-            for figure in replay_figures(self.replayed, self.residuals.joint_names):
-                figure.save(folder / f"{figure.name}.svg")
+            self.replayed.save(folder / REPLAY)
+            figures += replay_figures(self.replayed, names)
+        for figure in figures:
+            figure.save(folder / f"{figure.name}.svg")
         for offer in self.offers:
             offer.plan.save(folder / offer.file)
 
 
 def replaceable(folder: Path) -> None:
-    """Whether a diagnosis may be written there. ConfigurationError where the folder holds anything else than one."""
+    """Refuse a folder with other files than a diagnosis. Raises ConfigurationError."""
     if folder.exists() and not folder.is_dir():
         raise ConfigurationError(f"{folder} is a file; name a folder with --out")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / DIAGNOSIS).is_file():
@@ -155,14 +167,15 @@ def study(
     reference: DynamicModel | None = None,
     simulate: bool = True,
     compare: Sequence[tuple[Place, Place]] = (),
+    sure: float = SURE,
 ) -> Study:
-    """Diagnose `sessions` and measure what it is worth.
+    """Diagnose `sessions` and measure the gain.
 
     arm : description of the arm, for stiffness, gear ratios and the simulation; without it nothing is replayed.
-    data : what is known of its drives; default: what the description says.
+    data : of its drives; default: from the description.
     model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
-    compare : causes to put side by side besides those that a finding is in doubt between.
-    Raises DataError for sessions that cannot be used.
+    compare : causes to put side by side besides those of open findings. sure : see `Study`.
+    Raises DataError for unusable sessions.
     """
     healthy = None if reference is None else Reference.of(reference)
     data = arm_data(arm, chain) if data is None else data
@@ -170,15 +183,10 @@ def study(
     replay = None
     if simulate and arm is not None:
         replay = Replay(_as_stiff(arm, healthy), everything)
+    logs, held_out = list(sessions), list(test)
     with _unadvised():
         found = diagnose(
-            list(sessions),
-            chain,
-            test=list(test),
-            arm=data,
-            model=model,
-            reference=healthy,
-            simulate=replay,
+            logs, chain, test=held_out, arm=data, model=model, reference=healthy, simulate=replay
         )
         pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
     notes = [*found.notes, *_little(found, everything)]
@@ -199,11 +207,12 @@ def study(
         pairs,
         _first_replay(replay),
         material=Material(tuple(sessions), chain, data, healthy),
+        sure=sure,
     )
 
 
 def _first_replay(replay: Replay | None) -> ReplayErrors | None:
-    """Errors over the session that was replayed first, with both models where both could be."""
+    """Errors over the session replayed first, with each model replayed on it."""
     if replay is None or not replay.first:
         return None
     name = replay.first[0][0]
@@ -211,17 +220,17 @@ def _first_replay(replay: Replay | None) -> ReplayErrors | None:
 
 
 def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:
-    """What cannot be claimed because little was recorded."""
+    """Limits of a small recording."""
     notes = []
     if "joint" not in diagnosis.rms_base:
         notes.append(
-            "no joint torque: errors of its sensors cannot be seen, and what acts on the links is told from what acts "
-            "in the drives by its shape alone"
+            "no joint torque: errors of its sensors are invisible, and torques on the links are separated from those "
+            "in the drives by their shape alone"
         )
     if len(sessions) == 1:
         notes.append(
-            "one session: what changes from one session to the next (warm-up, a drifting zero, a payload) cannot be "
-            "seen, and errors are measured on parts of the one motion"
+            "one session: changes from session to session (warm-up, a drifting zero, a payload) are invisible, and "
+            "errors are measured on parts of the one motion"
         )
     return notes
 
@@ -229,12 +238,12 @@ def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:
 def _unsimulated(chain: Chain) -> str:
     if chain.n != JOINTS:
         return f"no simulation: the emulator has a controller for {JOINTS} joints, this arm has {chain.n}"
-    return "no simulation: the arm is not one that the emulator has; name its description with --arm"
+    return "no simulation: the emulator has no such arm; name its description with --arm"
 
 
 @contextmanager
 def _unadvised() -> Iterator[None]:
-    """Without advice on settings of the signals, which a diagnosis chooses itself."""
+    """Without advice on settings of the signals; a diagnosis chooses them itself."""
 
     def wanted(record: logging.LogRecord) -> bool:
         return "raise `" not in record.getMessage()
@@ -248,15 +257,79 @@ def _unadvised() -> Iterator[None]:
 
 
 def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:
-    """The arm with the stiffness that commissioning found."""
-    if (
-        healthy is None
-        or len(healthy.compliance) != len(arm.stiffness)
-        or not np.all(healthy.compliance > 0.0)
-    ):
-        return arm
-    return replace(arm, stiffness=1.0 / healthy.compliance)
+    """The arm with the stiffness found by commissioning."""
+    compliance = np.zeros(0) if healthy is None else healthy.compliance
+    usable = len(compliance) == len(arm.stiffness) and bool(np.all(compliance > 0.0))
+    return replace(arm, stiffness=1.0 / compliance) if usable else arm
 
 
 def _write_json(content: dict[str, Any], path: Path) -> None:
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def chain_of(sessions: Sequence[Session], urdf: Path | None) -> Chain:
+    """Kinematics from a URDF file, or from the first session."""
+    text = sessions[0].robot_description
+    if urdf is None and text is None:
+        raise ConfigurationError(f"{sessions[0].path}: holds no robot description; name the URDF with --urdf")
+    return Chain.from_urdf(os.fspath(urdf) if urdf is not None else str(text))
+
+
+def known_arm(name: str | None, chain: Chain) -> Arm | None:
+    """The arm file called `name`; without a name the default one, if its joints are those of the chain."""
+    if name is not None:
+        return Arm.load(name)
+    arm = Arm.load(_DEFAULT_ARM)
+    return arm if arm.joint_names == chain.joint_names else None
+
+
+def arm_data(
+    arm: Arm | None, chain: Chain, coupling: Sequence[str] = (), gear_ratio: str | None = None
+) -> ArmData:
+    """Stiffness and gear ratios of an arm file, and the options of the command line about the drives.
+
+    coupling : each `A:B`, two joints with coupled drives. gear_ratio : `N` for all joints or `N,N,...`, in place
+    of the arm file's. Raises ConfigurationError for unknown joints and wrong numbers.
+    """
+    pairs = couplings(coupling)
+    for name in (name for pair in pairs for name in pair.joints):
+        if name not in chain.joint_names:
+            raise ConfigurationError(f"--coupling: no joint {name!r}; joints: {', '.join(chain.joint_names)}")
+    ratio = None if arm is None else arm.gear_ratio.astype(float)
+    if gear_ratio is not None:
+        ratio = _gear_ratios(gear_ratio, chain.n)
+    return ArmData(None if arm is None else arm.stiffness, ratio, pairs)
+
+
+def asked(text: str, names: Sequence[str]) -> Place:
+    """Cause and joint from `cause(joint)` or `cause:joint`, the joint by name or number from 1, none for the whole arm.
+
+    Raises ConfigurationError for unknown causes and joints.
+    """
+    match = re.fullmatch(r"\s*(\w+)\s*(?:\(([^()]*)\)|:(.*))?\s*", text)
+    if match is None:
+        raise ConfigurationError(f"--compare {text!r}: write a cause and its joint, such as cable_spring:5")
+    effect = find_effect(match.group(1))
+    word = (match.group(2) or match.group(3) or "").strip()
+    if effect.whole_arm:
+        return effect.cause, ()
+    if word in names:
+        return effect.cause, (list(names).index(word) + 1,)
+    if not word.isdigit() or not 1 <= int(word) <= len(names):
+        raise ConfigurationError(
+            f"--compare {text!r}: {effect.cause} belongs to a joint, 1 to {len(names)} or one of {', '.join(names)}; "
+            f"write {effect.cause}:{names[0]}"
+        )
+    return effect.cause, (int(word),)
+
+
+def _gear_ratios(text: str, n: int) -> NDArray[np.float64]:
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        raise ConfigurationError(f"--gear-ratio {text!r} is no number or list such as 100,100,160") from None
+    if len(values) not in (1, n) or not np.all((values > 0.0) & np.isfinite(values)):
+        raise ConfigurationError(
+            f"--gear-ratio {text!r}: one number above zero for all joints, or one for each of the {n} joints"
+        )
+    return np.broadcast_to(values, n).copy()

@@ -1,30 +1,119 @@
-"""What a diagnosis found, with its evidence, as a part of the report of a run or as a page of its own."""
+"""The layout of a diagnosis in HTML: a section of the report of a run, or the parts of a page of its own."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from html import escape
+from pathlib import Path
 from typing import Any
 
-from ident.effects import EFFECTS, described, summary_of
-from ident.effects.words import joints_text, named, quantity_text
-from runner.diagnosis.look_alikes import LookAlikes
-from runner.report.diagnosis_folder import DiagnosisFolder, values_of
+from fri.errors import ConfigurationError, DataError
+from ident.diagnosis.look_alikes import LookAlikes
+from ident.diagnosis.statements import (
+    Comparison,
+    FindingStatement,
+    Number,
+    Part,
+    Statements,
+    run_advice,
+    statements,
+)
+from runner.diagnosis.records import (
+    LOOK_ALIKES,
+    REPLAY,
+    RESIDUALS,
+    ReplayErrors,
+    Residuals,
+    read_look_alikes,
+)
+from runner.report.diagnosis_figures import (
+    finding_figure,
+    look_alike_figure,
+    replay_figures,
+    residual_figures,
+)
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
-from runner.report.look_alike_figures import look_alike_figure
-from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
-from runner.report.residual_figures import finding_figure, replay_figures, residual_figures
-from runner.report.verdicts import error_change, extension_gain
+from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
+from runner.report.markup import Number as Shown
 
-__all__ = ["diagnosis_parts", "diagnosis_section"]
+__all__ = ["DiagnosisFolder", "diagnosis_parts", "diagnosis_section"]
 
-_SURE = 0.8
-_SEEN = {
-    "motor": "Seen in the motor torque only.",
-    "joint": "Acts on the links, so both torques see it.",
-    "sensor": "An error of the joint torque sensor.",
-}
+
+@dataclass(frozen=True)
+class DiagnosisFolder:
+    """A folder with diagnosis.json; every other file of a diagnosis may be missing.
+
+    content : of diagnosis.json. joint_names : of the arm. experiment : folder of its experiment, None for a diagnosis
+    of logs.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+    joint_names: tuple[str, ...]
+    experiment: Path | None = None
+
+    @classmethod
+    def load(cls, path: str | Path) -> DiagnosisFolder:
+        """Of a folder by `lwr-run diagnose`. Raises ConfigurationError for another one, DataError for a broken one."""
+        folder = Path(path)
+        file = folder / "diagnosis.json"
+        if not file.is_file():
+            raise ConfigurationError(
+                f"{folder}: holds no diagnosis.json; name the folder of `lwr-run diagnose --out`"
+            )
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            found = cls(folder, content, tuple(_json(folder / "details.json").get("joints", ())))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{file}: cannot be read: {error}; run `lwr-run diagnose` again") from error
+        return found
+
+    @classmethod
+    def of(cls, results: ResultFolder) -> DiagnosisFolder | None:
+        """The diagnosis in the folder of an experiment, if any."""
+        if results.diagnosis is None:
+            return None
+        experiment = None if results.summary.get("from_logs") else results.path
+        return cls(results.diagnosis_folder, results.diagnosis, results.joint_names, experiment)
+
+    @property
+    def findings(self) -> Sequence[Mapping[str, Any]]:
+        """The findings, the largest effect first."""
+        found: Sequence[Mapping[str, Any]] = self.content.get("findings", [])
+        return found
+
+    @cached_property
+    def statements(self) -> Statements:
+        """The diagnosis in words."""
+        answers = _json(self.path / "decision.json").get("answers", [])
+        return statements(self.content, self.details, self.joint_names, answers)
+
+    @cached_property
+    def details(self) -> Mapping[str, Any]:
+        """Content of details.json."""
+        return _json(self.path / "details.json")
+
+    @cached_property
+    def residuals(self) -> Residuals | None:
+        """Held-out residuals, None without their file."""
+        file = self.path / RESIDUALS
+        return Residuals.load(file) if file.is_file() else None
+
+    @cached_property
+    def replayed(self) -> ReplayErrors | None:
+        """Errors of the replay over time, None without their file."""
+        file = self.path / REPLAY
+        return ReplayErrors.load(file) if file.is_file() else None
+
+    @cached_property
+    def look_alikes(self) -> tuple[LookAlikes, ...]:
+        """Look-alikes, empty without their file."""
+        entries, file = self.details.get("look_alikes") or [], self.path / LOOK_ALIKES
+        return read_look_alikes(file, entries) if entries and file.is_file() else ()
 
 
 def diagnosis_section(results: ResultFolder) -> str:
@@ -35,8 +124,8 @@ def diagnosis_section(results: ResultFolder) -> str:
             "diagnosis",
             "Diagnosis",
             "<p>This folder holds no diagnosis. <code>lwr-run diagnose SESSION... --out "
-            f"{escape(results.path.name)}/diagnosis</code> looks for what the model lacks, and the next "
-            "<code>lwr-run report</code> shows it here.</p>",
+            f"{escape(results.path.name)}/diagnosis</code> looks for errors of the model, and the next "
+            "<code>lwr-run report</code> shows them here.</p>",
         )
     parts = (
         html if anchor == "findings" else f"<h3>{title}</h3>{html}"
@@ -46,301 +135,87 @@ def diagnosis_section(results: ResultFolder) -> str:
 
 
 def diagnosis_parts(diagnosis: DiagnosisFolder) -> list[tuple[str, str, str]]:
-    """Anchor, title and HTML of each part that there is: findings, what would decide, gains, limits, residuals."""
-    names = diagnosis.joint_names
-    answers = "".join(paragraph(_answer(answer, names)) for answer in diagnosis.answers)
-    found = "".join(_finding(diagnosis, number) for number in range(1, len(diagnosis.findings) + 1))
-    if not diagnosis.findings:
-        found = paragraph("Nothing found: the data carry no claim about a cause.")
-    parts = [
-        ("findings", "Findings", answers + found),
-        ("side-by-side", "Side by side", _asked(diagnosis)),
-        ("deciding", "Motions that would decide", _offers(diagnosis)),
-        ("unexplained", "Seen, but without a name", _unexplained(diagnosis.unexplained, names)),
-        ("gain", "Gain", _gain(diagnosis)),
-        ("replay", "Replay in simulation", _simulated(diagnosis)),
-        ("absorbed", "What the base parameters had absorbed", _absorbed(diagnosis)),
-        ("limits", "What these data cannot show", _notes(diagnosis)),
-        ("residuals-held-out", "Held-out residuals", _plots(diagnosis)),
-    ]
+    """Anchor, title and HTML of each part with content, from the findings to the residuals."""
+    said = diagnosis.statements
+    answers = "".join(paragraph(f"{answer}.") for answer in said.answers)
+    found = "".join(_finding(diagnosis, one) for one in said.findings) or paragraph(f"{said.headline}.")
+    asked = "".join(_beside(diagnosis, one) for one in said.comparisons if not one.finding)
+    parts = [("findings", "Findings", answers + found), ("side-by-side", "Side by side", asked)]
+    parts += [(part.anchor, part.title, _part(diagnosis, part)) for part in said.parts]
+    parts.append(("residuals-held-out", "Held-out residuals", _residuals(diagnosis)))
     return [part for part in parts if part[2]]
 
 
-def _finding(diagnosis: DiagnosisFolder, number: int) -> str:
-    finding, names = diagnosis.findings[number - 1], diagnosis.joint_names
-    cause, joints = str(finding["cause"]), finding.get("joints", [])
-    side, parameters = str(finding.get("side", "")), finding.get("parameters") or {}
-    confidence = finding.get("confidence")
-    open_ = confidence is not None and confidence < _SURE and finding.get("alternatives")
-    sure = (
-        "" if confidence is None else f"Confidence {100 * confidence:.0f} %" + (", open." if open_ else ".")
-    )
-    title = f"{_words(cause).capitalize()}, {joints_text(joints, names)}"
-    intro = (
-        f"{summary_of(cause).capitalize()}: {described(cause, values_of(finding), finding.get('form'), names)}."
-        if parameters
-        else ""
-    )
-    seen = _SEEN.get(side, "")
-    parts = [f"<h3>{escape(title)}</h3>", paragraph(" ".join(part for part in (intro, seen, sure) if part))]
-    rows: list[list[Cell]] = []
-    evidence = finding.get("evidence") or {}
-    before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
-    if before is not None and after is not None and before > 0.0:
-        interval = evidence.get("gain_interval_95")
-        gain = f"; less by {interval[0]:.3g} to {interval[1]:.3g} Nm (95 %)" if interval else ""
-        rows.append(["error on unseen motions", f"{before:.3g} Nm without it, {after:.3g} Nm with it{gain}"])
-    for other in finding.get("alternatives") or []:
-        place = f", {joints_text(other['joints'], names)}" if other.get("joints") else ""
-        rows.append(
-            [
-                "could also be",
-                f"{_words(other['cause'])}{place}",
-            ]
-        )
-    if finding.get("tell_apart") and finding.get("alternatives"):
-        rows.append(["what would decide", named(str(finding["tell_apart"]), names)])
-    parts.append(table(("", ""), rows, f"Evidence: {title}", classes="facts"))
+def _finding(diagnosis: DiagnosisFolder, said: FindingStatement) -> str:
+    finding = diagnosis.findings[said.number - 1]
+    side, joints, title = str(finding.get("side", "")), finding.get("joints", []), _capital(said.title)
+    text = f"{said.text} {_capital(said.confidence)}.".strip()
+    facts = table(("", ""), said.facts, f"Evidence: {title}", classes="facts")
+    parts = [f"<h3>{escape(title)}</h3>", paragraph(text), facts]
     if diagnosis.residuals is not None and side != "timing":
-        numbers = {name: value for name, (value, _, _) in values_of(finding).items()}
-        others = [
-            j for k, one in enumerate(diagnosis.findings) if k + 1 != number for j in one.get("joints", [])
-        ]
-        figure = finding_figure(diagnosis.residuals, cause, side, joints, numbers, others)
-        if figure is not None:
-            parts.append(figure_html(figure))
-    parts += [_beside(pair, names) for pair in diagnosis.look_alikes if pair.finding == number]
-    parts.append(
-        fold(
-            "Parameters and statistics",
-            table(("", ""), _statistics(finding), f"Statistics: {title}", classes="facts"),
-        )
-    )
-    return "".join(parts)
-
-
-def _statistics(finding: Mapping[str, Any]) -> list[list[Cell]]:
-    """Parameters with their meaning, and what the claim rests on."""
-    evidence = finding.get("evidence") or {}
-    rows: list[list[Cell]] = [
-        [name.replace("_", " "), f"{value} ({meaning.replace('`', '')})" if meaning else value]
-        for name, value, meaning in parameter_rows(finding)
+        numbers = {name: float(one["value"]) for name, one in (finding.get("parameters") or {}).items()}
+        others = [j for one in diagnosis.findings if one is not finding for j in one.get("joints", [])]
+        figure = finding_figure(diagnosis.residuals, said.cause, side, joints, numbers, others)
+        parts += [figure_html(figure)] if figure is not None else []
+    parts += [
+        _beside(diagnosis, one) for one in diagnosis.statements.comparisons if one.finding == said.number
     ]
-    for key, label in (("delta_bic", "ΔBIC"), ("p_value", "p-value")):
-        if evidence.get(key) is not None:
-            rows.append([label, f"{evidence[key]:.3g}"])
-    for other in finding.get("alternatives") or []:
-        if other.get("delta_bic") is not None:
-            rows.append([f"ΔBIC with {_words(other['cause'])} instead", f"{other['delta_bic']:.3g}"])
-    return rows
+    statistics = table(("", ""), said.statistics, f"Statistics: {title}", classes="facts")
+    return "".join([*parts, fold("Parameters and statistics", statistics)])
 
 
-def parameter_rows(finding: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Name, value with standard deviation and unit, and meaning of each parameter."""
-    cause = str(finding["cause"])
-    meanings = {p.name: p.meaning for p in EFFECTS[cause].parameters} if cause in EFFECTS else {}
-    return [(name, quantity_text(*one), meanings.get(name, "")) for name, one in values_of(finding).items()]
-
-
-def _beside(pair: LookAlikes, names: Sequence[str]) -> str:
-    """Two causes side by side, what it means, and the motion that decides."""
-
-    def plain(text: str) -> str:
-        """With causes in words, and the names of joints as they are."""
-        for cause, _ in (pair.first, pair.second):
-            text = text.replace(cause, _words(cause))
-        return text
-
-    said, motion = pair.sentences(names)
-    figure = look_alike_figure(pair, names)
-    motion += "" if pair.foreseen is None else f"; {pair.foreseen.sentence()}"
+def _beside(diagnosis: DiagnosisFolder, said: Comparison) -> str:
+    """Two causes side by side, with their signatures where the file has them."""
+    pairs = diagnosis.look_alikes
+    figure = look_alike_figure(pairs[said.place], diagnosis.joint_names) if pairs else None
     return (
-        f"<h4>Side by side: {escape(plain(pair.title(names)))}</h4>"
-        f"{paragraph(plain(said[:1].upper() + said[1:]) + '.')}"
-        f"{paragraph(f'What would decide: {motion}.') if pair.open else ''}"
-        f"{figure_html(figure)}"
+        f"<h4>Side by side: {escape(said.title)}</h4>"
+        f"{paragraph(f'{_capital(said.overlap)}.')}"
+        f"{paragraph(f'To decide: {said.decides}.') if said.decides else ''}"
+        f"{'' if figure is None else figure_html(figure)}"
     )
 
 
-def _asked(diagnosis: DiagnosisFolder) -> str:
-    pairs = [pair for pair in diagnosis.look_alikes if not pair.finding]
-    return "".join(_beside(pair, diagnosis.joint_names) for pair in pairs)
+def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
+    if said.anchor == "limits":
+        return f"<ul>{''.join(f'<li>{escape(_capital(note))}.</li>' for note in said.sentences)}</ul>"
+    html = "".join(map(paragraph, said.sentences)) + (_table(said) if said.rows else "")
+    if said.anchor == "deciding":
+        html += paragraph(run_advice(None if diagnosis.experiment is None else diagnosis.experiment.name))
+    if said.anchor == "replay" and diagnosis.replayed is not None:
+        figures = replay_figures(diagnosis.replayed, diagnosis.joint_names)
+        html += "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
+    return html
 
 
-def _unexplained(entries: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
-    rows: list[list[Cell]] = [
-        [
-            f"{joints_text([entry['joint']] if 'joint' in entry else [], names)}, {entry.get('side', '')} side",
-            ", ".join(entry.get("depends_on", [])),
-            Number(entry.get("test_rms"), ".3g"),
-            Number(entry.get("noise_floor"), ".3g"),
-        ]
-        for entry in entries
-    ]
-    if not rows:
-        return ""
-    head = ("where", "depends on", "error on unseen motions [Nm]", "noise floor [Nm]")
-    return table(head, rows, "Unexplained residuals")
+def _table(said: Part) -> str:
+    units = said.head.index("unit") if "unit" in said.head else -1
+
+    def shown(place: int, cell: str | Number) -> Cell:
+        if isinstance(cell, Number):
+            return Shown(cell.value, cell.form, cell.key)
+        return pretty_unit(cell) if place == units else cell
+
+    return table(said.head, [[shown(*one) for one in enumerate(row)] for row in said.rows], said.title)
 
 
-def _gain(folder: DiagnosisFolder) -> str:
-    diagnosis, details, names = folder.content, folder.details, folder.joint_names
-    gain = diagnosis.get("gain") or {}
-    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
-    floor = (diagnosis.get("baseline") or {}).get("noise_floor") or {}
-    measured = {(row["side"], row["joint"]): row for row in details.get("rows", [])}
-    named = bool(diagnosis.get("findings"))
-    rows: list[list[Cell]] = []
-    for side in base:
-        for k, before in enumerate(base[side] or ()):
-            after = (extended.get(side) or [])[k] if extended.get(side) else None
-            low = floor.get(side) or []
-            row = measured.get((side, k + 1), {})
-            cells: list[Cell] = [
-                f"{names[k] if k < len(names) else k + 1} {side}",
-                Number(low[k] if k < len(low) else None, ".4f"),
-                Number(before, ".4f", f"gain.test_rms_base.{side}.{k}"),
-            ]
-            if named:
-                change = None if not before or after is None else 100 * (after / before - 1)
-                interval = row.get("gain_interval_95")
-                cells += [
-                    Number(after, ".4f", f"gain.test_rms_extended.{side}.{k}"),
-                    Number(change, "+.1f"),
-                    "–" if not interval else _span(interval),
-                ]
-            share = row.get("avoidable_share")
-            rows.append([*cells, Number(None if share is None else 100 * share, ".0f")])
-    if not rows:
-        return ""
-    whole = extension_gain(diagnosis)
-    text = "" if whole is None else paragraph(f"Mean over joints and sides: {error_change(whole)} error.")
-    worse = [one for one in details.get("rows", []) if named and one["gain_interval_95"][1] < 0.0]
-    if worse:
-        places = ", ".join(f"{one['side']} torque of {joints_text([one['joint']], names)}" for one in worse)
-        text += paragraph(f"Worse than the base model there, by more than chance: {places}.")
-    sessions = (diagnosis.get("sessions") or {}).get("test") or []
-    unseen = ", ".join(sessions) or "each part of the motion, predicted from the others"
-    text = paragraph(f"Root mean square errors on what was not fitted: {unseen}.", "soft") + text
-    middle = ("extended [Nm]", "change %", "gain [Nm], 95 % interval") if named else ()
-    head = ("joint", "noise floor [Nm]", "base model [Nm]", *middle, "avoidable % of its power")
-    title = "Gain of the extended model on unseen motions" if named else "Error on unseen motions"
-    return text + table(head, rows, title)
-
-
-def _span(interval: Sequence[float]) -> str:
-    text = f"{interval[0]:+.4f} to {interval[1]:+.4f}"
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
-def _simulated(folder: DiagnosisFolder) -> str:
-    """Error of the replay with the same commands, before and after."""
-    diagnosis, names = folder.content, folder.joint_names
-    gain = diagnosis.get("gain") or {}
-    before, after = gain.get("simulation_error_base") or {}, gain.get("simulation_error_extended") or {}
-    named = bool(diagnosis.get("findings"))
-    rows: list[list[Cell]] = []
-    for key, label, scale in (
-        ("position", "position [mrad]", 1e3),
-        ("motor", "motor torque [Nm]", 1.0),
-        ("joint", "joint torque [Nm]", 1.0),
-    ):
-        if not before.get(key):
-            continue
-        rows.append([f"{label}, base model", *_scaled(before[key], scale)])
-        if named and after.get(key):
-            rows.append([f"{label}, extended", *_scaled(after[key], scale)])
-    if not rows:
-        return ""
-    title = "Replay in simulation"
-    text = paragraph("The same commands to the simulated arm: measured less simulated, root mean square.")
-    figures = [] if folder.replayed is None else replay_figures(folder.replayed, names)
-    plots = "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
-    return text + table(("", *names), rows, title) + plots
-
-
-def _scaled(values: Sequence[float | None], scale: float) -> list[Cell]:
-    return [Number(None if value is None else scale * value, ".3f") for value in values]
-
-
-def _absorbed(diagnosis: DiagnosisFolder) -> str:
-    """Base parameters that were wrong because they had taken up what the findings now say."""
-    entries = diagnosis.details.get("base_parameters") or []
-    if not entries:
-        return ""
-    rows: list[list[Cell]] = [
-        [
-            str(entry["name"]),
-            Number(entry["base"]),
-            Number(entry["extended"]),
-            Number(entry["std"], ".2g"),
-            Number(entry["change_in_std"], "+.1f"),
-            pretty_unit(str(entry["unit"])),
-        ]
-        for entry in entries
-    ]
-    head = ("parameter", "base model", "extended", "std", "change [std]", "unit")
-    title = "What the base parameters had absorbed"
-    text = paragraph(
-        "Wrong in the base model, because they stood for what is now in the model by name.", "soft"
-    )
-    return text + table(head, rows, title)
-
-
-def _notes(diagnosis: DiagnosisFolder) -> str:
-    notes = [str(note) for note in diagnosis.details.get("notes", [])]
-    items = "".join(f"<li>{escape(note[:1].upper() + note[1:])}.</li>" for note in notes)
-    return f"<ul>{items}</ul>" if notes else ""
-
-
-def _offers(diagnosis: DiagnosisFolder) -> str:
-    """The motions that would decide, as files that can be run."""
-    offers = diagnosis.details.get("deciding_motions") or []
-    if not offers:
-        return ""
-    parts = [
-        paragraph(
-            f"{offer['kind'].capitalize()}, {offer['duration_s']:.0f} s: `{offer['file']}`, about "
-            f"{' or '.join(dict.fromkeys(_words(rival['cause']) for rival in offer['rivals']))}."
-        )
-        for offer in offers
-    ]
-    if diagnosis.experiment is not None:
-        name = diagnosis.experiment.name
-        run = f"`lwr-run experiment --resume {name} --decide` runs them and concludes."
-    else:
-        run = (
-            "Each is a plan that has passed every check: name it in an experiment file, `excitation: {plan: FILE}`, "
-            "run it, and give its session to `lwr-run diagnose` beside these."
-        )
-    return "".join([*parts, paragraph(run)])
-
-
-def _plots(diagnosis: DiagnosisFolder) -> str:
+def _residuals(diagnosis: DiagnosisFolder) -> str:
     """Residuals against everything, folded."""
     residuals = diagnosis.residuals
     if residuals is None:
         return ""
-    parts = [
-        fold(figure.caption, figure_html(figure))
-        for side in residuals.sides
-        for figure in residual_figures(residuals, side)
-    ]
-    return "".join(parts)
+    figures = (figure for side in residuals.sides for figure in residual_figures(residuals, side))
+    return "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
 
 
-def _answer(answer: Mapping[str, Any], names: Sequence[str]) -> str:
-    asked = " or ".join(
-        f"{_words(rival['cause'])} ({joints_text(rival['joints'], names)})" for rival in answer["rivals"]
-    )
-    named = answer.get("named")
-    said = "nothing" if named is None else f"{_words(named['cause'])} ({joints_text(named['joints'], names)})"
-    if answer["outcome"] == "decided":
-        return f"Deciding motions: {said}, confidence {answer['confidence']:.2f}; asked was {asked}."
-    if answer["outcome"] == "open":
-        return f"Deciding motions: still open between {asked}."
-    return f"Deciding motions: none of {asked}; found instead: {said}."
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
-def _words(cause: str) -> str:
-    return cause.replace("_", " ")
+def _json(path: Path) -> Mapping[str, Any]:
+    """Content of a file, empty for a missing one."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

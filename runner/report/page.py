@@ -7,13 +7,23 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
+from runner.computer import versions
 from runner.report import sections
-from runner.report.diagnosis import diagnosis_section
+from runner.report.diagnosis import DiagnosisFolder, diagnosis_parts, diagnosis_section
 from runner.report.folder import ResultFolder
 from runner.report.interactive import plotly_script
+from runner.report.markup import section
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 
-__all__ = ["page_html", "report_html", "write_page", "write_report"]
+__all__ = [
+    "REPORT",
+    "diagnosis_html",
+    "page_html",
+    "report_html",
+    "write_diagnosis_report",
+    "write_page",
+    "write_report",
+]
 
 REPORT = "report.html"
 
@@ -52,6 +62,29 @@ def write_report(folder: str | Path) -> Path:
     """
     results = ResultFolder.load(folder)
     return write_page(report_html(results), results.path)
+
+
+def write_diagnosis_report(folder: str | Path) -> Path:
+    """Write `report.html` into a folder of `lwr-run diagnose`; returns its path.
+
+    ConfigurationError where the folder holds no diagnosis or the extra `view` is not installed.
+    """
+    diagnosis = DiagnosisFolder.load(folder)
+    return write_page(diagnosis_html(diagnosis), diagnosis.path)
+
+
+def diagnosis_html(diagnosis: DiagnosisFolder) -> str:
+    """The text of the page of a diagnosis."""
+    parts, said = diagnosis_parts(diagnosis), diagnosis.statements
+    return page_html(
+        "Diagnosis",
+        escape(f"{said.about} · {diagnosis.path.resolve().name}"),
+        (said.level, said.headline),
+        [Verdict(line.subject, line.found, line.wanted, line.level, line.anchor) for line in said.lines],
+        "".join(section(anchor, title, html) for anchor, title, html in parts),
+        [(anchor, title) for anchor, title, _ in parts],
+        str(versions()["software"]),
+    )
 
 
 def write_page(text: str, folder: Path) -> Path:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
+from ident.diagnosis.statements import in_short
 from runner.report.folder import ResultFolder
 
-__all__ = ["Level", "Verdict", "error_change", "extension_gain", "headline", "largest_gain", "verdicts"]
+__all__ = ["Level", "Verdict", "headline", "verdicts"]
 
 Level = Literal["good", "look", "bad"]
 
@@ -203,48 +204,8 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
     diagnosis = results.diagnosis
     if diagnosis is None:
         return None
-    causes = [str(finding["cause"]).replace("_", " ") for finding in diagnosis.get("findings", [])]
-    unexplained = len(diagnosis.get("unexplained", []))
-    text = f"found: {_listed(causes)}" if causes else "nothing found"
-    if unexplained:
-        text += f"; {unexplained} unexplained"
-    gain = extension_gain(diagnosis)
-    if gain is not None:
-        place, best = largest_gain(diagnosis, results.joint_names)
-        change = f"{error_change(best)} error on held-out motions, {error_change(gain)} on average"
-        text += f"; the extended model: {place} {change}"
-    return Verdict("diagnosis", text, "", "look" if causes or unexplained else "good", "diagnosis")
-
-
-def error_change(gain: float) -> str:
-    """A removed share of the error as change in percent; small ones with a decimal, zero without a sign."""
-    percent = round(-100.0 * gain, 0 if abs(gain) >= 0.01 else 1)
-    return f"{percent:+g} %" if percent else "0 %"
-
-
-def extension_gain(diagnosis: Mapping[str, Any]) -> float | None:
-    """Share of the held-out error removed by the extended model, mean over joints and sides."""
-    ratios = [ratio for ratio, _, _ in _error_ratios(diagnosis)]
-    return 1.0 - float(np.mean(ratios)) if ratios and diagnosis.get("findings") else None
-
-
-def largest_gain(diagnosis: Mapping[str, Any], names: Sequence[str]) -> tuple[str, float]:
-    """Joint and side with the largest gain by the extended model, and the removed share of its error."""
-    found = _error_ratios(diagnosis)
-    share, place = max((1.0 - r, f"{names[k] if k < len(names) else k + 1} {side}") for r, k, side in found)
-    return place, share
-
-
-def _error_ratios(diagnosis: Mapping[str, Any]) -> list[tuple[float, int, str]]:
-    """Held-out error of the extended model over the base model's, with the place of the joint and the side."""
-    gain = diagnosis.get("gain") or {}
-    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
-    return [
-        (after / before, k, side)
-        for side in base
-        for k, (before, after) in enumerate(zip(base[side] or (), extended.get(side) or (), strict=False))
-        if before and after is not None
-    ]
+    level, text = in_short(diagnosis, results.joint_names)
+    return Verdict("diagnosis", text, "", level, "diagnosis")
 
 
 _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (

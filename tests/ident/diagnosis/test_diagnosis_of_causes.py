@@ -74,7 +74,7 @@ def healthy(make: Make, chain: Chain) -> Diagnosis:
 def test_says_nothing_where_nothing_is_wrong(healthy: Diagnosis) -> None:
     assert healthy.findings == ()
     assert healthy.unexplained == ()
-    assert "Nothing is wrong" in str(healthy)
+    assert "No model error is detectable" in str(healthy)
 
 
 def test_base_model_alone_leaves_only_noise(healthy: Diagnosis) -> None:

@@ -14,21 +14,20 @@ from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
 from lwr_driver.session import Session
-from runner.diagnosis.deciding import Deciding
-from runner.diagnosis.decision import decisions
-from runner.diagnosis.foresight import made_up
+from runner.diagnosis.after_run import decisions
+from runner.diagnosis.discriminating import Discriminating, made_up
 
 Make = Callable[..., Session]
 PAIR = ("stribeck", "viscous_nonlinear")
 STEP_S = 0.1
 
 
-def of_joint_2(name: str, path: Sequence[float], chain: Chain) -> Deciding:
+def of_joint_2(name: str, path: Sequence[float], chain: Chain) -> Discriminating:
     """A motion of joint 2 through points every tenth of a second, at rest before and after."""
     points = np.zeros((3, len(path) + 8))
     points[1] = np.pad(path, 4)
     whole = round((points.shape[1] - 1) * STEP_S / 0.12) * 0.12
-    return Deciding(
+    return Discriminating(
         name,
         Experiment.SLOW_SWEEP,
         2,

@@ -11,18 +11,20 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
+from ident.diagnosis.look_alikes import LookAlikes
+from ident.diagnosis.statements import comparison
 from ident.dynamics.kinematics import Chain
 from ident.effects import Experiment
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
 from lwr_driver.session import Session
-from runner.diagnosis import Study, study
-from runner.diagnosis.deciding import Deciding
-from runner.diagnosis.look_alikes import FILE, LookAlikes, asked, read_look_alikes
+from runner.diagnosis import Study, asked, study
+from runner.diagnosis.discriminating import Discriminating
+from runner.diagnosis.records import LOOK_ALIKES, read_look_alikes
 from runner.diagnosis.study import replaceable
-from runner.report.diagnosis_folder import DiagnosisFolder
-from runner.report.diagnosis_page import diagnosis_html, diagnosis_verdicts
-from runner.report.look_alike_figures import look_alike_figure
+from runner.report.diagnosis import DiagnosisFolder
+from runner.report.diagnosis_figures import look_alike_figure
+from runner.report.page import diagnosis_html
 
 Make = Callable[..., Session]
 NAMES = ("one", "two", "three")
@@ -56,7 +58,7 @@ def test_a_doubt_is_shown_with_both_signatures(found: Study) -> None:
     assert np.corrcoef(trace.first, trace.measured)[0, 1] > 0.8
     said = str(found)
     assert f"overlap {pair.alike:.3f}" in said
-    assert "Side by side: cable_spring (joint three) or joint_zero_offset (joint two)" in said
+    assert "Side by side: cable spring (joint three) or joint zero offset (joint two)" in said
 
 
 def test_what_a_motion_will_tell_is_foreseen(found: Study) -> None:
@@ -66,7 +68,7 @@ def test_what_a_motion_will_tell_is_foreseen(found: Study) -> None:
     # Slowly over a wide range, which the session does not cover.
     points[2] = 2.6 * np.sin(4.0 * np.pi * share) * np.minimum(1.0, 20.0 * np.minimum(share, 1.0 - share))
     plan = ExcitationPlan(SplineMotion(24.0, points), NAMES, 1)
-    sweep = Deciding("slow_sweep_3", Experiment.SLOW_SWEEP, 3, plan, (None,), (pair.first, pair.second))
+    sweep = Discriminating("slow_sweep_3", Experiment.SLOW_SWEEP, 3, plan, (None,), (pair.first, pair.second))
     again = found.with_offers([sweep]).pairs
     seen = again[0].foreseen
     assert seen is not None
@@ -99,13 +101,13 @@ def test_the_files_and_the_page_hold_the_pairs(found: Study, tmp_path: Path) -> 
     assert len(list(tmp_path.glob("look-alike-*.svg"))) == len(found.pairs)
     page = diagnosis_html(folder)
     assert page.count("Side by side:") == len(found.pairs)
-    assert "What would decide" in page
-    assert diagnosis_verdicts(folder)[0].subject.startswith("sensor ripple, joint three")
+    assert "To decide" in page
+    assert folder.statements.lines[0].subject.startswith("sensor ripple, joint three")
     replaceable(tmp_path)
-    (tmp_path / FILE).write_bytes(b"PK")
+    (tmp_path / LOOK_ALIKES).write_bytes(b"PK")
     entries = json.loads((tmp_path / "details.json").read_text())["look_alikes"]
     with pytest.raises(DataError, match="run the diagnosis again"):
-        read_look_alikes(tmp_path / FILE, entries)
+        read_look_alikes(tmp_path / LOOK_ALIKES, entries)
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -156,9 +158,9 @@ def test_what_the_overlap_means_is_said_in_words() -> None:
         ("move joint 1",) * 2,
     )
     assert alike.apart < alike.needed
-    said, decides = alike.sentences(NAMES)
-    assert said.endswith("not with these sessions")
-    assert decides == "move joint one"
+    said = comparison(alike.to_dict(), NAMES)
+    assert said.overlap.endswith("not with these sessions")
+    assert said.decides == "move joint one"
     apart = replace(alike, alike=0.3)
-    assert apart.sentences(NAMES)[0].endswith("these sessions do")
-    assert "without a motor torque" in replace(apart, shape_alone=True).sentences(NAMES)[0]
+    assert comparison(apart.to_dict(), NAMES).overlap.endswith("these sessions do")
+    assert "without a motor torque" in comparison(replace(apart, shape_alone=True).to_dict(), NAMES).overlap

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import Finding
+from ident.diagnosis.statements import answer_statement
 from ident.effects import EFFECTS
 from ident.effects.words import quantity_text
 from ident.excitation import ExcitationPlan
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
-from runner.diagnosis.deciding import Deciding, offers, open_findings
-from runner.diagnosis.decision import decision_text, decisions
+from runner.diagnosis.after_run import decisions
+from runner.diagnosis.discriminating import Discriminating, offers, open_findings
 from runner.experiment_file import Experiment
 from runner.planning import excitation_rows, plan_excitation, session_motion
 
@@ -44,7 +45,7 @@ def diagnosis(*findings: Finding) -> Any:
     return SimpleNamespace(findings=findings)
 
 
-def offered(found: Any, experiment: Experiment, arm: Arm) -> tuple[Deciding, ...]:
+def offered(found: Any, experiment: Experiment, arm: Arm) -> tuple[Discriminating, ...]:
     cell = Cell.load(experiment.cell)
     return offers(found, experiment, arm, cell, plan_excitation(experiment, arm, cell))
 
@@ -136,15 +137,17 @@ def test_the_decision_names_the_one_that_stands() -> None:
     (answer,) = decisions(before, after)
     assert answer.outcome == "decided"
     assert answer.named == ("viscous_nonlinear", (2,))
-    assert decision_text([answer], NAMES).startswith("decided: viscous_nonlinear (joint A2), confidence 0.95")
+    said = answer_statement(answer.to_dict(), NAMES)
+    assert said.startswith("Decided: viscous nonlinear (joint A2), confidence 0.95")
 
 
 def test_the_decision_says_that_it_is_still_open() -> None:
     before = diagnosis(finding("stribeck", 2, 0.6, ("viscous_nonlinear", (2,))))
     (answer,) = decisions(before, diagnosis(finding("stribeck", 2, 0.7, ("viscous_nonlinear", (2,)))))
     assert answer.outcome == "open"
-    assert "still open" in answer.text(NAMES)
-    assert "stribeck (joint A2) is the better now, confidence 0.70" in answer.text(NAMES)
+    said = answer_statement(answer.to_dict(), NAMES)
+    assert "Still open" in said
+    assert "stribeck (joint A2) is the better now, confidence 0.70" in said
 
 
 def test_the_decision_says_that_none_of_them_stands() -> None:
@@ -152,7 +155,7 @@ def test_the_decision_says_that_none_of_them_stands() -> None:
     (other,) = decisions(before, diagnosis(finding("friction_load", 2, 0.9)))
     assert (other.outcome, other.named) == ("neither", ("friction_load", (2,)))
     (nothing,) = decisions(before, diagnosis())
-    assert "found instead: nothing" in nothing.text(NAMES)
+    assert "found instead: nothing" in answer_statement(nothing.to_dict(), NAMES)
 
 
 @pytest.mark.parametrize(

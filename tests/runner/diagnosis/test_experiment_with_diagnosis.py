@@ -20,17 +20,16 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session
 from runner.cli import main
-from runner.commissioning import record_sets
+from runner.commands.commission import record_sets
 from runner.diagnosis import Study, after_run
 from runner.diagnosis.after_run import conclude_run
-from runner.diagnosis.replayed import QUANTITIES, ReplayErrors
-from runner.diagnosis.residuals import Residuals
+from runner.diagnosis.records import QUANTITIES, ReplayErrors, Residuals
 from runner.experiment_file import Experiment
 from runner.planning import Excitations
 from runner.replay import Replay, replay
+from runner.report.diagnosis_figures import AGAINST
 from runner.report.folder import ResultFolder
 from runner.report.page import report_html
-from runner.report.residual_figures import AGAINST
 from sim_backend.configuration import load_configuration
 
 pytestmark = pytest.mark.slow
@@ -90,7 +89,7 @@ def test_the_experiment_ends_with_the_hidden_cause(done: Done) -> None:
     finding = content(done, "diagnosis.json")["findings"][0]
     assert (finding["cause"], finding["joints"]) == ("presliding_hysteresis", [2])
     assert (done.folder / "diagnosis" / "diagnosis.txt").read_text() in done.text
-    assert "presliding_hysteresis, joint A2" in done.text
+    assert "Presliding hysteresis, joint A2 [presliding_hysteresis]" in done.text
     assert "no reference of the healthy arm" in done.text
     assert done.text.strip().splitlines()[-1] == str(done.folder)
 
@@ -149,7 +148,7 @@ def test_errors_of_the_replay_are_kept_over_time_and_drawn(done: Done) -> None:
         rms = np.sqrt(np.nanmean(replayed.errors["extended", quantity] ** 2, axis=0))
         np.testing.assert_allclose(rms, error[quantity], rtol=1e-3)
     text = (folder / "replay-position.svg").read_text()
-    assert text.count("Measured less simulated position of") == 7
+    assert text.count("Measured minus simulated position of") == 7
     assert "mrad rms, extended" in text
     broken = done.folder / "broken_replay.npz"
     broken.write_bytes(b"PK")
@@ -272,7 +271,7 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
     (answer,) = json.loads((out / "diagnosis" / "decision.json").read_text())["answers"]
     assert answer["outcome"] == "decided"
     assert answer["named"] == {"cause": "sensor_gain", "joints": [2]}
-    assert "decided: sensor_gain (joint A2)" in text
+    assert "Decided: sensor gain (joint A2)" in text
     before = json.loads((out / "diagnosis" / "before_deciding.json").read_text())["findings"][0]
     assert (before["cause"], before["confidence"]) == ("sensor_crosstalk", 0.6)
     after = json.loads((out / "diagnosis" / "diagnosis.json").read_text())

@@ -20,13 +20,13 @@ from click.testing import CliRunner
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
+from ident.diagnosis.statements import error_change
 from lwr_driver.session import Session
 from runner.cli import main
 from runner.published import TABLE_1, TABLE_2
 from runner.report.figures import torque_figure
 from runner.report.folder import ResultFolder
 from runner.report.page import write_report
-from runner.report.verdicts import error_change, headline, verdicts
 from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, opened
 
 pytestmark = pytest.mark.slow

@@ -1,8 +1,8 @@
-"""Motions that tell causes apart, as splines that begin and end at rest.
+"""Motions of the discriminating experiments, as splines from rest to rest.
 
 A spline through dense points of a path of straight lines rounds its corners and keeps its speeds, so one form
-serves slow sweeps, reversals of growing size, poses and chirps alike. Every motion lasts a whole number of
-`GRAIN_S`, which the usual FRI cycles divide.
+serves slow sweeps, reversals of growing size, poses and chirps alike. Every motion lasts a multiple of `GRAIN_S`, a
+multiple of the usual FRI cycles.
 """
 
 from __future__ import annotations
@@ -50,34 +50,33 @@ _POSE_SPEED = 0.25
 _POSE_REST_S = 0.4
 
 
-def slow_sweep(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion:
-    """Constant speeds of `joint` (from 0) from 0.6 down to 0.013 rad/s, there and back, over `reach` [rad].
+def slow_sweep(arm: Arm, home: Floats, joint: int, span: float) -> SplineMotion:
+    """Constant speeds of `joint` (from 0) from 0.6 down to 0.013 rad/s, there and back, over `span` [rad].
 
-    Swings of up to 1.4 rad/s follow: what falls towards zero is told from what bends at high speed by both ends.
-    The large sweeps are repeated with the next joint turned, so that what depends on the load is told from what
-    depends on the angle.
+    Swings of up to 1.4 rad/s follow, because low and high speeds together separate the Stribeck effect from nonlinear
+    viscous friction. The large sweeps are repeated with the next joint turned, to separate load from angle.
     """
-    middle = _centred(arm, home, joint, reach)
+    middle = _centred(arm, home, joint, span)
     points = [middle]
     speeds: list[float] = []
     for share, speed in _SWEEPS:
-        _there_and_back(points, speeds, joint, 0.5 * share * reach, speed)
-    _swing(arm, points, speeds, joint, 0.5 * reach)
+        _there_and_back(points, speeds, joint, 0.5 * share * span, speed)
+    _swing(arm, points, speeds, joint, 0.5 * span)
     other = joint - 1 if joint > 0 else joint + 1
     turned = np.array(middle)
     turned[other] += 0.35 if turned[other] < 0.5 * (arm.q_low[other] + arm.q_high[other]) else -0.35
     points.append(turned)
     speeds.append(_POSE_SPEED)
-    _there_and_back(points, speeds, joint, 0.5 * reach, 0.15)
+    _there_and_back(points, speeds, joint, 0.5 * span, 0.15)
     points.append(middle)
     speeds.append(_POSE_SPEED)
     return _along(points, speeds, 0.0)
 
 
-def reversal_ladder(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion:
-    """Reversals of `joint` (from 0) at amplitudes from 0.01 rad to half of `reach`."""
-    middle = _centred(arm, home, joint, reach)
-    rungs = [(min(a, 0.5 * reach), f, n) for a, f, n in _LADDER]
+def reversal_ladder(arm: Arm, home: Floats, joint: int, span: float) -> SplineMotion:
+    """Reversals of `joint` (from 0) at amplitudes from 0.01 rad to half of `span`."""
+    middle = _centred(arm, home, joint, span)
+    rungs = [(min(a, 0.5 * span), f, n) for a, f, n in _LADDER]
     ends = np.cumsum([n / f for _, f, n in rungs])
 
     def offset(t: Floats) -> Floats:
@@ -91,9 +90,9 @@ def reversal_ladder(arm: Arm, home: Floats, joint: int, reach: float) -> SplineM
     return _about(middle, joint, offset, float(ends[-1]))
 
 
-def chirp(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion:
-    """Oscillation of `joint` (from 0) from 1 to 8 Hz, as large as acceleration and jerk allow with ease."""
-    middle = _centred(arm, home, joint, reach)
+def chirp(arm: Arm, home: Floats, joint: int, span: float) -> SplineMotion:
+    """Oscillation of `joint` (from 0) from 1 to 8 Hz, well within the limits of acceleration and jerk."""
+    middle = _centred(arm, home, joint, span)
     first, last, duration = _CHIRP
     a_most, j_most = 0.3 * float(arm.a_max[joint]), 0.5 * float(arm.j_max[joint])
 
@@ -101,7 +100,7 @@ def chirp(arm: Arm, home: Floats, joint: int, reach: float) -> SplineMotion:
         share = np.clip(t / duration, 0.0, 1.0)
         phase = 2.0 * np.pi * duration * (first * share + 0.5 * (last - first) * share**2)
         omega = 2.0 * np.pi * (first + (last - first) * share)
-        size = np.minimum.reduce([np.full_like(t, 0.1 * reach), a_most / omega**2, j_most / omega**3])
+        size = np.minimum.reduce([np.full_like(t, 0.1 * span), a_most / omega**2, j_most / omega**3])
         edge = np.minimum(1.0, 4.0 * np.minimum(share, 1.0 - share) / 0.2)
         return np.asarray(size * edge * np.sin(phase))
 
@@ -113,8 +112,7 @@ def poses(
 ) -> SplineMotion:
     """Slowly through `count` poses within `spread` [rad] of home and back the same way, with a rest in each.
 
-    free : whether a pose (n,) keeps clear of everything. Slow motion both ways, for at rest nobody knows the
-    friction.
+    free : whether a pose (n,) is clear of collisions. Slow motion both ways, because friction at rest is unknown.
     """
     random = np.random.default_rng(1)
     low, high = np.maximum(arm.q_low, home - spread), np.minimum(arm.q_high, home + spread)
@@ -130,16 +128,16 @@ def poses(
     return _along(points, [_POSE_SPEED] * (len(points) - 1), _POSE_REST_S)
 
 
-def _centred(arm: Arm, home: Floats, joint: int, reach: float) -> Floats:
-    """Home, with the joint where it has `reach` around it."""
+def _centred(arm: Arm, home: Floats, joint: int, span: float) -> Floats:
+    """Home, with room for `span` around the joint."""
     middle = np.array(home, dtype=float)
-    half = 0.5 * reach
+    half = 0.5 * span
     middle[joint] = np.clip(middle[joint], arm.q_low[joint] + half, arm.q_high[joint] - half)
     return middle
 
 
 def _there_and_back(points: list[Floats], speeds: list[float], joint: int, half: float, speed: float) -> None:
-    """From where the path is to one side of it, to the other, and back to the middle."""
+    """From the end of the path to one side, to the other, and back."""
     middle = np.array(points[-1])
     for offset in (half, -half, 0.0):
         point = np.array(middle)
@@ -149,7 +147,7 @@ def _there_and_back(points: list[Floats], speeds: list[float], joint: int, half:
 
 
 def _swing(arm: Arm, points: list[Floats], speeds: list[float], joint: int, half: float) -> None:
-    """Sinusoids about where the path is, as fast as speed and acceleration allow with ease."""
+    """Sinusoids about the end of the path, well within the limits of speed and acceleration."""
     middle = np.array(points[-1])
     fastest = min(_SWING_SPEED, 0.8 * float(arm.v_max[joint]), float(np.sqrt(0.5 * arm.a_max[joint] * half)))
     count = max(8, round(2.0 * np.pi * half / fastest / _SWING_STEP_S))
@@ -194,7 +192,7 @@ def _about(middle: Floats, joint: int, offset: Callable[[Floats], Floats], durat
 
 def _spline(at: Callable[[Floats], Floats], duration_s: float, step_s: float) -> SplineMotion:
     whole = float(np.ceil(duration_s / GRAIN_S - 1e-9)) * GRAIN_S
-    # Six decimals of a second, so that the file shows the number that is meant.
+    # Six decimals of a second, for a clean number in the file.
     whole = round(whole, 6)
     count = max(12, round(whole / step_s))
     points = at(np.linspace(0.0, whole, count)).T.copy()

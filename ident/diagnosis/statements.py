@@ -1,0 +1,591 @@
+"""A diagnosis in words: one list of statements for terminal, report and notebook.
+
+The statements are made from plain content, that of `diagnosis.json` (`content`) and of `details.json` (`details`);
+each part of either may be missing.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ident.diagnosis.selection import margin
+from ident.effects import EFFECTS, described, summary_of
+from ident.effects.words import joints_text, named, quantity_text, spoken
+
+__all__ = [
+    "REPLAYED",
+    "SURE",
+    "Comparison",
+    "FindingStatement",
+    "Line",
+    "Number",
+    "Part",
+    "Statements",
+    "answer_statement",
+    "comparison",
+    "error_change",
+    "extension_gain",
+    "finding_statement",
+    "in_short",
+    "is_open",
+    "run_advice",
+    "statements",
+    "values_of",
+]
+
+Plain = Mapping[str, Any]
+
+SURE = 0.8
+"""Default confidence below which a finding with alternatives is open between look-alikes."""
+
+_WIDTH = 100
+_MOST_ROWS = {"unexplained": 4, "absorbed": 5}
+_REPR_LINES = 10
+_AVOIDABLE_LOOK = 0.3
+_WORSE_REPLAY = 1.1
+_SEEN = {
+    "motor": "Seen in the motor torque only.",
+    "joint": "Acts on the links, so both torques see it.",
+    "sensor": "An error of the joint torque sensor.",
+}
+REPLAYED = (
+    ("position", "position", "mrad", 1e3),
+    ("motor", "motor torque", "Nm", 1.0),
+    ("joint", "joint torque", "Nm", 1.0),
+)
+"""Replayed quantities: key, words, unit, scale from SI."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number in a table. key : its place in diagnosis.json."""
+
+    value: float | None
+    form: str = ".4g"
+    key: str = ""
+
+    def __str__(self) -> str:
+        return "–" if self.value is None or math.isnan(self.value) else format(self.value, self.form)
+
+
+Row = Sequence[str | Number]
+Level = Literal["good", "look"]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the summary. wanted : the value of a good result; anchor : of the part with the details."""
+
+    subject: str
+    found: str
+    wanted: str
+    level: Level
+    anchor: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two causes side by side. place : in the list of `look_alikes`, from 0; finding : number from 1, 0 if asked for.
+
+    decides : empty for causes separated by these sessions.
+    """
+
+    place: int
+    finding: int
+    title: str
+    overlap: str
+    decides: str
+
+
+@dataclass(frozen=True)
+class FindingStatement:
+    """One finding. facts : error, alternatives, discriminating motion; statistics : parameters with their meaning and
+    the figures behind the claim; both as (label, text).
+    """
+
+    number: int
+    cause: str
+    title: str
+    text: str
+    confidence: str
+    facts: tuple[tuple[str, str], ...]
+    statistics: tuple[tuple[str, str], ...]
+    is_open: bool
+
+    def lines(self) -> list[str]:
+        """For the terminal."""
+        found = [f"{self.number}. {_capital(self.title)} [{self.cause}]: {self.confidence}"]
+        found += _wrapped(self.text, "     ", "     ") if self.text else []
+        for label, text in self.facts:
+            if self.is_open or label.startswith("error"):
+                found += _wrapped(f"{label}: {text}", "     ", "        ")
+        return found
+
+
+@dataclass(frozen=True)
+class Part:
+    """Sentences and a table under a title. rows : of the table, each with its heading first."""
+
+    anchor: str
+    title: str
+    sentences: Sequence[str] = ()
+    head: Sequence[str] = ()
+    rows: Sequence[Row] = ()
+
+    def lines(self) -> list[str]:
+        """For the terminal."""
+        if self.anchor == "limits":
+            return [line for note in self.sentences for line in _wrapped(note, "note: ", "      ")]
+        found = [self.title]
+        for sentence in self.sentences:
+            found += _wrapped(sentence, "  ", "    ")
+        if not self.rows:
+            return found
+        most = _MOST_ROWS.get(self.anchor, len(self.rows))
+        rows = [self.head, *([str(cell) for cell in row] for row in self.rows[:most])]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        for first, *rest in rows:
+            cells = (f"{cell:>{width}}" for cell, width in zip(rest, widths[1:], strict=True))
+            found.append(f"  {first:<{widths[0]}}  {'  '.join(cells)}".rstrip())
+        more = len(self.rows) - most
+        return [*found, f"  ... and {more} more"] if more > 0 else found
+
+
+@dataclass(frozen=True)
+class Statements:
+    """All that a diagnosis says.
+
+    lines : the summary. answers : of the discriminating experiments already run. asked : causes side by side on
+    request, besides those of a finding. parts : in their order, empty ones left out.
+    """
+
+    about: str
+    level: Level
+    headline: str
+    lines: tuple[Line, ...]
+    answers: tuple[str, ...]
+    findings: tuple[FindingStatement, ...]
+    comparisons: tuple[Comparison, ...]
+    parts: tuple[Part, ...]
+
+    def text(self) -> str:
+        """The whole, for the terminal."""
+        found = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
+        found += [f"{answer}." for answer in self.answers]
+        for finding in self.findings:
+            found += finding.lines()
+            found += [x for one in self.comparisons if one.finding == finding.number for x in _beside(one)]
+        for one in self.comparisons:
+            if not one.finding:
+                found += [f"Side by side: {one.title}", *_beside(one)]
+        return "\n".join([*found, *(line for part in self.parts for line in part.lines())])
+
+    def brief(self) -> str:
+        """Headline and summary, at most ten lines."""
+        found = [self.about, f"{self.headline}.", *(f"{line.subject}: {line.found}" for line in self.lines)]
+        more = len(found) - _REPR_LINES
+        kept = [*found[: _REPR_LINES - 1], f"... and {more + 1} more lines"] if more > 0 else found
+        return "\n".join(textwrap.shorten(line, 2 * _WIDTH, placeholder=" ...") for line in kept)
+
+
+def statements(
+    content: Plain, details: Plain, names: Sequence[str], answers: Sequence[Plain] = ()
+) -> Statements:
+    """The statements of a diagnosis. names : of the joints. answers : of decision.json."""
+    sure = float(details.get("sure", SURE))
+    findings = [
+        finding_statement(number, finding, names, sure)
+        for number, finding in enumerate(content.get("findings", []), start=1)
+    ]
+    level, headline = _headline(content, details, findings)
+    parts = (
+        _experiments(details, names),
+        _unexplained(content, names),
+        _gain(content, details, names),
+        _replay(content, names),
+        _absorbed(details),
+        Part("limits", "Limits of these data", details.get("notes", ())),
+    )
+    return Statements(
+        f"Diagnosis of {', '.join((content.get('sessions') or {}).get('train', []))}",
+        level,
+        headline,
+        tuple(_lines(content, details, findings, names)),
+        tuple(answer_statement(answer, names) for answer in answers),
+        tuple(findings),
+        tuple(comparison(one, names, k) for k, one in enumerate(details.get("look_alikes") or [])),
+        tuple(part for part in parts if part.sentences or part.rows),
+    )
+
+
+def is_open(confidence: float | None, alternatives: Sequence[Any] | None, sure: float = SURE) -> bool:
+    """Whether a finding is open between look-alikes."""
+    return confidence is not None and confidence < sure and bool(alternatives)
+
+
+def values_of(finding: Plain) -> dict[str, tuple[float, float, str]]:
+    """Value, standard deviation and unit by parameter."""
+    return {
+        name: (float(one.get("value", math.nan)), float(one.get("std") or 0.0), str(one.get("unit", "1")))
+        for name, one in (finding.get("parameters") or {}).items()
+    }
+
+
+def finding_statement(
+    number: int, finding: Plain, names: Sequence[str], sure: float = SURE
+) -> FindingStatement:
+    """A finding in words."""
+    cause, mode, side = str(finding["cause"]), finding.get("mode"), str(finding.get("side", ""))
+    counted = cause in EFFECTS and EFFECTS[cause].counted
+    meaning = ""
+    if mode and counted:
+        meaning = f"{summary_of(cause)}: {mode}."
+    elif finding.get("parameters"):
+        meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
+        meaning += f", {mode} sessions." if mode else "."
+    confidence, others = finding.get("confidence"), finding.get("alternatives") or []
+    open_ = is_open(confidence, others, sure)
+    known = "no confidence given" if confidence is None else f"confidence {confidence:.2f}"
+    facts = []
+    evidence = finding.get("evidence") or {}
+    before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
+    if before and after is not None and not (mode and counted):
+        interval = evidence.get("gain_interval_95")
+        gain = f", less by {interval[0]:.3g} to {interval[1]:.3g} Nm (95 %)" if interval else ""
+        facts.append(("error on held-out data", f"{before:.3g} -> {after:.3g} Nm{gain}"))
+    facts += [("could also be", _placed(other, names)) for other in others]
+    if finding.get("tell_apart") and others:
+        facts.append(("discriminating experiment", named(str(finding["tell_apart"]), names)))
+    return FindingStatement(
+        number,
+        cause,
+        _placed(finding, names, always=True),
+        " ".join(part for part in (_capital(meaning), _SEEN.get(side, "")) if part),
+        known + (", open between look-alikes" if open_ else ""),
+        tuple(facts),
+        tuple(_statistics(finding)),
+        open_,
+    )
+
+
+def comparison(entry: Plain, names: Sequence[str], place: int = 0) -> Comparison:
+    """Two causes side by side, from the plain content of a `LookAlikes`."""
+    first, second = (
+        f"{spoken(one['cause'])} ({joints_text(one['joints'], names)})" for one in entry["causes"]
+    )
+    if not entry["told_apart"]:
+        verdict = "not with these sessions"
+    elif entry["shape_alone"]:
+        verdict = (
+            "their shapes differ enough, but without a motor torque a sensor error cannot be separated from a torque "
+            "of the arm of the same shape"
+        )
+    else:
+        verdict = "these sessions do"
+    overlap = (
+        f"overlap {entry['overlap']:.3f}: beside a refitted base model, {first} would leave "
+        f"{entry['strength'][0]:.2g} times the noise, and {second} could imitate all of it but {entry['apart']:.2g}. "
+        f"Telling them apart takes {entry['needed']:.2g}: {verdict}"
+    )
+    decides, seen = "", entry.get("foreseen")
+    if not entry["told_apart"] or entry["shape_alone"]:
+        decides = " or ".join(dict.fromkeys(named(text, names) for text in entry["decides"]))
+    if seen is not None:
+        needed = math.sqrt(margin(seen["strength"] ** 2))
+        decides += (
+            f"{'; ' * bool(decides)}with {seen['file']} recorded as well, the expected overlap is "
+            f"{seen['overlap']:.3f} and the expected rest {seen['apart']:.2g} times the noise, of {needed:.2g} needed: "
+            + ("enough" if seen["apart"] > needed else "not enough")
+        )
+    return Comparison(place, int(entry.get("finding") or 0), f"{first} or {second}", overlap, decides)
+
+
+def answer_statement(answer: Plain, names: Sequence[str]) -> str:
+    """The answer of the discriminating experiments to one open finding."""
+
+    def said(place: Plain) -> str:
+        return f"{spoken(place['cause'])} ({joints_text(place['joints'], names)})"
+
+    asked, found = " or ".join(map(said, answer["rivals"])), answer.get("named")
+    named_one, confidence = "nothing" if found is None else said(found), f"{answer['confidence']:.2f}"
+    if answer["outcome"] == "decided":
+        return f"Decided: {named_one}, confidence {confidence}; the question was {asked}"
+    if answer["outcome"] == "open":
+        return (
+            f"Still open after the discriminating experiments: {asked}; {named_one} is the better now, "
+            f"confidence {confidence}"
+        )
+    return f"Decided against all candidates ({asked}); found instead: {named_one}"
+
+
+def run_advice(experiment: str | None) -> str:
+    """How to run discriminating experiments. experiment : folder of the experiment, None for a diagnosis of logs."""
+    if experiment is not None:
+        return f"`lwr-run experiment --resume {experiment} --decide` runs the discriminating experiments and concludes."
+    return (
+        "Each is a plan with all checks passed: name it in an experiment file, `excitation: {plan: FILE}`, run it, "
+        "and give its session to `lwr-run diagnose` beside these."
+    )
+
+
+def error_change(gain: float) -> str:
+    """A share of the error removed, as the change of the error; small ones with a decimal, none without a sign."""
+    percent = round(-100.0 * gain, 0 if abs(gain) >= 0.01 else 1)
+    return f"{percent:+g} %" if percent else "0 %"
+
+
+def extension_gain(content: Plain) -> float | None:
+    """Share of the error on held-out data removed by the extended model, mean over joints and sides."""
+    shares = [share for share, _ in _shares(content, ())]
+    return sum(shares) / len(shares) if shares and content.get("findings") else None
+
+
+def in_short(content: Plain, names: Sequence[str]) -> tuple[Level, str]:
+    """The whole diagnosis in one line of a run's summary."""
+    causes = [spoken(str(finding["cause"])) for finding in content.get("findings", [])]
+    unexplained = len(content.get("unexplained", []))
+    text = f"found: {', '.join(dict.fromkeys(causes))}" if causes else "nothing found"
+    text += f"; {unexplained} unexplained" if unexplained else ""
+    gain = extension_gain(content)
+    if gain is not None:
+        best, place = max(_shares(content, names))
+        text += (
+            f"; the extended model: {place} {error_change(best)} error on held-out data, {error_change(gain)} on "
+            "average"
+        )
+    return ("look" if causes or unexplained else "good"), text
+
+
+def _shares(content: Plain, names: Sequence[str]) -> list[tuple[float, str]]:
+    """Share of the error removed by the extended model, and its joint and side."""
+    gain = content.get("gain") or {}
+    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
+    return [
+        (1.0 - after / before, f"{_name(k + 1, names)} {side}")
+        for side in base
+        for k, (before, after) in enumerate(zip(base[side] or (), extended.get(side) or (), strict=False))
+        if before and after is not None
+    ]
+
+
+def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatement]) -> tuple[Level, str]:
+    doubtful, count = sum(finding.is_open for finding in findings), len(findings)
+    if count == 1:
+        return "look", "One cause found" + (", open between look-alikes" if doubtful else "")
+    if count:
+        doubt = f", {'one' if doubtful == 1 else doubtful} of them open between look-alikes"
+        return "look", f"{count} causes found, the largest effect first" + (doubt if doubtful else "")
+    if content.get("unexplained"):
+        return "look", "The data support no cause, but the residuals depend on the motion"
+    worst = max((row["avoidable_share"] for row in details.get("rows", [])), default=0.0)
+    if worst < _AVOIDABLE_LOOK:
+        return "good", "No model error is detectable in these data"
+    return "look", (
+        f"The data support no cause, but up to {100 * worst:.0f} % of the error's power on held-out data is above the "
+        "noise; more or repeated motions may show the cause"
+    )
+
+
+def _lines(
+    content: Plain, details: Plain, findings: Sequence[FindingStatement], names: Sequence[str]
+) -> list[Line]:
+    """The summary: findings, unexplained residuals, gain, replay, limits."""
+    found = []
+    for finding in findings:
+        parts = [finding.text, *(f"{label} {text}" for label, text in finding.facts[:1]), finding.confidence]
+        text = "; ".join(part.rstrip(".") for part in parts if part)
+        found.append(Line(finding.title, text, "", "look", "findings"))
+    if not findings:
+        found.append(Line("causes", "none supported by the data", "none", "good", "findings"))
+    rest = ", ".join(f"{_name(u['joint'], names)} {u['side']}" for u in content.get("unexplained", []))
+    level: Level = "look" if rest else "good"
+    found.append(Line("unexplained residuals", rest or "none", "none", level, "unexplained"))
+    gain = extension_gain(content)
+    if gain is not None:
+        best, place = max(_shares(content, names))
+        text = f"{error_change(gain)} error on held-out data on average, {place} {error_change(best)}"
+        worse = _worse(details, names)
+        text += f"; worse: {', '.join(worse)}" if worse else ""
+        found.append(Line("extended model", text, "less", "look" if worse or gain <= 0.0 else "good", "gain"))
+    found += _replay_line(content)
+    count = len(details.get("notes", []))
+    if count:
+        text = f"{count} notes on limits of these data" if count > 1 else "one note"
+        found.append(Line("limits of the data", text, "", "look", "limits"))
+    return found
+
+
+def _replay_line(content: Plain) -> list[Line]:
+    """The replay over all joints together."""
+    before, after = _simulated(content)
+    parts, worse = [], False
+    for key, label, unit, scale in REPLAYED:
+        if not before.get(key) or not after.get(key):
+            continue
+        sizes = [math.hypot(*(v for v in side[key] if v is not None)) * scale for side in (before, after)]
+        worse = worse or sizes[1] > _WORSE_REPLAY * sizes[0]
+        change = f"{sizes[0]:.3g} -> {sizes[1]:.3g}" if content.get("findings") else f"{sizes[0]:.3g}"
+        parts.append(f"{label} {change} {unit}")
+    text = f"error over all joints together: {', '.join(parts)}"
+    return [Line("replay in simulation", text, "less", "look" if worse else "good", "replay")] * bool(parts)
+
+
+def _worse(details: Plain, names: Sequence[str]) -> list[str]:
+    rows = details.get("rows", [])
+    return [f"{_name(r['joint'], names)} {r['side']}" for r in rows if r["gain_interval_95"][1] < 0.0]
+
+
+def _statistics(finding: Plain) -> list[tuple[str, str]]:
+    cause, evidence = str(finding["cause"]), finding.get("evidence") or {}
+    meanings = {p.name: p.meaning for p in EFFECTS[cause].parameters} if cause in EFFECTS else {}
+    rows = []
+    for name, one in values_of(finding).items():
+        meaning = meanings.get(name, "").replace("`", "")
+        rows.append((spoken(name), quantity_text(*one) + (f" ({meaning})" if meaning else "")))
+    for key, label in (("delta_bic", "ΔBIC"), ("p_value", "p-value")):
+        if evidence.get(key) is not None:
+            rows.append((label, f"{evidence[key]:.3g}"))
+    return rows + [
+        (f"ΔBIC with {spoken(other['cause'])} instead", f"{other['delta_bic']:.3g}")
+        for other in finding.get("alternatives") or []
+        if other.get("delta_bic") is not None
+    ]
+
+
+def _experiments(details: Plain, names: Sequence[str]) -> Part:
+    """The discriminating experiments, planned and checked."""
+    sentences = []
+    for offer in details.get("deciding_motions") or []:
+        where = "" if offer["joint"] is None else f" of {_name(offer['joint'], names)}"
+        loads = " and ".join("bare" if load is None else f"with {load}" for load in offer["payloads"])
+        causes = " or ".join(dict.fromkeys(spoken(rival["cause"]) for rival in offer["rivals"]))
+        sentences.append(
+            f"{_capital(offer['kind'])}{where}, {offer['duration_s']:.0f} s, {loads}, for {causes}: `{offer['file']}`"
+        )
+    return Part("deciding", "Discriminating experiments", sentences)
+
+
+def _unexplained(content: Plain, names: Sequence[str]) -> Part:
+    rows = [
+        (
+            f"{_name(entry['joint'], names)} {entry['side']}",
+            ", ".join(entry.get("depends_on", [])),
+            Number(entry.get("test_rms"), ".3g"),
+            Number(entry.get("noise_floor"), ".3g"),
+        )
+        for entry in content.get("unexplained", [])
+    ]
+    head = ("torque", "depends on", "error on held-out data [Nm]", "noise floor [Nm]")
+    return Part("unexplained", "Unexplained residuals", (), head, rows)
+
+
+def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
+    gain = content.get("gain") or {}
+    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
+    floor = (content.get("baseline") or {}).get("noise_floor") or {}
+    measured = {(row["side"], row["joint"]): row for row in details.get("rows", [])}
+    is_named = bool(content.get("findings"))
+    rows: list[Row] = []
+    for side in base:
+        for k, before in enumerate(base[side] or ()):
+            after = (extended.get(side) or [])[k] if extended.get(side) else None
+            low = floor.get(side) or []
+            row = measured.get((side, k + 1), {})
+            cells: list[str | Number] = [
+                f"{_name(k + 1, names)} {side}",
+                Number(low[k] if k < len(low) else None, ".4f"),
+                Number(before, ".4f", f"gain.test_rms_base.{side}.{k}"),
+            ]
+            if is_named:
+                change = None if not before or after is None else 100 * (after / before - 1)
+                span = row.get("gain_interval_95")
+                cells += [
+                    Number(after, ".4f", f"gain.test_rms_extended.{side}.{k}"),
+                    Number(change, "+.1f"),
+                    "–" if not span else f"{span[0]:+.4f} to {span[1]:+.4f}".replace("-", "\N{MINUS SIGN}"),
+                ]
+            share = row.get("avoidable_share")
+            rows.append((*cells, Number(None if share is None else 100 * share, ".0f")))
+    if not rows:
+        return Part("gain", "Gain")
+    sessions = ", ".join((content.get("sessions") or {}).get("test") or [])
+    held_out = sessions or "each part of the motion, predicted from the others"
+    sentences = [f"Root mean square errors below are on held-out data: {held_out}."]
+    whole, worse = extension_gain(content), _worse(details, names) if is_named else []
+    if whole is not None:
+        sentences.append(f"Mean over joints and sides: {error_change(whole)} error.")
+    if worse:
+        sentences.append(f"Worse than the base model by more than chance: {', '.join(worse)}.")
+    middle = ("extended [Nm]", "change %", "gain [Nm], 95 %") if is_named else ()
+    head = ("torque", "noise [Nm]", "base model [Nm]", *middle, "avoidable %")
+    return Part("gain", "Gain" if is_named else "Error on held-out data", sentences, head, rows)
+
+
+def _simulated(content: Plain) -> tuple[Plain, Plain]:
+    gain = content.get("gain") or {}
+    return gain.get("simulation_error_base") or {}, gain.get("simulation_error_extended") or {}
+
+
+def _replay(content: Plain, names: Sequence[str]) -> Part:
+    """Error of the replay with the same commands, without and with the extension."""
+    before, after = _simulated(content)
+    rows: list[Row] = []
+    for key, label, unit, scale in REPLAYED:
+        for model, errors in (("base model", before), ("extended", after)):
+            if errors.get(key) and (model == "base model" or (content.get("findings") and before.get(key))):
+                cells = [Number(None if v is None else scale * v, ".3f") for v in errors[key]]
+                rows.append((f"{label} [{unit}], {model}", *cells))
+    sentence = "The same commands to the simulated arm: measured minus simulated, root mean square."
+    return Part("replay", "Replay in simulation", [sentence] * bool(rows), ("", *names), rows)
+
+
+def _absorbed(details: Plain) -> Part:
+    """Base parameters with errors in the base model, for they had absorbed the findings."""
+    rows = [
+        (
+            str(entry["name"]),
+            Number(entry["base"]),
+            Number(entry["extended"]),
+            Number(entry["std"], ".2g"),
+            Number(entry["change_in_std"], "+.1f"),
+            str(entry["unit"]),
+        )
+        for entry in details.get("base_parameters") or []
+    ]
+    head = ("parameter", "base model", "extended", "std", "change [std]", "unit")
+    sentence = "Wrong in the base model: they had absorbed the causes now in the extended model."
+    return Part("absorbed", "Base parameters affected by the findings", [sentence] * bool(rows), head, rows)
+
+
+def _beside(one: Comparison) -> list[str]:
+    found = _wrapped(one.overlap, "     ", "        ")
+    return found + (_wrapped(f"to decide: {one.decides}", "     ", "        ") if one.decides else [])
+
+
+def _placed(entry: Plain, names: Sequence[str], *, always: bool = False) -> str:
+    """A cause with its joints, in words. always : say `whole arm`, too."""
+    joints = entry.get("joints", [])
+    return spoken(str(entry["cause"])) + (f", {joints_text(joints, names)}" if joints or always else "")
+
+
+def _name(joint: int, names: Sequence[str]) -> str:
+    return names[joint - 1] if 0 < joint <= len(names) else str(joint)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _wrapped(text: str, first: str, later: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        _WIDTH,
+        initial_indent=first,
+        subsequent_indent=later,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

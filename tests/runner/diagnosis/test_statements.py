@@ -1,0 +1,102 @@
+"""A diagnosis in words: the same statements for terminal, report and notebook."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ident.diagnosis.statements import SURE, is_open, statements
+from runner.experiment_file import DiagnosisPlan
+from runner.report.diagnosis import DiagnosisFolder
+from runner.report.page import diagnosis_html
+
+NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
+FINDING: dict[str, Any] = {
+    "cause": "viscous_nonlinear",
+    "side": "motor",
+    "joints": [2],
+    "parameters": {"exponent": {"value": 0.7, "std": 0.02, "unit": "1"}},
+    "evidence": {"test_rms_before": 0.61, "test_rms_after": 0.34, "gain_interval_95": [0.22, 0.31]},
+    "confidence": 0.85,
+    "alternatives": [{"cause": "stribeck", "joints": [2], "delta_bic": -102.0}],
+    "tell_apart": "a slow sweep of joint 2",
+}
+CONTENT: dict[str, Any] = {
+    "sessions": {"train": ["a.mcap"], "test": ["b.mcap"]},
+    "findings": [FINDING],
+    "unexplained": [],
+    "gain": {
+        "test_rms_base": {"motor": [0.5] * 7},
+        "test_rms_extended": {"motor": [0.5, 0.25, *[0.5] * 5]},
+        "simulation_error_base": {"position": [1e-3] * 7, "motor": None, "joint": None},
+        "simulation_error_extended": {"position": [2e-3] * 7, "motor": None, "joint": None},
+    },
+}
+
+
+def details(**changes: Any) -> dict[str, Any]:
+    return {"joints": list(NAMES), "notes": ["one session only"], **changes}
+
+
+def test_terminal_and_report_say_the_same(tmp_path: Path) -> None:
+    (tmp_path / "diagnosis.json").write_text(json.dumps(CONTENT))
+    (tmp_path / "details.json").write_text(json.dumps(details()))
+    said = statements(CONTENT, details(), NAMES)
+    page, text = diagnosis_html(DiagnosisFolder.load(tmp_path)), " ".join(said.text().split())
+    assert said.headline == "One cause found"
+    for sentence in (
+        said.headline,
+        "Viscous nonlinear, joint A2",
+        "error on held-out data",
+        "a.mcap",
+        "Root mean square errors below are on held-out data: b.mcap.",
+        "measured minus simulated",
+        "session only",
+    ):
+        assert sentence in text, sentence
+        assert sentence in page, sentence
+
+
+def test_the_confidence_that_counts_as_sure_is_a_setting() -> None:
+    assert DiagnosisPlan().sure == SURE
+    assert is_open(0.85, FINDING["alternatives"], 0.9)
+    assert not is_open(0.5, [], 0.9)
+    said = statements(CONTENT, details(sure=0.9), NAMES)
+    assert said.headline == "One cause found, open between look-alikes"
+    assert "could also be: stribeck, joint A2" in said.text()
+    assert "could also be" not in statements(CONTENT, details(sure=0.8), NAMES).text()
+
+
+@pytest.mark.parametrize(
+    ("share", "unexplained", "level", "headline"),
+    [
+        (0.1, False, "good", "No model error is detectable in these data"),
+        (0.6, False, "look", "The data support no cause, but up to 60 %"),
+        (0.1, True, "look", "The data support no cause, but the residuals depend on the motion"),
+    ],
+)
+def test_a_diagnosis_without_findings_says_why(
+    share: float, unexplained: bool, level: str, headline: str
+) -> None:
+    rest = [{"side": "motor", "joint": 3, "depends_on": ["q3"], "test_rms": 0.2, "noise_floor": 0.1}]
+    content = {**CONTENT, "findings": [], "unexplained": rest * unexplained}
+    rows = [{"side": "motor", "joint": 1, "avoidable_share": share, "gain_interval_95": [0.0, 0.0]}]
+    said = statements(content, details(rows=rows), NAMES)
+    assert said.level == level
+    assert said.headline.startswith(headline)
+    assert ("E1 motor" in said.brief()) == unexplained
+
+
+def test_a_notebook_shows_ten_lines_at_most() -> None:
+    said = statements({**CONTENT, "findings": [FINDING] * 12}, details(), NAMES)
+    assert len(said.brief().splitlines()) == 10
+    assert said.brief().endswith("more lines")
+
+
+def test_a_worse_replay_is_pointed_out() -> None:
+    line = next(one for one in statements(CONTENT, details(), NAMES).lines if one.anchor == "replay")
+    assert line.level == "look"
+    assert "position 2.65 -> 5.29 mrad" in line.found
