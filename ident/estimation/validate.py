@@ -28,9 +28,10 @@ from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.identify import IdentificationSettings, identify
 from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import Model, as_model
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name, require
+from ident.rows.sessions import Sessions, as_sessions, payload_name
 from lwr_driver.session import Session
 
 __all__ = [
@@ -208,7 +209,7 @@ class Validation(Tabular):
 
 
 def validate(
-    model: DynamicModel,
+    model: Model,
     sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
@@ -216,13 +217,13 @@ def validate(
 ) -> Validation:
     """Computed-torque test of a model on sessions.
 
-    sessions : a session, the path of a log, or several of either.
+    model : a model or the path of its file. sessions : a session, the path of a log, or several of either.
     allow_seen : score sessions the model was fitted to as well, and label them; otherwise they are refused.
 
     Raises ConfigurationError for arguments of a wrong type. Raises DataError for a session of another robot,
     with a payload missing in the model, without any channel of the model, or seen by the estimate.
     """
-    require(model, DynamicModel, "model", "read one with `read_model`, or take `identify(...).model`")
+    model = as_model(model)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file the model was not fitted to")

@@ -7,7 +7,7 @@ repairs the log of a killed recorder. `as_sessions` accepts sessions and paths a
 from __future__ import annotations
 
 from lwr_driver.arm import LinkFrames
-from lwr_driver.session.reader import as_sessions, describe, read_session
+from lwr_driver.session.reader import Sessions, as_sessions, describe, read_session
 from lwr_driver.session.recovery import Recovery, recover
 from lwr_driver.session.session import (
     ControllerModelColumns,
@@ -32,6 +32,7 @@ __all__ = [
     "Session",
     "SessionSummary",
     "SessionWriter",
+    "Sessions",
     "StatusColumns",
     "as_sessions",
     "describe",
