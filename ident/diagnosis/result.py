@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.diagnosis.evidence import Floats
+from ident.dynamics.tables import Tabular
 from ident.model import DynamicModel
+from lwr_driver.notebook import subplots
 
 __all__ = [
     "SCHEMA_VERSION",
@@ -157,7 +159,7 @@ class RowStates:
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(Tabular):
     """Everything that was found; prints itself.
 
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
@@ -185,6 +187,57 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
+
+    def __repr__(self) -> str:
+        count = f"{len(self.findings) or 'no'} finding{'s' if len(self.findings) != 1 else ''}"
+        held = f", held out: {', '.join(self.test)}" if self.test else ""
+        lines = [
+            f"  {f.cause}, {_place(f)}: {_values(f)}, confidence {f.confidence:.2f}" for f in self.findings
+        ]
+        rest = [f"{u.side} joint {u.joint}" for u in self.unexplained]
+        if rest:
+            lines.append(f"  unexplained: {', '.join(rest)}")
+        if len(lines) > 9:
+            lines = [*lines[:8], f"  and {len(lines) - 8} lines more: print() shows all"]
+        head = f"Diagnosis of {', '.join(self.train)}{held}: {count}"
+        return "\n".join(line if len(line) <= 120 else f"{line[:117]}..." for line in (head, *lines))
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each finding."""
+        return [
+            {
+                "cause": f.cause,
+                "side": f.side,
+                "joint": _place(f),
+                "parameters": _values(f),
+                "confidence": f.confidence,
+                "rms_before": f.evidence.test_rms_before,
+                "rms_after": f.evidence.test_rms_after,
+                "gain": f.gain,
+            }
+            for f in self.findings
+        ]
+
+    def plot(self) -> Any:
+        """RMS error on held-out rows by joint, before and after; the matplotlib Axes, one for each side.
+
+        Raises ConfigurationError without matplotlib.
+        """
+        sides = list(self.rms_base)
+        size = (4.0 * len(sides), 3.0)
+        axes = subplots("Diagnosis: plot()", "to_dict()", 1, len(sides), figsize=size)
+        for axis, side in zip(axes, sides, strict=True):
+            rows = (
+                ("noise floor", self.noise_floor.get(side)),
+                ("base model", self.rms_base[side]),
+                ("extended model", self.rms_extended.get(side)),
+            )
+            for k, (label, values) in enumerate(rows):
+                if values is not None:
+                    axis.bar(np.arange(len(values)) + 1 + 0.27 * (k - 1), values, 0.27, label=label)
+            axis.set(title=f"{side} torque", xlabel="joint", ylabel="rms error, held out [Nm]")
+        axes[0].legend(fontsize="small")
+        return axes
 
     def to_dict(self) -> dict[str, Any]:
         """Content of `diagnosis.json`. Errors of a simulation that was not made are null."""
@@ -248,6 +301,14 @@ class Diagnosis:
                 lines.append(f"  simulated position {label:<9} mrad" + cells)
         lines += [f"note: {note}" for note in self.notes]
         return "\n".join(lines)
+
+
+def _place(finding: Finding) -> str:
+    return f"joint {' and '.join(map(str, finding.joints))}" if finding.joints else "whole arm"
+
+
+def _values(finding: Finding) -> str:
+    return ", ".join(f"{name} {_short(v.value, v.std)} {v.unit}" for name, v in finding.parameters.items())
 
 
 def _sides(table: Mapping[str, Floats]) -> dict[str, Any]:
