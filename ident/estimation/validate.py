@@ -81,7 +81,10 @@ class Score:
 
 
 class Trace(NamedTuple):
-    """Times (m,) [s], measured and computed torque (m, n) [Nm] of one side, thinned for a figure."""
+    """Times (m,) [s], measured and computed torque (m, n) [Nm] of one side, thinned for a figure.
+
+    computed : NaN for samples without a score.
+    """
 
     times: Floats
     measured: Floats
@@ -398,7 +401,9 @@ def score_session(
         times = np.concatenate([r.times for r in rows])
         still.append(1.0 - float(used.mean()))
         thin = slice(None, None, -(-len(times) // _DRAWN))
-        traces[side] = Trace(times[thin].copy(), torque[thin].copy(), (torque - error)[thin].copy())
+        traces[side] = Trace(
+            times[thin].copy(), torque[thin].copy(), np.where(used, torque - error, np.nan)[thin]
+        )
         relative[side] = _ratio(np.linalg.norm(error[used]), np.linalg.norm(torque[used]))
         for k, joint in enumerate(prepared.joint_names):
             scores.append(_score(joint, side, k, rows, (times, error, torque, used), prepared))
