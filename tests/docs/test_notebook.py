@@ -1,0 +1,40 @@
+"""The notebook of the documents runs again, with the outputs that it stores."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+from markdown import ROOT
+from nbclient import NotebookClient
+
+NOTEBOOK = ROOT / "docs/notebook.ipynb"
+
+
+def outputs(notebook: Any) -> list[list[str]]:
+    """Kinds of output of each cell: the text of the streams may differ, warnings among them."""
+    kinds = [
+        [kind for output in cell.get("outputs", ()) for kind in output.get("data", ())]
+        for cell in notebook.cells
+    ]
+    assert all(output.output_type != "error" for cell in notebook.cells for output in cell.get("outputs", ()))
+    return kinds
+
+
+def test_the_notebook_is_small_and_stores_its_outputs() -> None:
+    assert NOTEBOOK.stat().st_size < 300 * 1024
+    stored = outputs(nbformat.read(NOTEBOOK, as_version=4))
+    assert sum("image/png" in kinds for kinds in stored) == 4
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    stored = outputs(notebook)
+    client = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}})
+    client.execute()
+    assert outputs(notebook) == stored
