@@ -13,14 +13,11 @@ from nbclient import NotebookClient
 NOTEBOOK = ROOT / "docs/notebook.ipynb"
 
 
-def outputs(notebook: Any) -> list[list[str]]:
-    """Kinds of output of each cell: the text of the streams may differ, warnings among them."""
-    kinds = [
-        [kind for output in cell.get("outputs", ()) for kind in output.get("data", ())]
-        for cell in notebook.cells
-    ]
-    assert all(output.output_type != "error" for cell in notebook.cells for output in cell.get("outputs", ()))
-    return kinds
+def outputs(notebook: Any) -> list[set[str]]:
+    """Kinds of output of each cell, without streams."""
+    found = [cell.get("outputs", ()) for cell in notebook.cells]
+    assert all(output.output_type != "error" for each in found for output in each)
+    return [{kind for output in each for kind in output.get("data", ())} for each in found]
 
 
 def test_the_notebook_is_small_and_stores_its_outputs() -> None:
