@@ -7,10 +7,9 @@ from typing import Any
 
 import nbformat
 import pytest
-from markdown import ROOT
 from nbclient import NotebookClient
 
-NOTEBOOK = ROOT / "docs/notebook.ipynb"
+NOTEBOOK = Path(__file__).resolve().parents[2] / "docs/notebook.ipynb"
 
 
 def outputs(notebook: Any) -> list[set[str]]:
