@@ -85,7 +85,7 @@ def plan(
         problem = PlanProblem.load(problem)
     elif not isinstance(problem, PlanProblem):
         raise ConfigurationError(
-            f"`problem` must be a PlanProblem or the path of a problem file, not {type(problem).__name__} "
+            f"`problem` must be of type PlanProblem or the path of a problem file, not {type(problem).__name__} "
             f"{problem!r:.60}; read one with `PlanProblem.load`"
         )
     problem, interrupted = _with_goal(problem, progress)

@@ -168,7 +168,7 @@ def as_model(value: Model, name: str = "model") -> DynamicModel:
     if isinstance(value, (str, os.PathLike)):
         return read_model(Path(value))
     raise ConfigurationError(
-        f"`{name}` must be a DynamicModel or the path of a model file, not {type(value).__name__} "
+        f"`{name}` must be of type DynamicModel or the path of a model file, not {type(value).__name__} "
         f"{value!r:.60}; read one with `read_model`, or take `identify(...).model`"
     )
 

@@ -14,7 +14,7 @@ def require(value: Any, kind: type, name: str, advice: str) -> None:
     """Raise ConfigurationError, with advice, when the argument `name` is not of the type `kind`."""
     if not isinstance(value, kind):
         raise ConfigurationError(
-            f"`{name}` must be a {kind.__name__}, not {type(value).__name__} {value!r:.60}; {advice}"
+            f"`{name}` must be of type {kind.__name__}, not {type(value).__name__} {value!r:.60}; {advice}"
         )
 
 

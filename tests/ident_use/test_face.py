@@ -80,11 +80,11 @@ def test_wrong_arguments_are_refused_with_advice(bench: Any, logs: tuple[Path, P
             call()
     with pytest.raises(ConfigurationError, match=r"sets: .* is no list of sets; give"):
         commission(str(logs[0]), bench.chain)
-    with pytest.raises(ConfigurationError, match=r"`chain` must be a Chain, not str"):
+    with pytest.raises(ConfigurationError, match=r"`chain` must be of type Chain, not str"):
         diagnose(logs[0], "arm.urdf")  # type: ignore[arg-type]
-    with pytest.raises(ConfigurationError, match=r"`reference` must be a DynamicModel or the path"):
+    with pytest.raises(ConfigurationError, match=r"`reference` must be of type DynamicModel or the path"):
         diagnose(logs[0], bench.chain, reference=5)  # type: ignore[arg-type]
-    with pytest.raises(ConfigurationError, match=r"`problem` must be a PlanProblem or the path"):
+    with pytest.raises(ConfigurationError, match=r"`problem` must be of type PlanProblem or the path"):
         plan(5)  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match=r"none\.yaml"):
         plan(tmp_path / "none.yaml")

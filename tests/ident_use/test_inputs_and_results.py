@@ -99,17 +99,19 @@ def test_a_missing_log_is_an_error_of_the_data(bench: Any, found: Any, tmp_path:
 
 
 def test_a_model_or_chain_of_another_type_is_refused(bench: Any, unloaded: Any, found: Any) -> None:
-    with pytest.raises(ConfigurationError, match=r"`chain` must be a Chain, not str 'arm\.urdf'; read one"):
+    with pytest.raises(
+        ConfigurationError, match=r"`chain` must be of type Chain, not str 'arm\.urdf'; read one"
+    ):
         identify(unloaded, "arm.urdf")  # type: ignore[arg-type]
-    with pytest.raises(ConfigurationError, match=r"`settings` must be a IdentificationSettings"):
+    with pytest.raises(ConfigurationError, match=r"`settings` must be of type IdentificationSettings"):
         identify(unloaded, bench.chain, {"model": 1})  # type: ignore[arg-type]
     for call in (
         lambda: validate(5, unloaded),  # type: ignore[arg-type]
         lambda: identify_payload(found, unloaded),
     ):
-        with pytest.raises(ConfigurationError, match=r"`model` must be a DynamicModel or the path"):
+        with pytest.raises(ConfigurationError, match=r"`model` must be of type DynamicModel or the path"):
             call()
-    with pytest.raises(ConfigurationError, match=r"`second` must be a DynamicModel"):
+    with pytest.raises(ConfigurationError, match=r"`second` must be of type DynamicModel"):
         compare(found.model, found)
 
 
