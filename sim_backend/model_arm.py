@@ -20,7 +20,7 @@ from ident.dynamics import regressor
 from ident.dynamics.parameters import INERTIAL, PER_LINK
 from ident.effects import Parameters, Simulated, find_effect, parameter_values
 from ident.estimators.physical import cad_prior
-from ident.export import consistent_parameters
+from ident.formats import consistent_parameters
 from ident.model import DynamicModel
 from sim_backend.plant import Effect
 from sim_backend.robot import Drive, with_inertias

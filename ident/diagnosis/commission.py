@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from fri.errors import DataError
+from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.nominal import Arm, Nominal
@@ -24,6 +25,7 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
+from ident.rows.sessions import Sessions, as_sessions, require
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
@@ -171,7 +173,7 @@ class _Day:
 
 
 def commission(
-    sets: Sequence[Sequence[Session]],
+    sets: Iterable[Sessions],
     chain: Chain,
     *,
     arm: ArmData | None = None,
@@ -180,13 +182,21 @@ def commission(
 ) -> Reference:
     """A healthy-arm baseline from sets of sessions, each with the sessions of a later diagnosis.
 
-    The first sets give the side of the joints with the encoders, stiffness and presliding. All sets give parameters
-    and noise, with their changes between the sets. The null, the mean gain of each candidate, comes from each set
-    against a reference from the others. Raises DataError for unusable sessions, and for sets with different payloads
-    or channels.
+    sets : each a session, the path of a log, or several of either.
+
+    The side of the joints that the positions come from, stiffness and presliding come from the first sets;
+    parameters and noise from all, with what changed between them; the null, the mean gain of each candidate,
+    from each set against a reference made of the others. Raises DataError for sessions that cannot
+    be used, and where the sets differ in their payloads or channels.
     """
     settings = settings or DiagnosisSettings()
-    parts = [sorted(part, key=lambda s: s.start) for part in sets if part]
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    require(settings, DiagnosisSettings, "settings", "make one with `DiagnosisSettings()`")
+    if isinstance(sets, (str, os.PathLike)) or not isinstance(sets, Iterable):
+        raise ConfigurationError(
+            f"sets: {sets!r:.60} is no list of sets; give `[first, second, ...]`, each set a list of sessions"
+        )
+    parts = [sorted(part, key=lambda s: s.start) for part in map(as_sessions, sets) if part]
     if not parts:
         raise DataError("no session given; name at least one healthy session")
     start = replace(nominal_arm(chain, arm, None), encoder_known=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,10 +21,8 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.task import Baseline, Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
-from ident.model import DynamicModel
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
+from ident.model import Model, as_model
+from ident.rows.sessions import Sessions, as_sessions, require
 
 __all__ = ["diagnose"]
 
@@ -42,25 +39,32 @@ _INERTIA_BY_PHASE = 0.05
 
 
 def diagnose(
-    sessions: Sequence[Session],
+    sessions: Sessions,
     chain: Chain,
     *,
-    test: Sequence[Session] = (),
+    test: Sessions = (),
     arm: ArmData | None = None,
-    model: DynamicModel | None = None,
-    reference: Reference | None = None,
+    model: Model | None = None,
+    reference: Reference | Model | None = None,
     settings: DiagnosisSettings | None = None,
     simulate: Simulate | None = None,
     causes: Sequence[str] | None = None,
 ) -> Diagnosis:
     """Errors of the base model in `sessions`, by cause and joint, with an extended model.
 
-    test : held-out sessions. arm : stiffness and gear ratios, from its description. model : the present model,
-    for comparison with the extended one in simulation; default the base model fitted here. reference : the healthy
-    arm. simulate : replay, for the error of the simulation. causes : names to consider.
-    Raises DataError, with advice, for unusable sessions.
+    sessions : a session, the path of a log, or several of either. test : the same, for measuring only.
+    arm : stiffness and gear ratios, from its description. model : the present model, or its file, whose
+    simulation the extended one is compared with; default the base model fitted here. reference : the healthy
+    arm, or its model file. simulate : replay, for the error of the simulation. causes : names to consider.
+    Raises ConfigurationError for arguments of a wrong type, DataError, with advice, for unusable sessions.
     """
     settings = settings or DiagnosisSettings()
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    require(settings, DiagnosisSettings, "settings", "make one with `DiagnosisSettings()`")
+    sessions, test = as_sessions(sessions), as_sessions(test)
+    model = None if model is None else as_model(model)
+    if reference is not None and not isinstance(reference, Reference):
+        reference = Reference.of(as_model(reference, "reference"))
     if not sessions:
         raise DataError("no session given; name at least one session file")
     everything = sorted([*sessions, *test], key=lambda s: s.start)

@@ -8,8 +8,10 @@ of a claim.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +20,7 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.evidence import Floats
 from ident.dynamics.base_set import BaseSet
 from ident.estimators.estimate import fisher_limit
-from ident.model import DynamicModel
+from ident.model import DynamicModel, write_model
 
 __all__ = ["DELAY_STD_S", "Reference"]
 
@@ -56,6 +58,25 @@ class Reference:
     far: Floats | None = None
     far_share: Floats | None = None
     delay_std_s: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        joints = self.model.structure.chain.joint_names
+        stiff = ", ".join(
+            f"{name} {1.0 / c:.4g}" if c > 0.0 else f"{name} rigid"
+            for name, c in zip(joints, self.compliance, strict=False)
+        )
+        return "\n".join(
+            [
+                f"Reference of {self.model.robot}: {len(self.model.names)} parameters, healthy sets: {self.sets}",
+                f"  positions of the {self.encoder} side; delays: motor {1e3 * self.motor_delay_s:.2f} ms, "
+                f"joint {1e3 * self.joint_delay_s:.2f} ms",
+                f"  stiffness [Nm/rad]: {stiff or 'unknown'}",
+            ]
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model file with the reference in its provenance, for `diagnose(reference=path)`."""
+        write_model(replace(self.model, provenance={**self.model.provenance, **self.stored()}), Path(path))
 
     @classmethod
     def of(cls, model: DynamicModel) -> Reference:

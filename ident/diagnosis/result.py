@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.statements import Statements, finding_statement, statements
+from ident.dynamics.tables import Tabular
+from ident.effects.words import quantity_text
 from ident.model import DynamicModel
+from lwr_driver.notebook import subplots
 
 __all__ = [
     "SCHEMA_VERSION",
@@ -145,9 +148,9 @@ class RowStates:
     load: Floats
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis:
-    """Result of a diagnosis; prints itself.
+@dataclass(frozen=True, eq=False)
+class Diagnosis(Tabular):
+    """Everything that was found; prints itself.
 
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
@@ -174,6 +177,43 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each finding."""
+        return [
+            {
+                "cause": f.cause,
+                "side": f.side,
+                "joint": _place(f),
+                "parameters": _values(f),
+                "confidence": f.confidence,
+                "rms_before": f.evidence.test_rms_before,
+                "rms_after": f.evidence.test_rms_after,
+                "gain": f.gain,
+            }
+            for f in self.findings
+        ]
+
+    def plot(self) -> Any:
+        """RMS error on held-out rows by joint, before and after; the matplotlib Axes, one for each side.
+
+        Raises ConfigurationError without matplotlib.
+        """
+        sides = list(self.rms_base)
+        size = (4.0 * len(sides), 3.0)
+        axes = subplots("Diagnosis: plot()", "to_dict()", 1, len(sides), figsize=size)
+        for axis, side in zip(axes, sides, strict=True):
+            rows = (
+                ("noise floor", self.noise_floor.get(side)),
+                ("base model", self.rms_base[side]),
+                ("extended model", self.rms_extended.get(side)),
+            )
+            for k, (label, values) in enumerate(rows):
+                if values is not None:
+                    axis.bar(np.arange(len(values)) + 1 + 0.27 * (k - 1), values, 0.27, label=label)
+            axis.set(title=f"{side} torque", xlabel="joint", ylabel="rms error, held out [Nm]")
+        axes[0].legend(fontsize="small")
+        return axes
 
     def to_dict(self) -> dict[str, Any]:
         """Content of `diagnosis.json`, with null for missing simulation errors."""
@@ -219,6 +259,16 @@ class Diagnosis:
 
     def __repr__(self) -> str:
         return self.statements().brief()
+
+
+def _place(finding: Finding) -> str:
+    return f"joint {' and '.join(map(str, finding.joints))}" if finding.joints else "whole arm"
+
+
+def _values(finding: Finding) -> str:
+    return ", ".join(
+        f"{name} {quantity_text(v.value, v.std, v.unit)}" for name, v in finding.parameters.items()
+    )
 
 
 def _sides(table: Mapping[str, Floats]) -> dict[str, Any]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import html
-import importlib
 import math
 from typing import Any
 
-from fri.errors import ConfigurationError
+from lwr_driver.notebook import optional
 
 __all__ = ["Tabular"]
 
@@ -21,13 +20,7 @@ class Tabular:
 
     def to_dataframe(self) -> Any:
         """The rows as `pandas.DataFrame`. Raises ConfigurationError without pandas."""
-        try:
-            pandas = importlib.import_module("pandas")
-        except ImportError as error:
-            raise ConfigurationError(
-                f"{type(self).__name__}: to_dataframe() needs pandas, which is not installed; install it "
-                "(`pip install pandas`) or use records()"
-            ) from error
+        pandas = optional("pandas", f"{type(self).__name__}: to_dataframe()", "records()")
         return pandas.DataFrame(self.records())
 
     def _repr_html_(self) -> str:

@@ -37,9 +37,10 @@ from ident.estimation.validate import (
 )
 from ident.estimators.estimate import normal_tail
 from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel
-from ident.rows.sessions import Sessions, as_sessions, payload_name, require
+from ident.rows.sessions import Sessions, as_sessions, payload_name
 from lwr_driver.session import Session
 
 __all__ = ["Comparison", "Difference", "compare", "competitor_scores", "score_cad", "score_controller_model"]
@@ -156,18 +157,18 @@ class Comparison(Tabular):
 
 
 def compare(
-    first: DynamicModel, second: DynamicModel, *, level: float = 0.05, labels: tuple[str, str] | None = None
+    first: Model, second: Model, *, level: float = 0.05, labels: tuple[str, str] | None = None
 ) -> Comparison:
     """Compare two models of the same kinematics, with independent estimates.
 
+    first, second : models or paths of their files.
     level : probability of calling any parameter different when none is (Holm 1979).
     labels : names of the two models in the table.
 
     A parameter eliminated from one model as not essential counts as 0 there, without uncertainty.
     Raises ConfigurationError for arms of different joints or geometry, and when nothing is comparable.
     """
-    for name, model in (("first", first), ("second", second)):
-        require(model, DynamicModel, name, "read a model with `read_model`")
+    first, second = as_model(first, "first"), as_model(second, "second")
     _require_same_arm(first, second)
     first_k, second_k = _matrices(first, second)
     rows, found, only_first = [], [], []

@@ -180,6 +180,10 @@ class Identification(Tabular):
         """`parameters`."""
         return self.parameters
 
+    def plot(self) -> Any:
+        """`estimate.plot()`: parameters with their 95 % intervals."""
+        return self.estimate.plot()
+
     def __repr__(self) -> str:
         counts = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in self.counts.items())
         violated = [check.name for check in self.assumptions.checks if check.holds is False]

@@ -29,10 +29,11 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem, RowGroup
 from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import observe
 from ident.rows.prepare import prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
+from ident.rows.sessions import Sessions, as_sessions, payload_name, stated_mass
 from lwr_driver.session import Session
 
 __all__ = ["PayloadEstimate", "identify_payload", "with_payload"]
@@ -200,7 +201,7 @@ class PayloadEstimate(Tabular):
 
 
 def identify_payload(
-    model: DynamicModel,
+    model: Model,
     sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
@@ -209,14 +210,14 @@ def identify_payload(
 ) -> PayloadEstimate:
     """Estimate the payload of one or more sessions with the same payload, given a model of the arm.
 
-    sessions : a session, the path of a log, or several of either.
+    model : a model or the path of its file. sessions : a session, the path of a log, or several of either.
     free_offsets : estimate new torque offsets too, because sensor zeros move between mountings.
 
     Raises DataError for a session without payload, for different payloads or other joints, and for a motion
     too poor for the ten parameters (they are named); ConfigurationError for arguments of a wrong type, a model
     without a rigid part, and one with a payload inside its arm.
     """
-    require(model, DynamicModel, "model", "read the arm's model with `read_model`")
+    model = as_model(model)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name a session with the payload mounted")

@@ -16,21 +16,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import DataError
+from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.identify import IdentificationSettings, identify
 from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import Model, as_model
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name, require
+from ident.rows.sessions import Sessions, as_sessions, payload_name
+from lwr_driver.notebook import subplots
 from lwr_driver.session import Session
 
 __all__ = [
@@ -43,6 +45,9 @@ __all__ = [
     "seen_sessions",
     "validate",
 ]
+
+_DRAWN = 3000
+"""Most samples of a trace."""
 
 Predictor = Callable[[TorqueChannel, Side], Floats]
 """The torque (N, n) [Nm] of a side at the samples of a channel, from its times and motion."""
@@ -74,12 +79,23 @@ class Score:
         return {key: finite(value) for key, value in self.__dict__.items()}
 
 
+class Trace(NamedTuple):
+    """Times (m,) [s], measured and computed torque (m, n) [Nm] of one side, thinned for a figure.
+
+    computed : NaN for samples without a score.
+    """
+
+    times: Floats
+    measured: Floats
+    computed: Floats
+
+
 @dataclass(frozen=True)
 class SessionScore(Tabular):
     """Residuals of one model in one session.
 
     seen : whether the model was fitted to this session. relative : by side, residual over torque of all
-        joints, both as Euclidean norms. standstill : share of samples left out.
+        joints, both as Euclidean norms. standstill : share of samples left out. traces : by side, for `plot`.
     """
 
     session: str
@@ -91,6 +107,7 @@ class SessionScore(Tabular):
     relative: Mapping[str, float]
     standstill: float
     notes: tuple[str, ...] = ()
+    traces: Mapping[str, Trace] = field(default_factory=dict, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -110,6 +127,32 @@ class SessionScore(Tabular):
         """One row for each joint and side."""
         head = {"session": self.session, "predictor": self.predictor, "seen": self.seen}
         return [head | score.__dict__ for score in self.scores]
+
+    def plot(self, side: str | None = None) -> Any:
+        """Measured and computed torque of each joint over time; the matplotlib Axes, one for each joint.
+
+        side : `joint` or `motor`; default the first of the model. Raises ConfigurationError for a side without
+        scores, or without matplotlib.
+        """
+        side = next(iter(self.traces), "") if side is None else side
+        if side not in self.traces:
+            known = ", ".join(self.traces) or "none"
+            raise ConfigurationError(
+                f"plot of {self.session}: side {side!r} has no torque; choose of: {known}"
+            )
+        trace = self.traces[side]
+        joints = [score.joint for score in self.scores if score.side == side]
+        size = (8.0, 1.3 * len(joints))
+        axes = subplots(f"{type(self).__name__}: plot()", "records()", len(joints), sharex=True, figsize=size)
+        for k, (axis, joint) in enumerate(zip(axes, joints, strict=True)):
+            axis.plot(trace.times, trace.measured[:, k], linewidth=0.8, label="measured")
+            axis.plot(trace.times, trace.computed[:, k], linewidth=0.8, label=self.predictor)
+            axis.set_ylabel(joint, fontsize="small")
+        head = f"{self.session}, payload {self.payload or 'none'}: {side} torque [Nm]"
+        axes[0].set_title(head, fontsize="medium")
+        axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small")
+        axes[-1].set_xlabel("time [s]")
+        return axes
 
     def __repr__(self) -> str:
         relative = ", ".join(f"{side} {100 * value:.2f} %" for side, value in self.relative.items())
@@ -170,6 +213,14 @@ class Validation(Tabular):
         """One row for each session, predictor, joint and side."""
         return [row for score in (*self.scores, *self.competitors) for row in score.records()]
 
+    def plot(self, session: int = 0, side: str | None = None) -> Any:
+        """Measured and computed torque in one session, by its number from 0: `SessionScore.plot`."""
+        if not -len(self.scores) <= session < len(self.scores):
+            raise ConfigurationError(
+                f"plot: session {session} of {len(self.scores)}; count from 0 to {len(self.scores) - 1}"
+            )
+        return self.scores[session].plot(side)
+
     def __repr__(self) -> str:
         rivals = f", scores of competitors: {len(self.competitors)}" if self.competitors else ""
         return "\n".join(
@@ -207,7 +258,7 @@ class Validation(Tabular):
 
 
 def validate(
-    model: DynamicModel,
+    model: Model,
     sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
@@ -215,13 +266,13 @@ def validate(
 ) -> Validation:
     """Computed-torque test of a model on sessions.
 
-    sessions : a session, the path of a log, or several of either.
+    model : a model or the path of its file. sessions : a session, the path of a log, or several of either.
     allow_seen : score sessions the model was fitted to as well, and label them; otherwise they are refused.
 
     Raises ConfigurationError for arguments of a wrong type. Raises DataError for a session of another robot,
     with a payload missing in the model, without any channel of the model, or seen by the estimate.
     """
-    require(model, DynamicModel, "model", "read one with `read_model`, or take `identify(...).model`")
+    model = as_model(model)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file the model was not fitted to")
@@ -329,6 +380,7 @@ def score_session(
     """
     scores: list[Score] = []
     relative: dict[str, float] = {}
+    traces: dict[str, Trace] = {}
     still: list[float] = []
     for side in sides:
         rows = [
@@ -341,6 +393,10 @@ def score_session(
         used = np.concatenate([r.used for r in rows])
         times = np.concatenate([r.times for r in rows])
         still.append(1.0 - float(used.mean()))
+        thin = slice(None, None, -(-len(times) // _DRAWN))
+        traces[side] = Trace(
+            times[thin].copy(), torque[thin].copy(), np.where(used, torque - error, np.nan)[thin]
+        )
         relative[side] = _ratio(np.linalg.norm(error[used]), np.linalg.norm(torque[used]))
         for k, joint in enumerate(prepared.joint_names):
             scores.append(_score(joint, side, k, rows, (times, error, torque, used), prepared))
@@ -359,6 +415,7 @@ def score_session(
         relative=relative,
         standstill=float(np.mean(still)),
         notes=notes,
+        traces=traces,
     )
 
 

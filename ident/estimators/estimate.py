@@ -15,6 +15,7 @@ from scipy import special
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.estimators.problem import Problem
+from lwr_driver.notebook import subplots
 
 __all__ = [
     "ClassFit",
@@ -136,6 +137,26 @@ class Estimate(Tabular):
         )
         keys = ("name", "unit", "estimate", "std", "rsd_percent")
         return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+
+    def plot(self) -> Any:
+        """Values with their 95 % intervals; the matplotlib Axes, one for each unit.
+
+        Raises ConfigurationError without matplotlib.
+        """
+        units = list(dict.fromkeys(self._units))
+        groups = [[k for k, unit in enumerate(self._units) if unit == wanted] for wanted in units]
+        height = 0.6 + 0.16 * max(map(len, groups))
+        size = (2.6 * len(units), height)
+        axes = subplots("Estimate: plot()", "records()", 1, len(units), figsize=size)
+        half = self.interval()[:, 1] - self.values
+        for axis, unit, group in zip(axes, units, groups, strict=True):
+            names = [self.names[k] for k in group]
+            axis.errorbar(self.values[group], names, xerr=half[group], fmt=".", capsize=2.0)
+            axis.axvline(0.0, linewidth=0.5, color="grey")
+            axis.invert_yaxis()
+            axis.tick_params(labelsize="small")
+            axis.set_xlabel(f"[{unit}]")
+        return axes
 
     @property
     def _units(self) -> tuple[str, ...]:

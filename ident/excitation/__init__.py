@@ -1,6 +1,6 @@
 """Planning of exciting motions: parametrisations, criteria, constraints, search, and the resulting plan.
 
-`plan(PlanProblem.load("plans/default.yaml"))` does everything. `feasible_fourier` gives a safe motion without
+`plan("plans/default.yaml")` does everything. `feasible_fourier` gives a safe motion without
 optimisation, `random_points` the baseline, `trade_off` a front between two criteria, `check_motion` the verdict on any
 motion.
 
@@ -8,11 +8,11 @@ The search runs through `joblib`; its configured backend spreads it over process
 `search.jobs: -1` in the problem file::
 
     import joblib, distributed
-    from ident.excitation import PlanProblem, plan
+    from ident.excitation import plan
 
     client = distributed.Client("tcp://scheduler:8786")
     with joblib.parallel_config(backend="dask"):
-        result = plan(PlanProblem.load("plans/default.yaml"))
+        result = plan("plans/default.yaml")
 
 The result depends on the seed and the counts of the problem file, not on the backend or the number of processes.
 """

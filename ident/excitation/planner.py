@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -66,8 +67,12 @@ class Progress:
     elapsed_s: float
 
 
-def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = None) -> ExcitationPlan:
+def plan(
+    problem: PlanProblem | str | Path, progress: Callable[[Progress], None] | None = None
+) -> ExcitationPlan:
     """Search for the best motion within every limit, and return it with margins, values and provenance.
+
+    problem : a problem or the path of its file.
 
     Ctrl-C ends the search; the best motion found so far is polished, checked and returned. A motion outside a limit is
     never returned.
@@ -75,6 +80,13 @@ def plan(problem: PlanProblem, progress: Callable[[Progress], None] | None = Non
     Raises ConfigurationError for a contradictory problem, RefusedError for a problem without a feasible motion (with
     limit and excess), OperatorError for an interruption before the first motion.
     """
+    if isinstance(problem, (str, Path)):
+        problem = PlanProblem.load(problem)
+    elif not isinstance(problem, PlanProblem):
+        raise ConfigurationError(
+            f"`problem` must be of type PlanProblem or the path of a problem file, not {type(problem).__name__} "
+            f"{problem!r:.60}; read one with `PlanProblem.load`"
+        )
     problem, interrupted = _with_goal(problem, progress)
     assembled = assemble(problem)
     refuse_impossible(assembled)

@@ -18,10 +18,11 @@ Values keep all their digits; standard deviations and covariances ten.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import yaml
@@ -34,7 +35,10 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import parse, read_mapping
 
-__all__ = ["SCHEMA_VERSION", "read_model", "write_model"]
+__all__ = ["SCHEMA_VERSION", "Model", "as_model", "read_model", "write_model"]
+
+Model: TypeAlias = DynamicModel | str | os.PathLike[str]
+"""A model or the path of a model file."""
 
 SCHEMA_VERSION = 1
 
@@ -155,6 +159,18 @@ def _parameter_entries(model: DynamicModel) -> list[dict[str, Any]]:
         entry["kind"] = model.kind
         entries.append(entry)
     return entries
+
+
+def as_model(value: Model, name: str = "model") -> DynamicModel:
+    """The model `value`, or the one in the file at this path. Raises ConfigurationError for another type."""
+    if isinstance(value, DynamicModel):
+        return value
+    if isinstance(value, (str, os.PathLike)):
+        return read_model(Path(value))
+    raise ConfigurationError(
+        f"`{name}` must be of type DynamicModel or the path of a model file, not {type(value).__name__} "
+        f"{value!r:.60}; read one with `read_model`, or take `identify(...).model`"
+    )
 
 
 def read_model(source: str | Path | Mapping[str, Any]) -> DynamicModel:

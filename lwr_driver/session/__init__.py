@@ -7,7 +7,7 @@ repairs the log of a killed recorder. `as_sessions` accepts sessions and paths a
 from __future__ import annotations
 
 from lwr_driver.arm import LinkFrames
-from lwr_driver.session.reader import as_sessions, describe, read_session
+from lwr_driver.session.reader import Sessions, as_sessions, describe, read_session
 from lwr_driver.session.recovery import recover
 from lwr_driver.session.session import (
     JointColumns,
@@ -24,6 +24,8 @@ __all__ = [
     "Phase",
     "Session",
     "SessionWriter",
+    "Sessions",
+    "StatusColumns",
     "as_sessions",
     "describe",
     "read_session",

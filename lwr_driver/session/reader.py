@@ -11,7 +11,7 @@ import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,9 @@ _TEXT_TOPICS = ("/experiment/phase", "/robot_description")
 _FIXED_TOPICS = ("/fri/status", "/fri/controller_model")
 _MANY_LAYOUTS = 8
 """Most layouts of one block and size; further messages are decoded one by one."""
+
+Sessions: TypeAlias = Session | str | os.PathLike[str] | Iterable[Session | str | os.PathLike[str]]
+"""A session, the path of a session log, or several of either."""
 
 
 def read_session(
@@ -96,7 +99,7 @@ def read_session(
     return _session(scan, joints, texts, fixed, notes, joint_names)
 
 
-def as_sessions(value: Session | str | os.PathLike[str] | Iterable[Any]) -> list[Session]:
+def as_sessions(value: Sessions) -> list[Session]:
     """The sessions of `value`: a session, the path of a session log, or an iterable of these.
 
     ConfigurationError for anything else; DataError as `read_session`.

@@ -6,7 +6,6 @@ import dataclasses
 import datetime
 import difflib
 import html
-import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
+from lwr_driver.notebook import optional, subplots
 
 _WIDEST = 120
 """Characters of a line of a `repr`."""
@@ -280,13 +280,7 @@ class Session:
             raise ConfigurationError(
                 f"{self.path}: no channel {topic!r}; choose one of {', '.join(channels)}"
             )
-        try:
-            pandas = importlib.import_module("pandas")
-        except ImportError as error:
-            raise ConfigurationError(
-                "data frames need pandas, which is not installed; `pip install pandas`, or use the arrays of "
-                "`session.joint`"
-            ) from error
+        pandas = optional("pandas", "Session: to_dataframe()", "the arrays of `session.joint`")
         channel = channels[topic]
         columns = {
             f"{field}_{name}": getattr(channel, field)[:, column]
@@ -295,6 +289,32 @@ class Session:
         }
         time = pandas.Index((channel.log_time - self.start) * 1e-9, name="time_s")
         return pandas.DataFrame(columns, index=time)
+
+    def plot(self) -> Any:
+        """Positions, joint and motor torques over time; the matplotlib Axes, one for each channel with values.
+
+        ConfigurationError without matplotlib.
+        """
+        panels = [("position [rad]", self.joint, self.joint.position)]
+        if self.joint.effort.shape[1]:
+            panels.append(("joint torque [Nm]", self.joint, self.joint.effort))
+        if self.motor is not None:
+            panels.append(("motor torque [Nm]", self.motor, self.motor.effort))
+        axes = subplots(
+            "Session: plot()",
+            "the arrays of `session.joint`",
+            len(panels),
+            sharex=True,
+            figsize=(8.0, 2.2 * len(panels)),
+        )
+        for axis, (label, channel, values) in zip(axes, panels, strict=True):
+            for name, column in zip(channel.names, values.T, strict=True):
+                axis.plot((channel.log_time - self.start) * 1e-9, column, linewidth=0.8, label=name)
+            axis.set_ylabel(label)
+        axes[0].set_title(f"{self.path.name}, payload {_payload(self.metadata)}", fontsize="medium")
+        axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small")
+        axes[-1].set_xlabel("time [s]")
+        return axes
 
     @property
     def start(self) -> int:

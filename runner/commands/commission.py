@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +69,6 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
-    from ident.model.model_file import write_model
     from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, chain_of, known_arm
     from runner.experiment_file import DEFAULT, Experiment
@@ -94,7 +92,7 @@ def command(
     parts = [[read_session(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
     found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
-    write_model(replace(found.model, provenance={**found.model.provenance, **found.stored()}), out)
+    found.save(out)
     if as_json:
         click.echo(to_json(_content(found, paths, out)))
     else:

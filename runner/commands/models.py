@@ -11,8 +11,6 @@ import click
 from fri.errors import ConfigurationError
 from runner.terminal import PATH, json_option, to_json
 
-_FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
-
 
 @click.command("validate")
 @click.argument("model", type=PATH)
@@ -153,36 +151,17 @@ def export_command(
     \b
     lwr-run export results/model.yaml lwr.urdf lwr.xml lwr.c lwr.py
     """
-    from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
-    from ident.model.model_file import read_model
+    from ident.formats import FORMATS, export
 
     for output in outputs:
-        if output.suffix not in _FORMATS:
-            known = ", ".join(f"{ending} ({kind})" for ending, kind in _FORMATS.items())
-            raise ConfigurationError(f"output {output}: the ending says the format; known: {known}")
-        if output.exists() and not force:
+        if output.suffix in FORMATS and output.exists() and not force:
             raise ConfigurationError(f"output {output} exists; choose another name or give --force")
-    source = read_model(model)
-    plain = standard_model(source, payload=payload)
-    wants_bodies = any(output.suffix in (".urdf", ".xml") for output in outputs)
-    bodies = standard_model(source, payload=payload, consistent=True) if wants_bodies else plain
-    writers = {
-        ".urdf": lambda: to_urdf(bodies),
-        ".xml": lambda: to_mjcf(bodies, name=name),
-        ".c": lambda: to_c(plain, name),
-        ".py": lambda: to_numpy(plain),
-    }
-    for output in outputs:
-        text = writers[output.suffix]()
-        try:
-            output.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ConfigurationError(f"output {output} cannot be written: {error.strerror}") from error
+    done = export(model, *outputs, payload=payload, name=name, overwrite=force)
     if as_json:
-        files = [{"file": output, "format": _FORMATS[output.suffix]} for output in outputs]
-        click.echo(to_json({"files": files, "title": plain.title, "notes": bodies.notes}))
+        files = [{"file": output, "format": FORMATS[output.suffix]} for output in outputs]
+        click.echo(to_json({"files": files, "title": done.title, "notes": done.notes}))
         return
     for output in outputs:
-        click.echo(f"{output}: {_FORMATS[output.suffix]}, {plain.title}")
-    for note in bodies.notes:
+        click.echo(f"{output}: {FORMATS[output.suffix]}, {done.title}")
+    for note in done.notes:
         click.echo(f"  {note}")

@@ -20,7 +20,7 @@ from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.physical import project, reference_bodies
 from ident.dynamics.structure import ModelStructure
-from ident.export import CoupledDrives, Program, StandardModel, to_c, to_mjcf, to_numpy, to_urdf
+from ident.formats import CoupledDrives, Program, StandardModel, to_c, to_mjcf, to_numpy, to_urdf
 from lwr_driver.configuration import CONFIGS
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from ident.dynamics import parameters
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coulomb, Coupling, ModelStructure
-from ident.export import Program, consistent_parameters, standard_model, to_mjcf, to_numpy, to_urdf
+from ident.formats import Program, consistent_parameters, standard_model, to_mjcf, to_numpy, to_urdf
 from ident.model.dynamic_model import DynamicModel
 
 

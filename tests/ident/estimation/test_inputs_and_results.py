@@ -88,7 +88,7 @@ def test_other_inputs_are_refused_with_advice(bench: Any, found: Any, given: Any
         lambda: cross_validate(given, bench.chain),
         lambda: find_mounting(given, bench.chain),
     ):
-        with pytest.raises(ConfigurationError, match=r"give a session, the path of a log"):
+        with pytest.raises(ConfigurationError, match=r"give a Session, the path of a session log"):
             call()
 
 
@@ -109,10 +109,10 @@ def test_a_model_or_chain_of_another_type_is_refused(bench: Any, unloaded: Any, 
     with pytest.raises(ConfigurationError, match=r"`settings` must be of type IdentificationSettings"):
         identify(unloaded, bench.chain, {"model": 1})  # type: ignore[arg-type]
     for call in (
-        lambda: validate("model.yaml", unloaded),  # type: ignore[arg-type]
-        lambda: identify_payload("model.yaml", unloaded),  # type: ignore[arg-type]
+        lambda: validate(5, unloaded),  # type: ignore[arg-type]
+        lambda: identify_payload(found, unloaded),
     ):
-        with pytest.raises(ConfigurationError, match=r"`model` must be of type DynamicModel"):
+        with pytest.raises(ConfigurationError, match=r"`model` must be of type DynamicModel or the path"):
             call()
     with pytest.raises(ConfigurationError, match=r"`second` must be of type DynamicModel"):
         compare(found.model, found)

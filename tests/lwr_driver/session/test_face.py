@@ -67,7 +67,9 @@ def test_data_frame_of_a_channel(path, monkeypatch):
 
 def test_data_frame_without_pandas_is_refused_with_advice(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ConfigurationError, match="pip install pandas"):
+    with pytest.raises(
+        ConfigurationError, match=r"needs pandas, .*pip install .lwr-identification\[notebook\]"
+    ):
         read_session(path).to_dataframe()
 
 

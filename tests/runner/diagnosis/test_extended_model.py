@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.export import standard_model, to_c, to_mjcf, to_numpy, to_urdf
+from ident.formats import standard_model, to_c, to_mjcf, to_numpy, to_urdf
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model, write_model
 from lwr_driver.configuration import find

@@ -27,6 +27,7 @@ from runner.published import TABLE_1, TABLE_2
 from runner.report.figures import torque_figure
 from runner.report.folder import ResultFolder
 from runner.report.page import write_report
+from runner.report.verdicts import headline, verdicts
 from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, opened
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ident.export.standard import StandardModel
+from ident.formats.standard import StandardModel
 
 __all__ = ["Expression", "Graph", "Vector", "cross", "dot", "torques"]
 

@@ -12,8 +12,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 from fri.errors import ConfigurationError
-from ident.export.newton_euler import Expression, Graph, torques
-from ident.export.standard import StandardModel
+from ident.formats.newton_euler import Expression, Graph, torques
+from ident.formats.standard import StandardModel
 
 __all__ = ["Program", "to_c", "to_numpy"]
 

@@ -18,7 +18,7 @@ from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.parameters import Floats
 from ident.dynamics.urdf import read_urdf
-from ident.export.standard import StandardModel
+from ident.formats.standard import StandardModel
 
 __all__ = ["comment", "digits", "document", "friction", "require_consistent", "to_mjcf", "to_urdf"]
 

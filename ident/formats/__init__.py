@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from ident.export.code import Program, to_c, to_numpy
-from ident.export.description import to_mjcf, to_urdf
-from ident.export.standard import (
+from ident.formats.code import Program, to_c, to_numpy
+from ident.formats.description import to_mjcf, to_urdf
+from ident.formats.files import FORMATS, export
+from ident.formats.standard import (
     ConsistentParameters,
     CoupledDrives,
     StandardModel,
@@ -13,11 +14,13 @@ from ident.export.standard import (
 )
 
 __all__ = [
+    "FORMATS",
     "ConsistentParameters",
     "CoupledDrives",
     "Program",
     "StandardModel",
     "consistent_parameters",
+    "export",
     "standard_model",
     "to_c",
     "to_mjcf",

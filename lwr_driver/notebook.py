@@ -1,0 +1,31 @@
+"""The optional packages of a notebook: pandas for tables, matplotlib for figures."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from fri.errors import ConfigurationError
+
+__all__ = ["optional", "subplots"]
+
+
+def optional(package: str, use: str, instead: str) -> Any:
+    """The imported package. Raises ConfigurationError, with advice, where it is not installed.
+
+    use : what needs it. instead : what works without it.
+    """
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise ConfigurationError(
+            f"{use} needs {package.partition('.')[0]}, which is not installed; install it "
+            f"(`pip install 'lwr-identification[notebook]'`) or use {instead}"
+        ) from error
+
+
+def subplots(use: str, instead: str, rows: int, columns: int = 1, **settings: Any) -> Any:
+    """The axes (rows * columns,) of a new figure. Raises ConfigurationError without matplotlib."""
+    pyplot = optional("matplotlib.pyplot", use, instead)
+    _, axes = pyplot.subplots(rows, columns, squeeze=False, layout="constrained", **settings)
+    return axes.ravel()
