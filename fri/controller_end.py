@@ -15,8 +15,6 @@ from fri.errors import NetworkError
 from fri.krc import KrcSession, Sample, Setpoint
 from fri.states import State
 
-__all__ = ["ControllerEnd"]
-
 _BUFFER_SIZE = 2048
 _SLICE_S = 0.05
 _RESEND_S = 0.2

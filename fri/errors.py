@@ -18,16 +18,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = [
-    "ConfigurationError",
-    "DataError",
-    "LwrError",
-    "NetworkError",
-    "OperatorError",
-    "RefusedError",
-    "RobotError",
-]
-
 
 class LwrError(Exception):
     """Base of all errors of this project.

@@ -16,16 +16,6 @@ import numpy as np
 from fri.errors import ConfigurationError
 from fri.states import STRATEGY_BY_CONTROL, Control, State
 
-__all__ = [
-    "HANDSHAKES",
-    "Handshake",
-    "IdentificationHandshake",
-    "RcprgHandshake",
-    "RosHandshake",
-    "StanfordHandshake",
-    "find_handshake",
-]
-
 
 class Handshake(Protocol):
     """PC side of a KRL program. `cmd` and `msr` are records of shape (), dtypes `CMD` and `MSR`."""

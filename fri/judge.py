@@ -14,8 +14,6 @@ from fri.packets import JOINT_NAMES, JOINTS, CmdBuffer
 from fri.policy import KrcLimits, KrcPolicy
 from fri.states import ALLOWED_FLAGS, CommandFlag, Control, EventKind
 
-__all__ = ["CommandJudge", "Objection"]
-
 Objection = tuple[EventKind, str]
 
 _JNTPOS = int(CommandFlag.JNTPOS)

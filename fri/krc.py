@@ -41,9 +41,6 @@ from fri.states import (
 from fri.timing import AnswerStatistics, classify
 from fri.track import SetpointTrack
 
-__all__ = ["Event", "EventKind", "KrcLimits", "KrcPolicy", "KrcSession", "Sample", "Setpoint"]
-
-
 #: 3x4 row-major pose without rotation and translation.
 IDENTITY_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 

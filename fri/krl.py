@@ -20,8 +20,6 @@ from fri.errors import ConfigurationError
 from fri.krc import KrcSession
 from fri.states import State
 
-__all__ = ["AXES", "LOAD", "Interpreter", "KrlProgram", "Machinery", "NoMachinery"]
-
 #: Period of the KRL interpreter [ms].
 TICK_MS = 12
 #: Indices of the axes of KRL (A1 to A6, then E1) in the kinematic order A1 A2 E1 A3 A4 A5 A6.

@@ -13,8 +13,6 @@ from dataclasses import dataclass, field, replace
 
 from fri.errors import ConfigurationError
 
-__all__ = ["Expression", "Source", "Statement", "parse_source"]
-
 
 @dataclass(frozen=True)
 class Constant:

@@ -17,24 +17,6 @@ from math import hypot
 
 import numpy as np
 
-__all__ = [
-    "CMD",
-    "CMD_ID",
-    "CMD_OFFSETS",
-    "CMD_SIZE",
-    "JOINTS",
-    "JOINT_NAMES",
-    "MSR",
-    "MSR_ID",
-    "MSR_OFFSETS",
-    "MSR_SIZE",
-    "CmdBuffer",
-    "Fault",
-    "MsrBuffer",
-    "new_cmd",
-    "new_msr",
-]
-
 #: Joints in the order of the wire, the kinematic order; E1 is the third.
 JOINT_NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 JOINTS = len(JOINT_NAMES)

@@ -15,8 +15,6 @@ from fri.errors import ConfigurationError
 from fri.packets import JOINT_NAMES, JOINTS
 from fri.states import Quality
 
-__all__ = ["KrcLimits", "KrcPolicy"]
-
 
 @dataclass(frozen=True)
 class KrcPolicy:

@@ -33,8 +33,6 @@ from fri.packets import CMD_OFFSETS, JOINT_NAMES, JOINTS, Fault, MsrBuffer, new_
 from fri.sequence import Arrival, SequenceTracker
 from fri.states import FLAGS, Control, State
 
-__all__ = ["DEFAULT_PORT", "LinkEvent", "LinkEventKind", "RemoteEnd"]
-
 #: UDP port of FRI clients by default.
 DEFAULT_PORT = 49938
 

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from enum import Enum
 
-__all__ = ["Arrival", "SequenceTracker"]
-
 _WRAP = 0x10000
 # Tolerance between counter and clock over a jump [packets], in addition to 2 % of the jump.
 _SLACK = 16

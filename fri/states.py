@@ -11,22 +11,6 @@ from enum import Enum, IntEnum, IntFlag
 from types import MappingProxyType
 from typing import NamedTuple
 
-__all__ = [
-    "ALLOWED_FLAGS",
-    "ALL_DRIVES",
-    "CONTROL_BY_STRATEGY",
-    "FLAGS",
-    "STRATEGY_BY_CONTROL",
-    "TRANSITIONS",
-    "CommandFlag",
-    "Control",
-    "Event",
-    "EventKind",
-    "Quality",
-    "State",
-    "Trigger",
-]
-
 #: Drive bits of a fully powered arm: bit 0 is A1, bit 6 is A6.
 ALL_DRIVES = 0x7F
 

@@ -10,8 +10,6 @@ from math import sqrt
 from fri.policy import KrcPolicy
 from fri.states import Quality
 
-__all__ = ["AnswerStatistics", "classify"]
-
 _ABSENT = -1
 
 

@@ -15,8 +15,6 @@ import numpy as np
 from fri.packets import JOINTS
 from fri.policy import KrcLimits, KrcPolicy
 
-__all__ = ["SetpointTrack", "StopRamp"]
-
 
 class StopRamp:
     """Positions of seven joints braking from (q, v), each joint at its own bounds.

@@ -7,8 +7,6 @@ from typing import Any
 
 from fri.errors import ConfigurationError
 
-__all__ = ["optional", "subplots"]
-
 
 def optional(package: str, use: str, instead: str) -> Any:
     """The imported package. Raises ConfigurationError, with advice, where it is not installed.

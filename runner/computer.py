@@ -21,8 +21,6 @@ from typing import Any, Literal
 from fri.errors import LwrError, NetworkError, RefusedError
 from lwr_driver.realtime import assess
 
-__all__ = ["Finding", "examine_computer", "find_interface", "git_commit", "software", "versions"]
-
 _PACKAGES = ("numpy", "scipy", "pin", "ruckig", "numba", "mcap")
 _DISTRIBUTION = "lwr-identification"
 

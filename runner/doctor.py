@@ -26,8 +26,6 @@ from lwr_driver.driver import Driver, LinkSettings, LinkState
 from lwr_driver.link import advise_quality
 from runner.computer import Finding, examine_computer, find_interface, graded
 
-__all__ = ["Examination", "Heard", "LinkTest", "Patient", "examine", "judge_heard", "judge_link", "listen"]
-
 _HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
 _LARGEST = 65535
 _SLICE_S = 0.2

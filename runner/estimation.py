@@ -19,8 +19,6 @@ from ident.rows.filters import SignalSettings
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session import Session
 
-__all__ = ["KEYS", "IdentifySettings", "Key", "announced", "couplings"]
-
 
 @dataclass(frozen=True)
 class EstimatorOptions:

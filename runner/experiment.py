@@ -40,8 +40,6 @@ from runner.preflight import (
 )
 from runner.terminal import Interrupts, StatusLine
 
-__all__ = ["Bench", "Operator", "Progress", "Record", "Run"]
-
 Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]
 

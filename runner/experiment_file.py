@@ -19,8 +19,6 @@ from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session.motor_torque import KrlMotorTorque
 
-__all__ = ["Experiment", "Payload", "SessionPlan"]
-
 DEFAULT = "experiments/default.yaml"
 
 

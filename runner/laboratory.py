@@ -21,8 +21,6 @@ from sim_backend.pendant import Pendant
 from sim_backend.process import EmulatorProcess
 from sim_backend.robot import robot_file
 
-__all__ = ["Laboratory", "Person"]
-
 
 class Person:
     """The person at the arm, asked on the terminal: mounts payloads, enters load data, confirms.

@@ -31,8 +31,6 @@ from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
 from runner.experiment_file import Experiment, Payload
 
-__all__ = ["LiveView", "Sample"]
-
 Floats = NDArray[np.float64]
 
 _RATE_HZ = 20.0

@@ -29,8 +29,6 @@ from runner.preflight import (
     check_torque,
 )
 
-__all__ = ["PLAN", "Excitations", "checker", "dwell", "excitation_rows", "plan_excitation", "session_motion"]
-
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"
 Vector = npt.NDArray[np.float64]

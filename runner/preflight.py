@@ -30,11 +30,6 @@ from lwr_driver.realtime import Rights
 from runner.computer import free_disk
 from runner.experiment_file import Payload
 
-__all__ = [
-    "Item", "Preflight", "Rest", "check_disk", "check_gravity", "check_link", "check_motion_limits",
-    "check_path", "check_payload", "check_rights", "check_start", "check_torque", "load_data",
-]  # fmt: skip
-
 Vector = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
 

@@ -31,8 +31,6 @@ from runner.report.plot import STYLES, Line, Panel, Points
 from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
 
-__all__ = ["planned_motion", "preview_html", "serve"]
-
 Floats = NDArray[np.float64]
 
 _FRAMES_PER_S = 20.0

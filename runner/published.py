@@ -11,8 +11,6 @@ from typing import Any
 
 from ident.estimation.identify import Identification
 
-__all__ = ["SOURCE", "TABLE_1", "TABLE_2", "characteristics"]
-
 SOURCE = (
     "Kolyubin, Shiriaev, Jubien: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
     "IFAC-PapersOnLine 50-1 (2017)"

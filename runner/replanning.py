@@ -33,8 +33,6 @@ from runner.preflight import check_start
 from runner.results import estimate, named_model, summarise, unseen_sessions, write_results
 from runner.terminal import StatusLine
 
-__all__ = ["Rounds", "planned_near_home", "rounds_begun", "show_search"]
-
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"
 # Searches for a motion with a start near home, and its row period for that check [s].

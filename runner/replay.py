@@ -32,8 +32,6 @@ from sim_backend.model_arm import arm_of, is_possible, model_effects
 from sim_backend.plant import CYCLE_S, ElasticArm, Reading
 from sim_backend.robot import chain, robot_file, true_arm
 
-__all__ = ["Replay", "Replayed", "attached_experiment", "replay"]
-
 Floats = NDArray[np.float64]
 
 _BIN = 20

@@ -29,8 +29,6 @@ from runner.published import characteristics
 from runner.terminal import to_json
 from sim_backend.robot import truth
 
-__all__ = ["estimate", "named_model", "new_folder", "summarise", "write_log_results", "write_results"]
-
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
     """Identify the arm from the finished sessions of an experiment, those for validation left out."""

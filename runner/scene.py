@@ -21,8 +21,6 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell, PayloadShape
 from runner.experiment_file import Payload
 
-__all__ = ["ALARM", "GHOST", "ArmShape", "Colour", "add_cell", "line_colour", "start_server", "stop_server"]
-
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
 

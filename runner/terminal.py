@@ -17,11 +17,6 @@ from typing import Any, Self, TextIO
 import click
 import numpy as np
 
-__all__ = [
-    "PATH", "GroupedCommand", "Interrupts", "StatusLine", "coupling_option", "gear_ratio_option", "json_option",
-    "plain", "to_json",
-]  # fmt: skip
-
 PATH = click.Path(path_type=Path)
 _BAR = 24
 

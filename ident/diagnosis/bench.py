@@ -22,17 +22,6 @@ from ident.dynamics.structure import Coupling
 from ident.effects import DELAYS, ELASTICITY, Shape
 from ident.estimators.physical import cad_prior
 
-__all__ = [
-    "ArmData",
-    "Bench",
-    "every_joint_moves",
-    "mean_delay",
-    "nominal_arm",
-    "prepare_bench",
-    "slow_delay",
-    "some_joint_moves",
-]
-
 _BySide = dict[str, Floats]
 _SLOW_S = 0.1
 # Relative standard deviation of a stiffness from the literature, and largest relative change in a step.

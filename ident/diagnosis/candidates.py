@@ -13,8 +13,6 @@ from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Scor
 from ident.diagnosis.nominal import Nominal
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
 
-__all__ = ["Burst", "Candidate", "Dictionary", "Trial", "find_bursts"]
-
 # Bursts: window, least excess over its standard deviation, longest duration, largest number.
 _WINDOW_S, _FAR, _LONGEST_S, _MOST = 0.1, 8.0, 4.0, 4
 # Distance from the ends of a session within which filters and wide bins are unreliable.

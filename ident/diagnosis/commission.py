@@ -25,12 +25,12 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
-from ident.rows.sessions import Sessions, as_sessions, require
+from ident.rows.sessions import require
+from lwr_driver.session import Sessions, as_sessions
 
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["SlowTurns", "commission", "delay_std", "presliding_length", "slow_turns", "with_far_presliding"]
 
 log = logging.getLogger(__name__)
 

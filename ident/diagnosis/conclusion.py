@@ -24,8 +24,6 @@ from ident.diagnosis.task import Baseline, State, Task
 from ident.effects import LOST_SAMPLES
 from ident.model import DynamicModel
 
-__all__ = ["conclude", "timing_finding"]
-
 # Largest unexplained part in the rows of a claim without a loss of confidence, over the claim's gain.
 _DOUBT = 0.2
 # Confidence in a claim supported by the rows fitted and not fully by the held-out ones, and its least gain over the

@@ -12,7 +12,6 @@ from scipy.ndimage import binary_dilation
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["SampleLoss", "Stuck", "clipped_at", "held_times", "passed_band", "sample_loss", "stuck_at"]
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -22,9 +22,8 @@ from ident.diagnosis.task import Baseline, Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
 from ident.model import Model, as_model
-from ident.rows.sessions import Sessions, as_sessions, require
-
-__all__ = ["diagnose"]
+from ident.rows.sessions import require
+from lwr_driver.session import Sessions, as_sessions
 
 # Largest number of shifts of a late channel.
 _SHIFTS = 5

@@ -20,8 +20,6 @@ from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.estimators.estimate import chi_square_tail, fisher_tail
 
-__all__ = ["Evidence", "Fit", "Products", "Rows", "Score"]
-
 Floats = NDArray[np.float64]
 # Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3

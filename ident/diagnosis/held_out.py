@@ -9,8 +9,6 @@ import numpy as np
 
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 
-__all__ = ["HeldOut", "fall", "held_out", "interval"]
-
 _DRAWS = 1000
 
 

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 
-__all__ = ["Estimate", "estimated", "phases_of"]
-
 # Largest last step of a shape parameter over its value, for the linearisation to hold.
 _NEAR = 0.3
 # Least share of the information on a direction from the other phases.

@@ -28,7 +28,6 @@ from ident.effects import find_effect
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["Foreseen", "LookAlikes", "Place", "Trace", "look_alikes"]
 
 Place = tuple[str, tuple[int, ...]]
 """A cause and its joints, from 1; none for the whole arm."""

@@ -15,8 +15,6 @@ from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.probes import groups, hats, hats_of
 from ident.effects import ZERO_OFFSET, Shape
 
-__all__ = ["companions", "model_form_error"]
-
 
 def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
     """Columns of the trial's cause beyond its law, None without such knowledge.

@@ -12,8 +12,6 @@ from ident.diagnosis.nominal import SideRows
 from ident.diagnosis.recording import Recording
 from ident.estimators.covariance import correlation_time
 
-__all__ = ["noise_floor", "repeatability"]
-
 Floats = NDArray[np.float64]
 
 

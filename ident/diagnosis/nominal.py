@@ -33,8 +33,6 @@ from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import differentiate, low_pass
 
-__all__ = ["TRAVEL_RAD", "Arm", "Nominal", "SideRows", "structure_of"]
-
 Floats = NDArray[np.float64]
 
 _CHUNK = 2000

@@ -18,8 +18,6 @@ from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Scor
 from ident.diagnosis.nominal import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
 
-__all__ = ["Remainder", "find_line", "find_remainders", "groups", "hats", "hats_of"]
-
 # Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
 # Width of the compared spectrum beside a line [Hz].

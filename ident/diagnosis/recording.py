@@ -20,7 +20,6 @@ from ident.rows.prepare import PreparedSession, prepare
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["Recording", "Stretch", "record"]
 
 Floats = NDArray[np.float64]
 

@@ -22,8 +22,6 @@ from ident.dynamics.base_set import BaseSet
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
 
-__all__ = ["DELAY_STD_S", "Reference"]
-
 DELAY_STD_S = 2e-4
 """Usual standard deviation [s] of a healthy channel's delay from day to day."""
 

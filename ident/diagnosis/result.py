@@ -17,17 +17,6 @@ from ident.effects.words import quantity_text
 from ident.model import DynamicModel
 from lwr_driver.notebook import subplots
 
-__all__ = [
-    "SCHEMA_VERSION",
-    "Diagnosis",
-    "Evident",
-    "Finding",
-    "RowStates",
-    "SimulationError",
-    "Unexplained",
-    "Value",
-]
-
 SCHEMA_VERSION = 1
 
 

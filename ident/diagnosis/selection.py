@@ -21,8 +21,6 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import DELAYS, ELASTICITY, Shape
 from ident.estimators.estimate import normal_tail
 
-__all__ = ["Claim", "Null", "Selection", "best_candidate", "confidence", "gains", "margin", "select"]
-
 log = logging.getLogger(__name__)
 
 # Obvious evidence, over the usual one.

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from fri.errors import ConfigurationError
 
-__all__ = ["DiagnosisSettings"]
-
 
 @dataclass(frozen=True)
 class DiagnosisSettings:

@@ -29,7 +29,6 @@ from ident.effects import Form, find_effect
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["Cause", "Signature", "overlap", "signature_bench", "signatures"]
 
 Cause = tuple[str, Sequence[int]]
 """Name of a cause and its joints, counted from 1; none for the whole arm."""

@@ -16,27 +16,6 @@ from ident.diagnosis.selection import margin
 from ident.effects import EFFECTS, described, summary_of
 from ident.effects.words import joints_text, named, quantity_text, spoken
 
-__all__ = [
-    "REPLAYED",
-    "SURE",
-    "Comparison",
-    "FindingStatement",
-    "Line",
-    "Number",
-    "Part",
-    "Statements",
-    "answer_statement",
-    "comparison",
-    "error_change",
-    "extension_gain",
-    "finding_statement",
-    "in_short",
-    "is_open",
-    "run_advice",
-    "statements",
-    "values_of",
-]
-
 Plain = Mapping[str, Any]
 
 SURE = 0.8

@@ -21,7 +21,6 @@ from ident.model import DynamicModel
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["Baseline", "Simulate", "State", "Task"]
 
 Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 """Replays sessions with a model and returns the error; provided by the runner."""

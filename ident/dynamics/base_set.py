@@ -20,15 +20,6 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
 from ident.dynamics.structure import Condition, ModelStructure
 
-__all__ = [
-    "BaseSet",
-    "columns_by_preference",
-    "independent_columns",
-    "numeric_base",
-    "random_states",
-    "rank_at_gap",
-]
-
 _NEGLIGIBLE = 1e-10
 
 

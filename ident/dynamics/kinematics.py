@@ -29,8 +29,6 @@ from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.dynamics.urdf import Joint, read_urdf
 
-__all__ = ["STANDARD_GRAVITY", "Chain", "build_frames", "exact_cos_sin", "mdh_transform", "table_as_is"]
-
 _LENGTH_SNAP_M = 1e-9
 _PARALLEL = 1e-7
 

@@ -27,26 +27,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
 
-__all__ = [
-    "DRIVE",
-    "INERTIAL",
-    "PER_LINK",
-    "Consistency",
-    "Floats",
-    "consistency",
-    "frame_change",
-    "from_com",
-    "from_pinocchio",
-    "from_pseudo_inertia",
-    "parameter_names",
-    "pseudo_inertia",
-    "split_name",
-    "to_com",
-    "to_pinocchio",
-    "transform",
-    "unit",
-]
-
 Floats = NDArray[np.float64]
 
 INERTIAL = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")

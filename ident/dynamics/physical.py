@@ -28,8 +28,6 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics import parameters
 from ident.dynamics.parameters import Floats
 
-__all__ = ["Projection", "project", "reference_bodies"]
-
 logger = logging.getLogger(__name__)
 
 _SQRT2 = float(np.sqrt(2.0))

@@ -26,16 +26,6 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 
-__all__ = [
-    "all_columns",
-    "check_states",
-    "fill_rigid",
-    "gravity_torque",
-    "mass_matrix",
-    "rigid_regressor",
-    "torque",
-]
-
 _BLOCK = 128
 
 

@@ -38,8 +38,6 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, INERTIAL, PER_LINK, Floats, parameter_names, split_name, unit
 from ident.dynamics.regressor import check_states, fill_rigid
 
-__all__ = ["MODEL_SIDES", "Condition", "Coulomb", "Coupling", "ModelStructure", "Side"]
-
 Side = Literal["motor", "joint", "difference"]
 MODEL_SIDES: dict[int, tuple[Side, ...]] = {1: ("joint",), 2: ("motor", "joint"), 3: ("difference",)}
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from lwr_driver.notebook import optional
 
-__all__ = ["Tabular"]
-
 
 class Tabular:
     """Base of the results with one row for each parameter, joint or session."""

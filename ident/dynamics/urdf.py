@@ -17,8 +17,6 @@ from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.parameters import Floats
 
-__all__ = ["Joint", "Urdf", "read_urdf"]
-
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
 
 

@@ -27,18 +27,6 @@ from ident.effects.effect import (
 from ident.effects.motion import Floats, Motion, dahl
 from ident.effects.words import Values, one_joint, quantity, times, wave
 
-__all__ = [
-    "JointTorqueDelay",
-    "LostSamples",
-    "MotorTorqueDelay",
-    "SensorCrosstalk",
-    "SensorGain",
-    "SensorHysteresis",
-    "SensorOffsetDrift",
-    "SensorRipple",
-    "SensorSaturation",
-]
-
 
 class SensorGain(ScaleError):
     """The joint torque is reported `1 + error` times."""

@@ -17,8 +17,6 @@ from ident.effects.effect import Effect, Form, FormName, Parameter, Parameters, 
 from ident.effects.motion import Floats, Motion, first_order
 from ident.effects.words import Values, quantity
 
-__all__ = ["TIME_CONSTANT", "Course", "Drifting"]
-
 TIME_CONSTANT = (
     Parameter("time_constant", "s", "within a session", shape=True, low=0.0),
     Parameter(

@@ -25,20 +25,6 @@ from ident.effects.effect import (
 from ident.effects.motion import Floats, Motion, dahl
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 
-__all__ = [
-    "FrictionAsymmetry",
-    "FrictionLoad",
-    "FrictionPosition",
-    "FrictionTemperature",
-    "GearRipple",
-    "MotorTorqueGain",
-    "PreslidingHysteresis",
-    "ScaleError",
-    "Stribeck",
-    "ViscousNonlinear",
-    "dahl_step",
-]
-
 
 def dahl_step(run: Simulated, here: float, length: float) -> float:
     """Dahl's state of a simulated effect at the coordinate `here`, one cycle later."""

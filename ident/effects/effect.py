@@ -22,26 +22,6 @@ from fri.errors import ConfigurationError
 from ident.effects.motion import Floats, Motion
 from ident.effects.words import Values, quantity, spoken
 
-__all__ = [
-    "Column",
-    "Effect",
-    "EffectSide",
-    "Experiment",
-    "Form",
-    "FormName",
-    "Law",
-    "Loads",
-    "Parameter",
-    "Parameters",
-    "Plant",
-    "Reading",
-    "Setting",
-    "Shape",
-    "Simulated",
-    "Variable",
-    "both_sides",
-]
-
 EffectSide = Literal["motor", "joint", "sensor", "timing"]
 Variable = Literal["velocity", "load", "position", "time", "motor angle"]
 Parameters = Mapping[str, float]

@@ -28,16 +28,6 @@ from ident.effects.springs import Springs
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 from ident.rows.filters import differentiate, low_pass
 
-__all__ = [
-    "Backlash",
-    "BaseTilt",
-    "CableSpring",
-    "EncoderEccentricity",
-    "JointElasticity",
-    "JointZeroOffset",
-    "sideways_gravity",
-]
-
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
 _LINK_HZ, _MOTOR_HZ = 8.0, 30.0
 

@@ -28,8 +28,6 @@ from ident.effects.effect import (
 from ident.effects.motion import Floats, Motion
 from ident.effects.words import Values, quantity, quantity_text
 
-__all__ = ["Contact", "PayloadChange", "PayloadError", "force_torque", "leaning", "slide"]
-
 # Places among the ten inertial parameters: mass and first moments, and the six of the inertia.
 _MASS, _MOMENTS, _INERTIA = 9, (6, 7, 8), range(6)
 # Friction coefficient of a loose part.

@@ -13,8 +13,6 @@ from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
 from ident.effects.springs import Springs
 
-__all__ = ["Floats", "Motion", "dahl", "first_order"]
-
 Floats = NDArray[np.float64]
 
 

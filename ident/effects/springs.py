@@ -22,8 +22,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["Springs"]
-
 Floats = NDArray[np.float64]
 
 # Weight of the end of a step for a slow mode: half is the trapezoidal rule, one is the backward one.

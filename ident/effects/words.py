@@ -6,18 +6,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-__all__ = [
-    "Values",
-    "joints_text",
-    "named",
-    "one_joint",
-    "quantity",
-    "quantity_text",
-    "spoken",
-    "times",
-    "wave",
-]
-
 Triple = tuple[float, float, str]
 Values = Mapping[str, Triple]
 """Value, standard deviation and unit by name."""

@@ -19,8 +19,6 @@ from ident.dynamics.tables import Tabular
 from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, normal_tail, student_tail
 from ident.estimators.problem import Problem
 
-__all__ = ["Assumptions", "Check", "check_assumptions", "repeatability"]
-
 _LEVEL = 0.01
 _WIDE_CONDITION = 100.0
 

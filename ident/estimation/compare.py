@@ -40,10 +40,8 @@ from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel
-from ident.rows.sessions import Sessions, as_sessions, payload_name
-from lwr_driver.session import Session
-
-__all__ = ["Comparison", "Difference", "compare", "competitor_scores", "score_cad", "score_controller_model"]
+from ident.rows.sessions import payload_name
+from lwr_driver.session import Session, Sessions, as_sessions
 
 _SAME_ROW = 1e-8
 

@@ -22,8 +22,6 @@ from ident.estimators.estimate import Estimate, fisher_limit
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem
 
-__all__ = ["Elimination", "Essential", "EssentialSettings", "find_essential"]
-
 
 @dataclass(frozen=True)
 class EssentialSettings:

@@ -29,8 +29,6 @@ from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
 from lwr_driver.session import Session
 
-__all__ = ["ForwardSimulation", "simulate", "simulate_session"]
-
 _WIDTH_RAD_S = 5e-3
 _IMPLICIT = 0.6
 _LOST_RAD = 1.0

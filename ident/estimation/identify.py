@@ -27,10 +27,8 @@ from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
-from lwr_driver.session import Session
-
-__all__ = ["ESTIMATORS", "Identification", "IdentificationSettings", "estimator_factory", "identify"]
+from ident.rows.sessions import payload_name, require, stated_mass
+from lwr_driver.session import Session, Sessions, as_sessions
 
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 

@@ -29,10 +29,8 @@ from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.rows.observation import observe
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
-from ident.rows.sessions import Sessions, as_sessions, require
-from lwr_driver.session import Session
-
-__all__ = ["Mounting", "find_mounting"]
+from ident.rows.sessions import require
+from lwr_driver.session import Session, Sessions, as_sessions
 
 _NAMES = ("tilt_1", "tilt_2")
 

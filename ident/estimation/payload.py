@@ -33,10 +33,8 @@ from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import observe
 from ident.rows.prepare import prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name, stated_mass
-from lwr_driver.session import Session
-
-__all__ = ["PayloadEstimate", "identify_payload", "with_payload"]
+from ident.rows.sessions import payload_name, stated_mass
+from lwr_driver.session import Session, Sessions, as_sessions
 
 _BODY = len(INERTIAL)
 _LINK = len(PER_LINK)

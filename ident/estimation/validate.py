@@ -31,20 +31,9 @@ from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name
+from ident.rows.sessions import payload_name
 from lwr_driver.notebook import subplots
-from lwr_driver.session import Session
-
-__all__ = [
-    "CrossValidation",
-    "Score",
-    "SessionScore",
-    "Validation",
-    "cross_validate",
-    "score_session",
-    "seen_sessions",
-    "validate",
-]
+from lwr_driver.session import Session, Sessions, as_sessions
 
 _DRAWN = 3000
 """Most samples of a trace."""

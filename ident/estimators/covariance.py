@@ -30,8 +30,6 @@ from ident.dynamics.parameters import Floats
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import Problem, RowGroup
 
-__all__ = ["CovarianceSettings", "Scores", "bootstrap", "effective_rows", "hac", "jackknife", "textbook"]
-
 _LONGEST = 4000
 _CHUNK = 8192
 

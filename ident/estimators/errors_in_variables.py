@@ -32,8 +32,6 @@ from ident.estimators.least_squares import (
 )
 from ident.estimators.problem import Problem
 
-__all__ = ["InstrumentalVariables", "Instruments", "TotalLeastSquares"]
-
 Instruments = Callable[[Floats], Sequence[Floats]]
 
 

@@ -17,20 +17,6 @@ from ident.dynamics.tables import Tabular
 from ident.estimators.problem import Problem
 from lwr_driver.notebook import subplots
 
-__all__ = [
-    "ClassFit",
-    "Covariance",
-    "Estimate",
-    "Estimator",
-    "chi_square_tail",
-    "fisher_limit",
-    "fisher_tail",
-    "normal_quantile",
-    "normal_tail",
-    "student_quantile",
-    "student_tail",
-]
-
 Value = TypeVar("Value", float, Floats)
 
 

@@ -29,17 +29,6 @@ from ident.estimators.covariance import (
 from ident.estimators.estimate import ClassFit, Covariance, Estimate
 from ident.estimators.problem import Problem, TriangularFactor
 
-__all__ = [
-    "OrdinaryLeastSquares",
-    "RobustLeastSquares",
-    "WeightedLeastSquares",
-    "class_variances",
-    "consumed_parameters",
-    "estimate_from",
-    "factor_of",
-    "weighted_solution",
-]
-
 
 def factor_of(problem: Problem, weights: Floats) -> TriangularFactor:
     """Weighted factor of the whole stack, after the checks common to all estimators."""

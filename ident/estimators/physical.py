@@ -25,8 +25,6 @@ from ident.estimators.least_squares import class_variances
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
 
-__all__ = ["BodyPrior", "PhysicallyConsistent", "cad_prior", "nearest_consistent"]
-
 Metric = Literal["pullback", "entropic", "euclidean"]
 
 _BODY = 10

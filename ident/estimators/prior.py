@@ -26,8 +26,6 @@ from ident.estimators.least_squares import (
 )
 from ident.estimators.problem import Problem
 
-__all__ = ["MaximumAPosteriori", "Prior"]
-
 
 @dataclass(frozen=True)
 class Prior:

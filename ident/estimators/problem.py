@@ -19,8 +19,6 @@ from scipy.linalg import cholesky, solve_triangular
 from fri.errors import DataError
 from ident.dynamics.parameters import Floats
 
-__all__ = ["Floats", "Nuisance", "Problem", "RowClass", "RowGroup", "TriangularFactor"]
-
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
 

@@ -32,15 +32,6 @@ from ident.estimators.least_squares import consumed_parameters, estimate_from, w
 from ident.estimators.prior import Prior
 from ident.estimators.problem import Problem
 
-__all__ = [
-    "Instant",
-    "RecursiveFilter",
-    "RecursiveLeastSquares",
-    "RegressorExtensionMixing",
-    "Track",
-    "instants",
-]
-
 
 @dataclass(frozen=True)
 class Instant:

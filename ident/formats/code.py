@@ -15,8 +15,6 @@ from fri.errors import ConfigurationError
 from ident.formats.newton_euler import Expression, Graph, torques
 from ident.formats.standard import StandardModel
 
-__all__ = ["Program", "to_c", "to_numpy"]
-
 _LONGEST_INLINE = 3
 
 

@@ -20,8 +20,6 @@ from ident.dynamics.parameters import Floats
 from ident.dynamics.urdf import read_urdf
 from ident.formats.standard import StandardModel
 
-__all__ = ["comment", "digits", "document", "friction", "require_consistent", "to_mjcf", "to_urdf"]
-
 
 def friction(model: StandardModel) -> tuple[Floats, Floats, tuple[str, ...]]:
     """Damping [Nm s/rad] and dry friction [Nm] of each joint, both sides together, and notes.

@@ -11,8 +11,6 @@ from ident.formats.description import to_mjcf, to_urdf
 from ident.formats.standard import StandardModel, standard_model
 from ident.model.model_file import Model, as_model
 
-__all__ = ["FORMATS", "export"]
-
 FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
 """Name of the format by ending of the file name."""
 

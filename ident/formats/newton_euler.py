@@ -17,8 +17,6 @@ from dataclasses import dataclass
 
 from ident.formats.standard import StandardModel
 
-__all__ = ["Expression", "Graph", "Vector", "cross", "dot", "torques"]
-
 _COMMUTATIVE = ("add", "mul")
 
 

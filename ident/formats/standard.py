@@ -16,14 +16,6 @@ from ident.dynamics.physical import Projection, project, reference_bodies
 from ident.dynamics.structure import Side
 from ident.model.dynamic_model import DynamicModel
 
-__all__ = [
-    "ConsistentParameters",
-    "CoupledDrives",
-    "StandardModel",
-    "consistent_parameters",
-    "standard_model",
-]
-
 
 @dataclass(frozen=True)
 class CoupledDrives:

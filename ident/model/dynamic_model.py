@@ -19,8 +19,6 @@ from ident.dynamics.tables import Tabular
 from ident.effects import check_entry, effects_torque
 from ident.effects.motion import Motion
 
-__all__ = ["DynamicModel", "Projection"]
-
 Projection = Callable[["DynamicModel", Floats], Floats]
 """From a model and its nearest standard parameters (n_columns,) to consistent ones with the same torque."""
 

@@ -35,8 +35,6 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import parse, read_mapping
 
-__all__ = ["SCHEMA_VERSION", "Model", "as_model", "read_model", "write_model"]
-
 Model: TypeAlias = DynamicModel | str | os.PathLike[str]
 """A model or the path of a model file."""
 

@@ -13,8 +13,9 @@ from ident.rows.filters import (
 )
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-from ident.rows.sessions import Sessions, as_sessions, payload_name, require, stated_mass
+from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.timebase import Delay, DelayData, estimate_delay
+from lwr_driver.session import Sessions, as_sessions
 
 __all__ = [
     "Delay",

@@ -19,19 +19,6 @@ from scipy.ndimage import correlate1d
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import Floats
 
-__all__ = [
-    "ParallelFilter",
-    "SignalSettings",
-    "advice",
-    "block_means",
-    "differentiate",
-    "excitation_frequency",
-    "interpolate_uniform",
-    "low_pass",
-    "optimal_cutoff",
-    "thinning",
-]
-
 
 @dataclass(frozen=True)
 class SignalSettings:

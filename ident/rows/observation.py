@@ -36,7 +36,6 @@ from ident.rows.timebase import Stretch, sample_period, stretches
 if TYPE_CHECKING:
     from lwr_driver.session import Session
 
-__all__ = ["commanded", "observe", "stack"]
 
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4

@@ -44,7 +44,6 @@ from ident.rows.timebase import (
 if TYPE_CHECKING:
     from lwr_driver.session import JointColumns, Session
 
-__all__ = ["Passage", "PreparedSession", "TorqueChannel", "clock_ns", "prepare"]
 
 BoolArray = NDArray[np.bool_]
 

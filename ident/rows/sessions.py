@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError
-from lwr_driver.session import Session, Sessions, as_sessions
-
-__all__ = ["Sessions", "as_sessions", "payload_name", "require", "stated_mass"]
+from lwr_driver.session import Session
 
 
 def require(value: Any, kind: type, name: str, advice: str) -> None:

@@ -28,8 +28,6 @@ from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem, RowGroup
 from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform
 
-__all__ = ["Delay", "DelayData", "Stretch", "estimate_delay", "flag_outliers", "sample_period", "stretches"]
-
 BoolArray = NDArray[np.bool_]
 
 _JITTER = 0.02

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ident.diagnosis import Reference
     from runner.experiment_file import Experiment
 
-__all__ = ["command", "record_sets"]
 
 _RECORDED_SETS = 3
 _LOUDEST = 5

@@ -9,9 +9,6 @@ import click
 
 from runner.terminal import GroupedCommand, coupling_option, gear_ratio_option, json_option
 
-__all__ = ["command"]
-
-
 _GROUPS = {
     "Sessions": ("test", "model", "reference"),
     "Arm": ("arm", "urdf", "coupling", "gear_ratio"),

@@ -31,8 +31,6 @@ from runner.experiment import Bench, Progress, Record, Run
 from runner.experiment_file import Experiment, SessionPlan
 from runner.planning import Excitations, excitation_rows
 
-__all__ = ["DECIDING", "DECISION", "FOLDER", "Answer", "Conclusion", "conclude_run", "decisions"]
-
 log = logging.getLogger(__name__)
 
 FOLDER = "diagnosis"

@@ -31,8 +31,6 @@ from runner.diagnosis.motions import chirp, poses, reversal_ladder, slow_sweep
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import checker, excitation_rows, plan_excitation, session_motion
 
-__all__ = ["Discriminating", "foresee", "made_up", "offers", "offers_after_logs", "open_findings"]
-
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]

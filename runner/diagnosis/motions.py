@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from ident.excitation.motions import SplineMotion
 from lwr_driver.arm import Arm
 
-__all__ = ["GRAIN_S", "chirp", "poses", "reversal_ladder", "slow_sweep"]
-
 Floats = NDArray[np.float64]
 
 GRAIN_S = 0.12

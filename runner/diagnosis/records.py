@@ -19,20 +19,6 @@ from ident.diagnosis.look_alikes import LookAlikes, Trace
 from ident.diagnosis.result import RowStates
 from runner.replay import Replayed
 
-__all__ = [
-    "LOOK_ALIKES",
-    "QUANTITIES",
-    "REPLAY",
-    "RESIDUALS",
-    "ReplayErrors",
-    "Residuals",
-    "SideResiduals",
-    "moved_parameters",
-    "read_look_alikes",
-    "row_gains",
-    "write_look_alikes",
-]
-
 Floats = NDArray[np.float64]
 
 RESIDUALS, REPLAY, LOOK_ALIKES = "residuals.npz", "replay.npz", "look_alikes.npz"

@@ -39,20 +39,6 @@ from runner.diagnosis.records import (
 from runner.estimation import couplings
 from runner.replay import Replay
 
-__all__ = [
-    "DETAILS",
-    "DIAGNOSIS",
-    "EXTENDED",
-    "TEXT",
-    "Study",
-    "arm_data",
-    "asked",
-    "chain_of",
-    "known_arm",
-    "replaceable",
-    "study",
-]
-
 DIAGNOSIS = "diagnosis.json"
 DETAILS = "details.json"
 EXTENDED = "model_extended.yaml"

@@ -40,8 +40,6 @@ from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
 from runner.report.markup import Number as Shown
 
-__all__ = ["DiagnosisFolder", "diagnosis_parts", "diagnosis_section"]
-
 
 @dataclass(frozen=True)
 class DiagnosisFolder:

@@ -17,8 +17,6 @@ from runner.report.figures import bin_means
 from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
 from runner.report.svg import Figure
 
-__all__ = ["AGAINST", "finding_figure", "look_alike_figure", "replay_figures", "residual_figures"]
-
 Floats = NDArray[np.float64]
 
 AGAINST = ("time", "position", "velocity", "load", "motor angle", "run order")

@@ -30,11 +30,6 @@ from runner.report.interactive import DIVERGING, heatmap_chart, heatmap_figure
 from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
 from runner.report.svg import Figure
 
-__all__ = [
-    "STRONG", "bin_means", "correlation_figure", "every_figure", "motion_figure", "parameter_figure",
-    "residual_figure", "torque_figure", "velocity_figure",
-]  # fmt: skip
-
 Floats = NDArray[np.float64]
 Results = ResultFolder | str | Path
 

@@ -22,8 +22,6 @@ from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
 
-__all__ = ["Curves", "ResultFolder", "curves"]
-
 Floats = NDArray[np.float64]
 
 _ATTENUATION_DB = 40.0

@@ -13,11 +13,6 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits
 
-__all__ = [
-    "DIVERGING", "INSTALL", "heatmap_chart", "heatmap_figure", "panel_chart", "plotly_figure",
-    "plotly_script",
-]  # fmt: skip
-
 Floats = NDArray[np.float64]
 
 INSTALL = "the extra `view` is not installed; run `pip install 'lwr-identification[view]'`"

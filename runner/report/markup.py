@@ -12,8 +12,6 @@ from typing import Any
 from runner.report.interactive import panel_chart
 from runner.report.svg import Figure, legend_key
 
-__all__ = ["Number", "chart_html", "conditions_table", "figure_html", "fold", "paragraph", "section", "table"]
-
 
 @dataclass(frozen=True)
 class Number:

@@ -15,16 +15,6 @@ from runner.report.interactive import plotly_script
 from runner.report.markup import section
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 
-__all__ = [
-    "REPORT",
-    "diagnosis_html",
-    "page_html",
-    "report_html",
-    "write_diagnosis_report",
-    "write_page",
-    "write_report",
-]
-
 REPORT = "report.html"
 
 _MARKS = {"good": "\N{CHECK MARK} good", "look": "! look", "bad": "\N{MULTIPLICATION X} bad"}

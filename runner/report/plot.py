@@ -14,8 +14,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["STYLES", "Band", "Line", "Mark", "Panel", "Points", "Role", "limits", "thin"]
-
 Floats = NDArray[np.float64]
 Role = Literal[
     "logged", "measured", "computed", "error", "limit", "forward", "backward", "estimate", "truth",

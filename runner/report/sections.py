@@ -29,11 +29,6 @@ from runner.report.markup import (
     table,
 )
 
-__all__ = [
-    "assumption_section", "motion_section", "parameter_section", "provenance_section", "residual_section",
-    "session_section", "table_1_section", "table_2_section", "torque_section",
-]  # fmt: skip
-
 _PAIRS = 12
 _SLOWEST_S = 2e-3
 _WORDS: dict[bool | None, str] = {True: "yes", False: "no", None: "–"}

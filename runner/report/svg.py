@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from runner.report.interactive import plotly_figure
 from runner.report.plot import STYLES, Band, Line, Mark, Panel, Points, Role, Symbol, limits
 
-__all__ = ["Figure", "legend_key", "panel_svg", "ticks"]
-
 Floats = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 

@@ -14,8 +14,6 @@ import numpy as np
 from ident.diagnosis.statements import in_short
 from runner.report.folder import ResultFolder
 
-__all__ = ["Level", "Verdict", "headline", "verdicts"]
-
 Level = Literal["good", "look", "bad"]
 
 _TRACKING_LOOK_RAD = 0.02
