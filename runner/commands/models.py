@@ -22,6 +22,7 @@ from runner.terminal import PATH, json_option, to_json
 )
 @click.option("--forward", is_flag=True, help="Simulate along the commanded motion too.")
 @click.option("--cross", is_flag=True, help="Cross-validate over the sessions too.")
+@click.option("--settings", metavar="FILE", help="Settings of `identify`; its `signals` are used here.")
 def validate_command(
     model: Path,
     sessions: tuple[Path, ...],
@@ -30,6 +31,7 @@ def validate_command(
     against: tuple[Path, ...],
     forward: bool,
     cross: bool,
+    settings: str | None,
 ) -> None:
     """Test MODEL on SESSIONS it was not fitted to: torque residuals per joint and side.
 
@@ -46,22 +48,26 @@ def validate_command(
     from ident.estimation.validate import cross_validate, validate
     from ident.model.model_file import read_model
     from lwr_driver.session import read_session
+    from runner.estimation import IdentifySettings
 
     tested = read_model(model)
     logs = [read_session(path) for path in sessions]
-    result = validate(tested, logs, allow_seen=allow_seen)
+    signals = None if settings is None else IdentifySettings.load(settings).signals
+    result = validate(tested, logs, settings=signals, allow_seen=allow_seen)
     others = [read_model(path) for path in against]
-    result = replace(result, competitors=competitor_scores(tested, logs, others=others))
+    result = replace(result, competitors=competitor_scores(tested, logs, settings=signals, others=others))
     content: dict[str, Any] = result.to_dict()
     texts = [str(result)]
     if forward:
-        runs = [simulate_session(tested, log) for log in logs]
+        runs = [simulate_session(tested, log, settings=signals) for log in logs]
         content["forward"] = [run.to_dict() for run in runs]
         texts += [str(run) for run in runs]
     if cross:
         structure = tested.structure
         keys = ("model", "without", "couplings", "coulomb")
         wanted = IdentificationSettings(**{key: getattr(structure, key) for key in keys})
+        if signals is not None:
+            wanted = replace(wanted, signals=signals)
         folds = cross_validate(logs, structure.chain, wanted)
         content["cross_validation"] = folds.to_dict()
         texts.append(str(folds))

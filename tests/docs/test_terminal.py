@@ -479,6 +479,10 @@ def test_options_of_commands_for_models(workplace: Callable[[], Path]) -> None:
     code, text = run("validate", "model.yaml", *sessions, "--forward", "--cross", "--json")
     assert code == 0, text
     assert {"forward", "cross_validation"} <= set(json.loads(text))
+    (place / "slow.yaml").write_text("signals: {cutoff_hz: 3}\n")
+    code, slow = run("validate", "model.yaml", *sessions, "--settings", "slow.yaml", "--json")
+    assert code == 0, slow
+    assert json.loads(slow)["sessions"] != json.loads(text)["sessions"]
 
 
 def test_the_period_of_a_check(workplace: Callable[[], Path]) -> None:
