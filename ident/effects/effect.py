@@ -258,7 +258,8 @@ class Effect(ABC):
     hidden : linear parameters equal to 1 by the physics, free in the search and not reported.
     evidence_factor : multiple of the usual evidence, for a cause the nominal arm itself resembles slightly.
     beside_companions : the law is coarse, so parameters are estimated beside the companions.
-    confused_with : causes alike in many motions. contains : special cases of it.
+    confused_with : causes alike in many motions, for docs/effects.md only; the diagnosis finds look-alikes in the
+    data. contains : special cases of it.
     mean_of : causes with this one as the mean of their model-form error.
     experiment, tell_apart : the motion to decide between it and similar causes, and the same in words;
         `{joint}` stands for the joint's number. every_payload : the experiment needs every payload.
