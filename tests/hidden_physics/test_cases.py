@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ident.effects import EFFECTS
 from tests.hidden_physics import cases
 from tests.hidden_physics.cases import Store, draw, twin
 from tests.hidden_physics.causes import CAUSES
@@ -59,6 +60,7 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
 
 def test_every_cause_of_the_contract_can_be_hidden() -> None:
     assert {name: cause.side for name, cause in CAUSES.items()} == CONTRACT
+    assert set(CAUSES) == set(EFFECTS)
     assert not set(OUTSIDE) & set(CAUSES)
 
 

@@ -262,6 +262,7 @@ def test_every_cause_has_words(effect: Effect, form: Form | None, motion: Motion
     assert effect.depends_on in ("velocity", "load", "position", "time", "motor angle")
     assert effect.experiment
     assert effect.cause in repr(effect)
+    assert effect.confused_with or effect.counted
     assert set(effect.confused_with) <= set(EFFECTS) - {effect.cause}
     assert set(effect.mean_of) <= set(EFFECTS)
 
