@@ -201,7 +201,6 @@ def study(
 
 
 def _first_replay(replay: Replay | None) -> ReplayErrors | None:
-    """Errors over the session replayed first, with each model replayed on it."""
     if replay is None or not replay.first:
         return None
     name = replay.first[0][0]
