@@ -327,14 +327,13 @@ def _start_advice(patient: Patient, traffic: int) -> str:
         "enabling switch and the start key until friOpen is passed. In it, or in dlrrc.ini, the host must be "
         f"{patient.address} and the port {patient.port}."
     )
-    if traffic == 0:
-        return (
-            f"{steps} The interface has received nothing at all meanwhile: check cable and FRI network card"
+    received = "nothing at all meanwhile: check cable and FRI network card"
+    if traffic:
+        received = (
+            f"{traffic} other packets meanwhile: check host and port on the controller, and the firewall (sudo "
+            f"ufw allow {patient.port}/udp)"
         )
-    return (
-        f"{steps} The interface has received {traffic} other packets meanwhile: check host and port on the "
-        f"controller, and the firewall (sudo ufw allow {patient.port}/udp)"
-    )
+    return f"{steps} The interface has received {received}"
 
 
 def judge_link(patient: Patient, link: LinkTest) -> list[Finding]:
