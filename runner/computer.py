@@ -234,14 +234,13 @@ def _clock_source() -> Finding:
 
 
 def _clock_time() -> Finding:
-    """Synchronisation of the clock; only the dates in the logs depend on it."""
+    # Only the dates in the logs depend on it.
     status = -1
     with contextlib.suppress(OSError, AttributeError):
         status = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
-    if status < 0 or status == _CLOCK_UNSYNCHRONISED:
-        advice = "the dates in the logs may be wrong; sudo timedatectl set-ntp true"
-        return Finding("clock", "not synchronised", "synchronised", "advice", advice)
-    return Finding("clock", "synchronised", "synchronised", "ok")
+    wrong = status < 0 or status == _CLOCK_UNSYNCHRONISED
+    advice = "the dates in the logs may be wrong; sudo timedatectl set-ntp true"
+    return graded("clock", "not " * wrong + "synchronised", "synchronised", shortcoming=(wrong, advice))
 
 
 def _disk(folder: Path) -> Finding:

@@ -120,7 +120,7 @@ class LinkTest:
     @property
     def packets(self) -> int:
         """Packets received in the time."""
-        return self.end.received - self.start.received
+        return self.between("received")
 
     @property
     def rate_hz(self) -> float:
@@ -285,13 +285,8 @@ def examine(
     def testing(seconds: float, state: LinkState) -> None:
         tell("testing the link", seconds / link_s, f"{state.state} {state.quality}, {state.late} late")
 
-    settings = LinkSettings(
-        address=patient.address,
-        port=patient.port,
-        controller=patient.controller,
-        handshake=patient.handshake,
-        realtime="allow",
-    )
+    said = {key: getattr(patient, key) for key in ("address", "port", "controller", "handshake")}
+    settings = LinkSettings(**said, realtime="allow")
     with Driver(patient.arm, settings) as driver:
         try:
             driver.connect(timeout_s=wait_s)
@@ -332,14 +327,13 @@ def _start_advice(patient: Patient, traffic: int) -> str:
         "enabling switch and the start key until friOpen is passed. In it, or in dlrrc.ini, the host must be "
         f"{patient.address} and the port {patient.port}."
     )
-    if traffic == 0:
-        return (
-            f"{steps} The interface has received nothing at all meanwhile: check cable and FRI network card"
+    received = "nothing at all meanwhile: check cable and FRI network card"
+    if traffic:
+        received = (
+            f"{traffic} other packets meanwhile: check host and port on the controller, and the firewall (sudo "
+            f"ufw allow {patient.port}/udp)"
         )
-    return (
-        f"{steps} The interface has received {traffic} other packets meanwhile: check host and port on the "
-        f"controller, and the firewall (sudo ufw allow {patient.port}/udp)"
-    )
+    return f"{steps} The interface has received {received}"
 
 
 def judge_link(patient: Patient, link: LinkTest) -> list[Finding]:
@@ -430,18 +424,13 @@ def _robot(state: LinkState) -> list[Finding]:
     error = (state.error != 0, "acknowledge the messages at the pendant")
     off = (state.power != ALL_DRIVES, "switch the drives on before a motion")
     hottest = float(np.max(state.temperature))
+    shown = f"at most {hottest:.0f} °C"
     warm = "friction changes with temperature; let the arm rest, or warm it up to the same point each time"
     value, limit = f"{state.state}, control {state.control}", "POSITION" if stiff else "MON"
     return [
         graded("state", value, limit, shortcoming=(stiff, strategy)),
         graded("drives", bits, "no error" if state.error else "0x7f to move", error, off, RobotError),
-        Finding(
-            "temperature",
-            f"at most {hottest:.0f} °C",
-            f"{_WARM:.0f} °C",
-            "advice" if hottest > _WARM else "ok",
-            warm,
-        ),
+        Finding("temperature", shown, f"{_WARM:.0f} °C", "advice" if hottest > _WARM else "ok", warm),
     ]
 
 

@@ -264,10 +264,8 @@ class Experiment:
 
     def home(self, joints: int) -> npt.NDArray[np.float64]:
         """Resting position of the arm [rad], shape (joints,)."""
-        if len(self.moves.home) != joints:
-            raise ConfigurationError(
-                f"{self.source}: moves.home has {len(self.moves.home)} joints, the arm has {joints}"
-            )
+        given = len(self.moves.home)
+        _require(given == joints, f"{self.source}: moves.home has {given} joints, the arm has {joints}")
         return np.asarray(self.moves.home, dtype=np.float64)
 
     def payloads(self) -> dict[str, Payload]:

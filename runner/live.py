@@ -221,14 +221,9 @@ class Dashboard:
             f"**{sample.missed}** missed, **{self._lost}** lost"
         )
         lines = ["| | measured ° | commanded ° | error mrad | torque Nm |", "|:--|--:|--:|--:|--:|"]
-        columns = zip(
-            self._arm.joint_names,
-            np.degrees(sample.q),
-            np.degrees(sample.commanded),
-            1000.0 * sample.error,
-            sample.torque,
-            strict=True,
-        )
+        measured, commanded = np.degrees(sample.q), np.degrees(sample.commanded)
+        errors = 1000.0 * sample.error
+        columns = zip(self._arm.joint_names, measured, commanded, errors, sample.torque, strict=True)
         lines += [f"| {n} | {q:.2f} | {c:.2f} | {e:+.1f} | {tau:.1f} |" for n, q, c, e, tau in columns]
         self._table.content = "\n".join(lines)
 

@@ -198,7 +198,8 @@ def preview_html(planned: Planned) -> str:
         for row in rows:
             arm.pose(planned.motion.q[row])
             recording.insert_sleep(step)
-        scene = recording.as_html()
+        # As the value of an attribute in single quotes.
+        scene = recording.as_html().replace("&", "&amp;").replace("'", "&#39;")
     finally:
         stop_server(server)
     style = resources.files("runner").joinpath("preview.css").read_text(encoding="utf-8")
@@ -214,7 +215,7 @@ def preview_html(planned: Planned) -> str:
         f"<title>Preview of {escape(planned.title)}</title><link rel=icon href='data:,'>"
         f"<style>{style}</style></head><body><main>"
         "<section class=view><iframe title='The planned motion in 3D, with time slider' "
-        f"srcdoc='{_quoted(scene)}'></iframe><p class=key><span class=free></span>path of the flange, free "
+        f"srcdoc='{scene}'></iframe><p class=key><span class=free></span>path of the flange, free "
         "<span class=near></span>near <span class=alarm></span>tightest moment</p></section>"
         f"<section class=facts><h1>Preview of {escape(planned.title)}</h1>"
         f"<p class='verdict {'good' if ok else 'bad'}'>{mark} {verdict}</p>"
@@ -341,8 +342,3 @@ def _joint_panels(planned: Planned) -> Sequence[Panel]:
             )
         )
     return panels
-
-
-def _quoted(text: str) -> str:
-    """Text as the value of an attribute in single quotes."""
-    return text.replace("&", "&amp;").replace("'", "&#39;")

@@ -160,7 +160,6 @@ def next_problem(
 
 
 def _always(motion: ExcitationPlan, periods: int) -> Callable[[SessionPlan, float], Motion]:
-    """The same motion for every session."""
     rows = excitation_rows(motion, periods)
     return lambda session, period_s: rows(period_s)
 
@@ -187,7 +186,6 @@ def _knowledge(wanted: Knowledge, payload: Payload | None, found: Identification
 
 
 def _names(found: Identification, payload: Payload | None) -> tuple[str, ...]:
-    """The essential parameters of the arm and of the planned payload."""
     names = found.base.names if found.essential is None else found.essential.names
     joints = found.structure.chain.n
     link = None if payload is None else found.structure.payload_link(payload.name)

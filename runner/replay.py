@@ -191,16 +191,8 @@ def replay(
     joint_error = None
     if joint.effort.shape[1]:
         joint_error = _binned(_resampled(joint.log_time, joint.effort, grid) - link)
-    commanded = source is not None
-    return Replayed(
-        _binned(measured - position),
-        motor_error,
-        joint_error,
-        delay,
-        commanded,
-        bench.exact,
-        len(grid) * CYCLE_S,
-    )
+    errors = _binned(measured - position), motor_error, joint_error
+    return Replayed(*errors, delay, source is not None, bench.exact, len(grid) * CYCLE_S)
 
 
 class _Bench:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.arm import Arm
-from lwr_driver.arm.cell import Cell, PayloadShape
+from lwr_driver.arm.cell import Cell
 from runner.experiment_file import Payload
 
 Floats = NDArray[np.float64]
@@ -155,14 +155,9 @@ def _payload_shape(payload: Payload) -> tuple[Any, pin.SE3]:
         radius = float((payload.mass / (_DENSITY * 4.0 / 3.0 * np.pi)) ** (1.0 / 3.0))
         return coal.Sphere(radius), pin.SE3(np.eye(3), np.asarray(payload.com, dtype=np.float64))
     turn = pin.rpy.rpyToMatrix(np.radians(np.array(shape.rpy_deg)))
-    return _solid(shape), pin.SE3(turn, np.array(shape.centre_m))
-
-
-def _solid(shape: PayloadShape) -> Any:
-    size = shape.size_m
-    if shape.shape == "sphere":
-        return coal.Sphere(size[0])
-    return coal.Cylinder(size[0], size[1]) if shape.shape == "cylinder" else coal.Box(np.array(size))
+    make = {"sphere": coal.Sphere, "cylinder": coal.Cylinder}.get(shape.shape)
+    solid = coal.Box(np.array(shape.size_m)) if make is None else make(*shape.size_m)
+    return solid, pin.SE3(turn, np.array(shape.centre_m))
 
 
 def _add_shape(

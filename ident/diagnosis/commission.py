@@ -309,7 +309,6 @@ def _reference(
     sessions: Sequence[Session],
     null: Mapping[tuple[str, int], float],
 ) -> Reference:
-    """Mean of the days, with the covariance of a further day around it."""
     precisions = [np.asarray(np.linalg.inv(_sound(day.covariance)), dtype=np.float64) for day in days]
     within = np.linalg.inv(_sound(np.sum(precisions, axis=0)))
     pulls = [p @ day.values for p, day in zip(precisions, days, strict=True)]

@@ -155,7 +155,6 @@ def _excitation(claim: Claim, bench: Bench) -> float:
 
 
 def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:
-    """Position, speed and load in the rows of a side."""
     rows, motions = nominal.rows[side], nominal.motions
     signals = ([m.q for m in motions], [m.motor_speed for m in motions], [m.joint_torque for m in motions])
     return RowStates(rows.time, rows.session, block, *(nominal.reduce(side, parts) for parts in signals))
@@ -330,7 +329,6 @@ def _encompassed(
 
 
 def _at_most(confidence: float, finding: Finding) -> Finding:
-    """The finding with no more than that confidence."""
     return replace(finding, confidence=min(finding.confidence, confidence))
 
 
@@ -370,7 +368,6 @@ def _models(
 
 
 def _entry(finding: Finding) -> dict[str, Any]:
-    """A finding as an entry of a model's effects."""
     content = finding.to_dict()
     names = ("cause", "side", "joints", "form", "parameters")
     return {name: content[name] for name in names if name in content}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +11,7 @@ from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, Bench, again_with, nominal_arm, slow_delay, some_joint_moves
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import conclude, timing_finding
-from ident.diagnosis.evidence import Rows, Score
-from ident.diagnosis.nominal import Arm
+from ident.diagnosis.evidence import Score
 from ident.diagnosis.recording import record
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis
@@ -104,11 +103,16 @@ def _in_time(task: Task, state: State) -> State:
         late = _late(state.selection)
     if not late:
         return replace(state, left_out=tuple(doubtful))
-    baseline = Baseline.of(state.bench, _without_delays(state.selection))
+    named = zip(state.selection.nuisance, state.selection.nuisance_rows, strict=True)
+    baseline = Baseline.of(state.bench, [rows for name, rows in named if "delay" not in name])
     shifted, bench, amounts = task.arm, state.bench, {c.trial.candidate.cause: _made(c) for c in late}
     healthy = _at_another_phase(task.reference) if DELAYS["motor"].cause in amounts else task.reference
     for _ in range(_SHIFTS):
-        shifted = _shifted(shifted, amounts)
+        shifted = replace(
+            shifted,
+            motor_delay_s=shifted.motor_delay_s + amounts.get(DELAYS["motor"].cause, 0.0),
+            joint_delay_s=shifted.joint_delay_s + amounts.get(DELAYS["joint"].cause, 0.0),
+        )
         compliant = replace(shifted, compliance=bench.nominal.arm.compliance)
         bench = task.bench(compliant, healthy, fit_compliance=False)
         selection = task.select(bench)
@@ -143,19 +147,12 @@ def _refined(task: Task, state: State) -> State:
 
 
 def _late(selection: Selection) -> list[Claim]:
-    """Claims of late channels."""
     return [c for c in selection.claims if c.trial.candidate.effect.side == "timing"]
 
 
 def _made(claim: Claim) -> float:
     """Delay [s] in a claim of a late channel."""
     return float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
-
-
-def _without_delays(selection: Selection) -> list[Rows]:
-    """Columns of the tolerated deviations other than delays."""
-    named = zip(selection.nuisance, selection.nuisance_rows, strict=True)
-    return [rows for name, rows in named if "delay" not in name]
 
 
 def _rest(bench: Bench, selection: Selection, cause: str) -> tuple[float, float]:
@@ -188,15 +185,6 @@ def _at_another_phase(reference: Reference | None) -> Reference | None:
     return None if reference is None else reference.loosened("Ia", _INERTIA_BY_PHASE)
 
 
-def _shifted(arm: Arm, amounts: Mapping[str, float]) -> Arm:
-    """The arm with channels later by these delays [s], by cause."""
-    return replace(
-        arm,
-        motor_delay_s=arm.motor_delay_s + amounts.get(DELAYS["motor"].cause, 0.0),
-        joint_delay_s=arm.joint_delay_s + amounts.get(DELAYS["joint"].cause, 0.0),
-    )
-
-
 def _unknown_delay(task: Task, claim: Claim) -> float:
     """Largest delay [s] of a late channel on a healthy arm, 0 if a reference gives it.
 
@@ -220,7 +208,6 @@ def _own_delay(claim: Claim, limit: float) -> str:
 
 
 def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:
-    """Whether the slow part of the motion confirms a late channel."""
     bench.evidence.replace([])
     made = _made(claim)
     slow, std = slow_delay(bench, claim.trial)

@@ -200,7 +200,6 @@ class Evidence:
     # ---- products ----
 
     def _base_products(self) -> None:
-        """Products of the base, made once."""
         p = self.base_count
         self._base_gram = np.zeros((self.blocks, p, p))
         self._base_target = np.zeros((self.blocks, p))
@@ -300,7 +299,8 @@ class Evidence:
         """Products (blocks, k, l) of two groups of padded columns."""
         width = (next(iter(a.values())).shape[2], next(iter(b.values())).shape[2])
         total = np.zeros((self.blocks, *width))
-        for key in a.keys() & b.keys():
+        # In a fixed order: the last digits of a sum depend on it.
+        for key in sorted(a.keys() & b.keys()):
             total += self._weights[key] * np.matmul(a[key].transpose(0, 2, 1), b[key])
         return total
 
@@ -406,7 +406,6 @@ class Evidence:
         return float(linear - square)
 
     def _prior_penalty(self, values: Floats) -> float:
-        """Chi-square of base parameters against the prior."""
         if self.prior is None:
             return 0.0
         difference = values[: self.base_count] - self.prior[1]

@@ -332,7 +332,6 @@ class Nominal:
         return np.asarray((since < lead) | (np.mod(since - lead, every) < _WINDOW_S))
 
     def _make_rows(self) -> None:
-        """Rows of all sides from the present motions."""
         self.rows = {side: self._side_rows(side) for side in self.sides}
 
     def _side_rows(self, side: str) -> SideRows:
@@ -421,7 +420,6 @@ class Nominal:
 
 
 def _holds(recording: Recording, stretch: Stretch, side: str) -> bool:
-    """Whether a stretch has torques of a side."""
     return side in recording.sides and (side == "joint" or len(stretch.motor_time) > 1)
 
 

@@ -138,7 +138,6 @@ def best_candidate(
 
 
 def _others(claims: Sequence[Claim], k: int) -> list[Trial]:
-    """Trials of all claims but one."""
     return [claim.trial for i, claim in enumerate(claims) if i != k]
 
 

@@ -372,7 +372,6 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
 def _lines(
     content: Plain, details: Plain, findings: Sequence[FindingStatement], names: Sequence[str]
 ) -> list[Line]:
-    """The summary: findings, unexplained residuals, gain, replay, limits."""
     found = []
     for finding in findings:
         parts = [finding.text, *(f"{label} {text}" for label, text in finding.facts[:1]), finding.confidence]
@@ -399,7 +398,6 @@ def _lines(
 
 
 def _replay_line(content: Plain) -> list[Line]:
-    """The replay over all joints together."""
     before, after = _simulated(content)
     parts, worse = [], False
     for key, label, unit, scale in REPLAYED:
@@ -436,7 +434,6 @@ def _statistics(finding: Plain) -> list[tuple[str, str]]:
 
 
 def _experiments(details: Plain, names: Sequence[str]) -> Part:
-    """The discriminating experiments, planned and checked."""
     sentences = []
     for offer in details.get("deciding_motions") or []:
         where = "" if offer["joint"] is None else f" of {_name(offer['joint'], names)}"
@@ -524,15 +521,9 @@ def _replay(content: Plain, names: Sequence[str]) -> Part:
 
 def _absorbed(details: Plain) -> Part:
     """Base parameters with errors in the base model, for they had absorbed the findings."""
-    rows = [
-        (
-            str(entry["name"]),
-            Number(entry["base"]),
-            Number(entry["extended"]),
-            Number(entry["std"], ".2g"),
-            Number(entry["change_in_std"], "+.1f"),
-            str(entry["unit"]),
-        )
+    forms = {"base": ".4g", "extended": ".4g", "std": ".2g", "change_in_std": "+.1f"}
+    rows: list[Row] = [
+        (str(entry["name"]), *(Number(entry[key], form) for key, form in forms.items()), str(entry["unit"]))
         for entry in details.get("base_parameters") or []
     ]
     head = ("parameter", "base model", "extended", "std", "change [std]", "unit")
@@ -560,11 +551,5 @@ def _capital(text: str) -> str:
 
 
 def _wrapped(text: str, first: str, later: str) -> list[str]:
-    return textwrap.wrap(
-        text,
-        _WIDTH,
-        initial_indent=first,
-        subsequent_indent=later,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    wrapper = textwrap.TextWrapper(_WIDTH, first, later, break_long_words=False, break_on_hyphens=False)
+    return wrapper.wrap(text)

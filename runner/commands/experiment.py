@@ -114,7 +114,6 @@ def command(
 
 @contextmanager
 def _watched(bench: Bench, experiment: Experiment, port: int | None) -> Iterator[Bench]:
-    """The bench, with the live view as onlooker if a port is given."""
     if port is None:
         yield bench
         return
@@ -126,7 +125,6 @@ def _watched(bench: Bench, experiment: Experiment, port: int | None) -> Iterator
 
 
 def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Experiment, Path]:
-    """The experiment and the folder of its results, with a copy of the experiment file."""
     if resume is not None:
         if file is not None or out is not None:
             raise ConfigurationError(
@@ -152,7 +150,6 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
 
 
 def _failure(record: Record, folder: Path) -> LwrError:
-    """The error of an unfinished experiment, for the exit code."""
     text = f"session {record.name}: {record.reason}. `lwr-run experiment --resume {folder}` goes on from here"
     if record.status == "abort":
         return OperatorError(text)

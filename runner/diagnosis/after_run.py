@@ -252,7 +252,6 @@ def _later(session: Session, shift_ns: int) -> Session:
 
 
 def _with_sessions(experiment: Experiment, offered: Sequence[Discriminating]) -> Experiment:
-    """The experiment with the sessions of the discriminating experiments instead of its own."""
     sessions = [session for one in offered for session in one.sessions]
     # With as few payload swaps as possible.
     order = list(dict.fromkeys(session.payload for session in sessions))

@@ -25,7 +25,6 @@ from ident.excitation.motions import ParametricMotion
 from ident.model import DynamicModel
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
-from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session
 from runner.diagnosis.motions import chirp, poses, reversal_ladder, slow_sweep
 from runner.experiment_file import Experiment, Payload, SessionPlan
@@ -247,7 +246,8 @@ def _plan(
         try:
             plan = ExcitationPlan(make(), arm.joint_names, 1, provenance=provenance)
             rows = excitation_rows(plan, 1)(_CHECK_S)
-            if all(_passes(experiment, arm, cell, payload, rows, home) for payload in loads):
+            checks = [SessionPlan("check", load) for load in loads]
+            if all(session_motion(experiment, arm, cell, one, rows, home)[1].ok for one in checks):
                 return plan
         except (RefusedError, ConfigurationError) as error:
             log.info("%s: %s", kind.value, error)
@@ -276,10 +276,3 @@ def _sizes(
         return [lambda spread=spread: poses(arm, home, spread, free) for spread in _SPREADS]  # type: ignore[misc]
     make = {Kind.SLOW_SWEEP: slow_sweep, Kind.REVERSAL_LADDER: reversal_ladder, Kind.CHIRP: chirp}[kind]
     return [lambda span=span: make(arm, home, one, span) for span in _SPANS]  # type: ignore[misc]
-
-
-def _passes(
-    experiment: Experiment, arm: Arm, cell: Cell, payload: Payload | None, rows: Motion, home: Floats
-) -> bool:
-    _, preflight = session_motion(experiment, arm, cell, SessionPlan("check", payload), rows, home)
-    return preflight.ok

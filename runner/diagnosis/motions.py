@@ -162,11 +162,9 @@ def _along(points: Sequence[Floats], speeds: Sequence[float], rest_s: float) -> 
     """Straight lines through points (n,), each at its speed of the fastest joint [rad/s], with rests [s]."""
     times, places, now = [0.0, _REST_S], [points[0], points[0]], _REST_S
     for (start, stop), speed in zip(pairwise(points), speeds, strict=True):
-        now += max(float(np.max(np.abs(stop - start))) / speed, _COARSE_S)
-        times.append(now)
-        places.append(stop)
-        if rest_s:
-            now += rest_s
+        moving = max(float(np.max(np.abs(stop - start))) / speed, _COARSE_S)
+        for lasting in (moving, rest_s) if rest_s else (moving,):
+            now += lasting
             times.append(now)
             places.append(stop)
     path = np.array(places)

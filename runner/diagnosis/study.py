@@ -179,7 +179,10 @@ def study(
     if replay is not None:
         notes += replay.notes
     elif simulate:
-        notes.append(_unsimulated(chain))
+        lack = "the emulator has no such arm; name its description with --arm"
+        if chain.n != JOINTS:
+            lack = f"the emulator has a controller for {JOINTS} joints, this arm has {chain.n}"
+        notes.append(f"no simulation: {lack}")
     notes += unshown
     names = tuple(session.path.name for session in everything)
     return Study(
@@ -198,7 +201,6 @@ def study(
 
 
 def _first_replay(replay: Replay | None) -> ReplayErrors | None:
-    """Errors over the session replayed first, with each model replayed on it."""
     if replay is None or not replay.first:
         return None
     name = replay.first[0][0]
@@ -206,7 +208,6 @@ def _first_replay(replay: Replay | None) -> ReplayErrors | None:
 
 
 def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:
-    """Limits of a small recording."""
     notes = []
     if "joint" not in diagnosis.rms_base:
         notes.append(
@@ -219,12 +220,6 @@ def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:
             "errors are measured on parts of the one motion"
         )
     return notes
-
-
-def _unsimulated(chain: Chain) -> str:
-    if chain.n != JOINTS:
-        return f"no simulation: the emulator has a controller for {JOINTS} joints, this arm has {chain.n}"
-    return "no simulation: the emulator has no such arm; name its description with --arm"
 
 
 @contextmanager
@@ -243,7 +238,6 @@ def _unadvised() -> Iterator[None]:
 
 
 def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:
-    """The arm with the stiffness found by commissioning."""
     compliance = np.zeros(0) if healthy is None else healthy.compliance
     usable = len(compliance) == len(arm.stiffness) and bool(np.all(compliance > 0.0))
     return replace(arm, stiffness=1.0 / compliance) if usable else arm

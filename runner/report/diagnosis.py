@@ -198,7 +198,6 @@ def _table(said: Part) -> str:
 
 
 def _residuals(diagnosis: DiagnosisFolder) -> str:
-    """Residuals against everything, folded."""
     residuals = diagnosis.residuals
     if residuals is None:
         return ""
@@ -211,7 +210,6 @@ def _capital(text: str) -> str:
 
 
 def _json(path: Path) -> Mapping[str, Any]:
-    """Content of a file, empty for a missing one."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

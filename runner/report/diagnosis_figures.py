@@ -105,13 +105,6 @@ def _panel(residuals: Residuals, side: str, joint: int, against: str, *, with_si
     )
 
 
-def _abscissa(residuals: Residuals, rows: SideResiduals, joint: int, against: str) -> Floats:
-    if against in ("position", "velocity", "load"):
-        return {"position": rows.position, "velocity": rows.speed, "load": rows.load}[against][:, joint]
-    turns = rows.position[:, joint] * residuals.gear_ratio[joint] / (2.0 * np.pi)
-    return np.asarray(turns - np.floor(turns))
-
-
 def _models(residuals: Residuals, rows: SideResiduals, joint: int) -> list[tuple[Role, str, Floats]]:
     shown = zip(_MODELS, (rows.base, rows.extended)[: 1 + residuals.named], strict=False)
     return [(role, label, part[:, joint]) for (role, label), part in shown]
@@ -127,7 +120,12 @@ def _means(role: Role, label: str, x: Floats, values: Floats) -> list[Mark]:
 
 def _binned_marks(residuals: Residuals, rows: SideResiduals, joint: int, against: str) -> list[Mark]:
     marks: list[Mark] = []
-    x = _abscissa(residuals, rows, joint, against)
+    columns = {"position": rows.position, "velocity": rows.speed, "load": rows.load}
+    if against in columns:
+        x = columns[against][:, joint]
+    else:
+        turns = rows.position[:, joint] * residuals.gear_ratio[joint] / (2.0 * np.pi)
+        x = np.asarray(turns - np.floor(turns))
     for role, label, values in _models(residuals, rows, joint):
         good = np.isfinite(values) & np.isfinite(x)
         if np.count_nonzero(good) >= 10 and np.ptp(x[good]) > 0.0:
@@ -205,7 +203,6 @@ def _lines(trace: Trace, labels: Sequence[str]) -> list[tuple[Role, str, Floats]
 
 
 def _over_time(pair: LookAlikes, trace: Trace, labels: Sequence[str], names: Sequence[str]) -> Panel:
-    """The seconds of the largest torques."""
     session, begin = _busiest(trace)
     inside = (trace.session == session) & (trace.time >= begin) & (trace.time <= begin + _WINDOW_S)
     x = trace.time[inside]

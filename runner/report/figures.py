@@ -163,15 +163,11 @@ def parameter_figure(results: Results) -> Figure:
         if not mine:
             continue
         x = np.array([1.0 + links.index(_link(e["name"])) for e in mine])
+        estimates = np.array([e["estimate"] for e in mine])
+        intervals = np.array([interval_95(e) for e in mine])
+        said = tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine)
         marks: list[Mark] = [
-            Points(
-                "estimate",
-                "estimate with 95 % interval",
-                x,
-                np.array([e["estimate"] for e in mine]),
-                np.array([interval_95(e) for e in mine]),
-                tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine),
-            )
+            Points("estimate", "estimate with 95 % interval", x, estimates, intervals, said),
         ]
         placed = list(zip(x, mine, strict=True))
         known = [
@@ -232,25 +228,21 @@ def interval_95(entry: dict[str, float]) -> tuple[float, float]:
 
 def _binned(one: Curves, residual: Floats, joint: int, against: str) -> tuple[Mark, ...]:
     moving = np.isfinite(residual)
-    q = np.interp(one.grid[moving], one.time, one.q[:, joint])
-    qd = np.interp(one.grid[moving], one.time, one.qd[:, joint])
+    q, qd = (np.interp(one.grid[moving], one.time, column[:, joint]) for column in (one.q, one.qd))
     residual = residual[moving]
+    x, mean, low, high = bin_means(qd if against == "velocity" else q, residual)
+    spread = Band("spread", "5 to 95 % of the samples", x, low, high)
     if against == "velocity":
-        x, mean, low, high = bin_means(qd, residual)
-        return (
-            Band("spread", "5 to 95 % of the samples", x, low, high),
-            Line("measured", "mean", x, mean),
-        )
-    x, _, low, high = bin_means(q, residual)
-    marks: list[Mark] = [Band("spread", "5 to 95 % of the samples", x, low, high)]
-    for role, label, chosen in (
+        return spread, Line("measured", "mean", x, mean)
+    ways: tuple[tuple[Role, str, NDArray[np.bool_]], ...] = (
         ("forward", "mean, joint moving up", qd > _MOVING),
         ("backward", "mean, joint moving down", qd < -_MOVING),
-    ):
-        if np.count_nonzero(chosen) > _BINS:
-            x, mean, _, _ = bin_means(q[chosen], residual[chosen])
-            marks.append(Line(role, label, x, mean))  # type: ignore[arg-type]
-    return tuple(marks)
+    )
+    return spread, *(
+        Line(role, label, *bin_means(q[chosen], residual[chosen])[:2])
+        for role, label, chosen in ways
+        if np.count_nonzero(chosen) > _BINS
+    )
 
 
 def bin_means(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:

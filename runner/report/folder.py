@@ -235,12 +235,8 @@ class ResultFolder:
     @cached_property
     def preflights(self) -> dict[str, list[dict[str, Any]]]:
         """Conditions checked before the motion, by session."""
-        found = {}
-        for name, session in self.sessions.items():
-            text = session.attachments.get("preflight.json")
-            if text is not None:
-                found[name] = json.loads(text)
-        return found
+        texts = {name: one.attachments.get("preflight.json") for name, one in self.sessions.items()}
+        return {name: json.loads(text) for name, text in texts.items() if text is not None}
 
     @cached_property
     def curves(self) -> tuple[Curves, ...]:

@@ -62,15 +62,8 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
         layout["yaxis"]["automargin"] = True
     if panel.split:
         # The x axis belongs to the lower part, so the frame of the upper one is drawn.
-        frame = {
-            "type": "rect",
-            "xref": "paper",
-            "yref": "paper",
-            "x0": 0,
-            "x1": 1,
-            "y0": _SPLIT + 0.05,
-            "y1": 1,
-        }
+        box = {"x0": 0, "x1": 1, "y0": _SPLIT + 0.05, "y1": 1}
+        frame = {"type": "rect", "xref": "paper", "yref": "paper", **box}
         layout["shapes"] = [{**frame, "line": {"color": "#8c8c8c", "width": 1}}]
         layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 6}
     return {"data": data, "layout": layout}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from html import escape
+from typing import Any
 
 from runner.published import SOURCE, TABLE_1, TABLE_2
 from runner.report.figures import (
@@ -150,11 +152,7 @@ def table_2_section(results: ResultFolder) -> str:
     printed_names = {entry.name for entry in TABLE_2}
     forms = {"estimate": ".4g", "std": ".3g", "rsd_percent": ".2f"}
     others = [
-        [
-            e["name"],
-            pretty_unit(e["unit"]),
-            *(Number(e[what], form, f"{k}.{what}") for what, form in forms.items()),
-        ]
+        [e["name"], pretty_unit(e["unit"]), *_numbers(e, forms, k)]
         for n, (e, k) in kept.items()
         if n not in printed_names
     ]
@@ -176,10 +174,7 @@ def table_2_section(results: ResultFolder) -> str:
     if eliminated:
         title = f"{len(eliminated)} parameters eliminated, in this order"
         forms = {"estimate": ".4g", "rsd_percent": ".1f", "f": ".2f"}
-        lines = [
-            [e["name"], *(Number(e[what], form) for what, form in forms.items()), e["reason"]]
-            for e in eliminated
-        ]
+        lines = [[e["name"], *_numbers(e, forms), e["reason"]] for e in eliminated]
         parts.append(fold(title, table(("parameter", "estimate", "RSD %", "F", "reason"), lines, title)))
     source = f"Published: {SOURCE}; the arm and the payload were others than those of this run."
     parts.append(paragraph(source, "soft"))
@@ -187,7 +182,6 @@ def table_2_section(results: ResultFolder) -> str:
 
 
 def _why_absent(results: ResultFolder, absent: list[str]) -> str:
-    """Reasons for missing parameters."""
     reasons = []
     if any(name.endswith("8") for name in absent):
         carried = {s.metadata.get("payload", "none") for s in results.sessions.values()} - {"none"}
@@ -201,14 +195,13 @@ def _why_absent(results: ResultFolder, absent: list[str]) -> str:
 
 def motion_section(results: ResultFolder) -> str:
     """Figure 2 for each session."""
-    parts, first = [], True
-    for one in results.curves:
+    parts = []
+    for index, one in enumerate(results.curves):
         if one.side == "joint":
             velocity = figure_html(velocity_figure(results, one.session))
-            parts.append(fold(f"2a, joint velocities, {one.session}", velocity, is_open=first))
+            parts.append(fold(f"2a, joint velocities, {one.session}", velocity, is_open=not index))
         torque = figure_html(motion_figure(results, one.session, one.side))
-        parts.append(fold(f"2b, {one.side} torques, {one.session}", torque, is_open=first))
-        first = False
+        parts.append(fold(f"2b, {one.side} torques, {one.session}", torque, is_open=not index))
     return section("motion", "Figure 2: velocities and torques of the motion", *parts) if parts else ""
 
 
@@ -281,12 +274,12 @@ def assumption_section(results: ResultFolder) -> str:
         ]
         for name, check in checks.items()
     ]
-    covered = (
-        "They hold for correlated, non-normal residuals of unequal variance, but do not cover a lack of fit or of "
-        "exogeneity."
-    )
-    if str(results.summary["covariance"]).startswith("textbook"):
-        covered = "They need every assumption above."
+    covered = "They need every assumption above."
+    if not str(results.summary["covariance"]).startswith("textbook"):
+        covered = (
+            "They hold for correlated, non-normal residuals of unequal variance, but do not cover a lack of fit or of "
+            "exogeneity."
+        )
     parts = [
         table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
         paragraph(f"Standard deviations: {results.summary['covariance']}. {covered}", "soft"),
@@ -314,17 +307,14 @@ def parameter_section(results: ResultFolder) -> str:
     truth = "within_3_sigma" in results.summary
     rows: list[list[Cell]] = []
     for index, entry in enumerate(entries):
-        low, high = interval_95(entry)
         key = f"parameters.{index}"
         rows.append(
             [
                 entry["name"],
                 pretty_unit(entry["unit"]),
-                Number(entry["estimate"], ".5g", f"{key}.estimate"),
-                Number(entry["std"], ".3g", f"{key}.std"),
-                Number(low, ".5g"),
-                Number(high, ".5g"),
-                Number(entry["rsd_percent"], ".2f", f"{key}.rsd_percent"),
+                *_numbers(entry, {"estimate": ".5g", "std": ".3g"}, key),
+                *(Number(bound, ".5g") for bound in interval_95(entry)),
+                *_numbers(entry, {"rsd_percent": ".2f"}, key),
                 *([Number(entry.get("truth"), ".5g", f"{key}.truth")] if truth else []),
             ]
         )
@@ -394,6 +384,11 @@ def provenance_section(results: ResultFolder) -> str:
         "Lichtblick open them as they are.</p>"
     )
     return section("provenance", "Provenance", *parts)
+
+
+def _numbers(entry: Mapping[str, Any], forms: Mapping[str, str], key: str = "") -> list[Number]:
+    """Values of an entry. key : place of the entry in summary.json."""
+    return [Number(entry[what], form, key and f"{key}.{what}") for what, form in forms.items()]
 
 
 def _micro(seconds: float | None) -> Cell:

@@ -62,10 +62,9 @@ def _exit(results: ResultFolder) -> Verdict:
     reason = f": {summary['reason']}" if summary.get("reason") else ""
     kind = "logs" if summary.get("from_logs") else "sessions finished"
     text = f"{status}{reason}; {kind}: {', '.join(done) or 'none'}"
-    if status == "success":
-        return Verdict("exit status", text, "success", "good", "sessions")
-    wanted = f"success; lwr-run experiment --resume {results.path} goes on"
-    return Verdict("exit status", text, wanted, "bad", "sessions")
+    done_well = status == "success"
+    wanted = "success" if done_well else f"success; lwr-run experiment --resume {results.path} goes on"
+    return Verdict("exit status", text, wanted, "good" if done_well else "bad", "sessions")
 
 
 def _link(results: ResultFolder) -> Verdict | None:
@@ -77,11 +76,11 @@ def _link(results: ResultFolder) -> Verdict | None:
     )
     reply = max((link["latency_s"].get("p99", 0.0) for link in links), default=0.0)
     # The histogram of the loop ends at 2 ms.
-    replies = (
-        f"99 % of replies within {1e6 * reply:.0f} µs" if reply < _SLOWEST_S else "replies take over 2 ms"
-    )
+    replies = f"99 % of replies within {1e6 * reply:.0f} µs"
     if results.lock_step:
         replies = "lock step, so the emulator waited for every reply"
+    elif reply >= _SLOWEST_S:
+        replies = "replies take over 2 ms"
     text = f"{missed} missed, {lost} lost, {late} late of {cycles} cycles; {replies}"
     level: Level = "good" if missed + lost == 0 and late <= _LATE_LOOK * cycles else "look"
     return Verdict("link quality", text, "none missed or lost", level, "sessions")
@@ -97,11 +96,8 @@ def _limits(results: ResultFolder) -> Verdict | None:
     margin = "" if tightest is None else f"; tightest: {tightest['value']} (limit {tightest['limit']})"
     unknown = [name for name in results.sessions if name not in results.preflights]
     margin += f"; no record of {_listed(unknown)}" if unknown else ""
-    if failed:
-        return Verdict("limits", f"not held: {_listed(failed)}", "every condition held", "bad", "sessions")
-    return Verdict(
-        "limits", f"all {len(items)} conditions held{margin}", "every condition held", "good", "sessions"
-    )
+    text = f"not held: {_listed(failed)}" if failed else f"all {len(items)} conditions held{margin}"
+    return Verdict("limits", text, "every condition held", "bad" if failed else "good", "sessions")
 
 
 def _tracking(results: ResultFolder) -> Verdict | None:
@@ -193,9 +189,8 @@ def _truth(results: ResultFolder) -> Verdict | None:
         return None
     text = f"{100 * share:.1f} % of the estimates within 3 standard deviations"
     level: Level = "good" if share >= _TRUTH_WANTED else "look"
-    return Verdict(
-        "truth of the emulated arm", text, f"at least {100 * _TRUTH_WANTED:.0f} %", level, "parameters"
-    )
+    wanted = f"at least {100 * _TRUTH_WANTED:.0f} %"
+    return Verdict("truth of the emulated arm", text, wanted, level, "parameters")
 
 
 def _diagnosis(results: ResultFolder) -> Verdict | None:
