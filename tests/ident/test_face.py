@@ -166,8 +166,11 @@ def test_a_diagnosis_is_short_a_table_and_a_figure(found: Any) -> None:
     )
     lines = repr(diagnosis).splitlines()
     assert len(lines) <= 10
-    assert lines[0] == "Diagnosis of a.mcap, held out: b.mcap: 12 findings"
-    assert lines[1] == "  joint_elasticity, joint 4: compliance 0.00012 ± 1e-05 rad/Nm, confidence 0.98"
+    assert lines[0] == "Diagnosis of a.mcap"
+    assert lines[1].startswith("12 causes found")
+    assert lines[2].lower().startswith("joint elasticity, joint a3: ")
+    assert "compliance 0.00012 ± 1e-05 rad/Nm" in lines[2]
+    assert lines[-1].startswith("... and ")
     table = diagnosis.to_dataframe()
     assert isinstance(table, pandas.DataFrame)
     assert table.loc[0, "rms_after"] == 0.21
