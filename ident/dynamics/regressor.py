@@ -381,14 +381,8 @@ def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, ou
             else:
                 e0, e1, e2 = e0 + w1 * rate, e1 - w0 * rate, e2 + qdd[s, k]
                 w2 += rate
-            xx, xy, xz, yy, yz, zz = (
-                bodies[k, 0],
-                bodies[k, 1],
-                bodies[k, 2],
-                bodies[k, 3],
-                bodies[k, 4],
-                bodies[k, 5],
-            )
+            xx, xy, xz = bodies[k, 0], bodies[k, 1], bodies[k, 2]
+            yy, yz, zz = bodies[k, 3], bodies[k, 4], bodies[k, 5]
             h0, h1, h2, m = bodies[k, 6], bodies[k, 7], bodies[k, 8], bodies[k, 9]
             # omega x h, then f = m a + alpha x h + omega x (omega x h)
             g0, g1, g2 = w1 * h2 - w2 * h1, w2 * h0 - w0 * h2, w0 * h1 - w1 * h0

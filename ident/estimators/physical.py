@@ -346,17 +346,15 @@ def _touching(prior: BodyPrior, standard: Floats, margin: float) -> int:
 
 def _refit(estimate: Estimate, problem: Problem, values: Floats) -> tuple:
     """Class table with the residuals of the constrained values."""
-    fits = []
-    for fit, row_class in zip(estimate.classes, problem.classes, strict=True):
-        square = row_class.factor.sum_of_squares(values)
-        fits.append(
-            replace(
-                fit,
-                rms=float(np.sqrt(square / max(fit.rows, 1))),
-                sigma=float(np.sqrt(square / max(fit.rows - fit.parameters, 1.0))),
-            )
+    squares = [row_class.factor.sum_of_squares(values) for row_class in problem.classes]
+    return tuple(
+        replace(
+            fit,
+            rms=float(np.sqrt(square / max(fit.rows, 1))),
+            sigma=float(np.sqrt(square / max(fit.rows - fit.parameters, 1.0))),
         )
-    return tuple(fits)
+        for fit, square in zip(estimate.classes, squares, strict=True)
+    )
 
 
 # Prior of a payload of unknown inertia: mass, radius of gyration and relative standard deviation.

@@ -118,10 +118,6 @@ class MaximumAPosteriori:
         tempered = weights * _shares(problem, values)
         values, root = _posterior(problem, self.prior, tempered, scale)
         bread = root @ root.T
-        coefficients = [
-            tempered[number] * residual
-            for residual, number in zip(problem.residuals(values), problem.class_of_group, strict=True)
-        ]
         estimate = estimate_from(
             problem,
             method="MAP",
@@ -130,11 +126,7 @@ class MaximumAPosteriori:
             bread=bread,
             consumed=consumed_parameters(problem, tempered, root),
             settings=self.covariance,
-            coefficients=coefficients,
-            row_weights=[
-                np.full(len(group.target), tempered[number])
-                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
-            ],
+            class_weights=tempered,
             iterations=iteration,
             converged=converged,
             notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({self._how()})",),
