@@ -98,7 +98,8 @@ def fill_rigid(
 
     out : (>= C, >= 1, n, >= N) float64 C-contiguous; writes [column, 0, joint, sample] except structural zeros.
     """
-    _fill(_fixed(q), _fixed(qd), _fixed(qdd), *_constants(chain), chain.gravity, _fixed(columns), out)
+    constants = (*chain.cos_sin_alpha, chain.d, chain.theta, chain.r, chain.prismatic.astype(np.float64))
+    _fill(_fixed(q), _fixed(qd), _fixed(qdd), *constants, chain.gravity, _fixed(columns), out)
 
 
 def _fixed(array: Any) -> Any:
@@ -106,11 +107,6 @@ def _fixed(array: Any) -> Any:
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
     return view
-
-
-def _constants(chain: Chain) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    cosine, sine = chain.cos_sin_alpha
-    return cosine, sine, chain.d, chain.theta, chain.r, chain.prismatic.astype(np.float64)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

@@ -65,12 +65,9 @@ def class_variances(problem: Problem, values: Floats, consumed: Floats) -> Float
             )
         result.append(row_class.factor.sum_of_squares(values) / freedom)
     variance = np.array(result)
-    floor = np.finfo(float).tiny + 1e-20 * max(float(variance.max()), _mean_square(problem))
+    square = sum(float(c.factor.r[:, -1] @ c.factor.r[:, -1]) for c in problem.classes)
+    floor = np.finfo(float).tiny + 1e-20 * max(float(variance.max()), square / max(problem.rows, 1))
     return np.maximum(variance, floor)
-
-
-def _mean_square(problem: Problem) -> float:
-    return sum(float(c.factor.r[:, -1] @ c.factor.r[:, -1]) for c in problem.classes) / max(problem.rows, 1)
 
 
 def estimate_from(

@@ -118,6 +118,7 @@ class MaximumAPosteriori:
         tempered = weights * _shares(problem, values)
         values, root = _posterior(problem, self.prior, tempered, scale)
         bread = root @ root.T
+        how = self.strength.replace("_", "-") if isinstance(self.strength, str) else "stated"
         estimate = estimate_from(
             problem,
             method="MAP",
@@ -129,7 +130,7 @@ class MaximumAPosteriori:
             class_weights=tempered,
             iterations=iteration,
             converged=converged,
-            notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({self._how()})",),
+            notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({how})",),
         )
         posterior = Covariance(bread, "posterior with the effective number of rows: holds if the prior does")
         return replace(
@@ -138,9 +139,6 @@ class MaximumAPosteriori:
             prior_scale=scale,
             covariances={**estimate.covariances, "posterior": posterior},
         )
-
-    def _how(self) -> str:
-        return "stated" if isinstance(self.strength, (int, float)) else self.strength.replace("_", "-")
 
     def _scale(self, problem: Problem, tempered: Floats) -> float:
         if isinstance(self.strength, (int, float)):
