@@ -178,7 +178,7 @@ STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 _CONSTANTS = ("alpha", "d", "theta", "r")
 
 
-def _transformed(inertial: ArrayLike, poses: Floats) -> Floats:
+def _transformed(inertial: ArrayLike, poses: NDArray[np.floating[Any]]) -> Floats:
     rows = np.asarray(inertial, dtype=np.float64)
     return np.array([parameters.transform(row, pose) for row, pose in zip(rows, poses, strict=True)])
 
@@ -284,7 +284,7 @@ class Chain(Tabular):
         return cls(
             tuple(names),
             np.array(prismatic, dtype=bool),
-            *np.array(table, dtype=np.float64).reshape(-1, 4).T,
+            **dict(zip(_CONSTANTS, np.array(table, dtype=np.float64).reshape(-1, 4).T, strict=True)),
             gravity=np.asarray(gravity, dtype=np.float64),
             base_placement=np.eye(4)
             if base_placement is None
@@ -333,7 +333,7 @@ class Chain(Tabular):
         return cls(
             tuple(joint.name for joint in movable),
             np.array([joint.kind == "prismatic" for joint in movable]),
-            *table.T,
+            **dict(zip(_CONSTANTS, table.T, strict=True)),
             gravity=base[:3, :3].T @ np.asarray(gravity, dtype=np.float64),
             base_placement=base,
             link_names=tuple(joint.child for joint in movable),

@@ -279,7 +279,8 @@ class ModelStructure:
             raise ConfigurationError(f"columns must be a list of indices below {self.n_columns}")
         n, samples = self.chain.n, len(position)
         out = np.zeros((len(wanted), len(chosen), n, samples))
-        sources = {c: s for c, k in enumerate(wanted) if (s := self.rigid_of(int(k), payload)) is not None}
+        rigid = {c: self.rigid_of(int(column), payload) for c, column in enumerate(wanted)}
+        sources = {c: source for c, source in rigid.items() if source is not None}
         # Difference rows have no rigid part and are never preceded by other sides (side order).
         rigid_sides = [s for s, side in enumerate(chosen) if side != "difference"]
         if rigid_sides:

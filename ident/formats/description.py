@@ -138,8 +138,8 @@ def _new(model: StandardModel, name: str) -> str:
     root = ElementTree.Element("robot", {"name": name})
     damping, dry, notes = friction(model)
     root.append(ElementTree.Comment(comment(model, notes)))
-    base = ElementTree.SubElement(root, "link", {"name": "base_link"})
-    parent = base.get("name", "")
+    parent = "base_link"
+    ElementTree.SubElement(root, "link", {"name": parent})
     for k, joint_name in enumerate(chain.joint_names):
         pose = chain.placement(k) if k else chain.base_placement @ chain.placement(0)
         kind = "prismatic" if chain.prismatic[k] else "continuous"

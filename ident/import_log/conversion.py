@@ -354,7 +354,7 @@ def _read(
         raw = recording.columns(signal, joints, name)
         place = f"{recording.path(signal.file)}: `{name}`"
         base = signal.time if signal.time is not None else mapping.time
-        clock = _clock(mapping, base, signal, recording, len(raw), place)
+        clock = _clock(base, signal, recording, len(raw), place)
         total = len(raw) if name == "position" else total
         if name in _ONCE and len(raw) != total:
             raise DataError(
@@ -373,9 +373,7 @@ def _read(
     return total, channels
 
 
-def _clock(
-    mapping: LogMapping, base: TimeBase, signal: Signal, recording: Recording, count: int, place: str
-) -> Floats:
+def _clock(base: TimeBase, signal: Signal, recording: Recording, count: int, place: str) -> Floats:
     """Times of the samples (n,) [s] by the source's clock."""
     if base.column is None:
         assert base.rate_hz is not None
