@@ -281,10 +281,12 @@ class Chain(Tabular):
             names.append(str(row.get("name", f"q{number}")))
             prismatic.append(kind == "prismatic")
             table.append([float(row.get(key, 0.0)) for key in _CONSTANTS])
+        columns = np.array(table, dtype=np.float64).reshape(-1, 4).T
+        constants: dict[str, Any] = dict(zip(_CONSTANTS, columns, strict=True))
         return cls(
             tuple(names),
             np.array(prismatic, dtype=bool),
-            **dict(zip(_CONSTANTS, np.array(table, dtype=np.float64).reshape(-1, 4).T, strict=True)),
+            **constants,
             gravity=np.asarray(gravity, dtype=np.float64),
             base_placement=np.eye(4)
             if base_placement is None
