@@ -71,7 +71,7 @@ class _Axes:
     r1 : first revolute joint (n if none). r2 : first revolute joint not parallel to it (n if none).
     r3 : first revolute joint after r2 not parallel to r2 (n if none).
     along : (n,) cosine between z_j and z_r1, for j <= r2. second : (n,) the same with z_r2, for r2 <= j < r3.
-        axis : (n, 3) z_r1 in frame j, for r1 <= j < r2.
+        axis : (n, 3) z_r1 in frame j, for r1 <= j < r2. frames : orientation of frame j in frame 0 at q = 0.
     """
 
     r1: int
@@ -80,6 +80,7 @@ class _Axes:
     along: Floats
     second: Floats
     axis: Floats
+    frames: tuple[Floats, ...]
 
     @classmethod
     def of(cls, chain: Chain) -> _Axes:
@@ -96,7 +97,7 @@ class _Axes:
         z2 = frames[r2][:, 2] if r2 < n else np.zeros(3)
         second = np.array([float(frame[:, 2] @ z2) for frame in frames])
         r3 = next((j for j in range(r2 + 1, n) if not chain.prismatic[j] and abs(second[j]) < 1 - _SAME), n)
-        return cls(r1, r2, r3, along, second, np.array([frame.T @ z1 for frame in frames]))
+        return cls(r1, r2, r3, along, second, np.array([frame.T @ z1 for frame in frames]), tuple(frames))
 
 
 class _Rigid:
@@ -167,10 +168,7 @@ class _Rigid:
     def _stands_still(self, j: int) -> bool:
         """Whether the axis of revolute joint j < r2 is fixed in space and lies along gravity."""
         chain, axes = self.chain, self.axes
-        turn = np.eye(3)
-        for k in range(axes.r1 + 1):
-            turn = turn @ chain.placement(k)[:3, :3]
-        gravity = turn.T @ chain.gravity
+        gravity = axes.frames[axes.r1].T @ chain.gravity
         if np.hypot(gravity[0], gravity[1]) > _SAME * np.linalg.norm(chain.gravity):
             return False
         for k in range(j):
@@ -213,10 +211,8 @@ class _Rigid:
                 form[:, :n] = np.outer(turning, turning)
                 relate(j, self._function(j, _ZZ), form)
             elif chain.prismatic[j] and j < axes.r1:
-                turn, directions = np.eye(3), np.zeros((n, 3))
-                for k in range(j + 1):
-                    turn = turn @ chain.placement(k)[:3, :3]
-                    directions[k] = turn[:, 2]
+                directions = np.zeros((n, 3))
+                directions[: j + 1] = [frame[:, 2] for frame in axes.frames[: j + 1]]
                 form[:, :n] = directions @ directions.T
                 form[:, n] = -directions @ chain.gravity
                 relate(j, self._function(j, _M), form)
@@ -249,14 +245,8 @@ class _Rigid:
         before = np.where(np.arange(n) < j, speed, 0.0)
         form = np.zeros((n, n + 1))
         form[:, :n] = np.outer(speed, speed) - np.outer(before, before)
-        form[j, n] = -self._gravity_along() * axes.along[j]
+        form[j, n] = -float(axes.frames[axes.r1][:, 2] @ chain.gravity) * axes.along[j]
         return form
-
-    def _gravity_along(self) -> float:
-        turn = np.eye(3)
-        for k in range(min(self.axes.r1 + 1, self.chain.n)):
-            turn = turn @ self.chain.placement(k)[:3, :3]
-        return float(turn[:, 2] @ self.chain.gravity)
 
 
 def _coordinates(structure: ModelStructure, rigid: _Rigid, payload: str | None, side: Side) -> Floats:

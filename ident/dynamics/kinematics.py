@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -175,6 +175,12 @@ def _perpendicular(link: Floats, axis: Floats) -> Floats:
 logger = logging.getLogger(__name__)
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
+_CONSTANTS = ("alpha", "d", "theta", "r")
+
+
+def _transformed(inertial: ArrayLike, poses: NDArray[np.floating[Any]]) -> Floats:
+    rows = np.asarray(inertial, dtype=np.float64)
+    return np.array([parameters.transform(row, pose) for row, pose in zip(rows, poses, strict=True)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,20 +215,10 @@ class Chain(Tabular):
             raise ConfigurationError("the chain has no movable joint; at least one is needed")
         if len(set(self.joint_names)) != n:
             raise ConfigurationError(f"joint names {', '.join(self.joint_names)} repeat; each must be unique")
-        object.__setattr__(self, "prismatic", np.asarray(self.prismatic, dtype=bool).copy())
-        for name, shape in {
-            "prismatic": (n,),
-            "alpha": (n,),
-            "d": (n,),
-            "theta": (n,),
-            "r": (n,),
-            "gravity": (3,),
-            "base_placement": (4, 4),
-        }.items():
-            value = getattr(self, name)
-            if name != "prismatic":
-                value = np.array(value, dtype=np.float64)
-                object.__setattr__(self, name, value)
+        shapes = dict.fromkeys(("prismatic", *_CONSTANTS), (n,))
+        for name, shape in {**shapes, "gravity": (3,), "base_placement": (4, 4)}.items():
+            value = np.array(getattr(self, name), dtype=bool if name == "prismatic" else np.float64)
+            object.__setattr__(self, name, value)
             if value.shape != shape or not np.all(np.isfinite(value)):
                 raise ConfigurationError(
                     f"chain: `{name}` of shape {value.shape}: expected finite values of shape {shape}"
@@ -272,7 +268,7 @@ class Chain(Tabular):
         """
         names, prismatic, table = [], [], []
         for number, row in enumerate(rows, start=1):
-            unknown = set(row) - {"name", "kind", "alpha", "d", "theta", "r"}
+            unknown = set(row) - {"name", "kind", *_CONSTANTS}
             if unknown:
                 raise ConfigurationError(
                     f"joint {number}: unknown key `{sorted(unknown)[0]}` in the modified-DH table"
@@ -284,15 +280,13 @@ class Chain(Tabular):
                 )
             names.append(str(row.get("name", f"q{number}")))
             prismatic.append(kind == "prismatic")
-            table.append([float(row.get(key, 0.0)) for key in ("alpha", "d", "theta", "r")])
-        constants = np.array(table, dtype=np.float64).reshape(-1, 4).T
+            table.append([float(row.get(key, 0.0)) for key in _CONSTANTS])
+        columns = np.array(table, dtype=np.float64).reshape(-1, 4).T
+        constants: dict[str, Any] = dict(zip(_CONSTANTS, columns, strict=True))
         return cls(
             tuple(names),
             np.array(prismatic, dtype=bool),
-            constants[0],
-            constants[1],
-            constants[2],
-            constants[3],
+            **constants,
             gravity=np.asarray(gravity, dtype=np.float64),
             base_placement=np.eye(4)
             if base_placement is None
@@ -341,10 +335,7 @@ class Chain(Tabular):
         return cls(
             tuple(joint.name for joint in movable),
             np.array([joint.kind == "prismatic" for joint in movable]),
-            table[:, 0],
-            table[:, 1],
-            table[:, 2],
-            table[:, 3],
+            **dict(zip(_CONSTANTS, table.T, strict=True)),
             gravity=base[:3, :3].T @ np.asarray(gravity, dtype=np.float64),
             base_placement=base,
             link_names=tuple(joint.child for joint in movable),
@@ -377,17 +368,12 @@ class Chain(Tabular):
     def inertial_from_links(self, inertial: ArrayLike) -> Floats:
         """(n, 10) parameters in modified-DH frames from the same about the URDF's link frames."""
         assert self.link_placements is not None
-        rows = np.asarray(inertial, dtype=np.float64)
-        return np.array(
-            [parameters.transform(row, pose) for row, pose in zip(rows, self.link_placements, strict=True)]
-        )
+        return _transformed(inertial, self.link_placements)
 
     def inertial_to_links(self, inertial: ArrayLike) -> Floats:
         """(n, 10) parameters about the URDF's link frames from those in modified-DH frames."""
         assert self.link_placements is not None
-        inverse = np.linalg.inv(self.link_placements)
-        rows = np.asarray(inertial, dtype=np.float64)
-        return np.array([parameters.transform(row, pose) for row, pose in zip(rows, inverse, strict=True)])
+        return _transformed(inertial, np.linalg.inv(self.link_placements))
 
     def urdf_inertials(self) -> Floats:
         """(n, 10) inertial parameters of the URDF, in modified-DH frames.
@@ -435,10 +421,7 @@ class Chain(Tabular):
                 "name": name,
                 "link": link,
                 "kind": "prismatic" if self.prismatic[k] else "revolute",
-                "alpha": float(self.alpha[k]),
-                "d": float(self.d[k]),
-                "theta": float(self.theta[k]),
-                "r": float(self.r[k]),
+                **{key: float(getattr(self, key)[k]) for key in _CONSTANTS},
             }
             for k, (name, link) in enumerate(zip(self.joint_names, self.link_names, strict=True))
         ]
@@ -458,15 +441,8 @@ class Chain(Tabular):
             raise ConfigurationError(f"chain: {named}")
         rows = [{key: value for key, value in row.items() if key != "link"} for row in content["joints"]]
         plain = cls.from_table(rows, gravity=content["gravity"], base_placement=content.get("base_placement"))
-        return cls(
-            plain.joint_names,
-            plain.prismatic,
-            plain.alpha,
-            plain.d,
-            plain.theta,
-            plain.r,
-            gravity=plain.gravity,
-            base_placement=plain.base_placement,
+        return replace(
+            plain,
             link_names=tuple(str(row.get("link", f"link_{k}")) for k, row in enumerate(content["joints"], 1)),
             link_placements=content.get("link_placements"),
             urdf=urdf,

@@ -83,7 +83,10 @@ def project(
     # x = x0 + T z, with z the entries of L^-1 (P - P0) L^-T: every body has the size of one.
     step = _steps(roots)
     slope, missing = k_matrix @ step, chi - k_matrix @ bodies.ravel()
-    scale = _scale(slope, covariance)
+    if covariance is not None and np.shape(covariance) != (len(slope), len(slope)):
+        raise ConfigurationError(f"covariance has shape {np.shape(covariance)}; expected {(len(slope),) * 2}")
+    # Change of each base parameter when a body changes by its own size.
+    scale = np.linalg.norm(slope, axis=1)
     used = scale > 0.0
     found = None
     for closeness in (margin, 1e-3 * margin):
@@ -156,14 +159,6 @@ def _steps(roots: Floats) -> Floats:
     return steps
 
 
-def _scale(slope: Floats, covariance: ArrayLike | None) -> Floats:
-    """Change of each base parameter when a body changes by its own size."""
-    scale = np.linalg.norm(slope, axis=1)
-    if covariance is not None and np.shape(covariance) != (len(slope), len(slope)):
-        raise ConfigurationError(f"covariance has shape {np.shape(covariance)}; expected {(len(slope),) * 2}")
-    return scale
-
-
 def _root_weight(scale: Floats, covariance: ArrayLike | None) -> Floats:
     """Square root of the weight W; directions without variance are held to 1e-6 of the scale."""
     if covariance is None:
@@ -175,35 +170,17 @@ def _root_weight(scale: Floats, covariance: ArrayLike | None) -> Floats:
     return (vectors / np.sqrt(np.maximum(values, floor))).T / size
 
 
-def _cones(bodies: int, margin: float, offset: int, columns: int) -> tuple[sparse.csc_matrix, Floats]:
-    """A and b of s = b - A x with s in the cones 1 + mat(z) - margin 1 >= 0; z begins at column `offset`."""
-    size = 10 * bodies
-    identity = np.array([1.0 if i == j else 0.0 for i, j in _TRIANGLE])
-    rows = np.arange(size)
-    matrix = sparse.csc_matrix((-np.ones(size), (rows, rows + offset)), shape=(size, columns))
-    return matrix, np.tile((1.0 - margin) * identity, bodies)
-
-
 def _solve_exact(slope: Floats, missing: Floats, bodies: int, margin: float) -> Floats | None:
     """min |z|^2 / 2 with slope z = missing and all bodies real; None if there are none."""
-    import clarabel
-
-    size = 10 * bodies
     # The rows of the base set are independent but badly scaled: take orthonormal ones.
     left, values, right = np.linalg.svd(slope, full_matrices=False)
     keep = values > 1e-10 * values.max(initial=0.0)
     rows, target = right[keep], (left.T @ missing)[keep] / values[keep]
-    cone_a, cone_b = _cones(bodies, margin, 0, size)
-    a = sparse.vstack([sparse.csc_matrix(rows), cone_a], format="csc")
-    b = np.concatenate([target, cone_b])
-    cones = [clarabel.ZeroConeT(len(target)), *[clarabel.PSDTriangleConeT(4)] * bodies]
-    return _solve(sparse.identity(size, format="csc"), np.zeros(size), a, b, cones)
+    return _solve(sparse.identity(10 * bodies), sparse.csc_matrix(rows), target, bodies, margin)
 
 
 def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, firmness: float) -> Floats:
     """min |slope z - missing|^2 / 2 + firmness |z|^2 / 2 with all bodies real."""
-    import clarabel
-
     size = 10 * bodies
     _, triangle = np.linalg.qr(np.column_stack([slope, missing]))
     rows = triangle[:, :size]
@@ -211,15 +188,9 @@ def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, f
     unit = max(float(np.linalg.norm(rows, axis=1).max()), 1e-300)
     rows, right = rows / unit, right / unit
     # Residuals r = rows z - right are variables, for better scaling.
-    columns = size + len(rows)
-    p = sparse.diags(
-        np.concatenate([np.full(size, firmness / unit**2 + 1e-12), np.ones(len(rows))]), format="csc"
-    )
+    p = sparse.diags(np.concatenate([np.full(size, firmness / unit**2 + 1e-12), np.ones(len(rows))]))
     link = sparse.hstack([sparse.csc_matrix(rows), -sparse.identity(len(rows))], format="csc")
-    cone_a, cone_b = _cones(bodies, margin, 0, columns)
-    a = sparse.vstack([link, cone_a], format="csc")
-    cones = [clarabel.ZeroConeT(len(rows)), *[clarabel.PSDTriangleConeT(4)] * bodies]
-    solution = _solve(p, np.zeros(columns), a, np.concatenate([right, cone_b]), cones)
+    solution = _solve(p, link, right, bodies, margin)
     if solution is None:
         raise DataError(
             "no consistent bodies were found for these parameters; check the estimate and the prior bodies"
@@ -228,14 +199,20 @@ def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, f
 
 
 def _solve(
-    p: sparse.csc_matrix, q: Floats, a: sparse.csc_matrix, b: Floats, cones: list[object]
+    p: sparse.spmatrix, rows: sparse.csc_matrix, target: Floats, bodies: int, margin: float
 ) -> Floats | None:
+    """min z' p z / 2 with rows z = target and 1 + mat(z) - margin 1 >= 0 of each body; None without any z."""
     import clarabel
 
+    size, columns = 10 * bodies, rows.shape[1]
+    identity = np.array([1.0 if i == j else 0.0 for i, j in _TRIANGLE])
+    a = sparse.vstack([rows, -sparse.eye(size, columns)], format="csc")
+    b = np.concatenate([target, np.tile((1.0 - margin) * identity, bodies)])
+    cones = [clarabel.ZeroConeT(len(target)), *[clarabel.PSDTriangleConeT(4)] * bodies]
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = 200
-    solution = clarabel.DefaultSolver(sparse.csc_matrix(p), q, a, b, cones, settings).solve()
+    solution = clarabel.DefaultSolver(sparse.csc_matrix(p), np.zeros(columns), a, b, cones, settings).solve()
     status = str(solution.status)
     logger.debug("cone program: %s after %s iterations", status, solution.iterations)
     return np.array(solution.x) if status in ("Solved", "AlmostSolved") else None

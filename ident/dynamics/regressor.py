@@ -98,7 +98,8 @@ def fill_rigid(
 
     out : (>= C, >= 1, n, >= N) float64 C-contiguous; writes [column, 0, joint, sample] except structural zeros.
     """
-    _fill(_fixed(q), _fixed(qd), _fixed(qdd), *_constants(chain), chain.gravity, _fixed(columns), out)
+    constants = (*chain.cos_sin_alpha, chain.d, chain.theta, chain.r, chain.prismatic.astype(np.float64))
+    _fill(_fixed(q), _fixed(qd), _fixed(qdd), *constants, chain.gravity, _fixed(columns), out)
 
 
 def _fixed(array: Any) -> Any:
@@ -106,11 +107,6 @@ def _fixed(array: Any) -> Any:
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
     return view
-
-
-def _constants(chain: Chain) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    cosine, sine = chain.cos_sin_alpha
-    return cosine, sine, chain.d, chain.theta, chain.r, chain.prismatic.astype(np.float64)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -381,14 +377,8 @@ def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, ou
             else:
                 e0, e1, e2 = e0 + w1 * rate, e1 - w0 * rate, e2 + qdd[s, k]
                 w2 += rate
-            xx, xy, xz, yy, yz, zz = (
-                bodies[k, 0],
-                bodies[k, 1],
-                bodies[k, 2],
-                bodies[k, 3],
-                bodies[k, 4],
-                bodies[k, 5],
-            )
+            xx, xy, xz = bodies[k, 0], bodies[k, 1], bodies[k, 2]
+            yy, yz, zz = bodies[k, 3], bodies[k, 4], bodies[k, 5]
             h0, h1, h2, m = bodies[k, 6], bodies[k, 7], bodies[k, 8], bodies[k, 9]
             # omega x h, then f = m a + alpha x h + omega x (omega x h)
             g0, g1, g2 = w1 * h2 - w2 * h1, w2 * h0 - w0 * h2, w0 * h1 - w1 * h0

@@ -274,14 +274,31 @@ class ModelStructure:
         """
         position, speed, acceleration = check_states(self.chain, q, qd, qdd)
         chosen = self.condition_sides(Condition(payload, tuple(sides) if sides is not None else None))
-        wanted = self._columns(columns)
+        wanted = np.arange(self.n_columns) if columns is None else np.asarray(columns, dtype=np.int64)
+        if wanted.ndim != 1 or np.any((wanted < 0) | (wanted >= self.n_columns)):
+            raise ConfigurationError(f"columns must be a list of indices below {self.n_columns}")
         n, samples = self.chain.n, len(position)
         out = np.zeros((len(wanted), len(chosen), n, samples))
-        self._write_rigid(position, speed, acceleration, payload, chosen, wanted, out)
+        rigid = {c: self.rigid_of(int(column), payload) for c, column in enumerate(wanted)}
+        sources = {c: source for c, source in rigid.items() if source is not None}
+        # Difference rows have no rigid part and are never preceded by other sides (side order).
+        rigid_sides = [s for s, side in enumerate(chosen) if side != "difference"]
+        if rigid_sides:
+            first = np.full((n, len(INERTIAL)), -1, dtype=np.int64)
+            for c, source in sources.items():
+                if first[source] < 0:
+                    first[source] = c
+            fill_rigid(self.chain, position, speed, acceleration, first, out)
+            for c, source in sources.items():
+                if first[source] != c:
+                    out[c, 0] = out[first[source], 0]
+                for s in rigid_sides[1:]:
+                    out[c, s] = out[c, 0]
         signals = np.empty((self.n_signals, n, samples))
         self.signals(speed, acceleration, signals)
         for c, column in enumerate(wanted):
-            if not self._may_be_signal(column):
+            link, place = divmod(column, len(PER_LINK))
+            if link < self.n_links and place < len(INERTIAL):
                 continue
             for s, side in enumerate(chosen):
                 for joint in range(n):
@@ -289,45 +306,3 @@ class ModelStructure:
                     if atom is not None:
                         out[c, s, joint] = signals[atom, joint]
         return out.reshape(len(wanted), -1).T
-
-    def _columns(self, columns: ArrayLike | None) -> NDArray[np.int64]:
-        wanted = np.arange(self.n_columns) if columns is None else np.asarray(columns, dtype=np.int64)
-        if wanted.ndim != 1 or np.any((wanted < 0) | (wanted >= self.n_columns)):
-            raise ConfigurationError(f"columns must be a list of indices below {self.n_columns}")
-        return wanted
-
-    def _may_be_signal(self, column: int) -> bool:
-        link, position = divmod(column, len(PER_LINK))
-        return link >= self.n_links or position >= len(INERTIAL)
-
-    def _write_rigid(
-        self,
-        q: Floats,
-        qd: Floats,
-        qdd: Floats,
-        payload: str | None,
-        sides: Sequence[Side],
-        wanted: NDArray[np.int64],
-        out: Floats,
-    ) -> None:
-        rigid_sides = [s for s, side in enumerate(sides) if side != "difference"]
-        if not rigid_sides:
-            return
-        first = np.full((self.chain.n, len(INERTIAL)), -1, dtype=np.int64)
-        copies = []
-        for c, column in enumerate(wanted):
-            source = self.rigid_of(int(column), payload)
-            if source is None:
-                continue
-            if first[source] < 0:
-                first[source] = c
-            else:
-                copies.append((c, first[source]))
-        # Difference rows have no rigid part and are never preceded by other sides (side order).
-        fill_rigid(self.chain, q, qd, qdd, first, out)
-        for target, origin in copies:
-            out[target, 0] = out[origin, 0]
-        for side in rigid_sides[1:]:
-            for c, column in enumerate(wanted):
-                if self.rigid_of(int(column), payload) is not None:
-                    out[c, side] = out[c, 0]

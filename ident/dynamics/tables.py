@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+from collections.abc import Iterable
 from typing import Any
 
 from lwr_driver.notebook import optional
@@ -31,6 +32,11 @@ class Tabular:
         )
         title = html.escape(repr(self).splitlines()[0])
         return f"<p>{title}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def rows_of(**columns: Iterable[Any]) -> list[dict[str, Any]]:
+    """Rows of a table from its columns of equal length."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _cell(value: Any) -> str:

@@ -76,18 +76,14 @@ class Urdf:
         return path[::-1]
 
     def _only_tip(self, start: str) -> str:
-        link, pending = start, [start]
-        while pending:
-            here = pending.pop()
-            branches = [j for j in self._below(here) if j.movable]
+        link = start
+        while branches := [joint for joint in self._below(link) if joint.movable]:
             if len(branches) > 1:
                 named = ", ".join(joint.name for joint in branches)
                 raise ConfigurationError(
-                    f"robot {self.name!r} branches at link {here!r} (joints {named}); give the arm's `tip`"
+                    f"robot {self.name!r} branches at link {link!r} (joints {named}); give the arm's `tip`"
                 )
-            if branches:
-                link = branches[0].child
-                pending.append(link)
+            link = branches[0].child
         return link
 
     def _below(self, link: str) -> list[Joint]:

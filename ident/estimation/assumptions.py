@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +90,7 @@ def check_assumptions(
     instrumental : estimate of the same problem by instrumental variables, for the test of exogeneity.
     period_rows : rows of one period of the excitation, for the test against the repeatability.
     """
-    series = _Series.of(problem, estimate)
+    series = _joined(problem, estimate)
     checks = [
         _mean(series),
         _serial_correlation(series),
@@ -104,35 +104,32 @@ def check_assumptions(
     return Assumptions(tuple(checks))
 
 
-@dataclass(frozen=True)
-class _Series:
-    """Residuals of the classes, joined over records: label, residual, fitted torque, time, record, n_eff."""
+class _Series(NamedTuple):
+    """Rows of one joint and side, joined over records."""
 
-    labels: tuple[str, ...]
-    residuals: tuple[Floats, ...]
-    fitted: tuple[Floats, ...]
-    times: tuple[NDArray[np.int64], ...]
-    records: tuple[NDArray[np.int64], ...]
-    n_eff: Floats
+    label: str
+    residual: Floats
+    fitted: Floats
+    times: NDArray[np.int64]
+    records: NDArray[np.int64]
+    n_eff: float
 
-    @classmethod
-    def of(cls, problem: Problem, estimate: Estimate) -> _Series:
-        residuals, fitted, times, records = [], [], [], []
-        for row_class in problem.classes:
-            members = [problem.groups[index] for index in row_class.groups]
-            parts = [estimate.residuals[index] for index in row_class.groups]
-            residuals.append(np.concatenate(parts))
-            fitted.append(np.concatenate([g.target - r for g, r in zip(members, parts, strict=True)]))
-            times.append(np.concatenate([g.time_index for g in members]))
-            records.append(np.concatenate([np.full(len(g.target), g.record) for g in members]))
-        return cls(
-            tuple(row_class.label for row_class in problem.classes),
-            tuple(residuals),
-            tuple(fitted),
-            tuple(times),
-            tuple(records),
-            np.array([fit.n_eff for fit in estimate.classes]),
+
+def _joined(problem: Problem, estimate: Estimate) -> list[_Series]:
+    found = []
+    for row_class, fit in zip(problem.classes, estimate.classes, strict=True):
+        members = [(problem.groups[index], estimate.residuals[index]) for index in row_class.groups]
+        found.append(
+            _Series(
+                row_class.label,
+                np.concatenate([e for _, e in members]),
+                np.concatenate([group.target - e for group, e in members]),
+                np.concatenate([group.time_index for group, _ in members]),
+                np.concatenate([np.full(len(e), group.record) for group, e in members]),
+                fit.n_eff,
+            )
         )
+    return found
 
 
 def _worst(
@@ -147,26 +144,26 @@ def _worst(
     return Check(name, p_value > _LEVEL, finding(index, p_value), consequence, tests[index][0], p_value)
 
 
-def _mean(series: _Series) -> Check:
+def _mean(series: list[_Series]) -> Check:
     scores = [
-        float(np.mean(e) / (np.std(e) / np.sqrt(max(n, 2.0)) + 1e-300))
-        for e, n in zip(series.residuals, series.n_eff, strict=True)
+        float(np.mean(s.residual) / (np.std(s.residual) / np.sqrt(max(s.n_eff, 2.0)) + 1e-300))
+        for s in series
     ]
     return _worst(
         "zero mean",
         [(abs(score), 2.0 * normal_tail(abs(score))) for score in scores],
         lambda k, p: (
-            f"largest mean {np.mean(series.residuals[k]):.3g} Nm ({series.labels[k]}), "
+            f"largest mean {np.mean(series[k].residual):.3g} Nm ({series[k].label}), "
             f"{abs(scores[k]):.1f} standard errors"
         ),
         "an offset is missing from the model there",
     )
 
 
-def _serial_correlation(series: _Series) -> Check:
+def _serial_correlation(series: list[_Series]) -> Check:
     """Ljung and Box (1978) over ten lags; Durbin and Watson (1950) for the eye."""
     tests, watson = [], []
-    for e, times, records in zip(series.residuals, series.times, series.records, strict=True):
+    for _, e, _, times, records, _ in series:
         power = float(e @ e) + 1e-300
         joined = (np.diff(times) == 1) & (np.diff(records) == 0)
         watson.append(float(np.sum(np.diff(e)[joined] ** 2) / power))
@@ -179,24 +176,22 @@ def _serial_correlation(series: _Series) -> Check:
             total += rho**2 / pairs
         statistic = len(e) * (len(e) + 2) * total
         tests.append((statistic, chi_square_tail(statistic, lags)))
-    share = [n / max(len(e), 1) for n, e in zip(series.n_eff, series.residuals, strict=True)]
+    share = [s.n_eff / max(len(s.residual), 1) for s in series]
     return _worst(
         "serially uncorrelated",
         tests,
         lambda k, p: (
-            f"Ljung-Box p {p:.2g} ({series.labels[k]}, Durbin-Watson {watson[k]:.2f}); effective "
+            f"Ljung-Box p {p:.2g} ({series[k].label}, Durbin-Watson {watson[k]:.2f}); effective "
             f"rows {100 * min(share):.0f} to {100 * max(share):.0f} % of all"
         ),
         "the textbook standard deviations are too small; the stated robust ones hold",
     )
 
 
-def _equal_variance(series: _Series) -> Check:
+def _equal_variance(series: list[_Series]) -> Check:
     """Breusch and Pagan (1979, studentised) on torque size and time; n_eff in place of n."""
     tests = []
-    for e, fitted, times, n_eff in zip(
-        series.residuals, series.fitted, series.times, series.n_eff, strict=True
-    ):
+    for _, e, fitted, times, _, n_eff in series:
         square = e**2
         columns = [np.ones(len(e)), np.abs(fitted), times.astype(np.float64)]
         matrix = np.column_stack([c / (np.abs(c).max() + 1e-300) for c in columns])
@@ -207,15 +202,15 @@ def _equal_variance(series: _Series) -> Check:
     return _worst(
         "equal variance",
         tests,
-        lambda k, p: f"Breusch-Pagan p {p:.2g} ({series.labels[k]}: against torque and time)",
+        lambda k, p: f"Breusch-Pagan p {p:.2g} ({series[k].label}: against torque and time)",
         "the error grows with torque or drifts in time (load-dependent friction, warm-up): look at that joint",
     )
 
 
-def _normality(series: _Series) -> Check:
+def _normality(series: list[_Series]) -> Check:
     """Jarque and Bera (1980) with the effective number of rows."""
     tests, shapes = [], []
-    for e, n_eff in zip(series.residuals, series.n_eff, strict=True):
+    for _, e, *_, n_eff in series:
         centred = (e - e.mean()) / (e.std() + 1e-300)
         skew, excess = float(np.mean(centred**3)), float(np.mean(centred**4) - 3.0)
         statistic = float(n_eff) / 6.0 * (skew**2 + excess**2 / 4.0)
@@ -224,7 +219,7 @@ def _normality(series: _Series) -> Check:
     return _worst(
         "normality",
         tests,
-        lambda k, p: f"Jarque-Bera p {p:.2g} ({series.labels[k]}: {shapes[k]})",
+        lambda k, p: f"Jarque-Bera p {p:.2g} ({series[k].label}: {shapes[k]})",
         "outliers or reversal spikes; compare with the robust estimator (`huber`)",
     )
 
@@ -236,10 +231,6 @@ def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
     The variance of a difference is at most the sum of both. Instruments as strong as here make it far smaller,
     so it is taken as V_IV - V_LS, and at least a hundredth of the sum.
     """
-    consequence = (
-        "noise in the positions or unmodelled physics correlates with the regressor: lower "
-        "`cutoff_hz`, use instrumental variables, or extend the model"
-    )
     if instrumental is None:
         return Check("exogeneity", None, "needs the commanded motion as instruments", "record /joint_command")
     shift = instrumental.values - estimate.values
@@ -257,7 +248,8 @@ def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
         p_value > _LEVEL,
         f"Durbin-Wu-Hausman p {p_value:.2g}; instruments move {estimate.names[index]} by "
         f"{abs(shift[index]) / max(float(estimate.std[index]), 1e-300):.2f} of its standard deviations",
-        consequence,
+        "noise in the positions or unmodelled physics correlates with the regressor: lower "
+        "`cutoff_hz`, use instrumental variables, or extend the model",
         float(scores[index]),
         p_value,
     )

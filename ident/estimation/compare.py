@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import regressor
+from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
@@ -44,6 +45,7 @@ from ident.rows.sessions import payload_name
 from lwr_driver.session import Session, Sessions, as_sessions
 
 _SAME_ROW = 1e-8
+_SAMPLES = ("times", "q", "qd", "qdd", "torque", "flagged")
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ def compare(
     _require_same_arm(first, second)
     first_k, second_k = _matrices(first, second)
     rows, found, only_first = [], [], []
-    for k, name in enumerate(_names(first)):
+    for k, name in enumerate(_table(first).names):
         target = first_k[k]
         weights, residual = _combination(second_k, target)
         if residual > _SAME_ROW * max(1.0, float(np.abs(target).max())):
@@ -178,10 +180,10 @@ def compare(
             continue
         rows.append((k, weights))
         note = _note(weights, second, name)
-        found.append((name, _units(first)[k], note))
+        found.append((name, _table(first).units[k], note))
     only_second = [
         name
-        for k, name in enumerate(_names(second))
+        for k, name in enumerate(_table(second).names)
         if _combination(first_k, second_k[k])[1] > _SAME_ROW * max(1.0, float(np.abs(second_k[k]).max()))
     ]
     if not rows:
@@ -189,7 +191,7 @@ def compare(
             f"the models of {first.robot} and {second.robot} have no parameter in common; compare models of "
             "the same number (1, 2 or 3)"
         )
-    select = np.zeros((len(rows), len(_names(first))))
+    select = np.zeros((len(rows), len(_table(first).names)))
     mix = np.array([weights for _, weights in rows])
     select[np.arange(len(rows)), [k for k, _ in rows]] = 1.0
     a, b = select @ _values(first), mix @ _values(second)
@@ -244,12 +246,9 @@ def _require_same_arm(first: DynamicModel, second: DynamicModel) -> None:
             )
 
 
-def _names(model: DynamicModel) -> tuple[str, ...]:
-    return model.names if model.base is None else model.base.names
-
-
-def _units(model: DynamicModel) -> tuple[str, ...]:
-    return model.units if model.base is None else model.base.units
+def _table(model: DynamicModel) -> DynamicModel | BaseSet:
+    """Names and units of all parameters, those without a value included."""
+    return model if model.base is None else model.base
 
 
 def _values(model: DynamicModel) -> Floats:
@@ -301,7 +300,7 @@ def _combination(rows: Floats, target: Floats) -> tuple[Floats, float]:
 
 def _note(weights: Floats, model: DynamicModel, name: str) -> str:
     """The parameter in terms of the second model; empty for its own parameter of the same name."""
-    names = _names(model)
+    names = _table(model).names
     used = np.flatnonzero(weights)
     if len(used) == 1 and weights[used[0]] == 1.0 and names[used[0]].rstrip("R") == name.rstrip("R"):
         return ""
@@ -400,7 +399,8 @@ def score_controller_model(prepared: PreparedSession, session: Session) -> Sessi
     for passage in prepared.passages:
         picked, _ = _matched(passage.joint.times, times)
         if len(picked) > 1:
-            passages.append(replace(passage, joint=_picked(passage.joint, picked)))
+            rows = {key: getattr(passage.joint, key)[picked] for key in _SAMPLES}
+            passages.append(replace(passage, joint=replace(passage.joint, **rows)))
     if not passages:
         return None
 
@@ -421,18 +421,6 @@ def _matched(samples: Floats, times: Floats) -> tuple[NDArray[np.int64], NDArray
     close = np.abs(samples[nearest] - times) <= 2e-3
     picked, first = np.unique(nearest[close], return_index=True)
     return picked, np.flatnonzero(close)[first]
-
-
-def _picked(channel: TorqueChannel, rows: NDArray[np.int64]) -> TorqueChannel:
-    return replace(
-        channel,
-        times=channel.times[rows],
-        q=channel.q[rows],
-        qd=channel.qd[rows],
-        qdd=channel.qdd[rows],
-        torque=channel.torque[rows],
-        flagged=channel.flagged[rows],
-    )
 
 
 def _score_other(other: DynamicModel, session: Session, settings: SignalSettings | None) -> SessionScore:

@@ -113,14 +113,7 @@ class Essential(Tabular):
             "names": list(self.names),
             "loss_percent": self.loss_percent,
             "eliminated": [
-                {
-                    "name": e.name,
-                    "estimate": e.estimate,
-                    "rsd_percent": e.rsd_percent,
-                    "f": e.f_statistic,
-                    "loss_percent": e.loss_percent,
-                    "reason": e.reason,
-                }
+                {key.removesuffix("_statistic"): value for key, value in e.__dict__.items()}
                 for e in self.eliminated
             ],
             "kept_because": dict(self.kept_because),

@@ -22,8 +22,8 @@ from fri.errors import DataError
 from ident.dynamics import regressor
 from ident.dynamics.parameters import PER_LINK, Floats
 from ident.dynamics.structure import Side
-from ident.dynamics.tables import Tabular
-from ident.estimation.validate import mounted, prepared_session
+from ident.dynamics.tables import Tabular, rows_of
+from ident.estimation.validate import mounted, prepared_session, resampled
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
@@ -86,9 +86,8 @@ class ForwardSimulation(Tabular):
 
     def records(self) -> list[dict[str, Any]]:
         """One row for each joint."""
-        columns = (self.joint_names, self.torque_rms.tolist(), self.position_rms.tolist())
-        keys = ("joint", "torque_rms", "position_rms")
-        return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+        torque, position = self.torque_rms.tolist(), self.position_rms.tolist()
+        return rows_of(joint=self.joint_names, torque_rms=torque, position_rms=position)
 
     def __repr__(self) -> str:
         return (
@@ -131,7 +130,7 @@ def simulate_session(
     first, last = float(passage.rows[0]), float(passage.rows[-1])
     times = np.arange(first, last, step_s)
     joint = passage.joint
-    measured = _resampled(joint.times, joint.q, times)
+    measured = resampled(joint.times, joint.q, times)
     command = _command(session, prepared, times)
     # The command in a log may belong to another cycle: another clock, a plan made later.
     if command is None or np.abs(command - measured).max() > _NEAR_RAD:
@@ -153,7 +152,7 @@ def simulate_session(
         qd=qd[settle],
         torque=torque[settle],
         measured_q=measured[settle],
-        measured_torque=_resampled(channel.times, channel.torque, times)[settle],
+        measured_torque=resampled(channel.times, channel.torque, times)[settle],
     )
 
 
@@ -264,8 +263,4 @@ def _command(session: Session, prepared: PreparedSession, times: Floats) -> Floa
     )
     if clock[0] > times[0] or clock[-1] < times[-1]:
         return None
-    return _resampled(clock, command.position, times)
-
-
-def _resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
-    return np.column_stack([np.interp(wanted, times, column) for column in values.T])
+    return resampled(clock, command.position, times)

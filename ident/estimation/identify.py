@@ -285,8 +285,14 @@ def identify(
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
     normalised = problem.require_rank()
-    instrumental = _instrumental(problem, problems, instruments, settings)
-    estimate = plain = _estimator(settings, base, problem).fit(problem)
+    instrumental = None
+    if len(instruments) == len(problems):
+        matrices = [group.matrix for one in instruments for group in one.groups]
+        instrumental = InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
+    # With instrumental variables, this is the WLS compared with them.
+    name = settings.estimator
+    factory = estimator_factory(name) if isinstance(name, str) else name
+    estimate = plain = factory(base, problem, settings.covariance).fit(problem)
     if settings.estimator == "iv":
         if instrumental is None:
             raise DataError(
@@ -331,26 +337,6 @@ def estimator_factory(name: str, *, prior_std: float = 0.2, **options: Any) -> E
         return kind.make(covariance=covariance, **prior, **options)
 
     return factory
-
-
-def _estimator(settings: IdentificationSettings, base: BaseSet, problem: Problem) -> Estimator:
-    """The estimator; for instrumental variables the WLS they are compared with."""
-    name = settings.estimator
-    factory = estimator_factory(name) if isinstance(name, str) else name
-    return factory(base, problem, settings.covariance)
-
-
-def _instrumental(
-    problem: Problem,
-    problems: Sequence[Problem],
-    instruments: Sequence[Problem],
-    settings: IdentificationSettings,
-) -> Estimate | None:
-    """Instrumental-variable estimate on the commanded motion; None when a session lacks it."""
-    if len(instruments) < len(problems):
-        return None
-    matrices = [group.matrix for one in instruments for group in one.groups]
-    return InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
 
 
 def _common_period(prepared: Sequence[PreparedSession]) -> int | None:

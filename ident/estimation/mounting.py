@@ -32,8 +32,6 @@ from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
-_NAMES = ("tilt_1", "tilt_2")
-
 
 @dataclass(frozen=True)
 class Mounting:
@@ -183,7 +181,7 @@ def _step(
     )
     problem = replace(
         found.problem,
-        names=(*found.problem.names, *_NAMES),
+        names=(*found.problem.names, "tilt_1", "tilt_2"),
         groups=groups,
         units=(*found.problem.units, "rad", "rad") if found.problem.units else (),
     )

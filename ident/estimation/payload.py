@@ -24,10 +24,10 @@ from ident.dynamics.base_set import numeric_base
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, to_com
 from ident.dynamics.physical import project, reference_bodies
 from ident.dynamics.structure import Condition, ModelStructure
-from ident.dynamics.tables import Tabular
+from ident.dynamics.tables import Tabular, rows_of
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
-from ident.estimators.problem import Problem, RowGroup
+from ident.estimators.problem import Problem
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
@@ -143,17 +143,8 @@ class PayloadEstimate(Tabular):
 
     def records(self) -> list[dict[str, Any]]:
         """One row for each of the ten parameters."""
-        return [
-            {"name": name, "unit": unit, "value": value, "std": std, "consistent": body}
-            for name, unit, value, std, body in zip(
-                self.names,
-                self.units,
-                self.values.tolist(),
-                self.std.tolist(),
-                self.consistent.tolist(),
-                strict=True,
-            )
-        ]
+        values, std, bodies = self.values.tolist(), self.std.tolist(), self.consistent.tolist()
+        return rows_of(name=self.names, unit=self.units, value=values, std=std, consistent=bodies)
 
     @property
     def _mass_and_com(self) -> list[str]:
@@ -358,13 +349,10 @@ def _reduced(rows: Problem, chi: Floats, units: Sequence[str]) -> Problem:
     """The rows minus the torque of the arm's parameters `chi`, with the remaining columns."""
     arm = len(chi)
     groups = [
-        RowGroup(
-            group.joint,
-            group.side,
-            group.record,
-            np.ascontiguousarray(group.matrix[:, arm:]),
-            group.target - group.matrix[:, :arm] @ chi,
-            group.time_index,
+        replace(
+            group,
+            matrix=np.ascontiguousarray(group.matrix[:, arm:]),
+            target=group.target - group.matrix[:, :arm] @ chi,
         )
         for group in rows.groups
     ]

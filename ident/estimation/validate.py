@@ -377,10 +377,9 @@ def score_session(
         ]
         if not rows:
             continue
-        error = np.concatenate([r.error for r in rows])
-        torque = np.concatenate([r.torque for r in rows])
-        used = np.concatenate([r.used for r in rows])
-        times = np.concatenate([r.times for r in rows])
+        times, error, torque, used = (
+            np.concatenate([getattr(r, key) for r in rows]) for key in ("times", "error", "torque", "used")
+        )
         still.append(1.0 - float(used.mean()))
         thin = slice(None, None, -(-len(times) // _DRAWN))
         traces[side] = Trace(
@@ -422,7 +421,7 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
     torque, flagged = channel.torque, channel.flagged
     if side == "difference":
         joint = passage.joint
-        torque = torque - _interpolated(joint.times, joint.torque, channel.times)
+        torque = torque - resampled(joint.times, joint.torque, channel.times)
     error = torque - predict(channel, side)
     parallel = ParallelFilter(channel.times, passage.rows, settings.decimate_hz, settings.attenuation_db)
     inside = _inside(channel, passage)
@@ -430,7 +429,8 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
     return _Rows(channel.times, error, torque, used, parallel.apply(error), valid, passage.index)
 
 
-def _interpolated(times: Floats, values: Floats, wanted: Floats) -> Floats:
+def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
+    """Columns of `values` at the times `wanted`, by linear interpolation."""
     return np.column_stack([np.interp(wanted, times, column) for column in values.T])
 
 
@@ -471,16 +471,14 @@ def _score(
         worst=float(e[worst]),
         worst_time_s=float(t[worst]),
         band_rms=_rms(band) if len(band) else math.nan,
-        floor_rms=_floor(k, rows, prepared),
+        floor_rms=_floor(np.concatenate([r.index[r.valid[:, k]] for r in rows]), band, prepared),
     )
 
 
-def _floor(k: int, rows: Sequence[_Rows], prepared: PreparedSession) -> float:
-    """Scatter of the residual between periods, in the band [Nm]."""
+def _floor(index: NDArray[np.int64], band: Floats, prepared: PreparedSession) -> float:
+    """Scatter between periods [Nm] of the residual in the band, at rows of these numbers."""
     if prepared.period_rows is None or prepared.periods < 2:
         return math.nan
-    index = np.concatenate([r.index[r.valid[:, k]] for r in rows])
-    band = np.concatenate([r.band[r.valid[:, k], k] for r in rows])
     phase = index % prepared.period_rows
     counts = np.bincount(phase, minlength=prepared.period_rows)
     means = np.bincount(phase, band, prepared.period_rows) / np.maximum(counts, 1)

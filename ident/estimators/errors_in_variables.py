@@ -168,10 +168,6 @@ class TotalLeastSquares:
         # The criterion's gradient is a row's a w e + D chi w e^2 / scale; the second part, summed,
         # cancels the bias.
         correction = spread * values / scale
-        coefficients = [
-            weights[number] * residual
-            for residual, number in zip(residuals, problem.class_of_group, strict=True)
-        ]
         matrices = [
             group.matrix + residual[:, None] * correction
             for group, residual in zip(problem.groups, residuals, strict=True)
@@ -184,12 +180,7 @@ class TotalLeastSquares:
             bread=bread,
             consumed=consumed,
             settings=self.covariance,
-            coefficients=coefficients,
             matrices=matrices,
-            row_weights=[
-                np.full(len(group.target), weights[number])
-                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
-            ],
             iterations=done,
             converged=converged,
             notes=(f"{len(noisy)} columns with errors, {len(clean)} exact",),

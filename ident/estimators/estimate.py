@@ -13,7 +13,7 @@ import numpy as np
 from scipy import special
 
 from ident.dynamics.parameters import Floats
-from ident.dynamics.tables import Tabular
+from ident.dynamics.tables import Tabular, rows_of
 from ident.estimators.problem import Problem
 from lwr_driver.notebook import subplots
 
@@ -114,15 +114,8 @@ class Estimate(Tabular):
 
     def records(self) -> list[dict[str, Any]]:
         """One row for each parameter: name, unit, estimate, std, rsd_percent."""
-        columns = (
-            self.names,
-            self._units,
-            self.values.tolist(),
-            self.std.tolist(),
-            self.rsd_percent.tolist(),
-        )
-        keys = ("name", "unit", "estimate", "std", "rsd_percent")
-        return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+        values, std, rsd = self.values.tolist(), self.std.tolist(), self.rsd_percent.tolist()
+        return rows_of(name=self.names, unit=self._units, estimate=values, std=std, rsd_percent=rsd)
 
     def plot(self) -> Any:
         """Values with their 95 % intervals; the matplotlib Axes, one for each unit.

@@ -65,12 +65,9 @@ def class_variances(problem: Problem, values: Floats, consumed: Floats) -> Float
             )
         result.append(row_class.factor.sum_of_squares(values) / freedom)
     variance = np.array(result)
-    floor = np.finfo(float).tiny + 1e-20 * max(float(variance.max()), _mean_square(problem))
+    square = sum(float(c.factor.r[:, -1] @ c.factor.r[:, -1]) for c in problem.classes)
+    floor = np.finfo(float).tiny + 1e-20 * max(float(variance.max()), square / max(problem.rows, 1))
     return np.maximum(variance, floor)
-
-
-def _mean_square(problem: Problem) -> float:
-    return sum(float(c.factor.r[:, -1] @ c.factor.r[:, -1]) for c in problem.classes) / max(problem.rows, 1)
 
 
 def estimate_from(
@@ -85,6 +82,7 @@ def estimate_from(
     coefficients: Sequence[Floats] | None = None,
     matrices: Sequence[Floats] | None = None,
     row_weights: Sequence[Floats] | None = None,
+    class_weights: Floats | None = None,
     plain: Covariance | None = None,
     scores: Scores | None = None,
     offset: Floats | None = None,
@@ -97,8 +95,10 @@ def estimate_from(
     bread : (p, p), derivative of the estimate by its scores. coefficients : weight times residual of each
         row (default: class weight times residual). matrices : their matrices (default: the regressors;
         instruments for an instrumental-variable estimate). row_weights : factor of a a^T of each row in the
-        inverse of `bread` (default: class weight). plain : the estimator's own textbook covariance.
-    scores : in place of coefficients and matrices. offset : (p, p), added to the robust covariances.
+        inverse of `bread` (default: class weight). class_weights : (classes,) class weights of these two
+        defaults, if other than `weights`. plain : the estimator's own textbook covariance.
+    scores : in place of coefficients and matrices, for the HAC covariance only.
+    offset : (p, p), added to the robust covariances.
     """
     residuals = problem.residuals(values)
     n_eff = effective_rows(problem, residuals)
@@ -114,19 +114,26 @@ def estimate_from(
         )  # fmt: skip
     covariances = {"textbook": plain or textbook(bread)}
     if settings.kind != "textbook":
+        by_group = (weights if class_weights is None else class_weights)[list(problem.class_of_group)]
         if coefficients is None:
-            coefficients = [
-                weights[number] * residual
-                for residual, number in zip(residuals, problem.class_of_group, strict=True)
-            ]
+            coefficients = [weight * e for weight, e in zip(by_group, residuals, strict=True)]
         if row_weights is None:
-            row_weights = [
-                np.full(len(group.target), weights[number])
-                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
-            ]
-        covariances |= _robust(
-            problem, bread, consumed, settings, weights, coefficients, row_weights, matrices, scores
-        )
+            row_weights = [np.full(len(e), weight) for weight, e in zip(by_group, residuals, strict=True)]
+        summed = scores
+        if summed is None:
+            rows_of = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
+            inflation = np.sqrt(rows_of / np.maximum(rows_of - consumed, 1.0))
+            corrected = [c * inflation[n] for c, n in zip(coefficients, problem.class_of_group, strict=True)]
+            summed = Scores.of(problem, corrected, matrices)
+        robust, bandwidth = hac(summed, bread, problem.sample_time_s, settings.bandwidth_s)
+        covariances["hac"] = robust
+        block = settings.block_s if settings.block_s is not None else 2.0 * bandwidth
+        if settings.kind == "bootstrap":
+            covariances["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
+        elif settings.kind == "jackknife" and scores is None:
+            covariances["jackknife"] = jackknife(
+                problem, bread, coefficients, row_weights, block, matrices=matrices, correlation=robust.matrix
+            )
         if offset is not None:
             covariances = {
                 name: replace(c, matrix=c.matrix + offset) if name != "textbook" else c
@@ -134,10 +141,7 @@ def estimate_from(
             }
     shared = _nuisance_covariance(problem, bread, weights, matrices)
     if shared is not None:
-        covariances = {
-            name: replace(covariance, matrix=covariance.matrix + shared)
-            for name, covariance in covariances.items()
-        }
+        covariances = {name: replace(c, matrix=c.matrix + shared) for name, c in covariances.items()}
     return Estimate(
         method=method,
         names=problem.names,
@@ -152,37 +156,6 @@ def estimate_from(
         notes=notes,
         units=problem.units,
     )
-
-
-def _robust(
-    problem: Problem,
-    bread: Floats,
-    consumed: Floats,
-    settings: CovarianceSettings,
-    weights: Floats,
-    coefficients: Sequence[Floats],
-    row_weights: Sequence[Floats],
-    matrices: Sequence[Floats] | None,
-    scores: Scores | None,
-) -> dict[str, Covariance]:
-    """The covariances robust to serial correlation; with given `scores` HAC only."""
-    rows = np.array([max(row_class.factor.rows, 1) for row_class in problem.classes])
-    inflation = np.sqrt(rows / np.maximum(rows - consumed, 1.0))
-    if scores is None:
-        corrected = [c * inflation[n] for c, n in zip(coefficients, problem.class_of_group, strict=True)]
-        summed = Scores.of(problem, corrected, matrices)
-    else:
-        summed = scores
-    robust, bandwidth = hac(summed, bread, problem.sample_time_s, settings.bandwidth_s)
-    found = {"hac": robust}
-    block = settings.block_s if settings.block_s is not None else 2.0 * bandwidth
-    if settings.kind == "bootstrap":
-        found["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
-    elif settings.kind == "jackknife" and scores is None:
-        found["jackknife"] = jackknife(
-            problem, bread, coefficients, row_weights, block, matrices=matrices, correlation=robust.matrix
-        )
-    return found
 
 
 def _nuisance_covariance(

@@ -134,13 +134,12 @@ class PhysicallyConsistent:
         assert linear.prior_scale is not None
         shares = effective_rows(problem, linear.residuals) / [max(c.rows, 1) for c in linear.classes]
         consumed = np.array([fit.parameters for fit in linear.classes])
-        program = _Program(self.prior, self.metric, 1.0 / linear.prior_scale, self.margin)
         p, projection = len(problem.names), self.prior.projection
         weights = np.minimum(linear.weights, _FINEST / _mean_squares(problem))
         for _ in range(_REWEIGHTINGS):
             # With active constraints the residual grows, so its weight must fall.
             factor = problem.weighted(weights * np.minimum(shares, 1.0))
-            standard = program.solve(factor.r[:p, :p] @ projection, factor.r[:p, p])
+            standard = self._solve(linear.prior_scale, factor.r[:p, :p] @ projection, factor.r[:p, p])
             values = projection @ standard
             before = weights
             weights = 1.0 / class_variances(problem, values, consumed)
@@ -163,40 +162,9 @@ class PhysicallyConsistent:
             standard=standard,
         )
 
-
-def _mean_squares(problem: Problem) -> Floats:
-    """Mean square torque of each class [Nm^2]."""
-    return np.maximum([c.factor.mean_square for c in problem.classes], np.finfo(float).tiny)
-
-
-def nearest_consistent(inertial: Floats, *, margin: float = 1e-2) -> Floats:
-    """Consistent (k, 10) nearest to `inertial` in size-relative Euclidean distance.
-
-    margin : smallest eigenvalue of each pseudo-inertia relative to a compact body of that mass.
-    """
-    result = []
-    for body in np.atleast_2d(np.asarray(inertial, dtype=np.float64)):
-        mass = max(float(body[9]), 1e-3)
-        floor = margin * _compact(mass)
-        weights = 1.0 / _sizes(body) ** 2
-        rows, offset, cones = _psd_rows(np.arange(_BODY), _BODY, floor)
-        solution = _run(sparse.diags(2.0 * weights).tocsc(), -2.0 * weights * body, rows, offset, cones)
-        result.append(solution)
-    return np.array(result)
-
-
-@dataclass(frozen=True)
-class _Program:
-    """The convex program in clarabel's form."""
-
-    prior: BodyPrior
-    metric: Metric
-    strength: float
-    margin: float
-
-    def solve(self, quadratic: Floats, target: Floats) -> Floats:
-        """Standard parameters (n,) for ||quadratic x - target||^2 plus the regularisation."""
-        prior, n = self.prior, quadratic.shape[1]
+    def _solve(self, scale: float, quadratic: Floats, target: Floats) -> Floats:
+        """Standard parameters (n,) for ||quadratic x - target||^2 plus the distance to the prior over `scale`."""
+        prior, n, tightness = self.prior, quadratic.shape[1], 1.0 / scale
         start = np.zeros(n)
         start[prior.bodies.ravel()] = prior.inertial.ravel()
         hessian = 2.0 * quadratic.T @ quadratic
@@ -204,7 +172,7 @@ class _Program:
         entropic = self.metric == "entropic"
         extra = len(prior.bodies) * (_BODY + 4) if entropic else 0
         if not entropic:
-            form = 2.0 * self.strength * prior.hessian(self.metric)
+            form = 2.0 * tightness * prior.hessian(self.metric)
             hessian += form
             gradient -= form @ start
         parts, offsets, cones = [], [], []
@@ -228,7 +196,7 @@ class _Program:
                 rows, offset, kinds = _entropic_rows(places, n + extra, first)
                 # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4; to second order the pullback metric.
                 slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
-                strength = self.strength * prior.firmness[number]
+                strength = tightness * prior.firmness[number]
                 linear[places] += strength * slope
                 linear[first + _BODY : first + _BODY + 4] -= strength
             else:
@@ -245,6 +213,27 @@ class _Program:
             sparse.csc_matrix(np.triu(full)), linear, np.vstack(parts), np.concatenate(offsets), cones
         )
         return solution[:n]
+
+
+def _mean_squares(problem: Problem) -> Floats:
+    """Mean square torque of each class [Nm^2]."""
+    return np.maximum([c.factor.mean_square for c in problem.classes], np.finfo(float).tiny)
+
+
+def nearest_consistent(inertial: Floats, *, margin: float = 1e-2) -> Floats:
+    """Consistent (k, 10) nearest to `inertial` in size-relative Euclidean distance.
+
+    margin : smallest eigenvalue of each pseudo-inertia relative to a compact body of that mass.
+    """
+    result = []
+    for body in np.atleast_2d(np.asarray(inertial, dtype=np.float64)):
+        mass = max(float(body[9]), 1e-3)
+        floor = margin * _compact(mass)
+        weights = 1.0 / _sizes(body) ** 2
+        rows, offset, cones = _psd_rows(np.arange(_BODY), _BODY, floor)
+        solution = _run(sparse.diags(2.0 * weights).tocsc(), -2.0 * weights * body, rows, offset, cones)
+        result.append(solution)
+    return np.array(result)
 
 
 def _run(quadratic: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Floats, cones: list) -> Floats:
@@ -346,17 +335,15 @@ def _touching(prior: BodyPrior, standard: Floats, margin: float) -> int:
 
 def _refit(estimate: Estimate, problem: Problem, values: Floats) -> tuple:
     """Class table with the residuals of the constrained values."""
-    fits = []
-    for fit, row_class in zip(estimate.classes, problem.classes, strict=True):
-        square = row_class.factor.sum_of_squares(values)
-        fits.append(
-            replace(
-                fit,
-                rms=float(np.sqrt(square / max(fit.rows, 1))),
-                sigma=float(np.sqrt(square / max(fit.rows - fit.parameters, 1.0))),
-            )
+    squares = [row_class.factor.sum_of_squares(values) for row_class in problem.classes]
+    return tuple(
+        replace(
+            fit,
+            rms=float(np.sqrt(square / max(fit.rows, 1))),
+            sigma=float(np.sqrt(square / max(fit.rows - fit.parameters, 1.0))),
         )
-    return tuple(fits)
+        for fit, square in zip(estimate.classes, squares, strict=True)
+    )
 
 
 # Prior of a payload of unknown inertia: mass, radius of gyration and relative standard deviation.

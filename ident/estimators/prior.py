@@ -118,10 +118,7 @@ class MaximumAPosteriori:
         tempered = weights * _shares(problem, values)
         values, root = _posterior(problem, self.prior, tempered, scale)
         bread = root @ root.T
-        coefficients = [
-            tempered[number] * residual
-            for residual, number in zip(problem.residuals(values), problem.class_of_group, strict=True)
-        ]
+        how = self.strength.replace("_", "-") if isinstance(self.strength, str) else "stated"
         estimate = estimate_from(
             problem,
             method="MAP",
@@ -130,14 +127,10 @@ class MaximumAPosteriori:
             bread=bread,
             consumed=consumed_parameters(problem, tempered, root),
             settings=self.covariance,
-            coefficients=coefficients,
-            row_weights=[
-                np.full(len(group.target), tempered[number])
-                for group, number in zip(problem.groups, problem.class_of_group, strict=True)
-            ],
+            class_weights=tempered,
             iterations=iteration,
             converged=converged,
-            notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({self._how()})",),
+            notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({how})",),
         )
         posterior = Covariance(bread, "posterior with the effective number of rows: holds if the prior does")
         return replace(
@@ -146,9 +139,6 @@ class MaximumAPosteriori:
             prior_scale=scale,
             covariances={**estimate.covariances, "posterior": posterior},
         )
-
-    def _how(self) -> str:
-        return "stated" if isinstance(self.strength, (int, float)) else self.strength.replace("_", "-")
 
     def _scale(self, problem: Problem, tempered: Floats) -> float:
         if isinstance(self.strength, (int, float)):

@@ -238,14 +238,11 @@ class Problem:
     def select(self, columns: Sequence[int] | NDArray[np.int64]) -> Problem:
         """The same rows with some of the parameters."""
         chosen = [int(c) for c in columns]
-        return Problem(
-            tuple(self.names[c] for c in chosen),
-            tuple(group.select(chosen) for group in self.groups),
-            self.sample_time_s,
-            tuple(self.units[c] for c in chosen) if self.units else (),
-            self.record_names,
-            self.nuisances,
-            self.periods,
+        return replace(
+            self,
+            names=tuple(self.names[c] for c in chosen),
+            groups=tuple(group.select(chosen) for group in self.groups),
+            units=tuple(self.units[c] for c in chosen) if self.units else (),
         )
 
     def require_rank(self) -> float:

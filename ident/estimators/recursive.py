@@ -301,7 +301,7 @@ def _influence(
     p = len(values)
     records: dict[int, list[tuple[int, Floats]]] = {}
     white = np.zeros((p, p))
-    variance = _class_variance(problem, values)
+    variance = np.array([c.factor.sum_of_squares(values) / max(c.factor.rows, 1) for c in problem.classes])
     back = np.zeros((p, p))
     for number in range(len(steps) - 1, -1, -1):
         step = steps[number]
@@ -322,7 +322,3 @@ def _influence(
         array[times - times.min()] = [influence for _, influence in records[record]]
         arrays.append(array)
     return Scores(tuple(arrays)), white
-
-
-def _class_variance(problem: Problem, values: Floats) -> Floats:
-    return np.array([c.factor.sum_of_squares(values) / max(c.factor.rows, 1) for c in problem.classes])

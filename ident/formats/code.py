@@ -58,7 +58,10 @@ def to_c(model: StandardModel, name: str = "arm") -> str:
 
     Raises ConfigurationError for an invalid name of a C function.
     """
-    _require_identifier(name)
+    if not re.fullmatch(r"[A-Za-z_]\w*", name) or keyword.iskeyword(name):
+        raise ConfigurationError(
+            f"name {name!r} cannot begin a C function; use letters, digits and underscores"
+        )
     program = Program.of(model)
     n = model.chain.n
     arguments = ", ".join(f"const double {item}[{n}]" for item in ("q", "qd", "qdd"))
@@ -135,14 +138,12 @@ def to_numpy(model: StandardModel) -> str:
 
 @dataclass(frozen=True)
 class _Language:
-    indent: str
     assign: str
     calls: dict[str, str]
     array: bool
 
 
 _C = _Language(
-    "    ",
     "const double {name} = {value};",
     {
         "sin": "sin({0})",
@@ -159,7 +160,6 @@ _C_HELPERS = {
     "{ return (double)((x > width) - (x < -width)); }",
 }
 _NUMPY = _Language(
-    "    ",
     "{name} = {value}",
     {
         "sin": "np.sin({0})",
@@ -190,20 +190,20 @@ def _body(program: Program, outputs: dict[str, list[Expression]], language: _Lan
         if named and graph.nodes[index][0] != "neg":
             name = f"t{number}"
             number += 1
-            lines.append(language.indent + language.assign.format(name=name, value=value))
+            lines.append("    " + language.assign.format(name=name, value=value))
             text[index] = (name, 4, 0)
         else:
             text[index] = (value, strength, depth)
     if not language.array:
         read = {str(graph.nodes[index][1]) for index in needed if graph.nodes[index][0] == "input"}
         arguments = ("q", "qd", "qdd") if outputs is program.outputs else ("q",)
-        lines += [f"{language.indent}(void){name};" for name in arguments if name not in read]
+        lines += [f"    (void){name};" for name in arguments if name not in read]
     for output, expressions in outputs.items():
         values = [text[expression.index][0] for expression in expressions]
         if language.array:
-            lines.append(f"{language.indent}{output} = [{', '.join(values)}]")
+            lines.append(f"    {output} = [{', '.join(values)}]")
         else:
-            lines += [f"{language.indent}{output}[{k}] = {value};" for k, value in enumerate(values)]
+            lines += [f"    {output}[{k}] = {value};" for k, value in enumerate(values)]
     return lines
 
 
@@ -257,10 +257,3 @@ _MEANING = {
     "tau_motor": "motor torque referred to the joint side.",
     "tau_difference": "motor torque minus joint torque.",
 }
-
-
-def _require_identifier(name: str) -> None:
-    if not re.fullmatch(r"[A-Za-z_]\w*", name) or keyword.iskeyword(name):
-        raise ConfigurationError(
-            f"name {name!r} cannot begin a C function; use letters, digits and underscores"
-        )

@@ -138,8 +138,8 @@ def _new(model: StandardModel, name: str) -> str:
     root = ElementTree.Element("robot", {"name": name})
     damping, dry, notes = friction(model)
     root.append(ElementTree.Comment(comment(model, notes)))
-    base = ElementTree.SubElement(root, "link", {"name": "base_link"})
-    parent = base.get("name", "")
+    parent = "base_link"
+    ElementTree.SubElement(root, "link", {"name": parent})
     for k, joint_name in enumerate(chain.joint_names):
         pose = chain.placement(k) if k else chain.base_placement @ chain.placement(0)
         kind = "prismatic" if chain.prismatic[k] else "continuous"
@@ -164,15 +164,9 @@ def _inertial(body: Floats) -> ElementTree.Element:
     element = ElementTree.Element("inertial")
     ElementTree.SubElement(element, "origin", {"xyz": " ".join(map(digits, com)), "rpy": "0 0 0"})
     ElementTree.SubElement(element, "mass", {"value": digits(float(mass))})
-    entries = {
-        "ixx": tensor[0, 0],
-        "ixy": tensor[0, 1],
-        "ixz": tensor[0, 2],
-        "iyy": tensor[1, 1],
-        "iyz": tensor[1, 2],
-        "izz": tensor[2, 2],
-    }
-    ElementTree.SubElement(element, "inertia", {key: digits(value) for key, value in entries.items()})
+    entries = map(digits, tensor[np.triu_indices(3)])
+    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    ElementTree.SubElement(element, "inertia", dict(zip(keys, entries, strict=True)))
     return element
 
 

@@ -119,11 +119,6 @@ def standard_model(
     else:
         vector = np.zeros(structure.n_columns)
         vector[model.columns] = model.values
-    link = structure.payload_link(payload)
-    table = vector[: _LINK * n].reshape(n, _LINK)
-    inertial = table[:, :_BODY].copy()
-    if link is not None:
-        inertial[-1] += vector[_LINK * link : _LINK * link + _BODY]
     if model.effects:
         named = ", ".join(str(effect["cause"]) for effect in model.effects)
         notes = (
@@ -135,8 +130,8 @@ def standard_model(
     title = f"{model.robot}, {'bare arm' if payload is None else f'payload {payload}'}"
     return StandardModel(
         chain=structure.chain,
-        inertial=inertial,
-        drive=table[:, _BODY:],
+        inertial=model.inertial(payload, standard=vector),
+        drive=vector[: _LINK * n].reshape(n, _LINK)[:, _BODY:],
         couplings=_couplings(model, vector),
         sides=structure.sides,
         coulomb_kind=structure.coulomb.kind,
@@ -210,20 +205,14 @@ def _reference(model: DynamicModel, reference: Floats | None) -> Floats:
         return reference_bodies(reference)
     links = chain.urdf_inertials() if chain.urdf is not None else np.zeros((chain.n, _BODY))
     links = np.where((links[:, 9] > 0.0)[:, None], links, _rods(chain))
-    payloads = []
-    for number in range(len(structure.payloads)):
-        first = _LINK * (chain.n + number)
-        payloads.append(model.standard[first : first + _BODY])
-    return reference_bodies(np.vstack([links, *payloads]), gyration_m=0.02)
+    bodies = model.standard[: _LINK * structure.n_links].reshape(-1, _LINK)[:, :_BODY]
+    return reference_bodies(np.vstack([links, bodies[chain.n :]]), gyration_m=0.02)
 
 
 def _rods(chain: Chain) -> Floats:
     """Bodies of 3 kg halfway to the next joint, for links of unknown inertia."""
-    bodies = []
-    for k in range(chain.n):
-        com = 0.5 * chain.placement(k + 1)[:3, 3] if k + 1 < chain.n else np.zeros(3)
-        bodies.append(from_com(3.0, com, 3.0 * 0.08**2 * np.eye(3)))
-    return np.array(bodies)
+    com = [0.5 * chain.placement(k)[:3, 3] for k in range(1, chain.n)] + [np.zeros(3)]
+    return np.array([from_com(3.0, place, 3.0 * 0.08**2 * np.eye(3)) for place in com])
 
 
 def _torque_change(model: DynamicModel, vector: Floats) -> Floats:
@@ -247,6 +236,5 @@ def _couplings(model: DynamicModel, vector: Floats) -> tuple[CoupledDrives, ...]
     for number, coupling in enumerate(structure.couplings):
         first = _LINK * structure.n_links + 3 * number
         a, b = (structure.chain.joint_names.index(name) for name in coupling.joints)
-        inertia, viscous, coulomb = (float(value) for value in vector[first : first + 3])
-        found.append(CoupledDrives((a, b), inertia, viscous, coulomb))
+        found.append(CoupledDrives((a, b), *map(float, vector[first : first + 3])))
     return tuple(found)

@@ -5,15 +5,15 @@ Recordings are CSV (any delimiter, with or without header) or NPZ files; incompl
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import hashlib
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
@@ -151,9 +151,8 @@ def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[st
     if len(rows) < 1 + header:
         raise DataError(f"{path}: holds no rows of numbers")
     first = rows[0][1]
-    mark = delimiter
-    if mark is None:
-        mark = next((m for m in (",", ";", "\t") if m in first.strip()), None)
+    found = next((m for m in (",", ";", "\t") if m in first.strip()), None)
+    mark = found if delimiter is None else delimiter
     names: tuple[str, ...] = ()
     if header:
         names = tuple(_split(first, mark))
@@ -290,7 +289,10 @@ def import_log(
     digest = hashlib.sha256(
         repr((sorted(recording.digests.values()), rows, mapping.joints)).encode()
     ).hexdigest()
-    urdf = None if mapping.urdf is None else find(mapping.urdf, beside=beside).read_text(encoding="utf-8")
+    attachments = {"mapping.yaml": yaml.safe_dump(_plain(asdict(mapping)), sort_keys=False).encode()}
+    if mapping.urdf is not None:
+        urdf = find(mapping.urdf, beside=beside).read_text(encoding="utf-8")
+        attachments["robot.urdf"] = urdf.encode()
     start = datetime.datetime.fromtimestamp(int(joint.times[0]) * 1e-9, datetime.UTC).isoformat()
     metadata = session_metadata(
         robot=mapping.robot,
@@ -311,7 +313,7 @@ def import_log(
         mapping.joints,
         metadata,
         robot_description=None,
-        attachments=_attachments(mapping, urdf),
+        attachments=attachments,
     ) as writer:
         _write(writer, channels)
     written = {
@@ -352,7 +354,7 @@ def _read(
         raw = recording.columns(signal, joints, name)
         place = f"{recording.path(signal.file)}: `{name}`"
         base = signal.time if signal.time is not None else mapping.time
-        clock = _clock(mapping, base, signal, recording, len(raw), place)
+        clock = _clock(base, signal, recording, len(raw), place)
         total = len(raw) if name == "position" else total
         if name in _ONCE and len(raw) != total:
             raise DataError(
@@ -371,9 +373,7 @@ def _read(
     return total, channels
 
 
-def _clock(
-    mapping: LogMapping, base: TimeBase, signal: Signal, recording: Recording, count: int, place: str
-) -> Floats:
+def _clock(base: TimeBase, signal: Signal, recording: Recording, count: int, place: str) -> Floats:
     """Times of the samples (n,) [s] by the source's clock."""
     if base.column is None:
         assert base.rate_hz is not None
@@ -489,15 +489,6 @@ def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
     if "command" in channels:
         command = channels["command"]
         writer.write_joint_command(command.times, command.values, publish_time=command.published)
-
-
-def _attachments(mapping: LogMapping, urdf: str | None) -> dict[str, bytes]:
-    import yaml
-
-    files = {"mapping.yaml": yaml.safe_dump(_plain(dataclasses.asdict(mapping)), sort_keys=False).encode()}
-    if urdf is not None:
-        files["robot.urdf"] = urdf.encode()
-    return files
 
 
 def _plain(value: object) -> object:

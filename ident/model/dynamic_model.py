@@ -210,13 +210,9 @@ class DynamicModel(Tabular):
         chosen = self.structure.sides[0] if side is None else side
         torque: Floats = self.linear_torque(position, speed, acceleration, payload=payload, side=chosen)
         if self.effects:
-            linear: dict[str, Floats] = {
-                of: torque
-                if of == chosen
-                else self.linear_torque(position, speed, acceleration, payload=payload, side=of)
-                for of in self.structure.sides
-                if of != "difference"
-            }
+            linear: dict[str, Floats] = {chosen: torque}
+            for of in set(self.structure.sides) - {chosen, "difference"}:
+                linear[of] = self.linear_torque(position, speed, acceleration, payload=payload, side=of)
             stamps: Floats = np.arange(len(position), dtype=np.float64) * 1e-3
             if time is not None:
                 stamps = np.asarray(time, dtype=np.float64)

@@ -225,11 +225,11 @@ def _groups(
     result = []
     average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
     for joint, name in enumerate(session.joint_names):
-        keep = [part.valid[:, joint] for part in parts]
-        matrix = np.concatenate([part.matrix[joint][k] for part, k in zip(parts, keep, strict=True)])
-        target = np.concatenate([part.target[k, joint] for part, k in zip(parts, keep, strict=True)])
-        slope = np.concatenate([part.slope[k, joint] for part, k in zip(parts, keep, strict=True)])
-        index = np.concatenate([part.index[k] for part, k in zip(parts, keep, strict=True)])
+        kept = [(part, part.valid[:, joint]) for part in parts]
+        matrix = np.concatenate([part.matrix[joint][k] for part, k in kept])
+        target = np.concatenate([part.target[k, joint] for part, k in kept])
+        slope = np.concatenate([part.slope[k, joint] for part, k in kept])
+        index = np.concatenate([part.index[k] for part, k in kept])
         if average and session.period_rows is not None:
             matrix, target, slope, index = _averaged(
                 matrix, target, slope, index, session.period_rows, session.periods

@@ -164,7 +164,9 @@ def prepare(
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
     whole = max(parts, key=lambda part: len(part.values)).values[:, : position.shape[1]]
     if settings.choose_cutoff:
-        settings = _chosen_cutoff(settings, whole, dt)
+        cutoff = max(optimal_cutoff(whole, dt, settings.order), 1.5 * settings.decimate_hz)
+        logger.info("position cut-off %.2f Hz chosen from the spectrum", cutoff)
+        settings = replace(settings, cutoff_hz=cutoff)
     names = moving(position, session.joint_names)
     if not names:
         raise DataError(
@@ -328,11 +330,10 @@ def _passage(
 ) -> Passage | None:
     first, last = motion.usable(settings)
     half = half_width(settings.decimate_hz, settings.attenuation_db)
-    inside = (grid >= first + half) & (grid <= last - half)
     within = np.zeros(len(grid), dtype=bool)
     for low, high in windows:
         within |= (grid >= low - 1e-9) & (grid <= high + 1e-9)
-    inside &= within
+    inside = within & (grid >= first + half) & (grid <= last - half)
     if not inside.any():
         return None
     rows = grid[inside]
@@ -351,8 +352,7 @@ def _valid(channel: TorqueChannel, rows: Floats, settings: SignalSettings) -> Bo
     parallel = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db)
     covered = parallel.coverage() >= 1.0 - settings.bridged_share
     bridged = parallel.share(block_means(channel.flagged, factor)) <= settings.bridged_share
-    slow = block_means(np.abs(channel.qd) < settings.standstill_rad_s, factor)
-    still = parallel.share(slow)
+    still = parallel.share(block_means(np.abs(channel.qd) < settings.standstill_rad_s, factor))
     return covered[:, None] & bridged & (still <= settings.standstill_share)
 
 
@@ -460,9 +460,3 @@ def _row_grid(
             total = count * len(windows)
             return first + (length / count) * np.arange(total, dtype=np.float64), count
     return np.arange(first, last + 1e-9, step), None
-
-
-def _chosen_cutoff(settings: SignalSettings, position: Floats, dt: float) -> SignalSettings:
-    cutoff = max(optimal_cutoff(position, dt, settings.order), 1.5 * settings.decimate_hz)
-    logger.info("position cut-off %.2f Hz chosen from the spectrum", cutoff)
-    return replace(settings, cutoff_hz=cutoff)

@@ -30,6 +30,8 @@ from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform
 
 BoolArray = NDArray[np.bool_]
 
+logger = logging.getLogger(__name__)
+
 _JITTER = 0.02
 _TOO_MANY = 0.01
 _GRAINS = 5.0
@@ -97,30 +99,24 @@ def stretches(
 
 def _uniform(times: Floats, values: Floats, dt: float) -> Stretch:
     steps = np.rint((times - times[0]) / dt).astype(np.int64)
-    regular = np.all(np.diff(steps) > 0) and float(
-        np.max(np.abs(times - times[0] - steps * _fitted_step(times, steps, dt)))
-    ) < max(_JITTER * dt, 2e-9)
-    if regular:
-        step = _fitted_step(times, steps, dt)
+    step = float((times[-1] - times[0]) / steps[-1]) if len(steps) > 1 and steps[-1] else dt
+    error = float(np.max(np.abs(times - times[0] - steps * step)))
+    if np.all(np.diff(steps) > 0) and error < max(_JITTER * dt, 2e-9):
         count = int(steps[-1]) + 1
         bridged = np.ones(count, dtype=bool)
         bridged[steps] = False
-        if not bridged.any():
-            return Stretch(float(times[0]), step, values, bridged, False)
-        full = np.empty((count, values.shape[1]))
-        full[steps] = values
-        full[bridged] = CubicSpline(steps.astype(float), values)(np.flatnonzero(bridged).astype(float))
-        return Stretch(float(times[0]), step, full, bridged, False)
+        if bridged.any():
+            gaps, known = np.flatnonzero(bridged).astype(float), values
+            values = np.empty((count, known.shape[1]))
+            values[steps] = known
+            values[bridged] = CubicSpline(steps.astype(float), known)(gaps)
+        return Stretch(float(times[0]), step, values, bridged, False)
     count = int(np.floor((times[-1] - times[0]) / dt)) + 1
     grid = times[0] + dt * np.arange(count)
-    nearest = np.abs(grid - times[np.clip(np.searchsorted(times, grid), 0, len(times) - 1)])
-    before = np.abs(grid - times[np.clip(np.searchsorted(times, grid) - 1, 0, len(times) - 1)])
+    after = np.searchsorted(times, grid)
+    nearest, before = (np.abs(grid - times[np.clip(k, 0, len(times) - 1)]) for k in (after, after - 1))
     bridged = np.minimum(nearest, before) > 1.0 * dt
     return Stretch(float(times[0]), dt, CubicSpline(times, values)(grid), bridged, True)
-
-
-def _fitted_step(times: Floats, steps: NDArray[np.int64], dt: float) -> float:
-    return float((times[-1] - times[0]) / steps[-1]) if len(steps) > 1 and steps[-1] else dt
 
 
 def flag_outliers(values: Floats, scale: float) -> tuple[BoolArray, list[int]]:
@@ -166,13 +162,12 @@ def _median_of_five(a: Floats, b: Floats, c: Floats, d: Floats, e: Floats) -> Fl
     return np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
 
 
-logger = logging.getLogger(__name__)
-
 _STEPS = 12
 # Largest scatter of the joints, in their standard deviations, with rows at reversals used.
 _TOLERATED = 2.0
 _GRID = 41
 _ATTENUATION_DB = 40.0
+_STILL = "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
 
 
 @dataclass(frozen=True)
@@ -233,9 +228,7 @@ def estimate_delay(
         )
     parts = [part for part in found if part is not None and part.moving.any()]
     if not parts:
-        raise DataError(
-            "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
-        )
+        raise DataError(_STILL)
     grid = np.linspace(-search_s, search_s, _GRID)
     cost = [_cost(parts, delay) for delay in grid]
     best = int(np.argmin(cost))
@@ -261,9 +254,9 @@ def _refined(
     """Gauss-Newton from `start`, then each joint by itself for their disagreement."""
     delay = start
     sampling = _sampling_error(parts) if which == "all rows" else 0.0
-    for stage in ("coarse", "fine"):
+    for fine in (False, True):
         for _ in range(_STEPS):
-            steps, stds, _ = _newton(parts, joint_names, delay, fine=stage == "fine")
+            steps, stds, _ = _newton(parts, joint_names, delay, fine=fine)
             delay = float(np.clip(delay + np.clip(steps[0], -0.01, 0.01), -search_s, search_s))
             if abs(steps[0]) < 0.1 * np.hypot(stds[0], sampling) or abs(steps[0]) < 1e-9:
                 break
@@ -388,9 +381,7 @@ def _newton(
         if sum(int(part.moving[:, joint].sum()) for part in parts) >= 16
     ]
     if not active:
-        raise DataError(
-            "the delay of the motor channel cannot be estimated: no joint moves; state `motor_delay_s`"
-        )
+        raise DataError(_STILL)
     delays = len(active) if separate else 1
     columns = [part.columns_at(delay) if fine else part.columns for part in parts]
     for place, joint in enumerate(active):
