@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,7 @@ from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
 from ident.rows.sessions import require
-from lwr_driver.session import Sessions, as_sessions
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
-
+from lwr_driver.session import Session, Sessions, as_sessions
 
 log = logging.getLogger(__name__)
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-if TYPE_CHECKING:
-    from lwr_driver.session import JointColumns, Session
-
+from lwr_driver.session import JointColumns, Session
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

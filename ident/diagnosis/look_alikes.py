@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +24,7 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import Signature, overlap, signature_bench, signatures
 from ident.dynamics.kinematics import Chain
 from ident.effects import find_effect
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
-
+from lwr_driver.session import Session
 
 Place = tuple[str, tuple[int, ...]]
 """A cause and its joints, from 1; none for the whole arm."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Side
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, prepare
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
-
+from lwr_driver.session import Session
 
 Floats = NDArray[np.float64]
 

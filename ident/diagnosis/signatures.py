@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,10 +24,7 @@ from ident.diagnosis.selection import select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
 from ident.effects import Form, find_effect
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
-
+from lwr_driver.session import Session
 
 Cause = tuple[str, Sequence[int]]
 """Name of a cause and its joints, counted from 1; none for the whole arm."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from ident.diagnosis.bench import Bench, prepare_bench
 from ident.diagnosis.evidence import Floats, Rows
@@ -17,10 +16,7 @@ from ident.diagnosis.result import Finding, SimulationError
 from ident.diagnosis.selection import Null, Selection, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.model import DynamicModel
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
-
+from lwr_driver.session import Session
 
 Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 """Replays sessions with a model and returns the error; provided by the runner."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +31,7 @@ from ident.rows.filters import (
 )
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, clock_ns
 from ident.rows.timebase import Stretch, sample_period, stretches
-
-if TYPE_CHECKING:
-    from lwr_driver.session import Session
-
+from lwr_driver.session import Session
 
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4

@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +39,7 @@ from ident.rows.timebase import (
     sample_period,
     stretches,
 )
-
-if TYPE_CHECKING:
-    from lwr_driver.session import JointColumns, Session
-
+from lwr_driver.session import JointColumns, Session
 
 BoolArray = NDArray[np.bool_]
 
