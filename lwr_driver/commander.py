@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lwr_driver.arm import JOINTS, Limits
+from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.control import Control, Mode, Result, Text, Word
 from lwr_driver.guard import Guard, Stop, Violation
 from lwr_driver.ring import NO_PHASE
@@ -81,7 +81,7 @@ class Commander:
     """
 
     def __init__(
-        self, limits: Limits, control: Control, joint_names: tuple[str, ...], tracking_limit: float
+        self, limits: ArmLimits, control: Control, joint_names: tuple[str, ...], tracking_limit: float
     ) -> None:
         self._limits, self._control, self._joint_names = limits, control, joint_names
         self._plan, self._tracking_limit = control.plan, tracking_limit

@@ -39,8 +39,8 @@ from lwr_driver.link import (
     LinkSettings,
     LinkState,
     Measured,
+    MotionProgress,
     Outcome,
-    Progress,
     Waiting,
     advise_command,
     advise_connect,
@@ -276,7 +276,7 @@ class Driver:
             raise
         return self.state()
 
-    def execute(self, motion: Motion, progress: Callable[[Progress], None] | None = None) -> Outcome:
+    def execute(self, motion: Motion, progress: Callable[[MotionProgress], None] | None = None) -> Outcome:
         """Command a motion from its first row to its last, then hold the last row.
 
         The first row must be the commanded position, `state().q_command`, to the last bit of float32.
@@ -311,7 +311,7 @@ class Driver:
                 if progress is not None:
                     row = max(int(control.words[Word.ROW]), 0)
                     phase = self._phase_name(names)
-                    progress(Progress(row, len(motion), row * motion.period_s, phase, self.state()))
+                    progress(MotionProgress(row, len(motion), row * motion.period_s, phase, self.state()))
         except BaseException as error:
             self._give_up(error)
             if isinstance(error, LwrError) and error is watch.error:

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
-from lwr_driver.arm import JOINTS, Limits
+from lwr_driver.arm import JOINTS, ArmLimits
 
 # Half the spacing of float32 numbers between 2 and 4 rad; joint positions of the arm are below 3 rad.
 ROUNDING = 2.0**-23
@@ -70,7 +70,7 @@ class Guard:
     period_s : time of one cycle [s]
     """
 
-    def __init__(self, limits: Limits, period_s: float) -> None:
+    def __init__(self, limits: ArmLimits, period_s: float) -> None:
         self._limits, self._period = limits, period_s
         self._middle = 0.5 * (limits.q_low + limits.q_high)
         self._half = 0.5 * (limits.q_high - limits.q_low)
@@ -154,7 +154,7 @@ class Stop:
     limits : acceleration and jerk of the stop; period_s : time of one cycle [s]
     """
 
-    def __init__(self, limits: Limits, period_s: float) -> None:
+    def __init__(self, limits: ArmLimits, period_s: float) -> None:
         self._period, self._limits = period_s, limits
         self._otg = Ruckig(JOINTS, period_s)
         self._trajectory = Trajectory(JOINTS)
@@ -208,7 +208,7 @@ class Stop:
         return self._cycle >= self._cycles
 
 
-def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, Rows]:
+def stop_extent(limits: ArmLimits, period_s: float, q: Rows) -> tuple[Rows, Rows, Rows]:
     """Lowest and highest position and highest speed of a stop begun at any row of q.
 
     q : (n, 7) [rad]; rows before the first equal the first
@@ -246,7 +246,7 @@ def stop_extent(limits: Limits, period_s: float, q: Rows) -> tuple[Rows, Rows, R
     return lowest, highest, np.maximum(np.abs(v), peak_speed)
 
 
-def _let_go(limits: Limits, period_s: float, v: Rows, a: Rows) -> Rows:
+def _let_go(limits: ArmLimits, period_s: float, v: Rows, a: Rows) -> Rows:
     """First acceleration of the profile: a, shifted by up to half a period of jerk against the motion."""
     excess = v + a * np.abs(a) / (2.0 * limits.j_max)
     half = 0.5 * period_s * limits.j_max

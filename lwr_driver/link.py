@@ -159,7 +159,7 @@ class LinkState:
 
 
 @dataclass(frozen=True)
-class Progress:
+class MotionProgress:
     """Progress of a motion: row sent of rows planned, time [s], name of the phase, state of the link."""
 
     row: int

@@ -21,7 +21,7 @@ from fri.handshake import IdentificationHandshake, find_handshake
 from fri.remote import LinkEvent, RemoteEnd
 from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
-from lwr_driver.arm import JOINTS, Limits
+from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.commander import Commander
 from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
 from lwr_driver.ring import ROW, Ring
@@ -116,7 +116,7 @@ class Loop:
     """
 
     def __init__(
-        self, settings: LoopSettings, limits: Limits, control: Control, ring: Ring | None = None
+        self, settings: LoopSettings, limits: ArmLimits, control: Control, ring: Ring | None = None
     ) -> None:
         self._settings, self._control, self._ring = settings, control, ring
         self.turnaround: Turnaround | None = None

@@ -26,7 +26,7 @@ import numpy as np
 
 from fri.errors import ConfigurationError, LwrError, NetworkError
 from lwr_driver import realtime
-from lwr_driver.arm import Limits
+from lwr_driver.arm import ArmLimits
 from lwr_driver.control import Control, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.realtime import Rights, Shortage
@@ -61,7 +61,7 @@ class LoopProcess:
     """
 
     def __init__(
-        self, settings: LoopSettings, limits: Limits, control: Control, ring: Ring, scheduling: Scheduling
+        self, settings: LoopSettings, limits: ArmLimits, control: Control, ring: Ring, scheduling: Scheduling
     ) -> None:
         self._control = control
         order = {
@@ -161,7 +161,7 @@ def main(arguments: Sequence[str]) -> None:
         scheduling = Scheduling(**order["scheduling"])
         settings = dict(order["settings"])
         settings["joint_names"] = tuple(settings["joint_names"])
-        limits = Limits(**{name: np.array(value) for name, value in order["limits"].items()})
+        limits = ArmLimits(**{name: np.array(value) for name, value in order["limits"].items()})
         control = Control(*order["control"])
         loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]))
         rights = _become_real_time(loop, control, scheduling) if scheduling.apply else Rights()

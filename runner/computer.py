@@ -67,7 +67,7 @@ _MARKS = {"ok": "ok  ", "advice": "note", "fail": "FAIL"}
 
 
 @dataclass(frozen=True)
-class Finding:
+class ComputerFinding:
     """One item: value, limit, verdict and advice.
 
     who : error class of a failure, by the person who must act; it gives the exit code.
@@ -101,13 +101,13 @@ def graded(
     failure: tuple[bool, str] = (False, ""),
     shortcoming: tuple[bool, str] = (False, ""),
     who: type[LwrError] = NetworkError,
-) -> Finding:
+) -> ComputerFinding:
     """A finding from its conditions, each with its advice: of a failure, and of a mere shortcoming."""
     if failure[0]:
-        return Finding(subject, value, limit, "fail", failure[1], who)
+        return ComputerFinding(subject, value, limit, "fail", failure[1], who)
     if shortcoming[0]:
-        return Finding(subject, value, limit, "advice", shortcoming[1])
-    return Finding(subject, value, limit, "ok")
+        return ComputerFinding(subject, value, limit, "advice", shortcoming[1])
+    return ComputerFinding(subject, value, limit, "ok")
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def find_interface(address: str) -> Interface | None:
     return None
 
 
-def examine_computer(address: str, port: int, folder: Path, *, realtime: bool) -> list[Finding]:
+def examine_computer(address: str, port: int, folder: Path, *, realtime: bool) -> list[ComputerFinding]:
     """Every finding without a controller.
 
     address, port : of the PC's end. folder : of the logs. realtime : real-time rights are needed (a real arm).
@@ -157,7 +157,7 @@ def examine_computer(address: str, port: int, folder: Path, *, realtime: bool) -
     ]
 
 
-def _interface(address: str) -> Finding:
+def _interface(address: str) -> ComputerFinding:
     found = find_interface(address)
     if found is None:
         known = ", ".join(name for _, name in socket.if_nameindex())
@@ -165,20 +165,22 @@ def _interface(address: str) -> Finding:
             f"set `link.address` to an address of this computer, or give the network card this one: "
             f"sudo ip address add {address}/24 dev CARD (CARD of {known})"
         )
-        return Finding("interface", f"none has {address}", "one", "fail", advice, NetworkError)
+        return ComputerFinding("interface", f"none has {address}", "one", "fail", advice, NetworkError)
     state, errors = found.read("operstate"), int(found.read("statistics/rx_errors") or 0)
     speed = found.read("speed")
     shown = f"{address} on {found.name}, {state}" + (f", {speed} Mbit/s" if speed.isdigit() else "")
     if state not in ("up", "unknown"):
         advice = "plug the cable in; the controller must be switched on"
-        return Finding("interface", shown, "up", "fail", advice, NetworkError)
+        return ComputerFinding("interface", shown, "up", "fail", advice, NetworkError)
     if errors:
         advice = "change the cable or the card if the number rises"
-        return Finding("interface", f"{shown}, {errors} receive errors", "up, 0 errors", "advice", advice)
-    return Finding("interface", shown, "up", "ok")
+        return ComputerFinding(
+            "interface", f"{shown}, {errors} receive errors", "up, 0 errors", "advice", advice
+        )
+    return ComputerFinding("interface", shown, "up", "ok")
 
 
-def _port(address: str, port: int) -> Finding:
+def _port(address: str, port: int) -> ComputerFinding:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((address, port))
@@ -187,27 +189,29 @@ def _port(address: str, port: int) -> Finding:
                 f"end the other FRI client (`sudo ss -lunp | grep {port}` names it), or choose another port"
             )
             value = f"UDP {address}:{port}: {error.strerror}"
-            return Finding("port", value, "free", "fail", advice, NetworkError)
-    return Finding("port", f"UDP {address}:{port}", "free", "ok")
+            return ComputerFinding("port", value, "free", "fail", advice, NetworkError)
+    return ComputerFinding("port", f"UDP {address}:{port}", "free", "ok")
 
 
-def _rights(*, needed: bool) -> list[Finding]:
+def _rights(*, needed: bool) -> list[ComputerFinding]:
     rights = assess()
     found = [
-        Finding("real-time rights", lack.what, "granted", "fail", lack.remedy, NetworkError)
+        ComputerFinding("real-time rights", lack.what, "granted", "fail", lack.remedy, NetworkError)
         if needed
-        else Finding("real-time rights", lack.what, "for a real arm", "advice", lack.remedy)
+        else ComputerFinding("real-time rights", lack.what, "for a real arm", "advice", lack.remedy)
         for lack in rights.missing
     ]
     if rights.ok:
-        found.append(Finding("real-time rights", "SCHED_FIFO and locked memory granted", "granted", "ok"))
+        found.append(
+            ComputerFinding("real-time rights", "SCHED_FIFO and locked memory granted", "granted", "ok")
+        )
     kernel = next((advice for advice in rights.advice if advice.what.startswith("kernel")), None)
     value = kernel.what if kernel else f"{platform.release()}, PREEMPT_RT"
     lacking = (kernel is not None, kernel.remedy if kernel else "")
     return [*found, graded("kernel", value, "PREEMPT_RT for 1 ms", shortcoming=lacking)]
 
 
-def _processors() -> Finding:
+def _processors() -> ComputerFinding:
     count = len(os.sched_getaffinity(0))
     governors = set()
     for path in Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"):
@@ -216,24 +220,24 @@ def _processors() -> Finding:
     value = f"{count}" + (f", governor {'/'.join(sorted(governors))}" if governors else "")
     if count >= 2 and governors - {"performance"}:
         advice = "sudo cpupower frequency-set -g performance"
-        return Finding("processors", value, "performance", "advice", advice)
+        return ComputerFinding("processors", value, "performance", "advice", advice)
     alone = (count < 2, "the loop shares it with all other processes")
     return graded("processors", value, "2", shortcoming=alone)
 
 
-def _clock_source() -> Finding:
+def _clock_source() -> ComputerFinding:
     path = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     try:
         source = path.read_text().strip()
     except OSError:
-        return Finding("clock source", "unknown", "a fast one", "advice", f"{path} cannot be read")
+        return ComputerFinding("clock source", "unknown", "a fast one", "advice", f"{path} cannot be read")
     if source not in _GOOD_CLOCKS:
         advice = "reading it takes microseconds; the kernel's messages explain why tsc was given up"
-        return Finding("clock source", source, "tsc", "advice", advice)
-    return Finding("clock source", source, "tsc or as good", "ok")
+        return ComputerFinding("clock source", source, "tsc", "advice", advice)
+    return ComputerFinding("clock source", source, "tsc or as good", "ok")
 
 
-def _clock_time() -> Finding:
+def _clock_time() -> ComputerFinding:
     # Only the dates in the logs depend on it.
     status = -1
     with contextlib.suppress(OSError, AttributeError):
@@ -243,13 +247,15 @@ def _clock_time() -> Finding:
     return graded("clock", "not " * wrong + "synchronised", "synchronised", shortcoming=(wrong, advice))
 
 
-def _disk(folder: Path) -> Finding:
+def _disk(folder: Path) -> ComputerFinding:
     place, free = free_disk(folder.resolve())
     if free < 1e6 * LEAST_DISK_MB:
-        return Finding(
+        return ComputerFinding(
             "disk", f"{free / 1e6:.0f} MB free at {place}", f"{LEAST_DISK_MB:.0f} MB", "fail", "make room"
         )
-    return Finding("disk", f"{free / 1e9:.0f} GB free at {place}", f"{LEAST_DISK_MB / 1000:.0f} GB", "ok")
+    return ComputerFinding(
+        "disk", f"{free / 1e9:.0f} GB free at {place}", f"{LEAST_DISK_MB / 1000:.0f} GB", "ok"
+    )
 
 
 def free_disk(folder: Path) -> tuple[Path, float]:
@@ -258,7 +264,7 @@ def free_disk(folder: Path) -> tuple[Path, float]:
     return place, float(shutil.disk_usage(place).free)
 
 
-def _versions() -> Finding:
+def _versions() -> ComputerFinding:
     found = versions()
     text = ", ".join([found["software"], *(f"{name} {found[name]}" for name in ("python", "numpy", "pin"))])
-    return Finding("versions", text, "", "ok")
+    return ComputerFinding("versions", text, "", "ok")

@@ -24,7 +24,7 @@ from fri.states import ALL_DRIVES
 from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings, LinkState
 from lwr_driver.link import advise_quality
-from runner.computer import Finding, examine_computer, find_interface, graded
+from runner.computer import ComputerFinding, examine_computer, find_interface, graded
 
 _HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
 _LARGEST = 65535
@@ -204,7 +204,7 @@ class Patient:
 class Examination:
     """All findings, and the link test if requested."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[ComputerFinding, ...]
     link: LinkTest | None = None
 
     @property
@@ -291,19 +291,21 @@ def examine(
         try:
             driver.connect(timeout_s=wait_s)
         except LwrError as error:
-            findings.append(Finding("packets", "stopped", "go on", "fail", str(error), type(error)))
+            findings.append(ComputerFinding("packets", "stopped", "go on", "fail", str(error), type(error)))
             return Examination(tuple(findings))
         link = exercise(driver, link_s, counter_int=patient.counter_int, report=testing)
     return Examination((*findings, *judge_link(patient, link)), link)
 
 
-def judge_heard(patient: Patient, heard: Heard, traffic: int) -> list[Finding]:
+def judge_heard(patient: Patient, heard: Heard, traffic: int) -> list[ComputerFinding]:
     """The datagrams at the port. traffic : packets received by the interface meanwhile, for any port."""
     place = f"UDP {patient.address}:{patient.port}"
     wanted = f"{MSR_SIZE} bytes, id 0x{MSR_ID:04x}"
     if not heard.kinds:
         seen = f"none on {place} in {heard.waited_s:.1f} s"
-        return [Finding("packets", seen, wanted, "fail", _start_advice(patient, traffic), NetworkError)]
+        return [
+            ComputerFinding("packets", seen, wanted, "fail", _start_advice(patient, traffic), NetworkError)
+        ]
     value, advice = f"FRI from {', '.join(heard.fri)}", ""
     if not heard.fri:
         value = str(heard)
@@ -336,10 +338,10 @@ def _start_advice(patient: Patient, traffic: int) -> str:
     return f"{steps} The interface has received {received}"
 
 
-def judge_link(patient: Patient, link: LinkTest) -> list[Finding]:
+def judge_link(patient: Patient, link: LinkTest) -> list[ComputerFinding]:
     """The test of the link, item by item."""
     if link.trouble is not None and not link.packets:
-        return [Finding("packets", "stopped", "go on", "fail", str(link.trouble), NetworkError)]
+        return [ComputerFinding("packets", "stopped", "go on", "fail", str(link.trouble), NetworkError)]
     return [
         _rate(link),
         _losses(link),
@@ -351,7 +353,7 @@ def judge_link(patient: Patient, link: LinkTest) -> list[Finding]:
     ]
 
 
-def _rate(link: LinkTest) -> Finding:
+def _rate(link: LinkTest) -> ComputerFinding:
     expected = 1.0 / link.end.period_s
     value = f"{link.rate_hz:.1f} packets/s at a cycle of {1000 * link.end.period_s:g} ms"
     off = abs(link.rate_hz - expected) > 0.05 * expected
@@ -359,7 +361,7 @@ def _rate(link: LinkTest) -> Finding:
     return graded("rate", value, f"{expected:.1f} ± 5 %", (off, advice))
 
 
-def _losses(link: LinkTest) -> Finding:
+def _losses(link: LinkTest) -> ComputerFinding:
     names = ("lost", "repeated", "reordered", "malformed", "foreign")
     counts = {name: link.between(name) for name in names}
     value = ", ".join(f"{count} {name}" for name, count in counts.items() if count) or "none"
@@ -382,11 +384,13 @@ def _quantiles(link: LinkTest) -> dict[float, float]:
     return {q: float(ends[place]) for q, place in zip((*_QUANTILES, 1.0), places, strict=True)}
 
 
-def _replies(link: LinkTest) -> Finding:
+def _replies(link: LinkTest) -> ComputerFinding:
     found = _quantiles(link)
     half = 0.5 * link.end.period_s
     if not found:
-        return Finding("reply", "no answer left", "each packet", "fail", "see the losses", NetworkError)
+        return ComputerFinding(
+            "reply", "no answer left", "each packet", "fail", "see the losses", NetworkError
+        )
     words = {q: "over 2000" if np.isinf(value) else f"{1e6 * value:.0f}" for q, value in found.items()}
     shown = ", ".join(f"p{100 * q:g} {words[q]}" for q in _QUANTILES) + f", longest {words[1.0]} µs"
     limit = f"p99 below {1e6 * half:.0f} µs"
@@ -396,7 +400,7 @@ def _replies(link: LinkTest) -> Finding:
     return graded("reply", shown, limit, (slow and not unknown, advice), (slow, advice))
 
 
-def _in_time(link: LinkTest) -> Finding:
+def _in_time(link: LinkTest) -> ComputerFinding:
     value = f"{100 * link.in_time:.3f} % of {link.packets} cycles"
     poor = "this set-up is not sufficient for command mode; see reply and losses"
     weak = "command mode would be lost now and then; take a longer cycle or a real-time kernel"
@@ -405,7 +409,7 @@ def _in_time(link: LinkTest) -> Finding:
     return graded("answered in time", value, limit, (share < _POOR_SHARE, poor), (share < _GOOD_SHARE, weak))
 
 
-def _quality(link: LinkTest) -> Finding:
+def _quality(link: LinkTest) -> ComputerFinding:
     end = link.end
     value = (
         f"{end.quality}, worst {link.worst_quality}, answer rate {end.answer_rate:.3f}, latency "
@@ -417,7 +421,7 @@ def _quality(link: LinkTest) -> Finding:
     return graded("quality", value, limit, (bad, advise_quality(end) if bad else ""), (dips, advice))
 
 
-def _robot(state: LinkState) -> list[Finding]:
+def _robot(state: LinkState) -> list[ComputerFinding]:
     stiff = state.control != "POSITION"
     strategy = "$STIFFNESS.STRATEGY=10; the KRL programs do so when command mode is asked for"
     bits = f"power 0x{state.power:02x}, error 0x{state.error:02x}, warning 0x{state.warning:02x}"
@@ -430,11 +434,11 @@ def _robot(state: LinkState) -> list[Finding]:
     return [
         graded("state", value, limit, shortcoming=(stiff, strategy)),
         graded("drives", bits, "no error" if state.error else "0x7f to move", error, off, RobotError),
-        Finding("temperature", shown, f"{_WARM:.0f} °C", "advice" if hottest > _WARM else "ok", warm),
+        ComputerFinding("temperature", shown, f"{_WARM:.0f} °C", "advice" if hottest > _WARM else "ok", warm),
     ]
 
 
-def _program(patient: Patient, link: LinkTest) -> list[Finding]:
+def _program(patient: Patient, link: LinkTest) -> list[ComputerFinding]:
     """The KRL program: its name, its load data, its motor torques."""
     handshake = find_handshake(patient.handshake)
     opened = handshake.opened(link.msr)
@@ -449,7 +453,7 @@ def _program(patient: Patient, link: LinkTest) -> list[Finding]:
         mass, *centre = handshake.load(link.msr).tolist()
         place = ", ".join(f"{value:.0f}" for value in centre)
         text = f"{mass:.3f} kg at ({place}) mm from the flange" if mass else "none: the empty flange"
-        found.append(Finding("load data", text, "as mounted", "ok"))
+        found.append(ComputerFinding("load data", text, "as mounted", "ok"))
     if link.fresh is None:
         return found
     rate = link.fresh / link.seconds if link.seconds > 0.0 else 0.0

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from fri.errors import DataError, LwrError, RefusedError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
-from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, Outcome
-from lwr_driver.driver import Progress as MotionProgress
+from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, MotionProgress, Outcome
 from lwr_driver.motion import Motion
 from lwr_driver.realtime import Rights
 from lwr_driver.session import read_session, session_metadata
@@ -49,7 +48,7 @@ _PROGRESS = "progress.json"
 
 
 @dataclass
-class Progress:
+class ExperimentProgress:
     """Progress of an experiment, stored beside its logs for a resumption.
 
     finished : the arm's state at rest after each finished session. attempts : uids of all attempts by session.
@@ -61,7 +60,7 @@ class Progress:
     attempts: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
-    def load(cls, folder: Path) -> Progress:
+    def load(cls, folder: Path) -> ExperimentProgress:
         """Read the progress in `folder`, or begin anew. DataError for a broken file."""
         path = folder / _PROGRESS
         if not path.exists():
@@ -76,7 +75,7 @@ class Progress:
             ) from error
 
     @classmethod
-    def create(cls, folder: Path, origin: Path) -> Progress:
+    def create(cls, folder: Path, origin: Path) -> ExperimentProgress:
         """Begin the progress of an experiment. origin : folder of its file."""
         progress = cls(folder / _PROGRESS, origin)
         progress._save()
@@ -208,7 +207,7 @@ class Run:
         excite: Callable[[SessionPlan, float], Motion],
     ) -> None:
         self.experiment, self.folder, self.bench, self.excite = experiment, folder, bench, excite
-        self._progress = Progress.load(folder)
+        self._progress = ExperimentProgress.load(folder)
         self._mounted: Payload | None = None
         self._rest: Rest | None = None
 

@@ -21,7 +21,7 @@ from lwr_driver.arm.cell import Cell
 from lwr_driver.arm.collision import Clearance, CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.motion import Motion
-from runner.experiment import Progress
+from runner.experiment import ExperimentProgress
 from runner.experiment_file import Experiment, Payload
 from runner.live import phase_at
 from runner.planning import Excitations, checker, excitation_rows, session_motion
@@ -119,7 +119,7 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     results = folder if folder.is_dir() else None
     if results is not None:
         path = folder / "experiment.yaml"
-        experiment = Experiment.load(path.resolve(), beside=Progress.load(folder).origin)
+        experiment = Experiment.load(path.resolve(), beside=ExperimentProgress.load(folder).origin)
     else:
         path = find(file)
         if read_mapping(path).get("kind") == "excitation plan":

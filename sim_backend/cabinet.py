@@ -22,7 +22,7 @@ from lwr_driver.arm import Arm
 from sim_backend.configuration import OWN_PROGRAM, EmulatorConfig, LoadData, Plugin, krl_program
 from sim_backend.controller import ControllerModel, PositionController
 from sim_backend.monitor import CommandMonitor
-from sim_backend.plant import CYCLE_S, Effect, ElasticArm, Plant
+from sim_backend.plant import CYCLE_S, ElasticArm, Plant, PlantEffect
 from sim_backend.robot import chain, robot_file, robot_model, true_arm
 from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
@@ -96,12 +96,12 @@ class Cabinet:
         payload = self.file.payload(robot.payload)
         own, others = seed.spawn(2)
         identified = robot_model(self.config)
-        own_effects: tuple[Effect, ...] = ()
+        own_effects: tuple[PlantEffect, ...] = ()
         if identified is not None:
             from sim_backend.model_arm import model_effects
 
             own_effects = model_effects(identified)
-        self.effects: tuple[Effect, ...] = (*own_effects, *(_load(effect) for effect in robot.effects))
+        self.effects: tuple[PlantEffect, ...] = (*own_effects, *(_load(effect) for effect in robot.effects))
         if robot.plant is not None:
             plant = _load(robot.plant, model, drive, np.random.default_rng(own))
             if not isinstance(plant, Plant):

@@ -22,7 +22,7 @@ from ident.effects import Parameters, Simulated, find_effect, parameter_values
 from ident.estimators.physical import cad_prior
 from ident.formats import consistent_parameters
 from ident.model import DynamicModel
-from sim_backend.plant import Effect
+from sim_backend.plant import PlantEffect
 from sim_backend.robot import Drive, with_inertias
 
 Floats = NDArray[np.float64]
@@ -92,7 +92,7 @@ def arm_of(
     return links, Drive(**rows, stiffness=stiffness, damping=damping)
 
 
-class ModelEffect(Effect):
+class ModelEffect(PlantEffect):
     """An effect of a model for the plant. begin_s : time of the session at time zero of the plant [s]."""
 
     def __init__(self, part: Simulated, begin_s: float = 0.0) -> None:

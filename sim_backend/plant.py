@@ -81,7 +81,7 @@ class Reading:
     motor_torque: np.ndarray
 
 
-class Effect:
+class PlantEffect:
     """Physics beyond the nominal equations; a subclass overrides some of the methods.
 
     Called once per 1 ms cycle. Its state must follow from its random stream and its arguments only.
@@ -126,7 +126,7 @@ class ElasticArm:
         *,
         substeps: int = 4,
         cycle_s: float = CYCLE_S,
-        effects: Sequence[Effect] = (),
+        effects: Sequence[PlantEffect] = (),
         random: np.random.SeedSequence | None = None,
     ) -> None:
         n = model.nv

@@ -11,8 +11,8 @@ from fri.errors import DataError
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.noise import noise_floor, repeatability
-from ident.diagnosis.nominal import TRAVEL_RAD, Arm, Nominal, structure_of
-from ident.diagnosis.recording import Recording
+from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, NominalArm, structure_of
+from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import Selection
 from ident.diagnosis.settings import DiagnosisSettings
@@ -40,7 +40,7 @@ class ArmData:
 
 
 @dataclass(eq=False)
-class Bench:
+class DiagnosisBench:
     """The nominal arm with its evidence and dictionary; `repeatable` : noise is known from repeated periods."""
 
     nominal: Nominal
@@ -49,14 +49,14 @@ class Bench:
     repeatable: bool
 
 
-def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None) -> Arm:
+def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None) -> NominalArm:
     """The nominal arm from a reference, else from the arm's description."""
     data = data or ArmData()
     n = chain.n
     ratio = np.ones(n) if data.gear_ratio is None else np.asarray(data.gear_ratio, dtype=float)
     compliance = np.zeros(n) if data.stiffness is None else 1.0 / np.asarray(data.stiffness, dtype=float)
     if reference is not None and len(reference.compliance) == n:
-        return Arm(
+        return NominalArm(
             chain,
             reference.compliance,
             ratio,
@@ -69,10 +69,10 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             far_share=reference.far_share,
             couplings=data.couplings,
         )
-    return Arm(chain, compliance, ratio, couplings=data.couplings)
+    return NominalArm(chain, compliance, ratio, couplings=data.couplings)
 
 
-def some_joint_moves(recordings: Sequence[Recording]) -> None:
+def some_joint_moves(recordings: Sequence[SessionRecord]) -> None:
     """Raises DataError if no joint moves in the fitted sessions."""
     fitted = [s for r in recordings if not r.test for s in r.stretches]
     if not any(np.any(np.ptp(s.q, axis=0) > TRAVEL_RAD) for s in fitted):
@@ -82,7 +82,7 @@ def some_joint_moves(recordings: Sequence[Recording]) -> None:
         )
 
 
-def every_joint_moves(recordings: Sequence[Recording], chain: Chain) -> None:
+def every_joint_moves(recordings: Sequence[SessionRecord], chain: Chain) -> None:
     """Raises DataError for a joint without motion."""
     for joint, name in enumerate(chain.joint_names):
         if not any(np.ptp(s.q[:, joint]) > 0.01 for r in recordings for s in r.stretches):
@@ -93,14 +93,14 @@ def every_joint_moves(recordings: Sequence[Recording], chain: Chain) -> None:
 
 
 def prepare_bench(
-    arm: Arm,
-    recordings: Sequence[Recording],
+    arm: NominalArm,
+    recordings: Sequence[SessionRecord],
     settings: DiagnosisSettings,
     reference: Reference | None,
     causes: Sequence[str] | None,
     *,
     fit_compliance: bool,
-) -> Bench:
+) -> DiagnosisBench:
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
     if fit_compliance and arm.encoder == "motor" and np.any(arm.compliance > 0.0):
         arm = _roughly_stiff(arm, recordings, settings, reference)
@@ -120,7 +120,7 @@ def prepare_bench(
             if np.all(np.abs(change) < 0.03 * arm.compliance):
                 break
             nominal.arm = replace(nominal.arm, compliance=nominal.arm.compliance + change)
-    return Bench(nominal, evidence, Dictionary(nominal, evidence, causes), repeatable)
+    return DiagnosisBench(nominal, evidence, Dictionary(nominal, evidence, causes), repeatable)
 
 
 def _drawn(base: BaseSet) -> tuple[Floats, Floats] | None:
@@ -163,8 +163,11 @@ def _noise(nominal: Nominal, residual: Mapping[str, Floats]) -> tuple[_BySide, _
 
 
 def _roughly_stiff(
-    arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, reference: Reference | None
-) -> Arm:
+    arm: NominalArm,
+    recordings: Sequence[SessionRecord],
+    settings: DiagnosisSettings,
+    reference: Reference | None,
+) -> NominalArm:
     """The arm with its compliance times the factor of the best fit, as a start near enough for derivatives."""
     tried = [replace(arm, compliance=factor * arm.compliance) for factor in _FACTORS]
     misfits = [
@@ -174,7 +177,7 @@ def _roughly_stiff(
     return tried[int(np.argmin(misfits))]
 
 
-def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
+def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> Floats:
     """Gauss-Newton step (n,) of the joints' compliance. With encoders at the links, the twist of a joint shows in its
     own motor row alone; with encoders at the motors it moves all links."""
     if nominal.arm.encoder == "motor":
@@ -191,7 +194,7 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
     return step
 
 
-def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> Floats:
+def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> Floats:
     """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The description's
     stiffness, known to a factor of about two, decides only where a joint hardly bends."""
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
@@ -214,8 +217,8 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: Arm) -> F
 
 
 def again_with(
-    bench: Bench, selection: Selection, settings: DiagnosisSettings, causes: Sequence[str] | None
-) -> Bench | None:
+    bench: DiagnosisBench, selection: Selection, settings: DiagnosisSettings, causes: Sequence[str] | None
+) -> DiagnosisBench | None:
     """The bench with predictions and noise floor after the claims; None without claims. Effects of the load depend on
     a torque predicted by the base parameters, wrong before the effects were in the model."""
     if not selection.claims:
@@ -232,10 +235,10 @@ def again_with(
     again = Evidence(
         nominal, settings, sigma, inflation, evidence.prior, compared=evidence.compared, floor=floor
     )
-    return Bench(nominal, again, Dictionary(nominal, again, causes), bench.repeatable)
+    return DiagnosisBench(nominal, again, Dictionary(nominal, again, causes), bench.repeatable)
 
 
-def slow_delay(bench: Bench, trial: Trial) -> tuple[float, float]:
+def slow_delay(bench: DiagnosisBench, trial: Trial) -> tuple[float, float]:
     """Delay [s] of a trial of a late channel, and its standard deviation, from means over a tenth of a second. A late
     channel is late at every frequency; a vibration missing in the positions vanishes in the means."""
     nominal = bench.nominal

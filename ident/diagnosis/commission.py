@@ -16,8 +16,8 @@ from scipy.optimize import minimize_scalar
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.diagnosis.evidence import Evidence, Floats
-from ident.diagnosis.nominal import Arm, Nominal
-from ident.diagnosis.recording import Recording, record
+from ident.diagnosis.nominal import Nominal, NominalArm
+from ident.diagnosis.recording import SessionRecord, record
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
@@ -132,7 +132,7 @@ def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
     return found
 
 
-def with_far_presliding(arm: Arm, days: Sequence[SlowTurns], coulomb: Sequence[Floats]) -> Arm:
+def with_far_presliding(arm: NominalArm, days: Sequence[SlowTurns], coulomb: Sequence[Floats]) -> NominalArm:
     """The arm with a share of friction with reversal within a longer distance, if several healthy sets agree on one:
     the mean of the sets is large against its standard error from their scatter.
 
@@ -197,7 +197,7 @@ def commission(
         raise DataError("no session given; name at least one healthy session")
     start = replace(nominal_arm(chain, arm, None), encoder_known=True)
     sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
-    recorded: list[list[Recording]] = []
+    recorded: list[list[SessionRecord]] = []
     for part in parts:
         recorded.append([record(s, k, chain, settings) for k, s in enumerate(part)])
         every_joint_moves(recorded[-1], chain)
@@ -237,8 +237,8 @@ def commission(
 
 
 def _tuned(
-    arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, rounds: int
-) -> tuple[float, Arm, BaseSet]:
+    arm: NominalArm, recordings: Sequence[SessionRecord], settings: DiagnosisSettings, rounds: int
+) -> tuple[float, NominalArm, BaseSet]:
     """Chi-square of a row, and the arm with stiffness, presliding and delays fitted to a set in turns.
 
     They are similar near a reversal, so they need a few rounds.
@@ -262,7 +262,7 @@ def _tuned(
     return misfit, arm, base
 
 
-def _middle(arms: Sequence[Arm]) -> Arm:
+def _middle(arms: Sequence[NominalArm]) -> NominalArm:
     """The mean of tuned arms; of the presliding lengths the geometric one, 0 if most of them have none."""
     found = np.array([arm.presliding for arm in arms])
     seen = found > 0.0
@@ -276,7 +276,9 @@ def _middle(arms: Sequence[Arm]) -> Arm:
     )
 
 
-def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings, base: BaseSet) -> _Day:
+def _day(
+    arm: NominalArm, recordings: Sequence[SessionRecord], settings: DiagnosisSettings, base: BaseSet
+) -> _Day:
     bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=False)
     if bench.nominal.base.names != base.names:
         raise DataError(
@@ -300,7 +302,7 @@ def _day(arm: Arm, recordings: Sequence[Recording], settings: DiagnosisSettings,
 def _reference(
     days: Sequence[_Day],
     base: BaseSet,
-    arm: Arm,
+    arm: NominalArm,
     robot: str,
     sessions: Sequence[Session],
     null: Mapping[tuple[str, int], float],

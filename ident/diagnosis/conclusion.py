@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ident.diagnosis.bench import Bench
+from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
 from ident.diagnosis.data_quality import SampleLoss, sample_loss
 from ident.diagnosis.evidence import Floats, Key, Rows
@@ -112,7 +112,7 @@ def _confirmed_findings(task: Task, state: State) -> list[tuple[Claim, Finding]]
     return kept
 
 
-def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float, float]) -> float:
+def _confirmed(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float]) -> float:
     """Largest confidence in a claim after the test on held-out rows: 1 confirmed, 0 refuted.
 
     fallen : interval of the fall of their chi-square by the claim; above zero it confirms the claim. A deviation of
@@ -137,7 +137,7 @@ def _confirmed(claim: Claim, finding: Finding, bench: Bench, fallen: tuple[float
     return _OPEN if shown or silent or low > -_ALL_BUT * high else 0.0
 
 
-def _excitation(claim: Claim, bench: Bench) -> float:
+def _excitation(claim: Claim, bench: DiagnosisBench) -> float:
     """Power of the claim's torque in the held-out rows over that in the rows fitted, 1 without held-out sessions."""
     power, counts = np.zeros(2), np.zeros(2)
     for (side, joint), columns in claim.trial.rows.items():
@@ -163,7 +163,7 @@ def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:
 # ---- findings ----
 
 
-def _finding(claim: Claim, bench: Bench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
+def _finding(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
     """The finding of a claim beside the columns of the evidence, with all other claims among them."""
     candidate, score, form = claim.trial.candidate, claim.score, claim.trial.shape.form
     keys = [key for key in claim.trial.rows if np.any(claim.trial.rows[key])]
@@ -193,7 +193,7 @@ def _relative(without: HeldOut, after: HeldOut, key: Key) -> float:
     return float((np.nanmean(a**2) - power) / power) if np.isfinite(a).any() else 0.0
 
 
-def _parameters(trial: Trial, bench: Bench) -> dict[str, Value]:
+def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
     """Values with standard deviations, see `intervals`.
 
     Friction near standstill is estimated beside all ways of reversing, beyond its law; the change of the values is
@@ -295,7 +295,7 @@ def _doubted(
 
 def _beyond(
     task: Task,
-    bench: Bench,
+    bench: DiagnosisBench,
     claims: Sequence[Claim],
     nuisance: Sequence[Rows],
     remainders: tuple[Remainder, ...],
@@ -314,7 +314,7 @@ def _beyond(
 
 
 def _encompassed(
-    claim: Claim, others: Sequence[Rows], bench: Bench, remainders: Sequence[Remainder]
+    claim: Claim, others: Sequence[Rows], bench: DiagnosisBench, remainders: Sequence[Remainder]
 ) -> float:
     """Share of a claim's gain lost with all remainders in the base, beside the columns of the others.
 
@@ -336,7 +336,7 @@ def _at_most(confidence: float, finding: Finding) -> Finding:
 
 
 def _models(
-    task: Task, bench: Bench, baseline: Baseline, findings: Sequence[Finding]
+    task: Task, bench: DiagnosisBench, baseline: Baseline, findings: Sequence[Finding]
 ) -> tuple[DynamicModel, DynamicModel, dict[str, float]]:
     """Base model, extended model with the columns of the evidence, and the change of the base parameters in their
     standard deviations.
@@ -399,7 +399,7 @@ def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[st
     return lines + stuck
 
 
-def _notes(bench: Bench, reference: Reference | None) -> list[str]:
+def _notes(bench: DiagnosisBench, reference: Reference | None) -> list[str]:
     notes, nominal, evidence = [], bench.nominal, bench.evidence
     if "motor" not in nominal.rows:
         notes.append(

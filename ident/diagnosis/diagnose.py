@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from fri.errors import DataError
-from ident.diagnosis.bench import ArmData, Bench, again_with, nominal_arm, slow_delay, some_joint_moves
+from ident.diagnosis.bench import (
+    ArmData,
+    DiagnosisBench,
+    again_with,
+    nominal_arm,
+    slow_delay,
+    some_joint_moves,
+)
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import conclude, timing_finding
 from ident.diagnosis.evidence import Score
@@ -155,7 +162,7 @@ def _made(claim: Claim) -> float:
     return float(claim.trial.shape["delay"]) * float(claim.score.coefficients[0])
 
 
-def _rest(bench: Bench, selection: Selection, cause: str) -> tuple[float, float]:
+def _rest(bench: DiagnosisBench, selection: Selection, cause: str) -> tuple[float, float]:
     """Remaining delay of a channel and its standard deviation [s], beside all claims but presliding, similar to a
     late motor.
     """
@@ -207,14 +214,14 @@ def _own_delay(claim: Claim, limit: float) -> str:
     )
 
 
-def _late_at_all_speeds(bench: Bench, claim: Claim) -> bool:
+def _late_at_all_speeds(bench: DiagnosisBench, claim: Claim) -> bool:
     bench.evidence.replace([])
     made = _made(claim)
     slow, std = slow_delay(bench, claim.trial)
     return abs(slow - made) < 0.3 * abs(made) + 4.0 * std and abs(slow) > 0.3 * abs(made)
 
 
-def _late_in_all_joints(bench: Bench, claim: Claim) -> bool:
+def _late_in_all_joints(bench: DiagnosisBench, claim: Claim) -> bool:
     """Whether the other joints confirm the delay of the joint with most of the evidence, unlike drag in one joint."""
     evidence = bench.evidence
     evidence.replace([])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fri.errors import DataError
-from ident.diagnosis.bench import ArmData, Bench
+from ident.diagnosis.bench import ArmData, DiagnosisBench
 from ident.diagnosis.candidates import Candidate
 from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.reference import Reference
@@ -208,7 +208,7 @@ def _rest(strength: float, alike: float) -> float:
     return strength * math.sqrt(max(0.0, 1.0 - alike**2))
 
 
-def _columns(bench: Bench, finding: Finding) -> Rows:
+def _columns(bench: DiagnosisBench, finding: Finding) -> Rows:
     """Columns of a finding on the bench; none for a cause without torque."""
     effect = find_effect(finding.cause)
     candidate = Candidate(effect, finding.joints[0] - 1 if finding.joints else -1)
@@ -222,7 +222,7 @@ def _values(finding: Finding) -> dict[str, float]:
 
 
 def _side_by_side(
-    bench: Bench, number: int, first: Place, second: Place, finding: Finding | None
+    bench: DiagnosisBench, number: int, first: Place, second: Place, finding: Finding | None
 ) -> LookAlikes:
     given = [None if finding is None else _values(finding), None]
     a, b = signatures(
@@ -250,7 +250,7 @@ def _side_by_side(
     )
 
 
-def _traces(bench: Bench, first: Signature, second: Signature) -> tuple[Trace, ...]:
+def _traces(bench: DiagnosisBench, first: Signature, second: Signature) -> tuple[Trace, ...]:
     """The rows of the causes' own joints, else the rows of their largest torques."""
     nominal, evidence = bench.nominal, bench.evidence
     power: dict[tuple[str, int], float] = {}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.diagnosis.nominal import SideRows
-from ident.diagnosis.recording import Recording
+from ident.diagnosis.recording import SessionRecord
 from ident.estimators.covariance import correlation_time
 
 Floats = NDArray[np.float64]
@@ -62,7 +62,7 @@ def noise_floor(
     return sigma, inflation, True
 
 
-def repeatability(recordings: Sequence[Recording], rows: SideRows, residual: Floats) -> Floats:
+def repeatability(recordings: Sequence[SessionRecord], rows: SideRows, residual: Floats) -> Floats:
     """Noise (n,) of a row [Nm] from sessions with the same motion, NaN without any. Every difference from run to run
     counts, drifts as well."""
     squares, counts = np.zeros((2, residual.shape[1]))
@@ -79,7 +79,7 @@ def repeatability(recordings: Sequence[Recording], rows: SideRows, residual: Flo
     return np.sqrt(np.where(counts > 0, squares / np.maximum(counts, 1.0), np.nan))
 
 
-def _same_motion(one: Recording, other: Recording) -> bool:
+def _same_motion(one: SessionRecord, other: SessionRecord) -> bool:
     """Whether two sessions run the same path in the same time, to a twentieth of its range."""
     if abs(one.duration_s - other.duration_s) > 0.02 * one.duration_s:
         return False

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
 
-from ident.diagnosis.recording import Recording, Stretch
+from ident.diagnosis.recording import RecordStretch, SessionRecord
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import split_name
 from ident.dynamics.structure import Condition, Coupling, ModelStructure, Side
-from ident.effects.motion import Motion, dahl
+from ident.effects.motion import ArmMotion, dahl
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import differentiate, low_pass
@@ -51,7 +51,7 @@ TRAVEL_RAD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class NominalArm:
     """Prior knowledge of the arm.
 
     compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio : (n,), one where
@@ -92,7 +92,7 @@ class Arm:
         return found
 
 
-def structure_of(arm: Arm, recordings: Sequence[Recording]) -> tuple[ModelStructure, BaseSet]:
+def structure_of(arm: NominalArm, recordings: Sequence[SessionRecord]) -> tuple[ModelStructure, BaseSet]:
     """Columns for the sessions' payloads and sides."""
     payloads = tuple(dict.fromkeys(r.payload for r in recordings if r.payload is not None))
     motor = any(r.has_motor for r in recordings)
@@ -124,12 +124,12 @@ class Nominal:
     motions : one for each stretch, with the predicted torques; default with the measured joint torque.
     """
 
-    arm: Arm
-    recordings: Sequence[Recording]
+    arm: NominalArm
+    recordings: Sequence[SessionRecord]
     settings: DiagnosisSettings
     structure: ModelStructure
     base: BaseSet
-    motions: list[Motion] = field(default_factory=list)
+    motions: list[ArmMotion] = field(default_factory=list)
     rows: dict[str, SideRows] = field(default_factory=dict, init=False)
     _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
         default_factory=dict, init=False, repr=False
@@ -140,7 +140,7 @@ class Nominal:
         self._make_rows()
 
     @property
-    def stretches(self) -> list[tuple[Recording, Stretch]]:
+    def stretches(self) -> list[tuple[SessionRecord, RecordStretch]]:
         """Recording and stretch of each motion."""
         return [(r, s) for r in self.recordings for s in r.stretches]
 
@@ -182,7 +182,7 @@ class Nominal:
         return rigid + drive["Fvl"] * qd + drive["Fcl"] * np.sign(qd) + drive["offl"]
 
     def _hanging(
-        self, motors: Stretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
+        self, motors: RecordStretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
     ) -> tuple[Floats, Floats, Floats, Springs]:
         """Position, speed and acceleration (N, n) of links on springs behind the motors; the springs."""
         stiffness = 1.0 / np.maximum(self.arm.compliance, _RIGID)
@@ -196,12 +196,12 @@ class Nominal:
 
     def _motion(
         self,
-        recording: Recording,
-        stretch: Stretch,
+        recording: SessionRecord,
+        stretch: RecordStretch,
         link_torque: Floats,
         bodies: Floats | None = None,
         drive: dict[str, Floats] | None = None,
-    ) -> Motion:
+    ) -> ArmMotion:
         n = self.arm.chain.n
         dt = float(stretch.time[1] - stretch.time[0])
         q, qd, qdd = stretch.q, stretch.qd, stretch.qdd
@@ -222,7 +222,7 @@ class Nominal:
         values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), np.zeros(n))
         slip = self.arm.slip(speed, dt)
         friction = values["Fvm"] * speed + values["Fcm"] * slip
-        return Motion(
+        return ArmMotion(
             chain=self.arm.chain,
             bodies=np.zeros((n, 10)) if bodies is None else bodies,
             session=recording.number,
@@ -252,7 +252,7 @@ class Nominal:
         """Length of a bin [s]."""
         return max(self.settings.bin_s, self.settings.ringing_s if self.arm.encoder == "motor" else 0.0)
 
-    def _sampling(self, side: str, stretch: Stretch) -> tuple[Floats, float, int]:
+    def _sampling(self, side: str, stretch: RecordStretch) -> tuple[Floats, float, int]:
         """Stamps (N,) [s] and delay [s] of a side's torque, and the samples in a bin."""
         if side == "joint":
             dt = float(stretch.time[1] - stretch.time[0])
@@ -273,7 +273,7 @@ class Nominal:
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
-    def _operator(self, side: str, number: int, stretch: Stretch) -> tuple[csr_array, float]:
+    def _operator(self, side: str, number: int, stretch: RecordStretch) -> tuple[csr_array, float]:
         """Matrix (m, N) from the grid of a stretch to its rows, at the channel's delay, and the rows' distance [s]."""
         delay = self.arm.joint_delay_s if side == "joint" else self.arm.motor_delay_s
         key = (side, number, delay)
@@ -314,12 +314,12 @@ class Nominal:
         step, edge = max(1, int(0.4 / (cutoff * dt))), int(0.5 / (cutoff * dt))
         return rows[edge : len(rows) - edge : step]
 
-    def _stamps(self, side: str, stretch: Stretch) -> Floats:
+    def _stamps(self, side: str, stretch: RecordStretch) -> Floats:
         """Times (m,) [s] of all rows of a stretch."""
         stamp, _, width = self._sampling(side, stretch)
         return self._slow(side, _binned(stamp[:, None], width)[:, 0], width * _step(stamp), smooth=False)
 
-    def _windows(self, recording: Recording, stamps: Floats) -> NDArray[np.bool_]:
+    def _windows(self, recording: SessionRecord, stamps: Floats) -> NDArray[np.bool_]:
         """Rows (m,) to use. Of a long session: the beginning, two periods at least, and windows spread evenly, so
         that drifts are seen and the rows stay within memory."""
         share = self.settings.most_s / len(self.recordings)
@@ -371,7 +371,7 @@ class Nominal:
         matrices, *others = zip(*parts, strict=True)
         return SideRows(np.concatenate(matrices, axis=1), *(np.concatenate(part) for part in others))
 
-    def _steady(self, speed: Floats, stretch: Stretch) -> Floats:
+    def _steady(self, speed: Floats, stretch: RecordStretch) -> Floats:
         """1 where a joint keeps its direction for a while before and after, 0 elsewhere, (N, n)."""
         dt = float(stretch.time[1] - stretch.time[0])
         size = 2 * round(self.settings.reversal_s / dt) + 1
@@ -379,7 +379,7 @@ class Nominal:
         return same.astype(float)
 
     def _matrix(
-        self, side: str, motion: Motion, recording: Recording, grid: Floats, at: Floats, width: int
+        self, side: str, motion: ArmMotion, recording: SessionRecord, grid: Floats, at: Floats, width: int
     ) -> Floats:
         """(n, m, p) regressor of one stretch and side in rows."""
         n, columns = motion.n, self.base.columns
@@ -419,7 +419,7 @@ class Nominal:
         return found
 
 
-def _holds(recording: Recording, stretch: Stretch, side: str) -> bool:
+def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
     return side in recording.sides and (side == "joint" or len(stretch.motor_time) > 1)
 
 

@@ -24,7 +24,7 @@ _HELD_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class RecordStretch:
     """An uninterrupted part of a session.
 
     time : (N,) even grid [s] from the first sample of the log; q, qd, qdd : (N, n).
@@ -44,7 +44,7 @@ class Stretch:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class SessionRecord:
     """A session ready for rows.
 
     number : in the order of the sessions' beginnings. payload : mounted, None for none.
@@ -58,7 +58,7 @@ class Recording:
     name: str
     number: int
     payload: str | None
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[RecordStretch, ...]
     start_s: float
     period_s: float
     duration_s: float
@@ -85,7 +85,7 @@ class Recording:
 
 def record(
     session: Session, number: int, chain: Chain, settings: DiagnosisSettings, *, test: bool = False
-) -> Recording:
+) -> SessionRecord:
     """Filter one session. Raises DataError for sessions without a stretch long enough."""
     chosen = session.select(chain.joint_names)
     rate = 1.0 / chosen.joint.period_s
@@ -103,7 +103,7 @@ def record(
     spans = chosen.spans("period")
     first, last = stretches[0].time[0], stretches[-1].time[-1]
     payload = chosen.metadata.get("payload", "none").strip()
-    return Recording(
+    return SessionRecord(
         name=prepared.name,
         number=number,
         payload=None if payload in ("", "none") else payload,
@@ -123,7 +123,9 @@ def record(
     )
 
 
-def _stretches(prepared: PreparedSession, rate: float, held: Floats, stuck: Sequence[Stuck]) -> list[Stretch]:
+def _stretches(
+    prepared: PreparedSession, rate: float, held: Floats, stuck: Sequence[Stuck]
+) -> list[RecordStretch]:
     found = []
     for passage in prepared.passages:
         joint = passage.joint
@@ -147,7 +149,7 @@ def _stretches(prepared: PreparedSession, rate: float, held: Floats, stuck: Sequ
             x[pick] for x in (joint.times, joint.q, joint.qd, joint.qdd, joint.torque)
         )
         known = ~joint.flagged[pick] & _apart(time, held)[:, None]
-        found.append(Stretch(time, q, qd, qdd, effort, known, motor_time, motor, usable))
+        found.append(RecordStretch(time, q, qd, qdd, effort, known, motor_time, motor, usable))
     return found
 
 

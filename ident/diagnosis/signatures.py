@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fri.errors import DataError
-from ident.diagnosis.bench import ArmData, Bench, nominal_arm, prepare_bench
+from ident.diagnosis.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.recording import record
@@ -63,7 +63,7 @@ def signature_bench(
     arm: ArmData | None = None,
     reference: Reference | None = None,
     settings: DiagnosisSettings | None = None,
-) -> Bench:
+) -> DiagnosisBench:
     """The bench of a diagnosis of sessions, with the tolerated deviations of the nominal arm beside its base.
 
     Raises DataError, with advice, for unusable sessions.
@@ -80,7 +80,7 @@ def signature_bench(
 
 
 def signatures(
-    bench: Bench,
+    bench: DiagnosisBench,
     causes: Sequence[Cause],
     *,
     parameters: Sequence[Mapping[str, float] | None] | None = None,
@@ -114,7 +114,7 @@ def overlap(a: Signature, b: Signature) -> float:
 
 
 def _signature(
-    bench: Bench, cause: Cause, values: Mapping[str, float] | None, form: str | Form | None
+    bench: DiagnosisBench, cause: Cause, values: Mapping[str, float] | None, form: str | Form | None
 ) -> Signature:
     name, joints = cause
     effect = find_effect(name)
@@ -154,7 +154,7 @@ def _signature(
     )
 
 
-def _fitted(bench: Bench, candidate: Candidate) -> Trial:
+def _fitted(bench: DiagnosisBench, candidate: Candidate) -> Trial:
     """The candidate with its best shape, even with implausible coefficients."""
     dictionary = bench.dictionary
     best = dictionary.best(candidate)
@@ -172,7 +172,7 @@ def _fitted(bench: Bench, candidate: Candidate) -> Trial:
 
 
 def _torques(
-    bench: Bench, rows: Rows, projection: Floats, coefficients: Floats
+    bench: DiagnosisBench, rows: Rows, projection: Floats, coefficients: Floats
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """Torque (m, n) [Nm] by side, and its remainder in the rows in use."""
     torque, left = {}, {}
@@ -187,7 +187,7 @@ def _torques(
     return torque, left
 
 
-def _weighted(bench: Bench, rows: Rows, projection: Floats | None) -> Floats:
+def _weighted(bench: DiagnosisBench, rows: Rows, projection: Floats | None) -> Floats:
     """Columns (all rows used, k) in units of the noise, minus their projection on the present columns."""
     evidence = bench.evidence
     width = next(iter(rows.values())).shape[1]

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ident.diagnosis.bench import Bench, prepare_bench
+from ident.diagnosis.bench import DiagnosisBench, prepare_bench
 from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.held_out import HeldOut, held_out
-from ident.diagnosis.nominal import Arm
-from ident.diagnosis.recording import Recording
+from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Finding, SimulationError
 from ident.diagnosis.selection import Null, Selection, select
@@ -31,8 +31,8 @@ class Task:
 
     sessions: Sequence[Session]
     test: Sequence[Session]
-    arm: Arm
-    recordings: tuple[Recording, ...]
+    arm: NominalArm
+    recordings: tuple[SessionRecord, ...]
     settings: DiagnosisSettings
     reference: Reference | None
     causes: Sequence[str] | None
@@ -44,13 +44,13 @@ class Task:
         """Gain of each candidate in healthy sets."""
         return None if self.reference is None else self.reference.limits()
 
-    def bench(self, arm: Arm, reference: Reference | None, *, fit_compliance: bool) -> Bench:
+    def bench(self, arm: NominalArm, reference: Reference | None, *, fit_compliance: bool) -> DiagnosisBench:
         """Rows, noise and candidates for an arm."""
         return prepare_bench(
             arm, self.recordings, self.settings, reference, self.causes, fit_compliance=fit_compliance
         )
 
-    def select(self, bench: Bench) -> Selection:
+    def select(self, bench: DiagnosisBench) -> Selection:
         """The causes supported by the data of a bench."""
         return select(bench.dictionary, bench.evidence, self.settings, self.null)
 
@@ -64,7 +64,7 @@ class Baseline:
     covariance: Floats
 
     @classmethod
-    def of(cls, bench: Bench, tolerated: Sequence[Rows]) -> Baseline:
+    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows]) -> Baseline:
         """Fitted on a bench, with tolerated deviations."""
         evidence = bench.evidence
         held, p = held_out(evidence, tolerated), evidence.base_count
@@ -79,7 +79,7 @@ class State:
     dropped from the candidates.
     """
 
-    bench: Bench
+    bench: DiagnosisBench
     selection: Selection
     timing: tuple[Finding, ...] = ()
     baseline: Baseline | None = None

@@ -18,8 +18,8 @@ from ident.dynamics.structure import Side
 from ident.effects import channel, drive, link, load
 from ident.effects.effect import (
     Column,
+    Discriminator,
     Effect,
-    Experiment,
     Form,
     Law,
     Parameter,
@@ -28,7 +28,7 @@ from ident.effects.effect import (
     Shape,
     Simulated,
 )
-from ident.effects.motion import Floats, Motion
+from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, spoken
 
 __all__ = [
@@ -38,12 +38,12 @@ __all__ = [
     "LOST_SAMPLES",
     "PRESLIDING",
     "ZERO_OFFSET",
+    "ArmMotion",
     "Column",
+    "Discriminator",
     "Effect",
-    "Experiment",
     "Form",
     "Law",
-    "Motion",
     "Parameter",
     "Parameters",
     "Setting",
@@ -158,7 +158,7 @@ def parameter_values(entry: Mapping[str, Any]) -> dict[str, float]:
 
 
 def effects_torque(
-    entries: Iterable[Mapping[str, Any]], motion: Motion, *, side: Side, measured: bool = False
+    entries: Iterable[Mapping[str, Any]], motion: ArmMotion, *, side: Side, measured: bool = False
 ) -> Floats:
     """Torque (N, n) [Nm] added to one side by the entries of a model's effects.
 

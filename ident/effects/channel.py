@@ -11,8 +11,8 @@ from ident.effects.course import TIME_CONSTANT, Course, Drifting
 from ident.effects.drive import ScaleError, dahl_step
 from ident.effects.effect import (
     Column,
+    Discriminator,
     Effect,
-    Experiment,
     Form,
     Law,
     Parameter,
@@ -24,7 +24,7 @@ from ident.effects.effect import (
     Simulated,
     Variable,
 )
-from ident.effects.motion import Floats, Motion, dahl
+from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.words import Values, one_joint, quantity, times, wave
 
 
@@ -38,7 +38,7 @@ class SensorGain(ScaleError):
     source = "Jubien, Gautier and Janot, IFAC 2014; Gautier and Briot, ICRA 2011"
     confused_with = ("sensor_crosstalk", "payload_error", "sensor_saturation")
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The predicted joint torque."""
         return (Column(joint=motion.joint_torque[:, joint]),)
 
@@ -61,7 +61,7 @@ class SensorCrosstalk(Effect):
     )
     depends_on = "load"
     confused_with = ("sensor_gain", "joint_zero_offset")
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     every_payload = True
     tell_apart = "load joint {joint} and the other one after another in static poses"
 
@@ -69,7 +69,7 @@ class SensorCrosstalk(Effect):
         """All other joints."""
         return [Shape(source=k + 1) for k in range(len(setting.gear_ratio)) if k != joint]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The other joint's predicted torque."""
         return (Column(joint=motion.joint_torque[:, round(shape["source"]) - 1]),)
 
@@ -100,7 +100,7 @@ class SensorHysteresis(Effect):
     law = Law("load")
     evidence_factor = 3.0
     confused_with = ("joint_torque_delay", "sensor_ripple")
-    experiment = Experiment.REVERSAL_LADDER
+    experiment = Discriminator.REVERSAL_LADDER
     tell_apart = "load joint {joint} quasi-statically up and down over its range, twice"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -108,7 +108,7 @@ class SensorHysteresis(Effect):
         top = float(setting.torque_range[joint])
         return [Shape(width=share * top) for share in (0.03, 0.1, 0.3) if share * top > 0.1]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Minus Dahl's state along the predicted torque."""
         return (
             Column(joint=-dahl(np.ascontiguousarray(motion.joint_torque[:, joint]), shape["width"], 0.0)),
@@ -146,7 +146,7 @@ class SensorSaturation(Effect):
     law = Law("load")
     hidden = ("share",)
     confused_with = ("sensor_gain", "sensor_hysteresis")
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     tell_apart = "raise the load of joint {joint} slowly in a static pose until the reading stops"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -169,7 +169,7 @@ class SensorSaturation(Effect):
         """Of a limit read from the samples: the sharpness of an amplifier's end."""
         return {"limit": _SHARP * parameters["limit"]} if form is _Clipping.SEEN else {}
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The clipped part of the predicted torque."""
         torque = motion.joint_torque[:, joint]
         return (Column(joint=np.clip(torque, -shape["limit"], shape["limit"]) - torque),)
@@ -201,10 +201,10 @@ class SensorOffsetDrift(Drifting):
     courses = (Course.WITHIN,)
     law = Law("time")
     confused_with = ("payload_change", "joint_zero_offset")
-    experiment = Experiment.HOT_AND_COLD
+    experiment = Discriminator.HOT_AND_COLD
     tell_apart = "hold one static pose for a minute at the start, in the middle and at the end of the session"
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The drift of the zero."""
         return tuple(Column(joint=factor) for factor in self.course(motion, joint, shape))
 
@@ -234,7 +234,7 @@ class SensorRipple(Effect):
     depends_on = "position"
     law = Law("q")
     confused_with = ("gear_ripple", "cable_spring", "encoder_eccentricity")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same path of joint {joint} at two constant speeds below 0.1 rad/s and with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -247,7 +247,7 @@ class SensorRipple(Effect):
         """The angle of the joint or of the motor."""
         return "motor angle" if parameters.get("ratio", 1.0) > _MOTOR_TURNS else "position"
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Cosine and sine."""
         angle = shape["cycles_per_turn"] * shape["ratio"] * motion.q[:, joint]
         return Column(joint=np.cos(angle)), Column(joint=np.sin(angle))
@@ -272,7 +272,7 @@ class _Delay(Effect):
     depends_on = "velocity"
     hidden = ("share",)
     whole_arm = True
-    experiment = Experiment.CHIRP
+    experiment = Discriminator.CHIRP
     tell_apart = "a 1 to 15 Hz chirp of one joint"
     parameters = (
         Parameter("share", "1", "late share of the torque", low=0.5, high=1.5, share=True),
@@ -284,7 +284,7 @@ class _Delay(Effect):
         """From a millisecond to thirty, late and early."""
         return [Shape(delay=sign * delay) for delay in self.grid_s for sign in (1.0, -1.0)]
 
-    def late(self, motion: Motion, torque: Floats, delay: float) -> Floats:
+    def late(self, motion: ArmMotion, torque: Floats, delay: float) -> Floats:
         """Torque (N, n) of `delay` before, minus that of now."""
         before = motion.time - delay
         return np.column_stack([np.interp(before, motion.time, column) for column in torque.T]) - torque
@@ -322,7 +322,7 @@ class MotorTorqueDelay(_Delay):
     # Close enough for friction's reversals to overlap.
     grid_s = (0.001, 0.002, 0.004, 0.007, 0.011, 0.015, 0.021, 0.03)
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Earlier minus present predicted torque, in all motor rows.
 
         Coulomb friction is in it for a delay longer than the friction's reversal. A shorter delay looks like another
@@ -342,7 +342,7 @@ class JointTorqueDelay(_Delay):
     confused_with = ("sensor_hysteresis", "joint_elasticity")
     grid_s = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Earlier minus present predicted torque without the jumps at reversals, in all joint rows."""
         return (Column(joint=self.late(motion, motion.smooth_torque("joint"), shape["delay"])),)
 
@@ -359,14 +359,14 @@ class LostSamples(Effect):
     depends_on = "time"
     whole_arm = True
     counted = True
-    experiment = Experiment.REPEATED_RUN
+    experiment = Discriminator.REPEATED_RUN
     tell_apart = "record at rest for ten seconds and look at the counter and at repeated values"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """None: seen in the channels, not in residuals."""
         return []
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """No torque of its own."""
         return (Column(motor=np.zeros_like(motion.q), joint=np.zeros_like(motion.q)),)
 

@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ident.effects.effect import Effect, Form, FormName, Parameter, Parameters, Setting, Shape
-from ident.effects.motion import Floats, Motion, first_order
+from ident.effects.motion import ArmMotion, Floats, first_order
 from ident.effects.words import Values, quantity
 
 TIME_CONSTANT = (
@@ -72,7 +72,7 @@ class Drifting(Effect):
         """Within a session or between sessions."""
         return "within" if shape.form in (Course.WITHIN, Course.HEATED) else "between"
 
-    def course(self, motion: Motion, joint: int, shape: Shape) -> tuple[Floats, ...]:
+    def course(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
         if shape.form is Course.HEATED:
             friction = motion.drive_friction[:, joint]

@@ -10,8 +10,8 @@ import numpy as np
 from ident.effects.course import TIME_CONSTANT, Course, Drifting
 from ident.effects.effect import (
     Column,
+    Discriminator,
     Effect,
-    Experiment,
     Form,
     Law,
     Loads,
@@ -22,7 +22,7 @@ from ident.effects.effect import (
     Shape,
     Simulated,
 )
-from ident.effects.motion import Floats, Motion, dahl
+from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 
 
@@ -50,7 +50,7 @@ class PreslidingHysteresis(Effect):
     depends_on = "velocity"
     evidence_factor = 2.0
     confused_with = ("stribeck", "backlash", "motor_torque_delay")
-    experiment = Experiment.REVERSAL_LADDER
+    experiment = Discriminator.REVERSAL_LADDER
     tell_apart = "reversals of joint {joint} at three accelerations and amplitudes (0.5, 2 and 10 mrad)"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -59,7 +59,7 @@ class PreslidingHysteresis(Effect):
         least = 0.0 if setting.presliding is None else 10.0 * float(setting.presliding[joint])
         return [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Dahl's state less sign(v) in the motor torque."""
         speed = motion.motor_speed[:, joint]
         path = np.cumsum(speed) * motion.dt
@@ -91,7 +91,7 @@ class Stribeck(Effect):
     law = Law("qd")
     beside_companions = True
     confused_with = ("viscous_nonlinear", "presliding_hysteresis", "friction_load")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "a slow constant-velocity sweep of joint {joint} through 0.01 to 0.2 rad/s"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -99,13 +99,13 @@ class Stribeck(Effect):
         speeds = [v for v in (0.01, 0.02, 0.04, 0.08, 0.16, 0.3) if v < setting.speed_range[joint]]
         return [Shape(velocity=v, exponent=e) for e in (1.0, 2.0) for v in speeds]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) exp(-(|v| / velocity)^exponent) in the motor torque."""
         speed = motion.motor_speed[:, joint]
         fall = np.exp(-((np.abs(speed) / shape["velocity"]) ** shape.get("exponent", 1.0)))
         return (Column(motor=motion.direction[:, joint] * fall),)
 
-    def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
+    def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """Bristles with a higher load at low speed are no stiffer: they bend further before they slip."""
         turning = PreslidingHysteresis()
         shapes = turning.shapes(setting, joint)
@@ -136,14 +136,14 @@ class ViscousNonlinear(Effect):
     depends_on = "velocity"
     law = Law("qd")
     confused_with = ("stribeck", "friction_temperature")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "a staircase of constant speeds of joint {joint} up to its limit, in random order"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """Powers below and above one."""
         return [Shape(exponent=p) for p in (0.4, 0.6, 0.8, 1.25, 1.6, 2.0, 3.0)]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) |v|^exponent in the motor torque."""
         speed = motion.motor_speed[:, joint]
         return (Column(motor=np.sign(speed) * np.abs(speed) ** shape["exponent"]),)
@@ -196,14 +196,14 @@ class FrictionAsymmetry(Effect):
     depends_on = "velocity"
     law = Law("qd")
     confused_with = ("friction_position", "motor_torque_gain")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same constant-speed sweep of joint {joint} both ways, twice"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """The viscous part alone, and both."""
         return [Shape(form) for form in _Asymmetric]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """|v| in the motor torque, and a constant."""
         viscous = Column(motor=np.abs(motion.motor_speed[:, joint]))
         if shape.form is _Asymmetric.VISCOUS:
@@ -243,11 +243,11 @@ class FrictionLoad(Effect):
     depends_on = "load"
     law = Law("load", signed=True)
     confused_with = ("friction_position", "motor_torque_gain", "stribeck")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     every_payload = True
     tell_apart = "a slow back and forth of joint {joint} with gravity for and against, with two payloads"
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """|tau_l| sign(v) in the motor torque."""
         return (Column(motor=np.abs(motion.joint_torque[:, joint]) * motion.direction[:, joint]),)
 
@@ -279,10 +279,10 @@ class FrictionTemperature(Drifting):
     courses = (Course.WITHIN, Course.HEATED)
     law = Law("time", signed=True)
     confused_with = ("viscous_nonlinear", "motor_torque_gain")
-    experiment = Experiment.HOT_AND_COLD
+    experiment = Discriminator.HOT_AND_COLD
     tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The model's friction times w in the motor torque."""
         friction = motion.drive_friction[:, joint]
         return tuple(Column(motor=friction * factor) for factor in self.course(motion, joint, shape))
@@ -333,7 +333,7 @@ class FrictionPosition(Effect):
     depends_on = "position"
     law = Law("q", signed=True)
     confused_with = ("friction_load", "friction_asymmetry", "cable_spring")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = (
         "a slow sweep of joint {joint} over its whole range, both ways, in two postures of the others"
     )
@@ -349,7 +349,7 @@ class FrictionPosition(Effect):
         ]
         return [*(Shape(_Place.WAVE, cycles_per_turn=k) for k in (1, 2, 3, 4)), *spots]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) cos(k q) and sign(v) sin(k q), or sign(v) in the spot, in the motor torque."""
         sign = motion.direction[:, joint]
         return tuple(Column(motor=sign * curve) for curve in _curves(motion.q[:, joint], shape))
@@ -400,7 +400,7 @@ class GearRipple(Effect):
     depends_on = "motor angle"
     law = Law("q")
     confused_with = ("sensor_ripple", "friction_position")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same path of joint {joint} at two constant speeds below 0.1 rad/s and with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -408,7 +408,7 @@ class GearRipple(Effect):
         ratio = float(setting.gear_ratio[joint])
         return [Shape(cycles_per_turn=k, gear_ratio=ratio) for k in (1.0, 2.0)] if ratio > 1.0 else []
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Cosine and sine in the motor torque."""
         angle = shape["cycles_per_turn"] * shape["gear_ratio"] * motion.q[:, joint]
         return Column(motor=np.cos(angle)), Column(motor=np.sin(angle))
@@ -438,7 +438,7 @@ class ScaleError(Effect):
     parameters = (Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),)
     depends_on = "load"
     law = Law("load")
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     every_payload = True
     tell_apart = "static poses of joint {joint} with a weighed mass and without it"
 
@@ -462,7 +462,7 @@ class MotorTorqueGain(ScaleError):
     source = "Gautier and Briot, ICRA 2011; Jubien, Gautier and Janot, IFAC 2014"
     confused_with = ("friction_load", "sensor_gain", "friction_temperature")
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The predicted motor torque."""
         return (Column(motor=motion.motor_torque[:, joint]),)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.effects.motion import Floats, Motion
+from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
 EffectSide = Literal["motor", "joint", "sensor", "timing"]
@@ -45,7 +45,7 @@ FormName = str | Form | None
 """A form, its name in a file, or None for an effect of a single form."""
 
 
-class Experiment(StrEnum):
+class Discriminator(StrEnum):
     """Discriminating experiments: motions to decide between causes alike in the sessions at hand."""
 
     SLOW_SWEEP = "slow sweep"
@@ -287,7 +287,7 @@ class Effect(ABC):
     confused_with: ClassVar[tuple[str, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
     mean_of: ClassVar[tuple[str, ...]] = ()
-    experiment: ClassVar[Experiment]
+    experiment: ClassVar[Discriminator]
     every_payload: ClassVar[bool] = False
     tell_apart: ClassVar[str]
     simulated: ClassVar[type[Simulated]] = Simulated
@@ -302,10 +302,10 @@ class Effect(ABC):
         return [Shape()]
 
     @abstractmethod
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Columns for the joint (counted from 0) and the shape."""
 
-    def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
+    def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """Columns of side effects in a real arm, beyond the law of the cause."""
         return ()
 
@@ -415,7 +415,7 @@ class Effect(ABC):
         )
 
     def torque(
-        self, motion: Motion, joint: int, parameters: Parameters, form: FormName = None
+        self, motion: ArmMotion, joint: int, parameters: Parameters, form: FormName = None
     ) -> tuple[Floats, Floats]:
         """Torque (N, n) [Nm] of the effect in the motor torque and in the joint torque."""
         total = np.zeros((2, len(motion.time), motion.n))
@@ -427,7 +427,7 @@ class Effect(ABC):
         return total[0], total[1]
 
     def derivative(
-        self, motion: Motion, joint: int, parameters: Parameters, name: str, form: FormName = None
+        self, motion: ArmMotion, joint: int, parameters: Parameters, name: str, form: FormName = None
     ) -> tuple[Floats, Floats]:
         """Derivative (N, n) of both torques by the parameter `name`.
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from ident.effects.effect import (
     Column,
+    Discriminator,
     Effect,
-    Experiment,
     Form,
     Law,
     Loads,
@@ -23,7 +23,7 @@ from ident.effects.effect import (
     Simulated,
     both_sides,
 )
-from ident.effects.motion import Floats, Motion, dahl
+from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 from ident.rows.filters import differentiate, low_pass
@@ -98,7 +98,7 @@ class JointElasticity(_Twisting):
         Parameter("size", "rad/Nm", "of the ringing links", shape=True, low=1e-7, high=0.02, optional=True),
     )
     confused_with = ("backlash", "joint_zero_offset", "joint_torque_delay")
-    experiment = Experiment.CHIRP
+    experiment = Discriminator.CHIRP
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -117,7 +117,7 @@ class JointElasticity(_Twisting):
         more, size = float(coefficients[0]), shape.get("size")
         return super().plausible(coefficients, shape) and (size is None or 0.6 * size < more < 1.7 * size)
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
         if motion.springs is not None and shape.form is _Encoder.MOTOR:
             size = shape.get("size", _SMALL)
@@ -154,7 +154,7 @@ class Backlash(_Twisting):
         Parameter("size", "rad", "gap of the ringing links", shape=True, low=1e-5, high=0.1, optional=True),
     )
     confused_with = ("joint_elasticity", "joint_zero_offset", "presliding_hysteresis")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "a slow sweep of joint {joint} through the poses where its gravity torque is zero"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -175,7 +175,7 @@ class Backlash(_Twisting):
         gap, size = float(coefficients[0]), shape.get("size")
         return super().plausible(coefficients, shape) and (size is None or 0.5 * size < gap < 2.0 * size)
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
         size = shape.get("size", 0.0)
         if motion.springs is not None and size > 0.0 and shape.form is _Encoder.MOTOR:
@@ -189,7 +189,7 @@ class Backlash(_Twisting):
 
 
 def _deflected(
-    motion: Motion, joint: int, twist: Floats, encoder_at_motor: bool, scale: float
+    motion: ArmMotion, joint: int, twist: Floats, encoder_at_motor: bool, scale: float
 ) -> tuple[Column, ...]:
     """Column for a twist (N,) of the joint, motor minus link, by a unit coefficient [rad].
 
@@ -216,7 +216,7 @@ def _deflected(
     return (Column(motor=motion.inertia[joint] * second + friction),)
 
 
-def _alone(motion: Motion, joint: int, values: Floats) -> Floats:
+def _alone(motion: ArmMotion, joint: int, values: Floats) -> Floats:
     """Values (N,) of a joint as (N, n), zero for the others."""
     shift = np.zeros_like(motion.q)
     shift[:, joint] = values
@@ -269,7 +269,7 @@ class CableSpring(Effect):
     depends_on = "position"
     law = Law("q")
     confused_with = ("joint_zero_offset", "payload_error", "sensor_ripple", "encoder_eccentricity")
-    experiment = Experiment.SLOW_SWEEP
+    experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -292,11 +292,11 @@ class CableSpring(Effect):
             return bool(coefficients[0] + coefficients[2] >= 0.0)
         return bool(coefficients[0] >= 0.0)
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The same torque on both sides."""
         return tuple(both_sides(pull) for pull in _pulls(motion.q[:, joint], shape))
 
-    def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
+    def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """A hose rubs along the arm: Dahl's friction along the angle."""
         return (both_sides(dahl(np.ascontiguousarray(motion.q[:, joint]), _RUB_RAD, 0.0)),)
 
@@ -359,10 +359,10 @@ class BaseTilt(Effect):
     depends_on = "position"
     whole_arm = True
     confused_with = ("joint_zero_offset", "payload_error")
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     tell_apart = "static poses over a whole turn of joint 1 with the arm stretched out; a spirit level"
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Gravity torques of the sideways parts of gravity, in all rows."""
         down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
         return tuple(both_sides(motion.gravity_along(side)) for side in sideways_gravity(down, np.eye(3)[:2]))
@@ -395,12 +395,12 @@ class JointZeroOffset(Effect):
     depends_on = "position"
     confused_with = ("base_tilt", "payload_error", "cable_spring", "encoder_eccentricity", "backlash")
     mean_of = ("joint_elasticity",)
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     tell_apart = (
         "static poses with joint {joint} on both sides of its gravity-free position; a mastering gauge"
     )
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Derivative of the joint torque by the joint's position, in all rows."""
         step = np.zeros_like(motion.q)
         step[:, joint] = 1e-4
@@ -445,7 +445,7 @@ class EncoderEccentricity(Effect):
     law = Law("q")
     confused_with = ("joint_zero_offset", "cable_spring", "sensor_ripple")
     contains = ("joint_zero_offset",)
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     every_payload = True
     tell_apart = "static poses over a whole turn of joint {joint} with two payloads; a gauge at the link"
 
@@ -453,7 +453,7 @@ class EncoderEccentricity(Effect):
         """One and two cycles a turn."""
         return [Shape(cycles_per_turn=k) for k in (1, 2)]
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Change of the joint torque with the joint displaced by the error, in all rows."""
         k = shape["cycles_per_turn"]
         q, qd, qdd = (values[:, joint] for values in (motion.q, motion.qd, motion.qdd))

@@ -12,8 +12,8 @@ from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
 from ident.effects.effect import (
     Column,
+    Discriminator,
     Effect,
-    Experiment,
     Form,
     FormName,
     Loads,
@@ -25,7 +25,7 @@ from ident.effects.effect import (
     Simulated,
     both_sides,
 )
-from ident.effects.motion import Floats, Motion
+from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, quantity_text
 
 # Places among the ten inertial parameters: mass and first moments, and the six of the inertia.
@@ -35,7 +35,7 @@ _FRICTION = 0.3
 _AXES = ("moment_x", "moment_y", "moment_z")
 
 
-def _body_torque(motion: Motion, place: int) -> Floats:
+def _body_torque(motion: ArmMotion, place: int) -> Floats:
     """Torque (N, n) of a unit of an inertial parameter in the last link's frame."""
     bodies = np.zeros_like(motion.bodies)
     bodies[-1, place] = 1.0
@@ -86,7 +86,7 @@ class _Payload(Effect):
     whole_arm = True
     simulated = _Body
 
-    def companions(self, motion: Motion, joint: int, setting: Setting) -> tuple[Column, ...]:
+    def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """The inertia of the body."""
         return tuple(both_sides(_body_torque(motion, place)) for place in _INERTIA)
 
@@ -114,11 +114,11 @@ class PayloadError(_Payload):
     )
     depends_on = "position"
     confused_with = ("base_tilt", "joint_zero_offset", "sensor_gain")
-    experiment = Experiment.STATIC_POSES
+    experiment = Discriminator.STATIC_POSES
     every_payload = True
     tell_apart = "weigh the payload, and hold static poses with it and without it"
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Torque of a unit mass and unit first moments in the last link, in all rows of loaded sessions."""
         share = float(motion.loaded)
         return tuple(both_sides(share * _body_torque(motion, place)) for place in (_MASS, *_MOMENTS))
@@ -157,7 +157,7 @@ class PayloadChange(_Payload):
     event = True
     step = True
     confused_with = ("sensor_offset_drift", "contact", "payload_error")
-    experiment = Experiment.REPEATED_RUN
+    experiment = Discriminator.REPEATED_RUN
     tell_apart = "hold one static pose for a minute at the start, in the middle and at the end of the session"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -175,7 +175,7 @@ class PayloadChange(_Payload):
         near = np.linalg.norm(coefficients[:3]) <= _ARM_M * abs(mass) + _SLIP_KG_M
         return super().plausible(coefficients, shape) and bool(near)
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Torque of unit first moments and a unit mass in the last link after the time, in all loaded rows."""
         changed = round(shape["session"]) - 1
         after = np.full(len(motion.time), motion.loaded and motion.session > changed)
@@ -204,7 +204,7 @@ def slide(lean: Floats) -> Floats:
     return np.tanh(lean / _FRICTION)
 
 
-def leaning(motion: Motion) -> Floats:
+def leaning(motion: ArmMotion) -> Floats:
     """Components (N, 3) of the direction of gravity along the axes of the last link."""
     chain = motion.chain
     turned = np.broadcast_to(
@@ -245,7 +245,7 @@ class Contact(Effect):
     whole_arm = True
     event = True
     confused_with = ("cable_spring", "payload_change")
-    experiment = Experiment.REPEATED_RUN
+    experiment = Discriminator.REPEATED_RUN
     tell_apart = "repeat the motion: a contact is tied to the moment, a snagging cable to the posture"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
@@ -256,7 +256,7 @@ class Contact(Effect):
         """Middle and duration, known to a part of the duration: a real push is no half sine."""
         return {"time": _COURSE * parameters["duration"], "duration": 2.0 * _COURSE * parameters["duration"]}
 
-    def columns(self, motion: Motion, joint: int, shape: Shape) -> tuple[Column, ...]:
+    def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Minus the Jacobian's transpose times the force over time, in all rows."""
         since = motion.time - shape["time"]
         inside = (np.abs(since) <= 0.5 * shape["duration"]) & (motion.session == round(shape["session"]) - 1)

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ArmMotion:
     """Motion of n joints at N samples and its torques as predicted by the present model.
 
     chain : the arm. bodies : (n, 10) inertial parameters of the links, the payload in the last one.

@@ -23,7 +23,7 @@ from lwr_driver.session import SessionWriter, session_metadata
 
 
 @dataclass
-class Recording:
+class ImportedRecording:
     """The files of a recording, each read once.
 
     source : a file, or the folder of the files named in the mapping.
@@ -283,7 +283,7 @@ def import_log(
     source = Path(source)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder; give the recording of the mapping")
-    recording = Recording(source, mapping.delimiter, mapping.header)
+    recording = ImportedRecording(source, mapping.delimiter, mapping.header)
     total, channels = _read(mapping, recording, rows)
     joint = channels["position"]
     digest = hashlib.sha256(
@@ -344,7 +344,7 @@ def import_log(
 
 
 def _read(
-    mapping: LogMapping, recording: Recording, rows: tuple[int, int] | None
+    mapping: LogMapping, recording: ImportedRecording, rows: tuple[int, int] | None
 ) -> tuple[int, dict[str, _Channel]]:
     """Rows of the recording, and every channel converted to joint side and SI."""
     joints = len(mapping.joints)
@@ -373,7 +373,7 @@ def _read(
     return total, channels
 
 
-def _clock(base: TimeBase, signal: Signal, recording: Recording, count: int, place: str) -> Floats:
+def _clock(base: TimeBase, signal: Signal, recording: ImportedRecording, count: int, place: str) -> Floats:
     """Times of the samples (n,) [s] by the source's clock."""
     if base.column is None:
         assert base.rate_hz is not None

@@ -17,7 +17,7 @@ from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
 from ident.dynamics.structure import Condition, ModelStructure, Side
 from ident.dynamics.tables import Tabular
 from ident.effects import check_entry, effects_torque
-from ident.effects.motion import Motion
+from ident.effects.motion import ArmMotion
 
 Projection = Callable[["DynamicModel", Floats], Floats]
 """From a model and its nearest standard parameters (n_columns,) to consistent ones with the same torque."""
@@ -228,7 +228,7 @@ class DynamicModel(Tabular):
         linear: Mapping[str, Floats],
         payload: str | None,
         time: Floats,
-    ) -> Motion:
+    ) -> ArmMotion:
         """The motion as the effects see it. linear : torque (N, n) of the linear model by side."""
         chain, drive = self.structure.chain, self.drive()
         bodies = self.inertial(payload)
@@ -240,7 +240,7 @@ class DynamicModel(Tabular):
         def friction(speed: Floats) -> Floats:
             return drive["Fvm"] * speed + drive["Fcm"] * np.sign(speed)
 
-        return Motion(
+        return ArmMotion(
             chain=chain,
             bodies=bodies,
             session=1,

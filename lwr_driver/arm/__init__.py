@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from lwr_driver.arm.description import JOINTS, Arm, Limits, LinkFrames, LinkInertia, link_inertias
+from lwr_driver.arm.description import JOINTS, Arm, ArmLimits, LinkFrames, LinkInertia, link_inertias
 
 if TYPE_CHECKING:
     from lwr_driver.arm.cell import Box, Cell, PayloadShape
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 __all__ = [
     "JOINTS",
     "Arm",
+    "ArmLimits",
     "Box",
     "Cell",
     "Clearance",
     "CollisionChecker",
-    "Limits",
     "LinkFrames",
     "LinkInertia",
     "PayloadShape",

@@ -73,7 +73,7 @@ class _ArmFile:
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class ArmLimits:
     """Limits of every command, each (7,) float64.
 
     q_low, q_high [rad]; v_max [rad/s]; a_max [rad/s²]; j_max [rad/s³]
@@ -163,9 +163,9 @@ class Arm:
         return self.q_max - self.margin
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ArmLimits:
         """Limits of every command: positions within the margin, the rest unchanged."""
-        return Limits(self.q_low, self.q_high, self.v_max, self.a_max, self.j_max)
+        return ArmLimits(self.q_low, self.q_high, self.v_max, self.a_max, self.j_max)
 
     @classmethod
     def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:

@@ -114,7 +114,7 @@ def record_sets(
     from fri.errors import OperatorError, RobotError
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
-    from runner.experiment import Progress, Run
+    from runner.experiment import ExperimentProgress, Run
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
     from runner.terminal import StatusLine
@@ -128,7 +128,7 @@ def record_sets(
         place = folder / f"set_{number + 1}"
         place.mkdir(parents=True, exist_ok=True)
         if not (place / "progress.json").is_file():
-            Progress.create(place, experiment.folder)
+            ExperimentProgress.create(place, experiment.folder)
         status.say(f"set {number + 1} of {sets}")
         one = _of_set(experiment, number)
         laboratory = Laboratory(

@@ -16,7 +16,7 @@ from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from runner.diagnosis.after_run import conclude_run
-from runner.experiment import Bench, Progress, Record, Run
+from runner.experiment import Bench, ExperimentProgress, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import Laboratory
 from runner.planning import PLAN, Excitations
@@ -132,7 +132,9 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
             )
         if not (resume / COPY).is_file():
             raise ConfigurationError(f"{resume} holds no {COPY}; name the folder of an aborted experiment")
-        return Experiment.load((resume / COPY).resolve(), beside=Progress.load(resume).origin), resume
+        return Experiment.load(
+            (resume / COPY).resolve(), beside=ExperimentProgress.load(resume).origin
+        ), resume
     experiment = Experiment.load(file if file is not None else DEFAULT)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out if out is not None else Path("experiments") / f"{experiment.name}-{stamp}"
@@ -141,7 +143,7 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
     try:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(experiment.source, folder / COPY)
-        Progress.create(folder, experiment.folder)
+        ExperimentProgress.create(folder, experiment.folder)
     except OSError as error:
         raise ConfigurationError(
             f"{folder} cannot be written: {error.strerror}; choose another --out"

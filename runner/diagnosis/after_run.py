@@ -27,7 +27,7 @@ from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
 from runner.diagnosis.discriminating import Discriminating, offers, open_findings
 from runner.diagnosis.study import DIAGNOSIS, Study, study
-from runner.experiment import Bench, Progress, Record, Run
+from runner.experiment import Bench, ExperimentProgress, Record, Run
 from runner.experiment_file import Experiment, SessionPlan
 from runner.planning import Excitations, excitation_rows
 
@@ -179,7 +179,7 @@ def _decided(
     place.mkdir(parents=True, exist_ok=True)
     deciding = _with_sessions(experiment, first.offers)
     if not (place / "progress.json").is_file():
-        Progress.create(place, experiment.folder)
+        ExperimentProgress.create(place, experiment.folder)
     plans = {session.name: offer.plan for offer in first.offers for session in offer.sessions}
 
     def rows(session: SessionPlan, period_s: float) -> Motion:

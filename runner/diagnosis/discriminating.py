@@ -19,7 +19,7 @@ from ident.diagnosis.signatures import overlap, signature_bench, signatures
 from ident.diagnosis.statements import SURE, is_open
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS
-from ident.effects import Experiment as Kind
+from ident.effects import Discriminator as Kind
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import ParametricMotion
 from ident.model import DynamicModel

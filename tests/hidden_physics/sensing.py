@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from sim_backend.plant import Effect, Plant, Reading
+from sim_backend.plant import Plant, PlantEffect, Reading
 from tests.hidden_physics.traits import JOINTS
 
 __all__ = ["FAULTS", "SensorChain"]
@@ -102,7 +102,7 @@ def _chain(
     _late(torque, rows, place, f[LATE] * 1000.0)
 
 
-class SensorChain(Effect):
+class SensorChain(PlantEffect):
     """An effect on the readings alone.
 
     faults : values by fault and joint number. leak : "i": {"j": share}, of torque j that sensor i shows

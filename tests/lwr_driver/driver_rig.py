@@ -17,7 +17,7 @@ from fri.krl import Interpreter
 from fri.packets import CMD, CMD_SIZE
 from fri.policy import KrcLimits, KrcPolicy
 from fri.states import State
-from lwr_driver.arm import Arm, Limits
+from lwr_driver.arm import Arm, ArmLimits
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion
@@ -35,7 +35,7 @@ def arm() -> Arm:
     return Arm.load()
 
 
-def excesses(rows: NDArray[np.float64], times: NDArray[np.float64], limits: Limits) -> list[str]:
+def excesses(rows: NDArray[np.float64], times: NDArray[np.float64], limits: ArmLimits) -> list[str]:
     """Which limits the values `rows` (n, 7), commanded at `times` [s] after rest at the first, break.
 
     Plain divided differences of the values as they arrived, with the worst that rounding to float32 can do.
@@ -69,7 +69,7 @@ class Arrived:
     rows: list[NDArray[np.float64]] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
 
-    def excesses(self, limits: Limits, period_s: float) -> list[str]:
+    def excesses(self, limits: ArmLimits, period_s: float) -> list[str]:
         found: list[str] = []
         for first, end in itertools.pairwise([*self.begins, len(self.rows)]):
             if end > first:

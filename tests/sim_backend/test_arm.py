@@ -6,7 +6,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from sim_backend.configuration import load_configuration
-from sim_backend.plant import Effect, Plant
+from sim_backend.plant import Plant, PlantEffect
 from sim_backend.robot import Payload, chain, robot_file, truth, with_inertias
 from tests.sim_backend import arms
 
@@ -97,7 +97,7 @@ def test_default_arm_meets_the_plant_protocol():
     assert isinstance(arms.lwr(), Plant)
 
 
-class Spring(Effect):
+class Spring(PlantEffect):
     """Cable on the link side, gravity-like pull on the motor side, doubled friction, a gain on the joint
     torque.
     """
@@ -125,7 +125,7 @@ def test_effects_act_on_both_sides_and_on_friction():
 
 
 def test_motor_side_effect_is_equivalent_to_motor_torque():
-    class Push(Effect):
+    class Push(PlantEffect):
         def load(self, time_s, plant, loads):
             loads.motor_torque += 20.0
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.commission import delay_std, with_far_presliding
-from ident.diagnosis.nominal import Arm
+from ident.diagnosis.nominal import NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
@@ -28,8 +28,8 @@ def model(chain: Chain) -> DynamicModel:
 
 
 @pytest.fixture
-def arm(chain: Chain) -> Arm:
-    return Arm(chain, np.zeros(3), np.ones(3), presliding=np.full(3, 2e-4))
+def arm(chain: Chain) -> NominalArm:
+    return NominalArm(chain, np.zeros(3), np.ones(3), presliding=np.full(3, 2e-4))
 
 
 def days(rng: np.random.Generator, mean: float, scatter: float, count: int) -> list[np.ndarray]:
@@ -39,7 +39,7 @@ def days(rng: np.random.Generator, mean: float, scatter: float, count: int) -> l
     ]
 
 
-def test_slow_friction_that_the_sets_agree_on_belongs_to_the_arm(arm: Arm) -> None:
+def test_slow_friction_that_the_sets_agree_on_belongs_to_the_arm(arm: NominalArm) -> None:
     found = with_far_presliding(arm, days(np.random.default_rng(1), 0.1, 0.02, 8), [np.full(3, 4.0)] * 8)
     assert found.far_share is not None
     assert found.far is not None
@@ -47,7 +47,7 @@ def test_slow_friction_that_the_sets_agree_on_belongs_to_the_arm(arm: Arm) -> No
     assert np.all(found.far > 3.0 * 2e-4)
 
 
-def test_slow_friction_that_comes_and_goes_does_not(arm: Arm) -> None:
+def test_slow_friction_that_comes_and_goes_does_not(arm: NominalArm) -> None:
     coulomb = [np.full(3, 4.0)] * 8
     found = with_far_presliding(arm, days(np.random.default_rng(2), 0.0, 0.2, 8), coulomb)
     against = with_far_presliding(arm, days(np.random.default_rng(2), -0.1, 0.02, 8), coulomb)
@@ -57,7 +57,7 @@ def test_slow_friction_that_comes_and_goes_does_not(arm: Arm) -> None:
     assert with_far_presliding(arm, days(np.random.default_rng(3), 0.1, 0.0, 2), coulomb[:2]) is arm
 
 
-def test_friction_turns_partly_within_the_longer_distance(arm: Arm) -> None:
+def test_friction_turns_partly_within_the_longer_distance(arm: NominalArm) -> None:
     both = replace(arm, far=np.full(3, 1e-2), far_share=np.full(3, 0.3))
     speed = np.repeat(np.where(np.arange(2000) < 1000, 0.1, -0.1)[:, None], 3, axis=1)
     slip = both.slip(speed, 1e-3)

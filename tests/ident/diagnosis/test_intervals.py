@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ident.diagnosis.bench import Bench
+from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.intervals import estimated, phases_of
 from ident.diagnosis.signatures import signature_bench
@@ -17,7 +17,7 @@ AMPLITUDE, VELOCITY = 0.4, 0.15
 
 
 @pytest.fixture(scope="module")
-def bench(make: Callable[..., Session], chain: Chain) -> Bench:
+def bench(make: Callable[..., Session], chain: Chain) -> DiagnosisBench:
     def stribeck(s: dict[str, np.ndarray]) -> None:
         v = s["qd"][:, 1]
         s["motor"][:, 1] += AMPLITUDE * np.sign(v) * np.exp(-np.abs(v) / VELOCITY)
@@ -25,7 +25,7 @@ def bench(make: Callable[..., Session], chain: Chain) -> Bench:
     return signature_bench([make("a.mcap", 1, stribeck), make("b.mcap", 2, stribeck, 1)], chain)
 
 
-def trial(bench: Bench, velocity: float) -> Trial:
+def trial(bench: DiagnosisBench, velocity: float) -> Trial:
     candidate = Candidate(EFFECTS["stribeck"], 1)
     found = bench.dictionary.trial(candidate, Shape(velocity=velocity, exponent=1.0))
     assert found is not None
@@ -33,7 +33,7 @@ def trial(bench: Bench, velocity: float) -> Trial:
 
 
 @pytest.mark.parametrize("begin", [0.13, 0.17])
-def test_values_are_those_of_all_parameters_at_a_time(bench: Bench, begin: float) -> None:
+def test_values_are_those_of_all_parameters_at_a_time(bench: DiagnosisBench, begin: float) -> None:
     before = list(bench.evidence.extra)
     values, deviations = estimated(bench.dictionary, bench.evidence, trial(bench, begin))
     assert abs(values["velocity"] - VELOCITY) < min(2.0 * deviations["velocity"], 0.04)
@@ -43,12 +43,12 @@ def test_values_are_those_of_all_parameters_at_a_time(bench: Bench, begin: float
     assert bench.evidence.extra == before
 
 
-def test_far_from_the_best_shape_no_step_is_made(bench: Bench) -> None:
+def test_far_from_the_best_shape_no_step_is_made(bench: DiagnosisBench) -> None:
     values, _ = estimated(bench.dictionary, bench.evidence, trial(bench, 0.02))
     assert values["velocity"] == 0.02
 
 
-def test_phases_repeat_with_the_motion(bench: Bench) -> None:
+def test_phases_repeat_with_the_motion(bench: DiagnosisBench) -> None:
     phases = phases_of(bench.evidence)
     counts = np.bincount(phases)
     assert len(counts) < 0.65 * len(phases)
@@ -57,7 +57,7 @@ def test_phases_repeat_with_the_motion(bench: Bench) -> None:
     assert not sessions[0] & sessions[1]
 
 
-def test_a_law_that_is_coarse_says_so(bench: Bench) -> None:
+def test_a_law_that_is_coarse_says_so(bench: DiagnosisBench) -> None:
     contact = EFFECTS["contact"]
     shape = Shape(time=8.0, duration=1.5, session=1.0, link=3.0)
     found = bench.dictionary.trial(Candidate(contact, -1), shape)

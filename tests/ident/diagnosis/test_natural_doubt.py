@@ -10,7 +10,7 @@ import pytest
 
 from ident.diagnosis import Diagnosis, diagnose
 from ident.dynamics.kinematics import Chain
-from ident.effects import Experiment
+from ident.effects import Discriminator
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
 from lwr_driver.session import Session
@@ -29,7 +29,7 @@ def of_joint_2(name: str, path: Sequence[float], chain: Chain) -> Discriminating
     whole = round((points.shape[1] - 1) * STEP_S / 0.12) * 0.12
     return Discriminating(
         name,
-        Experiment.SLOW_SWEEP,
+        Discriminator.SLOW_SWEEP,
         2,
         ExcitationPlan(SplineMotion(whole, points), chain.joint_names, 1),
         (None,),

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.diagnosis.nominal import Arm
+from ident.diagnosis.nominal import NominalArm
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Setting
 
@@ -16,7 +16,7 @@ def speed() -> np.ndarray:
 
 
 def test_friction_turns_within_the_reach_and_at_once_without_one(chain: Chain) -> None:
-    arm = Arm(chain, np.zeros(3), np.ones(3), presliding=np.array([0.0, 1e-3, 1e-2]))
+    arm = NominalArm(chain, np.zeros(3), np.ones(3), presliding=np.array([0.0, 1e-3, 1e-2]))
     slip = arm.slip(speed(), DT)
     np.testing.assert_array_equal(slip[:, 0], np.sign(speed()[:, 0]))
     # One reach after the reversal, 63 % of the way from 1 to -1 are done.

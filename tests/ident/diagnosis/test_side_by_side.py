@@ -14,7 +14,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.look_alikes import LookAlikes
 from ident.diagnosis.statements import comparison
 from ident.dynamics.kinematics import Chain
-from ident.effects import Experiment
+from ident.effects import Discriminator
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import SplineMotion
 from lwr_driver.session import Session
@@ -68,7 +68,9 @@ def test_what_a_motion_will_tell_is_foreseen(found: Study) -> None:
     # Slowly over a wide range, which the session does not cover.
     points[2] = 2.6 * np.sin(4.0 * np.pi * share) * np.minimum(1.0, 20.0 * np.minimum(share, 1.0 - share))
     plan = ExcitationPlan(SplineMotion(24.0, points), NAMES, 1)
-    sweep = Discriminating("slow_sweep_3", Experiment.SLOW_SWEEP, 3, plan, (None,), (pair.first, pair.second))
+    sweep = Discriminating(
+        "slow_sweep_3", Discriminator.SLOW_SWEEP, 3, plan, (None,), (pair.first, pair.second)
+    )
     again = found.with_offers([sweep]).pairs
     seen = again[0].foreseen
     assert seen is not None

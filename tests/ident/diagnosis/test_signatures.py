@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
-from ident.diagnosis.bench import Bench
+from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.signatures import overlap, signature_bench, signatures
 from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
@@ -15,7 +15,7 @@ Make = Callable[..., Session]
 
 
 @pytest.fixture(scope="module")
-def bench(make: Make, chain: Chain) -> Bench:
+def bench(make: Make, chain: Chain) -> DiagnosisBench:
     def cable(s: dict[str, np.ndarray]) -> None:
         s["motor"][:, 2] += 0.1 * s["q"][:, 2] ** 3
         s["joint"][:, 2] += 0.1 * s["q"][:, 2] ** 3
@@ -23,7 +23,7 @@ def bench(make: Make, chain: Chain) -> Bench:
     return signature_bench([make("a.mcap", 1, cable), make("b.mcap", 2, cable, 1)], chain)
 
 
-def test_signature_is_the_torque_of_the_cause_that_the_data_fit(bench: Bench) -> None:
+def test_signature_is_the_torque_of_the_cause_that_the_data_fit(bench: DiagnosisBench) -> None:
     (cable,) = signatures(bench, [("cable_spring", (3,))])
     assert cable.joints == (3,)
     assert cable.form is not None
@@ -36,7 +36,7 @@ def test_signature_is_the_torque_of_the_cause_that_the_data_fit(bench: Bench) ->
         assert not np.any(cable.torque[side][:, :2])
 
 
-def test_nothing_is_left_of_what_base_parameters_imitate(bench: Bench) -> None:
+def test_nothing_is_left_of_what_base_parameters_imitate(bench: DiagnosisBench) -> None:
     mass = {"mass": 0.3, "moment_x": 0.03, "moment_y": 0.0, "moment_z": 0.0}
     (payload,) = signatures(bench, [("payload_error", ())], parameters=[mass])
     assert np.abs(payload.torque["joint"]).max() > 0.3
@@ -44,7 +44,7 @@ def test_nothing_is_left_of_what_base_parameters_imitate(bench: Bench) -> None:
     assert np.nanmax(np.abs(payload.left["joint"])) < 1e-3
 
 
-def test_left_is_orthogonal_to_the_base(bench: Bench) -> None:
+def test_left_is_orthogonal_to_the_base(bench: DiagnosisBench) -> None:
     (stribeck,) = signatures(bench, [("stribeck", (2,))])
     rows, evidence = bench.nominal.rows["motor"], bench.evidence
     used = np.isfinite(stribeck.left["motor"][:, 1])
@@ -55,7 +55,7 @@ def test_left_is_orthogonal_to_the_base(bench: Bench) -> None:
     assert np.all(np.abs(moment[alone]) < 1e-5 * whole[alone])
 
 
-def test_look_alikes_overlap_and_strangers_do_not(bench: Bench) -> None:
+def test_look_alikes_overlap_and_strangers_do_not(bench: DiagnosisBench) -> None:
     names = [
         ("stribeck", (2,)),
         ("viscous_nonlinear", (2,)),
@@ -71,7 +71,7 @@ def test_look_alikes_overlap_and_strangers_do_not(bench: Bench) -> None:
     assert overlap(stribeck, stranger) < 0.2
 
 
-def test_what_has_no_signature_is_an_error(bench: Bench, make: Make, chain: Chain) -> None:
+def test_what_has_no_signature_is_an_error(bench: DiagnosisBench, make: Make, chain: Chain) -> None:
     with pytest.raises(DataError, match="lost_samples leaves no torque"):
         signatures(bench, [("lost_samples", ())])
     with pytest.raises(ConfigurationError, match="did you mean"):

@@ -8,7 +8,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.effects import EFFECTS, Motion, Setting, Shape, check_entry, find_effect
+from ident.effects import EFFECTS, ArmMotion, Setting, Shape, check_entry, find_effect
 from ident.effects.load import leaning, slide
 from ident.effects.motion import dahl
 
@@ -49,7 +49,7 @@ CONTACT = {"time": 0.5, "duration": 0.5, "session": 1.0, "link": 3.0}
 
 
 @pytest.fixture(scope="module")
-def motion(chain: Chain, bodies: np.ndarray) -> Motion:
+def motion(chain: Chain, bodies: np.ndarray) -> ArmMotion:
     time = np.arange(0.0, 4.0, 0.002)
     w = 2.0 * np.pi / 2.0 * np.array([1.0, 1.5, 2.0])
     phase = np.array([0.3, 1.0, 2.0])
@@ -59,7 +59,7 @@ def motion(chain: Chain, bodies: np.ndarray) -> Motion:
     from ident.dynamics.regressor import torque
 
     joint = torque(chain, q, qd, qdd, bodies)
-    return Motion(
+    return ArmMotion(
         chain=chain,
         bodies=bodies,
         session=0,
@@ -97,7 +97,7 @@ def test_causes_and_sides_are_those_of_the_table() -> None:
 
 
 @pytest.mark.parametrize("cause", sorted(EFFECTS))
-def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: Motion) -> None:
+def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: ArmMotion) -> None:
     effect = EFFECTS[cause]
     for shape in shapes(cause)[:3]:
         columns = effect.columns(motion, 1, shape)
@@ -120,17 +120,17 @@ def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: Motion
         np.testing.assert_allclose(motor, expected, atol=1e-12)
 
 
-def test_sensor_causes_leave_the_motor_torque_alone(motion: Motion) -> None:
+def test_sensor_causes_leave_the_motor_torque_alone(motion: ArmMotion) -> None:
     for cause in TABLE["sensor"]:
         assert all(c.motor is None for c in EFFECTS[cause].columns(motion, 1, shapes(cause)[0]))
 
 
-def test_motor_causes_leave_the_joint_torque_alone(motion: Motion) -> None:
+def test_motor_causes_leave_the_joint_torque_alone(motion: ArmMotion) -> None:
     for cause in TABLE["motor"]:
         assert all(c.joint is None for c in EFFECTS[cause].columns(motion, 1, shapes(cause)[0]))
 
 
-def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: Motion) -> None:
+def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: ArmMotion) -> None:
     (column,) = EFFECTS["joint_zero_offset"].columns(motion, 1, Shape())
     shift = np.array([0.0, 1e-3, 0.0])
     expected = motion.rigid_torque(motion.q + shift, motion.qd, motion.qdd) - motion.joint_torque
@@ -138,7 +138,7 @@ def test_zero_offset_column_is_the_torque_of_a_shifted_joint(motion: Motion) -> 
     np.testing.assert_allclose(1e-3 * column.joint, expected, atol=1e-4)
 
 
-def test_tilt_column_is_gravity_of_a_tilted_base(motion: Motion) -> None:
+def test_tilt_column_is_gravity_of_a_tilted_base(motion: ArmMotion) -> None:
 
     from ident.dynamics.regressor import gravity_torque
 
@@ -202,7 +202,7 @@ def test_a_payload_does_not_come_loose_metres_from_the_flange() -> None:
     ],
 )
 def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
-    motion: Motion, stated: dict[str, float], pulls: str
+    motion: ArmMotion, stated: dict[str, float], pulls: str
 ) -> None:
     """Hardening about 0.3 rad, less the torque at zero, which no motion tells from an offset; and play about 0.1."""
     effect = EFFECTS["cable_spring"]
@@ -223,7 +223,7 @@ def test_a_hose_pulls_in_the_rows_as_in_a_simulation(
         assert loads.link_torque[1] == pytest.approx(-wanted[row], abs=1e-9)
 
 
-def test_a_rough_spot_grips_in_the_rows_as_in_a_simulation(motion: Motion) -> None:
+def test_a_rough_spot_grips_in_the_rows_as_in_a_simulation(motion: ArmMotion) -> None:
     effect = EFFECTS["friction_position"]
     spot = {"cosine": 0.6, "centre": 0.2, "half_width": 0.3}
     grip = motion.direction[:, 1] * effect.torque(motion, 1, spot, "spot")[0][:, 1]
@@ -254,7 +254,7 @@ def test_viscous_friction_rises_from_standstill_on() -> None:
     assert not thinning(np.array([-2.0]), Shape(exponent=0.4))
 
 
-def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
+def test_loose_payload_lies_where_gravity_pulls_it(motion: ArmMotion) -> None:
     lean = leaning(motion)
     pose = motion.chain.forward(motion.q[7])[-1][:3, :3]
     down = motion.chain.gravity / np.linalg.norm(motion.chain.gravity)
@@ -271,7 +271,7 @@ def test_loose_payload_lies_where_gravity_pulls_it(motion: Motion) -> None:
         np.testing.assert_allclose(one.joint, slide(lean)[:, axis, None] * other.joint)
 
 
-def test_drive_warms_up_by_the_power_of_its_friction(motion: Motion) -> None:
+def test_drive_warms_up_by_the_power_of_its_friction(motion: ArmMotion) -> None:
     effect = EFFECTS["friction_temperature"]
 
     def at(speed: float, form: str) -> np.ndarray:

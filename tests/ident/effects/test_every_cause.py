@@ -19,9 +19,9 @@ from ident.dynamics.kinematics import Chain
 from ident.effects import (
     DELAYS,
     EFFECTS,
+    ArmMotion,
     Effect,
     Form,
-    Motion,
     Setting,
     Shape,
     check_entry,
@@ -55,7 +55,7 @@ FORMS = [
 
 
 @pytest.fixture(scope="module")
-def motion() -> Motion:
+def motion() -> ArmMotion:
     """All joints of the LWR4+ in motion, with drives of viscous and Coulomb friction and no inertia."""
     chain = Chain.from_urdf(str(URDF))
     time = np.arange(0.0, 4.0, DT)
@@ -73,7 +73,7 @@ def motion() -> Motion:
     def friction(speed: np.ndarray) -> np.ndarray:
         return VISCOUS * speed + COULOMB * np.sign(speed)
 
-    return Motion(
+    return ArmMotion(
         chain=chain,
         bodies=bodies,
         session=1,
@@ -94,7 +94,7 @@ def motion() -> Motion:
     )
 
 
-def setting(motion: Motion, encoder: str | None = None) -> Setting:
+def setting(motion: ArmMotion, encoder: str | None = None) -> Setting:
     return Setting(
         sessions=2,
         durations_s=(4.0, 4.0),
@@ -109,7 +109,7 @@ def setting(motion: Motion, encoder: str | None = None) -> Setting:
     )
 
 
-def stated(effect: Effect, form: Form | None, motion: Motion) -> dict[str, float]:
+def stated(effect: Effect, form: Form | None, motion: ArmMotion) -> dict[str, float]:
     """Values of all parameters of a form: a shape of its grid, coefficients of a sensible size."""
     for_all = [*effect.shapes(setting(motion), JOINT), *effect.shapes(setting(motion, "link"), JOINT)]
     shapes = [shape for shape in for_all if shape.form is form]
@@ -125,7 +125,7 @@ def stated(effect: Effect, form: Form | None, motion: Motion) -> dict[str, float
 
 
 def simulated(
-    effect: Effect, form: Form | None, motion: Motion, values: dict[str, float]
+    effect: Effect, form: Form | None, motion: ArmMotion, values: dict[str, float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motor torque and joint torque (N, n) that a simulation of the effect adds to those of the motion."""
     part = effect.simulate(JOINT, values, form)
@@ -182,7 +182,7 @@ def simulated(
 
 @pytest.mark.parametrize(("effect", "form"), FORMS)
 def test_the_torque_of_the_rows_is_that_of_the_simulation(
-    effect: Effect, form: Form | None, motion: Motion
+    effect: Effect, form: Form | None, motion: ArmMotion
 ) -> None:
     values = stated(effect, form, motion)
     rows = effect.torque(motion, JOINT, values, form)
@@ -200,7 +200,9 @@ def test_the_torque_of_the_rows_is_that_of_the_simulation(
 
 
 @pytest.mark.parametrize(("effect", "form"), FORMS)
-def test_the_derivative_is_the_slope_of_the_torque(effect: Effect, form: Form | None, motion: Motion) -> None:
+def test_the_derivative_is_the_slope_of_the_torque(
+    effect: Effect, form: Form | None, motion: ArmMotion
+) -> None:
     values = stated(effect, form, motion)
     # What sets in at a time moves by whole samples.
     shape = () if effect.step else effect.continuous(effect.shape_of(values, form))
@@ -221,7 +223,7 @@ def test_the_derivative_is_the_slope_of_the_torque(effect: Effect, form: Form | 
 
 @pytest.mark.parametrize(("effect", "form"), FORMS)
 def test_an_entry_of_a_model_is_read_as_it_was_written(
-    effect: Effect, form: Form | None, motion: Motion
+    effect: Effect, form: Form | None, motion: ArmMotion
 ) -> None:
     values = stated(effect, form, motion)
     entry: dict[str, Any] = {
@@ -250,7 +252,7 @@ def test_an_entry_of_a_model_is_read_as_it_was_written(
 
 
 @pytest.mark.parametrize(("effect", "form"), FORMS)
-def test_every_cause_has_words(effect: Effect, form: Form | None, motion: Motion) -> None:
+def test_every_cause_has_words(effect: Effect, form: Form | None, motion: ArmMotion) -> None:
     units = {p.name: p.unit for p in effect.parameters}
     values = {name: (value, 0.01, units[name]) for name, value in stated(effect, form, motion).items()}
     text = described(effect.cause, values, form, NAMES)

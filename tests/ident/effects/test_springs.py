@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ident.effects import EFFECTS, ELASTICITY, Motion
+from ident.effects import EFFECTS, ELASTICITY, ArmMotion
 from ident.effects.springs import Springs
 
 MASS, STIFFNESS, DAMPING, GAP = 2.0, 8000.0, 8.0, 2e-3
@@ -84,7 +84,7 @@ def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
 
     chain = Chain.from_table([{"name": "one"}])
     zero = np.zeros_like(plain.angle)
-    motion = Motion(
+    motion = ArmMotion(
         chain=chain,
         bodies=np.zeros((1, 10)),
         session=0,

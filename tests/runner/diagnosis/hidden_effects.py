@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from sim_backend.plant import Effect, Loads, Plant, Reading
+from sim_backend.plant import Loads, Plant, PlantEffect, Reading
 
 
-class Bristles(Effect):
+class Bristles(PlantEffect):
     """Bristles between the drive's surfaces, which bend before they slide (Dahl), besides Coulomb friction."""
 
     def __init__(self, joint: int, amplitude: float, length: float) -> None:
@@ -25,7 +25,7 @@ class Bristles(Effect):
         loads.motor_torque[self.joint] -= self.amplitude * self.bend
 
 
-class WrongGain(Effect):
+class WrongGain(PlantEffect):
     """A joint torque sensor or a torque constant with a wrong scale."""
 
     def __init__(self, joint: int, motor: float = 0.0, sensor: float = 0.0) -> None:

@@ -21,7 +21,7 @@ from fri.packets import MSR_ID, MSR_SIZE, new_msr
 from lwr_driver.arm import Arm
 from lwr_driver.link import LinkState
 from runner.cli import main
-from runner.computer import Finding, examine_computer, find_interface
+from runner.computer import ComputerFinding, examine_computer, find_interface
 from runner.doctor import Examination, Heard, LinkTest, Patient, judge_heard, judge_link, listen
 from runner.laboratory import free_port
 
@@ -205,7 +205,7 @@ def test_exit_code_is_that_of_the_first_failure_and_the_histogram_adds_up() -> N
     lines = [line for line in str(whole).splitlines() if " µs " in line and "%" in line and "ok" not in line]
     assert sum(int(line.split()[3]) for line in lines) == 2000
     assert "1   0.050 %" in lines[-1]
-    assert Examination((Finding("a", "b", "c", "advice", "d"),)).exit_code == 0
+    assert Examination((ComputerFinding("a", "b", "c", "advice", "d"),)).exit_code == 0
 
 
 def test_options_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
