@@ -36,7 +36,6 @@ _STILL_MS = 100
 
 
 def _load(plugin: Plugin, *arguments: Any, **named: Any) -> Any:
-    """Make the object of `plugin`."""
     module, _, name = plugin.type.partition(":")
     try:
         cls = getattr(importlib.import_module(module), name)

@@ -74,7 +74,6 @@ class _Twisting(Effect):
 
 
 def _places(setting: Setting) -> tuple[_Encoder, ...]:
-    """Places of the encoder to try."""
     known = {"motor": (_Encoder.MOTOR,), "link": (_Encoder.LINK,)}
     return tuple(_Encoder) if setting.encoder is None else known[setting.encoder]
 

@@ -202,7 +202,6 @@ def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate
 def _run(
     tasks: Sequence[Any], jobs: int, tracker: _Tracker, sizes: Sequence[int] | None = None
 ) -> list[Candidate]:
-    """Results in order, reported one by one."""
     results: list[Candidate] = []
     finished = Parallel(n_jobs=jobs, return_as="generator")(tasks)
     for candidate, size in zip(finished, sizes or [1] * len(tasks), strict=True):
@@ -212,7 +211,6 @@ def _run(
 
 
 def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Best first, without repetitions."""
     unique: list[Candidate] = []
     for candidate in sorted(
         candidates, key=lambda c: (not c.feasible, c.value if c.feasible else c.violation)

@@ -30,7 +30,6 @@ def _into(r, c, s, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _out(r, c, s, x, y, z):  # type: ignore[no-untyped-def]
-    """The way back."""
     u, v = c * x - s * y, s * x + c * y
     return (
         r[0, 0] * u + r[0, 1] * v + r[0, 2] * z,

@@ -54,13 +54,11 @@ class Opcode(IntEnum):
 
 
 def _record(opcode: Opcode, *parts: bytes) -> bytes:
-    """A record of this content."""
     content = b"".join(parts)
     return struct.pack("<BQ", opcode, len(content)) + content
 
 
 def _text(value: str) -> bytes:
-    """A string with its length."""
     data = value.encode()
     return struct.pack("<I", len(data)) + data
 
