@@ -15,6 +15,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Side
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.sessions import payload_name
 from lwr_driver.session import Session
 
 Floats = NDArray[np.float64]
@@ -102,11 +103,10 @@ def record(
         raise DataError(f"{prepared.name}: no stretch of the session is long enough for a diagnosis")
     spans = chosen.spans("period")
     first, last = stretches[0].time[0], stretches[-1].time[-1]
-    payload = chosen.metadata.get("payload", "none").strip()
     return SessionRecord(
         name=prepared.name,
         number=number,
-        payload=None if payload in ("", "none") else payload,
+        payload=payload_name(chosen),
         stretches=stretches,
         start_s=float(first),
         period_s=float(spans[0][1] - spans[0][0]) * 1e-9 if spans else last - first,

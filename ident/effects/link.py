@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -48,9 +49,9 @@ class _Twisting(Effect):
     displaces = True
     evidence_factor = 2.0
 
+    @abstractmethod
     def twist(self, torque: Any, parameters: Parameters) -> Any:
         """Angle of the motor minus angle of the link [rad] under a joint torque [Nm]."""
-        raise NotImplementedError
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """With the link's encoder, the motor drags against its friction."""
