@@ -22,6 +22,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
 from ident.model import DynamicModel
 from ident.rows.filters import low_pass
+from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import find, parse
 from lwr_driver.session import Session
@@ -207,7 +208,7 @@ class _Bench:
         number: int | None,
         begin_s: float,
     ) -> None:
-        payload = session.metadata.get("payload", "none").strip()
+        payload = payload_name(session)
         known = payload if payload in model.structure.payloads else None
         stiffness = np.asarray(arm.stiffness, dtype=float)
         damping = np.array(config.robot.damping, dtype=float)
@@ -290,8 +291,8 @@ def attached_experiment(session: Session) -> Experiment | None:
 
 def _announced_load(session: Session) -> LoadData:
     """The load data given to the controller, from the experiment file in the log; else the mass alone."""
-    payload = session.metadata.get("payload", "none").strip()
-    if payload in ("", "none"):
+    payload = payload_name(session)
+    if payload is None:
         return LoadData()
     experiment = attached_experiment(session)
     announced = None if experiment is None else experiment.payloads().get(payload)

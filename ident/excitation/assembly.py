@@ -33,6 +33,7 @@ from ident.excitation.problem import Objective, PlanProblem, Prior
 from ident.excitation.program import Bound, Setup
 from ident.model.model_file import read_model
 from ident.rows.prepare import prepare
+from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.arm.collision import CollisionChecker
@@ -390,6 +391,6 @@ def _recorded(
     parts = [[getattr(passage.joint, key) for passage in prepared.passages] for key in ("q", "qd", "qdd")]
     q, qd, qdd = (np.ascontiguousarray(np.vstack(part)) for part in parts)
     duration = sum(len(passage.rows) for passage in prepared.passages) * prepared.row_time_s
-    loaded = session.metadata.get("payload", "none").strip() not in ("", "none")
+    loaded = payload_name(session) is not None
     view = samples_view(Samples(q, qd, qdd, np.zeros_like(q)), mechanism, estimate, columns)
     return loaded, view, float(duration)
