@@ -85,6 +85,24 @@ class Coupling:
     joints: tuple[str, str]
 
 
+@dataclass(frozen=True, eq=False)
+class DriveMotion:
+    """Motion of the motors where it differs from the links', as behind elastic joints.
+
+    speed, acceleration : (N, n). slip : (N, n) Coulomb friction of the drives over its level; None: the structure's
+    function of the speed.
+    """
+
+    speed: Floats
+    acceleration: Floats
+    slip: Floats | None = None
+
+    def at(self, samples: slice | NDArray[np.int64]) -> DriveMotion:
+        """The same at some of the samples."""
+        slip = None if self.slip is None else self.slip[samples]
+        return DriveMotion(self.speed[samples], self.acceleration[samples], slip)
+
+
 @dataclass(frozen=True)
 class Condition:
     """Payload mounted in a session (None: the bare arm) and its measured sides (None: all of the structure)."""
@@ -214,9 +232,13 @@ class ModelStructure:
         """Number of non-rigid atoms: qdd, qd, sign(qd), 1 and three for each coupling."""
         return len(_SIGNALS) + 3 * len(self.couplings)
 
-    def signals(self, qd: Floats, qdd: Floats, out: Floats) -> None:
-        """Write the non-rigid atoms, from qd and qdd (N, n), to `out` (n_signals, n, N)."""
-        out[0], out[1], out[2], out[3] = qdd.T, qd.T, self.coulomb(qd).T, 1.0
+    def signals(self, qd: Floats, qdd: Floats, out: Floats, slip: Floats | None = None) -> None:
+        """Write the non-rigid atoms, from qd and qdd (N, n), to `out` (n_signals, n, N).
+
+        slip : (N, n) in place of sign(qd).
+        """
+        turned = self.coulomb(qd) if slip is None else slip
+        out[0], out[1], out[2], out[3] = qdd.T, qd.T, turned.T, 1.0
         out[4:] = 0.0
         for number, coupling in enumerate(self.couplings):
             a, b = (self._joint(name) for name in coupling.joints)
@@ -265,11 +287,13 @@ class ModelStructure:
         payload: str | None = None,
         sides: Sequence[Side] | None = None,
         columns: ArrayLike | None = None,
+        drive: DriveMotion | None = None,
     ) -> Floats:
         """Observation matrix of one session: (sides x n x N, C) float64, Fortran-ordered.
 
         q, qd, qdd : (N, n). payload : the mounted payload. sides : default all of the structure.
         columns : (C,) indices of columns (default all n_columns), e.g. those of a base set.
+        drive : motion of the motors, for the columns of the drives; default that of the links.
         Row order: side, joint, sample (see the module).
         """
         position, speed, acceleration = check_states(self.chain, q, qd, qdd)
@@ -296,13 +320,19 @@ class ModelStructure:
                     out[c, s] = out[c, 0]
         signals = np.empty((self.n_signals, n, samples))
         self.signals(speed, acceleration, signals)
+        moved = signals
+        if drive is not None:
+            moved = np.empty_like(signals)
+            self.signals(drive.speed, drive.acceleration, moved, drive.slip)
         for c, column in enumerate(wanted):
             link, place = divmod(column, len(PER_LINK))
             if link < self.n_links and place < len(INERTIAL):
                 continue
+            of_link = link < self.n_links and PER_LINK[place] in _JOINT_TERMS
+            atoms = signals if of_link else moved
             for s, side in enumerate(chosen):
                 for joint in range(n):
                     atom = self.signal_of(column, side, joint)
                     if atom is not None:
-                        out[c, s, joint] = signals[atom, joint]
+                        out[c, s, joint] = atoms[atom, joint]
         return out.reshape(len(wanted), -1).T

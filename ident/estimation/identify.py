@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -28,6 +29,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name, require, stated_mass
+from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session, Sessions, as_sessions
 
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
@@ -47,7 +49,8 @@ class IdentificationSettings:
         "physical" (consistent bodies within 20 % of the URDF's) predicts new motions best, above all after a
         short or weakly exciting recording: on three runs of a real LWR4+ its error is 3 to 4 %, that of least
         squares 9 to 14 % (`benchmarks/real_data.py`).
-    without : parameters left out of the model, by symbol or name. couplings, coulomb : see `ModelStructure`.
+    without : parameters left out of the model, by symbol or name. couplings : see `ModelStructure`.
+    coulomb : the function for sign(qd); None takes the one that predicts best, see `ident.rows.signal_choice`.
     resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
     essential : settings of the search for essential parameters; None skips it.
     robot : name of the arm in the model; default from the sessions' metadata.
@@ -59,7 +62,7 @@ class IdentificationSettings:
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
     without: tuple[str, ...] = ()
     couplings: tuple[Coupling, ...] = ()
-    coulomb: Coulomb = field(default_factory=Coulomb)
+    coulomb: Coulomb | None = None
     resonance_hz: float | None = None
     essential: EssentialSettings | None = field(default_factory=EssentialSettings)
     robot: str = ""
@@ -76,7 +79,8 @@ class Identification(Tabular):
 
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
-    warnings : sentences for the report.
+    warnings : sentences for the report. signal_reasons : why the signal settings are as they are, where the data chose
+    them.
     """
 
     settings: IdentificationSettings
@@ -92,6 +96,7 @@ class Identification(Tabular):
     essential: Essential | None
     robot: str
     warnings: tuple[str, ...]
+    signal_reasons: tuple[str, ...] = ()
 
     @cached_property
     def model(self) -> DynamicModel:
@@ -165,6 +170,7 @@ class Identification(Tabular):
                 for session, payload in zip(self.prepared, self.payloads, strict=True)
             ],
             "counts": self.counts,
+            "signals": dataclasses.asdict(self.settings.signals) | {"reasons": list(self.signal_reasons)},
             "condition": self.condition,
             "condition_normalised": self.condition_normalised,
             "parameters": self.parameters,
@@ -209,6 +215,7 @@ class Identification(Tabular):
                 f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
                 f"{session.counts['lost']} samples lost{delay}"
             )
+        lines += self.signal_reasons
         lines.append(
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
         )
@@ -263,23 +270,34 @@ def identify(
         carried,
         settings.without,
         settings.couplings,
-        settings.coulomb,
+        settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
-    base = numeric_base(structure, _conditions(structure, chosen, mounted))
+    conditions = _conditions(structure, chosen, mounted)
+    base = numeric_base(structure, conditions)
+    signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, settings.coulomb)
+    rows_structure = replace(structure, coulomb=signals.row_coulomb)
+    structure = replace(structure, coulomb=signals.coulomb)
+    base = numeric_base(structure, conditions)
+    settings = replace(settings, signals=signals.settings, coulomb=signals.coulomb)
     prepared, problems, instruments = [], [], []
     for session, payload in zip(chosen, mounted, strict=True):
         # One session after the other, so that memory holds the full-rate signals of one only.
-        whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
+        whole = prepare(
+            session,
+            settings.signals,
+            resonance_hz=settings.resonance_hz,
+            motor=needs_motor,
+        )
         problems.append(
-            observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
+            observe([whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units)
         )
         motion = None if settings.signals.average_periods else commanded(session, whole)
         prepared.append(whole.without_samples())
         del whole
         if motion is not None:
-            instruments.append(observe([motion], [payload], structure, columns=base.columns))
+            instruments.append(observe([motion], [payload], rows_structure, columns=base.columns))
             del motion
     warnings = [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
@@ -322,6 +340,7 @@ def identify(
         essential=essential,
         robot=settings.robot or chosen[0].metadata.get("robot", "") or "arm",
         warnings=tuple(warnings),
+        signal_reasons=signals.reasons,
     )
 
 

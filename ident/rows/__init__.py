@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ident.rows.delay import Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     ParallelFilter,
     SignalSettings,
@@ -14,7 +15,6 @@ from ident.rows.filters import (
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import payload_name, require, stated_mass
-from ident.rows.timebase import Delay, DelayData, estimate_delay
 from lwr_driver.session import Sessions, as_sessions
 
 __all__ = [

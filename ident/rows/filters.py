@@ -7,7 +7,7 @@ The spectra of the motion decide the cut-off frequencies.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -19,10 +19,15 @@ from scipy.ndimage import correlate1d
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import Floats
 
+# The paper's filters, section 5, and a time beside reversals that covers the turning of a strain-wave drive.
+CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
+# Highest cut-off over the sampling rate: differences lose accuracy beyond.
+NYQUIST_SHARE = 0.2
+
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """Settings from raw channels to rows. The defaults are those of the paper, section 5.
+    """Settings from raw channels to rows. None is chosen from the data: see `ident.rows.signal_choice`.
 
     cutoff_hz, order : Butterworth low-pass on the positions, run forward and back. Phase is zero, the gain
         is the square of the filter's: -6 dB at `cutoff_hz`, and the roll-off of order 2 x `order`.
@@ -30,57 +35,93 @@ class SignalSettings:
         included, pass this same filter, so that it cannot bias the estimate.
     rate_hz : rate of the rows, None takes 2.5 x `decimate_hz` (80 % of the band is kept).
     attenuation_db : stop band of the parallel low-pass.
-    choose_cutoff : take `cutoff_hz` from the spectrum of the positions instead.
     average_periods : average the rows of all periods; their scatter gives the noise variance.
     edge_s : time lost at each end of an uninterrupted stretch to the transients of the Butterworth filter,
         None takes 2 / `cutoff_hz`.
     longest_bridge_s : longest gap bridged by interpolation; a longer one splits the record.
-    bridged_share : largest share of the filter's weight on bridged samples; rows beyond it are dropped.
-    standstill_rad_s, standstill_share : below this speed the Coulomb torque of a joint is unknown; its rows
-        with more than this share of the filter's weight on such samples are dropped. Share 1 keeps all.
+    reversal_s : samples of a joint this close to its reversal have no part in its rows, because friction turns
+        there in a way that no sign function follows (presliding, stiction, a motor that reverses later).
+    standstill_rad_s : a joint below this speed rests, and its Coulomb torque is unknown.
+    known_share : least share of a row's filter on samples measured and away from reversals.
     outlier_scale : distance of an outlier from the running median, in robust standard deviations.
     motor_delay_s : delay of the motor channel's times [s], or "estimate" to estimate it from the data.
     delay_search_s : largest delay searched, in both directions.
+    stiffness_nm_rad : of the joints, for the motors' motion against the links: the joint torque twists a joint, and
+        the drive's friction and inertia act on the motor. Without it an elastic joint makes the motor channel look
+        early by Fvm / stiffness. None: rigid joints.
     """
 
-    cutoff_hz: float = 10.0
+    cutoff_hz: float | None = None
     order: int = 4
-    decimate_hz: float = 2.0
+    decimate_hz: float | None = None
     rate_hz: float | None = None
     attenuation_db: float = 40.0
-    choose_cutoff: bool = False
     average_periods: bool = False
     edge_s: float | None = None
     longest_bridge_s: float = 0.02
-    bridged_share: float = 0.1
+    reversal_s: float | None = None
     standstill_rad_s: float = 2e-3
-    standstill_share: float = 0.05
+    known_share: float = 0.4
     outlier_scale: float = 8.0
     motor_delay_s: float | Literal["estimate"] = "estimate"
     delay_search_s: float = 0.1
+    stiffness_nm_rad: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        positive = ("cutoff_hz", "order", "decimate_hz", "attenuation_db", "outlier_scale", "delay_search_s")
+        positive = (
+            "cutoff_hz",
+            "order",
+            "decimate_hz",
+            "rate_hz",
+            "attenuation_db",
+            "outlier_scale",
+            "delay_search_s",
+        )
         for name in positive:
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(f"`{name}` is {getattr(self, name)}, it must be positive")
-        if self.decimate_hz > self.cutoff_hz:
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ConfigurationError(f"`{name}` is {value}, it must be positive")
+        if self.stiffness_nm_rad is not None and min(self.stiffness_nm_rad, default=0.0) <= 0.0:
+            raise ConfigurationError(f"`stiffness_nm_rad` is {self.stiffness_nm_rad}, every value must be positive")
+        if self.reversal_s is not None and not self.reversal_s >= 0.0:
+            raise ConfigurationError(f"`reversal_s` is {self.reversal_s}, it must be zero or positive")
+        if None not in (self.decimate_hz, self.cutoff_hz) and self.decimate > self.cutoff:
             raise ConfigurationError(
                 f"`decimate_hz` {self.decimate_hz} exceeds `cutoff_hz` {self.cutoff_hz}; the parallel "
                 "filter must be the narrower one, lower `decimate_hz` or raise `cutoff_hz`"
             )
-        if self.rate_hz is not None and self.rate_hz <= 0:
-            raise ConfigurationError(f"`rate_hz` is {self.rate_hz}, it must be positive")
+
+    def settled(self, rate_hz: float) -> SignalSettings:
+        """With the figures of the paper where none is stated, as far as a channel of `rate_hz` carries them."""
+        cutoff = min(CUTOFF_HZ, NYQUIST_SHARE * rate_hz) if self.cutoff_hz is None else self.cutoff_hz
+        decimate = min(DECIMATE_HZ, cutoff / 1.5) if self.decimate_hz is None else self.decimate_hz
+        reversal = REVERSAL_S if self.reversal_s is None else self.reversal_s
+        return replace(self, cutoff_hz=max(cutoff, decimate), decimate_hz=decimate, reversal_s=reversal)
+
+    @property
+    def cutoff(self) -> float:
+        """Cut-off of the positions [Hz]."""
+        return CUTOFF_HZ if self.cutoff_hz is None else self.cutoff_hz
+
+    @property
+    def decimate(self) -> float:
+        """Cut-off of the parallel low-pass [Hz]."""
+        return DECIMATE_HZ if self.decimate_hz is None else self.decimate_hz
+
+    @property
+    def reversal(self) -> float:
+        """Time left out on either side of a reversal [s]."""
+        return REVERSAL_S if self.reversal_s is None else self.reversal_s
 
     @property
     def row_rate_hz(self) -> float:
         """Rate of the rows [Hz]."""
-        return self.rate_hz if self.rate_hz is not None else 2.5 * self.decimate_hz
+        return self.rate_hz if self.rate_hz is not None else 2.5 * self.decimate
 
     @property
     def edge(self) -> float:
         """Time lost at each end to the Butterworth filter [s]."""
-        return self.edge_s if self.edge_s is not None else 2.0 / self.cutoff_hz
+        return self.edge_s if self.edge_s is not None else 2.0 / self.cutoff
 
 
 # Central differences of sixth order: error (w dt)^6 / 140 of the velocity, (w dt)^6 / 560 of the
@@ -322,15 +363,15 @@ def advice(
 ) -> tuple[str, ...]:
     """Warnings about the cut-offs against the excitation n_f w0, the sampling rates and the resonance."""
     found: list[str] = []
-    if settings.decimate_hz < 2.0 * excitation_hz:
+    if settings.decimate < 2.0 * excitation_hz:
         found.append(
-            f"the parallel filter's cut-off {settings.decimate_hz:g} Hz is below twice the highest "
+            f"the parallel filter's cut-off {settings.decimate:g} Hz is below twice the highest "
             f"excitation frequency {excitation_hz:.2f} Hz; Coriolis and gravity terms extend that far, raise "
             "`decimate_hz`"
         )
-    if settings.cutoff_hz < 5.0 * excitation_hz:
+    if settings.cutoff < 5.0 * excitation_hz:
         found.append(
-            f"the position cut-off {settings.cutoff_hz:g} Hz is below 5 x the highest excitation frequency "
+            f"the position cut-off {settings.cutoff:g} Hz is below 5 x the highest excitation frequency "
             f"{excitation_hz:.2f} Hz; accelerations lose amplitude, raise `cutoff_hz`"
         )
     rates = [("joint", joint_rate_hz)] + ([("motor", motor_rate_hz)] if motor_rate_hz else [])
@@ -340,9 +381,9 @@ def advice(
                 f"rows at {settings.row_rate_hz:g} Hz exceed the {name} channel's {rate:.1f} Hz; lower "
                 "`decimate_hz`"
             )
-    if settings.cutoff_hz > 0.2 * joint_rate_hz:
+    if settings.cutoff > 0.2 * joint_rate_hz:
         found.append(
-            f"the position cut-off {settings.cutoff_hz:g} Hz is above a fifth of the sampling rate "
+            f"the position cut-off {settings.cutoff:g} Hz is above a fifth of the sampling rate "
             f"{joint_rate_hz:.0f} Hz; differences lose accuracy there, lower `cutoff_hz`"
         )
     if resonance_hz is not None:
@@ -352,9 +393,9 @@ def advice(
                 f"{resonance_hz:g} Hz; the joints' elasticity is excited and the rigid model is biased, "
                 "plan a slower motion"
             )
-        if settings.decimate_hz > 0.5 * resonance_hz:
+        if settings.decimate > 0.5 * resonance_hz:
             found.append(
-                f"the parallel filter's cut-off {settings.decimate_hz:g} Hz lets the lowest resonance "
+                f"the parallel filter's cut-off {settings.decimate:g} Hz lets the lowest resonance "
                 f"{resonance_hz:g} Hz through; lower `decimate_hz`"
             )
     return tuple(found)

@@ -152,10 +152,10 @@ def _side(
         start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
         inside = (passage.motor.times >= start) & (passage.motor.times <= joint.times[-1])
         times = passage.motor.times[inside]
-        factor = thinning(times, settings.decimate_hz)
+        factor = thinning(times, settings.decimate)
         torque = block_means(interpolate_uniform(joint.torque, start, dt, times), factor)
         means = block_means(times, factor)
-        parallel = ParallelFilter(means, passage.rows, settings.decimate_hz, settings.attenuation_db)
+        parallel = ParallelFilter(means, passage.rows, settings.decimate, settings.attenuation_db)
         target = target - parallel.apply(torque)
         valid = valid & passage.joint_valid
     return _Part(matrix, target, slope, valid, passage.index)
@@ -164,11 +164,11 @@ def _side(
 def _slope(channel: TorqueChannel, rows: Floats, session: PreparedSession) -> Floats:
     """Time derivative (K, n) of the filtered torque, the error per second of a wrong delay."""
     settings = session.settings
-    step = 0.04 / settings.decimate_hz
-    factor = thinning(channel.times, settings.decimate_hz)
+    step = 0.04 / settings.decimate
+    factor = thinning(channel.times, settings.decimate)
     times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
     ahead, behind = (
-        ParallelFilter(times, rows + shift, settings.decimate_hz, settings.attenuation_db).apply(torque)
+        ParallelFilter(times, rows + shift, settings.decimate, settings.attenuation_db).apply(torque)
         for shift in (step, -step)
     )
     return (ahead - behind) / (2.0 * step)
@@ -189,10 +189,12 @@ def _filtered(
     matrix = np.empty((joints, len(rows), len(columns)))
     target = np.empty((len(rows), joints))
     # Averaging neighbouring samples first saves nine tenths of the work and is the same for both sides.
-    factor = thinning(channel.times, settings.decimate_hz)
-    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
+    factor = thinning(channel.times, settings.decimate)
+    known = channel.known.astype(np.float64)
+    times, torque = block_means(channel.times, factor), block_means(channel.torque * known, factor)
+    share = block_means(known, factor)
     mean = np.full(factor, 1.0 / factor)
-    blocks = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db).blocks()
+    blocks = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db).blocks()
     while batch := list(islice(blocks, _BLOCKS)):
         low, high = batch[0][1].start, batch[-1][1].stop
         part = slice(low * factor, high * factor)
@@ -203,14 +205,18 @@ def _filtered(
             payload=payload,
             sides=(side,),
             columns=columns,
+            drive=None if channel.drive is None else channel.drive.at(part),
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
-        flat = (wide.T.reshape(-1, factor) @ mean).reshape(len(columns) * joints, high - low)
+        masked = wide.T.reshape(len(columns), joints, -1) * known[part].T
+        flat = (masked.reshape(-1, factor) @ mean).reshape(len(columns) * joints, high - low)
         for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
-            matrix[:, outputs] = filtered.transpose(1, 2, 0)
-            target[outputs] = weights @ torque[samples]
+            total = weights @ share[samples]
+            total = np.where(np.abs(total) > 0.05, total, 1.0)
+            matrix[:, outputs] = filtered.transpose(1, 2, 0) / total.T[:, :, None]
+            target[outputs] = (weights @ torque[samples]) / total
     return matrix, target
 
 
@@ -297,4 +303,4 @@ class _Motion:
         q, qd, qdd = (
             interpolate_uniform(state, self._start, self._dt, channel.times) for state in self._states
         )
-        return replace(channel, q=q, qd=qd, qdd=qdd)
+        return replace(channel, q=q, qd=qd, qdd=qdd, drive=None)

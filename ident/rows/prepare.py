@@ -14,8 +14,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import DataError
+from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
+from ident.dynamics.structure import DriveMotion
+from ident.rows.data_quality import stale
+from ident.rows.delay import Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     ParallelFilter,
     SignalSettings,
@@ -23,18 +26,14 @@ from ident.rows.filters import (
     block_means,
     differentiate,
     excitation_frequency,
-    half_width,
     interpolate_uniform,
     low_pass,
     moving,
-    optimal_cutoff,
     thinning,
 )
+from ident.rows.reversals import away_from_reversals
 from ident.rows.timebase import (
-    Delay,
-    DelayData,
     Stretch,
-    estimate_delay,
     flag_outliers,
     sample_period,
     stretches,
@@ -53,6 +52,8 @@ class TorqueChannel:
     """Torque of one side as measured, and the filtered motion at its sample times.
 
     times : (m,) [s], delay removed. q, qd, qdd, torque : (m, J). flagged : (m, J), bridged or outliers.
+    known : (m, J), neither flagged nor beside a reversal of their joint. drive : motion of the motors
+    where it is known to differ from the links', else None.
     """
 
     side: str
@@ -62,6 +63,8 @@ class TorqueChannel:
     qdd: Floats
     torque: Floats
     flagged: BoolArray
+    known: BoolArray
+    drive: DriveMotion | None = None
 
 
 @dataclass(frozen=True)
@@ -133,7 +136,6 @@ def prepare(
 
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
-    settings = settings or SignalSettings()
     name = session.path.name
     _check_finite(session.joint, name)
     origin = int(clock_ns(session.joint)[0])
@@ -149,20 +151,17 @@ def prepare(
         effort = np.zeros_like(position)
     sequence = session.joint.sequence if session.joint.numbered else None
     dt = sample_period(times, sequence, f"{name}: /joint_states")
+    settings = (settings or SignalSettings()).settled(1.0 / dt)
     warnings: list[str] = []
     position_flags, crowded = flag_outliers(position, settings.outlier_scale)
     effort_flags, also = flag_outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
-    bad: BoolArray = np.asarray(position_flags.any(axis=1))
+    old = stale(session.joint)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
     parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
-    whole = max(parts, key=lambda part: len(part.values)).values[:, : position.shape[1]]
-    if settings.choose_cutoff:
-        cutoff = max(optimal_cutoff(whole, dt, settings.order), 1.5 * settings.decimate_hz)
-        logger.info("position cut-off %.2f Hz chosen from the spectrum", cutoff)
-        settings = replace(settings, cutoff_hz=cutoff)
     names = moving(position, session.joint_names)
     if not names:
         raise DataError(
@@ -172,8 +171,8 @@ def prepare(
     windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
     count, resampled = len(parts), any(part.resampled for part in parts)
-    del whole
-    motions = [_Motion.of(parts.pop(0), effort_flags, times, settings) for _ in range(count)]
+    springs = _stiffness(settings, session.joint_names) if sensed else None
+    motions = [_Motion.of(parts.pop(0), effort_flags, times, settings, springs) for _ in range(count)]
     longest = max(motions, key=lambda motion: len(motion.qd))
     excitation = excitation_frequency(longest.qd, dt)
     motor_data = (
@@ -197,10 +196,9 @@ def prepare(
     if not sensed:
         passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
     if not passages:
-        need = 2.0 * (half_width(settings.decimate_hz, settings.attenuation_db) + settings.edge)
         raise DataError(
-            f"{name}: no stretch is longer than the filters' ends, {need:.1f} s; record a longer motion or "
-            "raise `decimate_hz`"
+            f"{name}: no stretch is longer than the ends of the position filter, {2.0 * settings.edge:.2f} s; record a "
+            "longer motion or raise `cutoff_hz`"
         )
     warnings += advice(
         settings,
@@ -211,6 +209,7 @@ def prepare(
     )
     counts = {
         "lost": lost,
+        "stale": int(old.sum()),
         "position_outliers": int(position_flags.sum()),
         "joint_torque_outliers": int(effort_flags.sum()),
         "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
@@ -234,7 +233,7 @@ def prepare(
         periods=len(windows) if period_rows else 0,
         delay=delay,
         excitation_hz=excitation,
-        cutoff_hz=settings.cutoff_hz,
+        cutoff_hz=settings.cutoff,
         moving=names,
         counts=counts,
         warnings=tuple(warnings),
@@ -263,11 +262,20 @@ class _Motion:
     qdd: Floats
     torque: Floats
     flagged: BoolArray
+    away: BoolArray
+    drive: DriveMotion | None
 
     @classmethod
-    def of(cls, part: Stretch, effort_flags: BoolArray, times: Floats, settings: SignalSettings) -> _Motion:
+    def of(
+        cls,
+        part: Stretch,
+        effort_flags: BoolArray,
+        times: Floats,
+        settings: SignalSettings,
+        stiffness: Floats | None,
+    ) -> _Motion:
         joints = effort_flags.shape[1]
-        q = low_pass(part.values[:, :joints], part.dt, settings.cutoff_hz, settings.order)
+        q = low_pass(part.values[:, :joints], part.dt, settings.cutoff, settings.order)
         qd, qdd = differentiate(q, part.dt)
         torque = part.values[:, joints:].copy()
         flagged = np.repeat(part.bridged[:, None], joints, axis=1)
@@ -278,12 +286,23 @@ class _Motion:
             flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
             good = ~flagged[:, joint]
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
-        return cls(part.start, part.dt, q, qd, qdd, torque, flagged)
+        away = away_from_reversals(qd, part.dt, settings.reversal, settings.standstill_rad_s)
+        drive = None
+        if stiffness is not None:
+            twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
+            rate, change = differentiate(twist, part.dt)
+            drive = DriveMotion(qd + rate, qdd + change)
+        return cls(part.start, part.dt, q, qd, qdd, torque, flagged, away, drive)
 
     @property
     def times(self) -> Floats:
         """Sample times (n,) [s]."""
         return self.start + self.dt * np.arange(len(self.q), dtype=np.float64)
+
+    @property
+    def of_motors(self) -> tuple[Floats, Floats]:
+        """Speed and acceleration (n, J) of the motors."""
+        return (self.qd, self.qdd) if self.drive is None else (self.drive.speed, self.drive.acceleration)
 
     def usable(self, settings: SignalSettings) -> tuple[float, float]:
         """First and last time unaffected by the filter's start and end [s]."""
@@ -293,9 +312,10 @@ class _Motion:
         """The joint torque channel, without the filter's ends."""
         cut = int(np.ceil(settings.edge / self.dt))
         part = slice(cut, len(self.q) - cut)
+        flagged = self.flagged[part]
         return TorqueChannel(
             "joint", self.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
-            self.flagged[part],
+            flagged, self.away[part] & ~flagged,
         )  # fmt: skip
 
     def motor_channel(
@@ -310,10 +330,26 @@ class _Motion:
         inside = (actual >= first) & (actual <= last)
         if inside.sum() < 16:
             return None
-        actual = actual[inside]
+        actual, flagged = actual[inside], flags[inside]
         start, dt = self.start, self.dt
         q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
-        return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flags[inside])
+        at = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
+        drive = None
+        if self.drive is not None:
+            moved = (self.drive.speed, self.drive.acceleration)
+            drive = DriveMotion(*(interpolate_uniform(state, start, dt, actual) for state in moved))
+        known = self.away[at] & ~flagged
+        return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flagged, known, drive)
+
+
+def _stiffness(settings: SignalSettings, names: tuple[str, ...]) -> Floats | None:
+    if settings.stiffness_nm_rad is None:
+        return None
+    if len(settings.stiffness_nm_rad) != len(names):
+        raise ConfigurationError(
+            f"`stiffness_nm_rad` has {len(settings.stiffness_nm_rad)} values for {len(names)} joints; give one a joint"
+        )
+    return np.array(settings.stiffness_nm_rad)
 
 
 def _passage(
@@ -325,11 +361,10 @@ def _passage(
     settings: SignalSettings,
 ) -> Passage | None:
     first, last = motion.usable(settings)
-    half = half_width(settings.decimate_hz, settings.attenuation_db)
     within = np.zeros(len(grid), dtype=bool)
     for low, high in windows:
         within |= (grid >= low - 1e-9) & (grid <= high + 1e-9)
-    inside = within & (grid >= first + half) & (grid <= last - half)
+    inside = within & (grid >= first) & (grid <= last)
     if not inside.any():
         return None
     rows = grid[inside]
@@ -342,14 +377,12 @@ def _passage(
 
 
 def _valid(channel: TorqueChannel, rows: Floats, settings: SignalSettings) -> BoolArray:
-    """Rows (K, J) with enough measured samples of a moving joint in their filter."""
-    factor = thinning(channel.times, settings.decimate_hz)
+    """Rows (K, J) with enough known samples in their filter; a gap and an end of the stretch are unknown."""
+    factor = thinning(channel.times, settings.decimate)
     times = block_means(channel.times, factor)
-    parallel = ParallelFilter(times, rows, settings.decimate_hz, settings.attenuation_db)
-    covered = parallel.coverage() >= 1.0 - settings.bridged_share
-    bridged = parallel.share(block_means(channel.flagged, factor)) <= settings.bridged_share
-    still = parallel.share(block_means(np.abs(channel.qd) < settings.standstill_rad_s, factor))
-    return covered[:, None] & bridged & (still <= settings.standstill_share)
+    parallel = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db)
+    known = parallel.share(block_means(channel.known, factor)) * parallel.coverage()[:, None]
+    return np.asarray(known >= settings.known_share)
 
 
 def _motor(
@@ -401,14 +434,18 @@ def _delay(
     if not sensed:
         return Delay(0.0, 0.0, "no joint torque to compare the motor channel with")
     times, torque, _ = motor_data
-    data = [DelayData(m.times, m.qd, m.qdd, m.torque, times, torque, m.usable(settings)) for m in motions]
+    data = [
+        DelayData(
+            m.times, *m.of_motors, m.torque, m.away & ~m.flagged, times, torque, m.usable(settings)
+        )
+        for m in motions
+    ]  # fmt: skip
     rate = 1.0 / float(np.median(np.diff(times)))
     return estimate_delay(
         data,
         names,
-        cutoff_hz=min(5.0, settings.cutoff_hz, 0.2 * rate),
+        cutoff_hz=min(5.0, settings.cutoff, 0.2 * rate),
         search_s=settings.delay_search_s,
-        standstill_rad_s=settings.standstill_rad_s,
     )
 
 

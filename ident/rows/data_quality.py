@@ -78,8 +78,8 @@ def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
     return tuple(sorted((loss for loss in found if loss.matters), key=lambda loss: -loss.share))
 
 
-def held_times(columns: JointColumns) -> Floats:
-    """Times (k,) [s] from the first sample of samples older than their stamp.
+def stale(columns: JointColumns) -> Flags:
+    """Samples (N,) older than their stamp.
 
     Either all joints repeat their last torques, or most moving joints jolt at once, like positions a part of a sample
     old. A few such samples are no finding, but derivatives of the positions are wrong there.
@@ -87,6 +87,12 @@ def held_times(columns: JointColumns) -> Floats:
     old = _jolts(columns.position)
     if _repeated(columns.effort):
         old |= _same(columns.effort)
+    return old
+
+
+def held_times(columns: JointColumns) -> Floats:
+    """Times (k,) [s] from the first sample of the `stale` ones."""
+    old = stale(columns)
     return (columns.log_time[old] - columns.log_time[0]) * 1e-9
 
 

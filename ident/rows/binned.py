@@ -1,0 +1,125 @@
+"""Rows at the full band of a channel: means over short bins of neighbouring samples.
+
+A mean acts on torque and regressor alike, so it adds no bias. A row depends on a few milliseconds only: a reversal
+or a lost sample spoils few rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.dynamics.parameters import Floats
+from ident.dynamics.structure import ModelStructure, Side
+from ident.rows.prepare import PreparedSession, TorqueChannel
+
+_CHUNK = 2000
+
+
+@dataclass(frozen=True)
+class BinnedRows:
+    """Rows of one side of one session in the order of time.
+
+    matrix : (n, m, C) by joint. torque, speed : (m, n) [Nm, rad/s]. known : (m, n), bins of known samples only.
+    measured : (m, n), bins without a flagged sample, beside reversals too. time : (m,) [s].
+    """
+
+    side: Side
+    matrix: Floats
+    torque: Floats
+    speed: Floats
+    known: NDArray[np.bool_]
+    measured: NDArray[np.bool_]
+    time: Floats
+
+
+def bins(values: Floats, width: int) -> Floats:
+    """Means (m, k) over `width` samples of (N, k); a remainder at the end is left out."""
+    if width == 1:
+        return values
+    count = len(values) // width
+    return values[: count * width].reshape(count, width, -1).mean(axis=1)
+
+
+def binned_regressor(
+    structure: ModelStructure,
+    columns: NDArray[np.int64],
+    channel: TorqueChannel,
+    payload: str | None,
+    side: Side,
+    width: int,
+) -> Floats:
+    """Regressor (n, m, C) of one channel in bins of `width` samples."""
+    n, count = structure.chain.n, len(channel.times) // width * width
+    size = max(width, _CHUNK // width * width)
+    parts = []
+    for first in range(0, count, size):
+        some = slice(first, min(first + size, count))
+        wide = structure.regressor(
+            channel.q[some],
+            channel.qd[some],
+            channel.qdd[some],
+            payload=payload,
+            sides=(side,),
+            columns=columns,
+            drive=None if channel.drive is None else channel.drive.at(some),
+        )
+        table = wide.T.reshape(len(columns), n, -1, width)
+        parts.append(table.mean(axis=3).transpose(1, 2, 0))
+    return np.concatenate(parts, axis=1) if parts else np.zeros((n, 0, len(columns)))
+
+
+def observe_bins(
+    session: PreparedSession,
+    payload: str | None,
+    structure: ModelStructure,
+    columns: Sequence[int] | NDArray[np.int64],
+    bin_s: float,
+) -> list[BinnedRows]:
+    """Rows of all sides of one session, one entry for each passage and side with samples."""
+    found = []
+    chosen = np.asarray(columns, dtype=np.int64)
+    for passage in session.passages:
+        for side in structure.sides:
+            channel = passage.joint if side == "joint" else passage.motor
+            if (
+                channel is None
+                or (side == "joint" and not passage.joint_valid.any())
+                or len(channel.times) < 2
+            ):
+                continue
+            inside = (channel.times >= passage.rows[0]) & (channel.times <= passage.rows[-1])
+            some = _part(channel, np.flatnonzero(inside))
+            if len(some.times) < 2:
+                continue
+            width = max(1, round(bin_s / float(np.median(np.diff(some.times)))))
+            torque = some.torque
+            if side == "difference":
+                torque = torque - np.column_stack(
+                    [np.interp(some.times, passage.joint.times, column) for column in passage.joint.torque.T]
+                )
+            found.append(
+                BinnedRows(
+                    side,
+                    binned_regressor(structure, chosen, some, payload, side, width),
+                    bins(torque, width),
+                    bins(some.qd, width),
+                    bins(some.known.astype(float), width) > 1.0 - 1e-9,
+                    bins((~some.flagged).astype(float), width) > 1.0 - 1e-9,
+                    bins(some.times[:, None], width)[:, 0],
+                )
+            )
+    return found
+
+
+def _part(channel: TorqueChannel, samples: NDArray[np.int64]) -> TorqueChannel:
+    """The channel at some of its samples."""
+    whole = len(samples) == len(channel.times)
+    if whole:
+        return channel
+    names = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
+    drive = None if channel.drive is None else channel.drive.at(samples)
+    return replace(channel, **{name: getattr(channel, name)[samples] for name in names}, drive=drive)

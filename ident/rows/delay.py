@@ -1,0 +1,264 @@
+"""Delay of the motor channel against the joint channel, from the difference of the torques of each joint.
+
+The difference obeys Model 3 of the paper at the motor channel's own times t,
+
+    tau_m(t) - tau_l(t - d) = Ia qdd(t - d) + Fvm qd(t - d) + Fcm sign(qd(t - d)) + offm,
+
+with one delay d for the channel and four parameters a joint. Samples near a reversal of the joint are left out,
+since friction turns there in an unknown way: with them a healthy channel looks early or late by milliseconds. All
+terms pass the same low-pass. d solves a small nonlinear least-squares problem (Gauss-Newton from a grid); its
+standard deviation is robust to serial correlation and inflated by the scatter of the joints. An unknown delay biases
+Ia by -Fvm d, so its uncertainty enters the covariance of every estimate.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from ident.dynamics.parameters import Floats
+from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.least_squares import WeightedLeastSquares
+from ident.estimators.problem import Problem, RowGroup
+from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
+
+logger = logging.getLogger(__name__)
+
+_STEPS = 12
+_GRID = 41
+_ATTENUATION_DB = 40.0
+# Least share of a row's filter on known samples.
+_KNOWN = 0.4
+# Rows of a joint needed for a delay of its own.
+_LEAST_ROWS = 16
+# Half the step of the derivative by the delay [s].
+_STEP_S = 1e-3
+# A delay within this many standard deviations of zero is not told apart from zero.
+_DISTINCT = 1.96
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of the motor channel against the joint channel.
+
+    seconds : the delay in use [s], zero where the data cannot tell it from zero. std : its standard deviation [s],
+        with the uncertainty of a delay that is set to zero. how : origin. estimate : the unrestricted estimate [s].
+    by_joint : delay of each moving joint by itself, and its standard deviation [s].
+    disagreement : scatter of the joints over their standard deviations; `std` already includes this factor.
+    """
+
+    seconds: float
+    std: float
+    how: str
+    estimate: float = 0.0
+    by_joint: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    disagreement: float = 1.0
+
+    @classmethod
+    def of(
+        cls,
+        estimate: float,
+        std: float,
+        how: str,
+        by_joint: Mapping[str, tuple[float, float]],
+        disagreement: float,
+    ) -> Delay:
+        """The delay of an estimate: zero within its interval, and where it would be negative."""
+        if estimate > _DISTINCT * std:
+            return cls(estimate, std, how, estimate, by_joint, disagreement)
+        return cls(0.0, float(np.hypot(std, max(estimate, 0.0))), how, estimate, by_joint, disagreement)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval [s]; no channel is early."""
+        if self.seconds > 0.0 or not self.std:
+            return max(self.seconds - 1.96 * self.std, 0.0), self.seconds + 1.96 * self.std
+        return 0.0, 1.96 * self.std
+
+    @property
+    def early(self) -> bool:
+        """Whether the estimate is negative beyond its interval: another channel is late, or the model is wrong."""
+        return self.estimate < -3.0 * max(self.std, 1e-9)
+
+    def __str__(self) -> str:
+        low, high = (1e3 * bound for bound in self.interval)
+        if self.std == 0.0:
+            return f"late by {1e3 * self.seconds:.2f} ms ({self.how})"
+        if self.seconds == 0.0:
+            return f"not late (0 to {high:.2f} ms, {self.how})"
+        return f"late by {1e3 * self.seconds:.2f} ms ({low:.2f} to {high:.2f} ms, {self.how})"
+
+
+@dataclass(frozen=True)
+class DelayData:
+    """One uninterrupted stretch: joint channel on (n,) even times, motor channel on (m,) times [s].
+
+    qd, qdd, joint_torque : (n, J); motor_torque : (m, J). known : (n, J), samples away from the reversals of their
+    joint. span : first and last usable time [s].
+    """
+
+    times: Floats
+    qd: Floats
+    qdd: Floats
+    joint_torque: Floats
+    known: NDArray[np.bool_]
+    motor_times: Floats
+    motor_torque: Floats
+    span: tuple[float, float]
+
+
+def estimate_delay(
+    stretches: Sequence[DelayData],
+    joint_names: Sequence[str],
+    *,
+    cutoff_hz: float = 5.0,
+    search_s: float = 0.1,
+) -> Delay:
+    """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t.
+
+    Raises DataError when the best delay lies at the edge of +- `search_s`, or no joint moves long enough.
+    """
+    parts = [part for data in stretches if (part := _Rows.of(data, cutoff_hz, search_s)) is not None]
+    joints = [
+        j
+        for j in range(len(joint_names))
+        if sum(int(part.known_rows[:, j].sum()) for part in parts) >= _LEAST_ROWS
+    ]
+    if not joints:
+        raise DataError(
+            "the delay of the motor channel cannot be estimated: no joint moves long enough between two reversals; "
+            "record a longer motion"
+        )
+    grid = np.linspace(-search_s, search_s, _GRID)
+    coarse = [part.thinned(cutoff_hz) for part in parts]
+    cost = [_misfit(coarse, joints, delay) for delay in grid]
+    best = int(np.argmin(cost))
+    if best in (0, len(grid) - 1):
+        raise DataError(
+            "the motor channel fits the joint channel best at the edge of the searched delays, "
+            f"{1e3 * grid[best]:.0f} ms; check the channel's clock and sign, raise `delay_search_s`, or "
+            "state `motor_delay_s`"
+        )
+    delay, std = float(grid[best]), 1.0
+    for _ in range(_STEPS):
+        steps, stds = _newton(parts, joints, delay, separate=False)
+        std = float(stds[0])
+        delay = float(np.clip(delay + np.clip(steps[0], -0.01, 0.01), -search_s, search_s))
+        if abs(steps[0]) < max(0.03 * std, 1e-9):
+            break
+    steps, stds = _newton(parts, joints, delay, separate=True)
+    mean = float(np.sum(steps / stds**2) / np.sum(1.0 / stds**2))
+    chi = float(np.sqrt(np.sum(((steps - mean) / stds) ** 2) / max(len(steps) - 1, 1)))
+    disagreement = max(1.0, chi)
+    by_joint = {
+        joint_names[j]: (delay + float(step), float(s))
+        for j, step, s in zip(joints, steps, stds, strict=True)
+    }
+    found = Delay.of(delay, std * disagreement, "from the torque difference", by_joint, disagreement)
+    logger.info("motor channel %s", found)
+    return found
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The known samples of the motor channel in one stretch, and their low-pass to rows.
+
+    known : (m, J) as 0 and 1; share : (K, J) of a row's filter on them; known_rows : (K, J).
+    """
+
+    data: DelayData
+    state: Floats
+    parallel: ParallelFilter
+    inside: slice
+    known: Floats
+    share: Floats
+    known_rows: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, data: DelayData, cutoff_hz: float, search_s: float, every: int = 1) -> _Rows | None:
+        width = half_width(cutoff_hz, _ATTENUATION_DB)
+        first = max(data.span[0], float(data.motor_times[0])) + search_s
+        last = min(data.span[1], float(data.motor_times[-1])) - search_s
+        if last - first < 2.0 * width:
+            return None
+        low, high = np.searchsorted(data.motor_times, [first, last])
+        inside = slice(int(low), int(high), every)
+        times = data.motor_times[inside]
+        outputs = np.arange(first + 0.5 * width, last - 0.5 * width, 1.0 / (2.5 * cutoff_hz))
+        parallel = ParallelFilter(times, outputs, cutoff_hz, _ATTENUATION_DB)
+        dt = float(data.times[1] - data.times[0])
+        at = np.clip(np.rint((times - data.times[0]) / dt).astype(np.int64), 0, len(data.times) - 1)
+        known = data.known[at].astype(np.float64)
+        share = parallel.apply(known)
+        # Interpolation smooths noise, and more so between two samples: without a low-pass the noise chooses the delay.
+        torque = low_pass(data.joint_torque, dt, min(3.0 * cutoff_hz, 0.4 / dt))
+        state = np.hstack([data.qdd, data.qd, torque])
+        return cls(data, state, parallel, inside, known, share, share > _KNOWN)
+
+    def thinned(self, cutoff_hz: float) -> _Rows:
+        """With no more samples than the coarse search needs, 40 a period of the cut-off."""
+        step = float(np.median(np.diff(self.parallel.times)))
+        search = max(0.0, float(self.parallel.times[0] - self.data.span[0]))
+        return _Rows.of(self.data, cutoff_hz, search, max(1, int(1.0 / (40.0 * cutoff_hz * step)))) or self
+
+    def at(self, delay: float) -> tuple[Floats, Floats]:
+        """Columns (K, J, 4) and difference of the torques (K, J) for a delay."""
+        data = self.data
+        times = data.motor_times[self.inside] - delay
+        dt = float(data.times[1] - data.times[0])
+        qdd, qd, torque = np.split(
+            interpolate_uniform(self.state, float(data.times[0]), dt, times), 3, axis=1
+        )
+        signals = [qdd, qd, np.sign(qd), np.ones_like(qd), data.motor_torque[self.inside] - torque]
+        total = np.where(self.known_rows, self.share, 1.0)
+        filtered = self.parallel.apply(np.stack(signals, axis=2) * self.known[:, :, None]) / total[:, :, None]
+        return filtered[:, :, :4], filtered[:, :, 4]
+
+
+def _misfit(parts: Sequence[_Rows], joints: Sequence[int], delay: float) -> float:
+    """Sum over joints of the log residual power: the likelihood with one unknown variance a joint."""
+    rows = [part.at(delay) for part in parts]
+    total = 0.0
+    for j in joints:
+        keep = [part.known_rows[:, j] for part in parts]
+        matrix = np.vstack([columns[k, j] for (columns, _), k in zip(rows, keep, strict=True)])
+        target = np.concatenate([values[k, j] for (_, values), k in zip(rows, keep, strict=True)])
+        residual = target - matrix @ np.linalg.lstsq(matrix, target, rcond=None)[0]
+        total += len(target) * float(np.log(residual @ residual + 1e-30))
+    return total
+
+
+def _newton(
+    parts: Sequence[_Rows], joints: Sequence[int], delay: float, *, separate: bool
+) -> tuple[Floats, Floats]:
+    """Gauss-Newton step of the delay (1,), or of each joint's own (J,), and standard deviations [s]."""
+    here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, _STEP_S, -_STEP_S))
+    count = len(joints) if separate else 1
+    groups = []
+    for place, j in enumerate(joints):
+        keep = [part.known_rows[:, j] for part in parts]
+        own = np.vstack([columns[k, j] for (columns, _), k in zip(here, keep, strict=True)])
+        values = np.concatenate([target[k, j] for (_, target), k in zip(here, keep, strict=True)])
+        model = np.linalg.lstsq(own, values, rcond=None)[0]
+        for record, k in enumerate(keep):
+            rows = np.flatnonzero(k)
+            if not len(rows):
+                continue
+            (ahead, target_ahead), (behind, target_behind) = later[record], earlier[record]
+            slope = (target_ahead[rows, j] - ahead[rows, j] @ model) - (
+                target_behind[rows, j] - behind[rows, j] @ model
+            )
+            matrix = np.zeros((len(rows), 4 * len(joints) + count))
+            matrix[:, 4 * place : 4 * place + 4] = here[record][0][rows, j]
+            matrix[:, 4 * len(joints) + (place if separate else 0)] = -slope / (2.0 * _STEP_S)
+            groups.append(RowGroup(str(j), "difference", record, matrix, here[record][1][rows, j], rows))
+    titles = [f"{symbol} {j}" for j in joints for symbol in ("Ia", "Fvm", "Fcm", "offm")]
+    titles += [f"delay {k}" for k in range(count)]
+    step = float(parts[0].parallel.outputs[1] - parts[0].parallel.outputs[0])
+    fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(Problem(tuple(titles), tuple(groups), step))
+    return fit.values[-count:], fit.std[-count:]

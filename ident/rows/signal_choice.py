@@ -1,0 +1,325 @@
+"""Signal settings and friction law chosen from the data.
+
+The positions' cut-off, the band of the rows, the time left out beside reversals and the law of Coulomb friction are
+properties of a recording: its sampling, motion, noise, earlier filters and drives. Each is chosen with the base
+model on rows at full band, in two-second blocks: the even ones are fitted, the odd ones predicted.
+
+* The band of the rows covers the excitation, and gives a short recording rows enough. Half of the band left by an
+  earlier filter is its upper limit.
+* The positions' cut-off is the lowest within half a per cent of the least held-back error: a lower one smears the
+  acceleration, a higher one lets noise into it.
+* The time left out beside reversals is the one with the least held-back error far from them: a shorter one lets the
+  turning of friction bend the parameters, a longer one wastes samples.
+* The friction law of the model is the one with the least held-back error over all samples, reversals and standstill
+  included. The rows of the estimation have it too if it predicts the samples far from reversals better than the sign:
+  a law may follow the turning of friction and still bend the friction of a moving joint.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.dynamics.parameters import Floats, split_name
+from ident.dynamics.structure import Coulomb, ModelStructure
+from ident.rows.binned import BinnedRows, observe_bins
+from ident.rows.data_quality import passed_band
+from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings
+from ident.rows.prepare import prepare
+from ident.rows.reversals import away_from_reversals
+from lwr_driver.session import JointColumns, Session
+
+logger = logging.getLogger(__name__)
+
+_BIN_S, _BLOCK_S = 0.02, 2.0
+# Longest part of all sessions together used for the choice [s].
+_MOST_S = 120.0
+# Rows of a joint in a short recording, at least.
+_LEAST_ROWS = 40
+_CUTOFFS = (2.5, 5.0, 10.0)
+_TOLERANCE = 0.005
+# Bins left out beside a reversal; the last ones are far from it.
+_WINDOWS = (0, 1, 2, 3, 4, 5, 7, 10)
+_WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+# Least fall of the held-back error for another law than the sign.
+_WORTH = 0.005
+_RIDGE = 1e-10
+# Rows of a joint for an error of its own.
+_LEAST = 8
+
+
+@dataclass(frozen=True)
+class SignalChoice:
+    """Settings without an open figure, the friction law of the model and of the rows, and the reasons as sentences."""
+
+    settings: SignalSettings
+    coulomb: Coulomb
+    row_coulomb: Coulomb
+    reasons: tuple[str, ...] = ()
+
+
+def choose_signals(
+    sessions: Sequence[Session],
+    payloads: Sequence[str | None],
+    structure: ModelStructure,
+    columns: NDArray[np.int64],
+    settings: SignalSettings,
+    coulomb: Coulomb | None,
+) -> SignalChoice:
+    """The figures that `settings` leaves open, and the law if `coulomb` is None, for the sessions of one model.
+
+    payloads : mounted in each session. columns : base columns of the structure.
+    """
+    wanted = (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s, coulomb)
+    if None not in wanted:
+        assert coulomb is not None
+        return SignalChoice(settings, coulomb, coulomb)
+    motor = structure.sides != ("joint",)
+    parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
+    rate = min(1.0 / session.joint.period_s for session in parts)
+    reasons: list[str] = []
+    found, band = _with_decimation(settings, parts, rate, motor, reasons)
+    rough = [prepare(session, found, motor=motor) for session in parts]
+    delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
+    bench = _Bench(parts, payloads, structure, columns, motor, delays)
+    if found.cutoff_hz is None:
+        found = bench.with_cutoff(found, rate, reasons)
+    rows = bench.rows(found)
+    if found.reversal_s is None:
+        found = replace(found, reversal_s=_reversal_s(rows, band, found.standstill_rad_s, reasons))
+    law, row_law = (coulomb, coulomb) if coulomb is not None else bench.laws(rows, found, reasons)
+    for reason in reasons:
+        logger.info("%s", reason)
+    return SignalChoice(found, law, row_law, tuple(reasons))
+
+
+def _excerpt(session: Session, longest_s: float) -> Session:
+    """The session, or its first `longest_s` seconds from the excitation on."""
+    if session.duration_s <= longest_s:
+        return session
+    spans = session.spans("period") or session.spans("excitation")
+    start = spans[0][0] if spans else session.start
+    stop = start + round(longest_s * 1e9)
+
+    def cut(channel: JointColumns) -> JointColumns:
+        first, last = np.searchsorted(channel.log_time, [start, stop])
+        return channel.rows(int(first), int(last))
+
+    motor = None if session.motor is None else cut(session.motor)
+    return replace(session, joint=cut(session.joint), motor=motor)
+
+
+def _with_decimation(
+    settings: SignalSettings, sessions: Sequence[Session], rate: float, motor: bool, reasons: list[str]
+) -> tuple[SignalSettings, float | None]:
+    """With the band of the rows; and the upper edge of an earlier low-pass on the torques [Hz], None without."""
+    edges = [
+        passed_band(channel.effort, channel.period_s)
+        for session in sessions
+        for channel in (session.joint, session.motor if motor else None)
+        if channel is not None and channel.effort.shape[1]
+    ]
+    band = min((edge for edge in edges if edge is not None), default=None)
+    if settings.decimate_hz is not None:
+        return settings, band
+    rough = [prepare(session, replace(settings, motor_delay_s=0.0)) for session in sessions]
+    excitation = max(session.excitation_hz for session in rough)
+    shortest = min(session.duration_s for session in sessions)
+    wanted = {
+        "the band of the paper": DECIMATE_HZ,
+        f"2.5 times the excitation of {excitation:.2g} Hz": 2.5 * excitation,
+        f"a recording of {shortest:.1f} s": _LEAST_ROWS / (2.5 * shortest),
+    }
+    why = max(wanted, key=lambda name: wanted[name])
+    limits = {f"the sampling rate of {rate:.0f} Hz": NYQUIST_SHARE * rate / 1.5}
+    if band is not None:
+        limits[f"an earlier low-pass at {band:.2g} Hz"] = 0.5 * band
+    if settings.cutoff_hz is not None:
+        limits[f"the position cut-off of {settings.cutoff_hz:g} Hz"] = settings.cutoff_hz / 1.5
+    limit = min(limits, key=lambda name: limits[name])
+    chosen = wanted[why] if wanted[why] <= limits[limit] else limits[limit]
+    reason = why if wanted[why] <= limits[limit] else limit
+    reasons.append(f"rows: low-pass {chosen:.3g} Hz, for {reason}")
+    return replace(settings, decimate_hz=float(f"{chosen:.3g}")), band
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of one joint and side of all sessions.
+
+    ends : (rows of each stretch). measured : (m,), neither bridged nor outliers. even : (m,), of the fitted blocks.
+    """
+
+    matrix: Floats
+    torque: Floats
+    speed: Floats
+    measured: NDArray[np.bool_]
+    even: NDArray[np.bool_]
+    stretches: tuple[slice, ...]
+
+    def known(self, bins: int, standstill_rad_s: float) -> NDArray[np.bool_]:
+        """Measured rows (m,) more than `bins` rows from a reversal."""
+        found = self.measured.copy()
+        for some in self.stretches:
+            found[some] &= away_from_reversals(self.speed[some, None], 1.0, float(bins), standstill_rad_s)[
+                :, 0
+            ]
+        return found
+
+
+_ByClass = dict[tuple[str, int], _Rows]
+_Masks = Mapping[tuple[str, int], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True)
+class _Bench:
+    sessions: Sequence[Session]
+    payloads: Sequence[str | None]
+    structure: ModelStructure
+    columns: NDArray[np.int64]
+    motor: bool
+    delays: Sequence[float]
+
+    def rows(self, settings: SignalSettings) -> _ByClass:
+        """Rows by side and joint."""
+        parts: dict[str, list[BinnedRows]] = {}
+        for session, payload, delay in zip(self.sessions, self.payloads, self.delays, strict=True):
+            prepared = prepare(session, replace(settings, motor_delay_s=delay, reversal_s=0.0), motor=self.motor)
+            for rows in observe_bins(prepared, payload, self.structure, self.columns, _BIN_S):
+                parts.setdefault(rows.side, []).append(rows)
+        found = {}
+        for side, some in parts.items():
+            even = np.concatenate([np.floor(rows.time / _BLOCK_S) % 2 == 0 for rows in some])
+            ends = np.cumsum([0, *(len(rows.time) for rows in some)]).tolist()
+            stretches = tuple(slice(first, last) for first, last in pairwise(ends))
+            for j in range(self.structure.chain.n):
+                measured = np.concatenate([rows.measured[:, j] for rows in some])
+                if measured.any():
+                    found[side, j] = _Rows(
+                        np.concatenate([rows.matrix[j] for rows in some]),
+                        np.concatenate([rows.torque[:, j] for rows in some]),
+                        np.concatenate([rows.speed[:, j] for rows in some]),
+                        measured,
+                        even,
+                        stretches,
+                    )
+        return found
+
+    def with_cutoff(self, settings: SignalSettings, rate: float, reasons: list[str]) -> SignalSettings:
+        """With the lowest cut-off of a held-back error near the least."""
+        ladder = sorted({min(factor * settings.decimate, NYQUIST_SHARE * rate) for factor in _CUTOFFS})
+        still = settings.standstill_rad_s
+        errors = []
+        for one in ladder:
+            rows = self.rows(replace(settings, cutoff_hz=one))
+            away = {key: own.known(_WINDOWS[-1] // 2, still) for key, own in rows.items()}
+            errors.append(_error(rows, _fit(rows, away), away))
+        best = int(np.argmin(errors))
+        chosen = next(one for one, error in zip(ladder, errors, strict=True) if error < errors[best] + _TOLERANCE)
+        listed = ", ".join(
+            f"{100.0 * np.expm1(error - errors[best]):+.1f} % at {one:g} Hz"
+            for one, error in zip(ladder, errors, strict=True)
+        )
+        reasons.append(f"positions: cut-off {chosen:g} Hz, held-back error of the base model {listed}")
+        return replace(settings, cutoff_hz=chosen)
+
+    def laws(self, rows: _ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:
+        """The friction laws of the model and of the rows."""
+        still = settings.standstill_rad_s
+        left_out = round(settings.reversal / _BIN_S)
+        away = {key: own.known(left_out, still) for key, own in rows.items()}
+        far = {key: own.known(_WINDOWS[-1], still) for key, own in rows.items()}
+        everything = {key: own.measured for key, own in rows.items()}
+        sign = _fit(rows, away)
+        plain = _error(rows, sign, everything)
+        errors: dict[tuple[Coulomb, bool], float] = {}
+        for width in _WIDTHS:
+            law = Coulomb("tanh", width)
+            smooth = self._with_law(rows, law)
+            own = _fit(smooth, away)
+            bends = _error(smooth, own, far) > _error(rows, sign, far)
+            errors[law, bends] = _error(smooth, sign if bends else own, everything)
+        best, bends = min(errors, key=lambda key: errors[key])
+        gain = plain - errors[best, bends]
+        if gain < _WORTH:
+            reasons.append("friction: sign of the speed, no smooth law predicts better")
+            return Coulomb(), Coulomb()
+        where = "in the model alone, the parameters come from the sign" if bends else "in the rows too"
+        reasons.append(
+            f"friction: tanh of the speed over {best.width:g} rad/s, held-back error over all samples "
+            f"{100.0 * -np.expm1(-gain):.1f} % less than with the sign; {where}"
+        )
+        return best, Coulomb() if bends else best
+
+    def _with_law(self, rows: _ByClass, law: Coulomb) -> _ByClass:
+        """The rows with their Coulomb columns anew."""
+        names = [split_name(self.structure.names[c]) for c in self.columns]
+        found = {}
+        for (side, j), own in rows.items():
+            matrix = own.matrix.copy()
+            for place, (symbol, link, *_) in enumerate(names):
+                if symbol in ("Fcl", "Fcm") and link == j + 1 and np.any(matrix[:, place]):
+                    matrix[:, place] = law(own.speed)
+            found[side, j] = replace(own, matrix=matrix)
+        return found
+
+
+def _reversal_s(rows: _ByClass, band: float | None, standstill_rad_s: float, reasons: list[str]) -> float:
+    """Time left out beside reversals [s]."""
+    if band is not None and band * _WINDOWS[-1] * _BIN_S < 2.0:
+        reasons.append(
+            f"reversals: nothing left out, an earlier low-pass at {band:.2g} Hz spread them; the same low-pass on "
+            "torque and friction columns allows for it"
+        )
+        return 0.0
+    masks = [{key: own.known(window, standstill_rad_s) for key, own in rows.items()} for window in _WINDOWS]
+    errors = [_error(rows, _fit(rows, mask), masks[-1]) for mask in masks]
+    best = int(np.argmin(errors))
+    chosen = _WINDOWS[best] * _BIN_S
+    reasons.append(
+        f"reversals: {1e3 * chosen:.0f} ms left out on either side, held-back error far from reversals "
+        f"{100.0 * np.expm1(errors[0] - errors[best]):.2f} % less than with all samples"
+    )
+    return chosen
+
+
+def _fit(rows: _ByClass, masks: _Masks) -> Floats:
+    """Weighted least squares of the masked rows in the even blocks."""
+    grams, targets, squares, counts = [], [], [], []
+    for key, own in rows.items():
+        used = masks[key] & own.even
+        matrix, torque = own.matrix[used], own.torque[used]
+        grams.append(matrix.T @ matrix)
+        targets.append(matrix.T @ torque)
+        squares.append(float(torque @ torque))
+        counts.append(max(int(used.sum()), 1))
+    weights = np.ones(len(grams))
+    values = np.zeros(grams[0].shape[0])
+    for _ in range(3):
+        normal = sum(w * gram for w, gram in zip(weights, grams, strict=True))
+        right = sum(w * target for w, target in zip(weights, targets, strict=True))
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        scaled = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
+        values = np.linalg.solve(scaled, right / scale) / scale
+        powers = [
+            max(square - 2.0 * values @ target + values @ gram @ values, 1e-12 * square + 1e-300) / count
+            for gram, target, square, count in zip(grams, targets, squares, counts, strict=True)
+        ]
+        weights = 1.0 / np.array(powers)
+    return values
+
+
+def _error(rows: _ByClass, values: Floats, masks: _Masks) -> float:
+    """Mean over joints and sides of the log residual [log Nm] of the masked rows in the odd blocks."""
+    logs = []
+    for key, own in rows.items():
+        used = masks[key] & ~own.even
+        if used.sum() >= _LEAST:
+            residual = own.torque[used] - own.matrix[used] @ values
+            logs.append(0.5 * float(np.log(np.mean(residual**2) + 1e-300)))
+    return float(np.mean(logs)) if logs else 0.0
