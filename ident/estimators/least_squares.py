@@ -132,7 +132,14 @@ def estimate_from(
             covariances["bootstrap"] = bootstrap(problem, weights, block, settings.draws, settings.seed)
         elif settings.kind == "jackknife" and scores is None:
             covariances["jackknife"] = jackknife(
-                problem, bread, coefficients, row_weights, block, matrices=matrices, correlation=robust.matrix
+                problem,
+                bread,
+                coefficients,
+                row_weights,
+                block,
+                matrices=matrices,
+                correlation=robust.matrix,
+                consumed=consumed,
             )
         if offset is not None:
             covariances = {

@@ -162,16 +162,21 @@ def _side(
 
 
 def _slope(channel: TorqueChannel, rows: Floats, session: PreparedSession) -> Floats:
-    """Time derivative (K, n) of the filtered torque, the error per second of a wrong delay."""
+    """Time derivative (K, n) of the torque in the rows, the error per second of a wrong delay."""
     settings = session.settings
-    step = 0.04 / settings.decimate
+    dt = float(np.median(np.diff(channel.times)))
+    smooth = low_pass(channel.torque, dt, min(2.5 * settings.decimate, 0.4 / dt))
+    known = channel.known.astype(np.float64)
     factor = thinning(channel.times, settings.decimate)
-    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
-    ahead, behind = (
-        ParallelFilter(times, rows + shift, settings.decimate, settings.attenuation_db).apply(torque)
-        for shift in (step, -step)
-    )
-    return (ahead - behind) / (2.0 * step)
+    times, share = block_means(channel.times, factor), block_means(known, factor)
+    rate = block_means(np.gradient(smooth, dt, axis=0) * known, factor)
+    parallel = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db)
+    return parallel.apply(rate) / _total(parallel.apply(share))
+
+
+def _total(share: Floats) -> Floats:
+    """Share of a row's filter on known samples, 1 where it is next to none."""
+    return np.where(np.abs(share) > 0.05, share, 1.0)
 
 
 def _filtered(
@@ -213,8 +218,7 @@ def _filtered(
         for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
-            total = weights @ share[samples]
-            total = np.where(np.abs(total) > 0.05, total, 1.0)
+            total = _total(weights @ share[samples])
             matrix[:, outputs] = filtered.transpose(1, 2, 0) / total.T[:, :, None]
             target[outputs] = (weights @ torque[samples]) / total
     return matrix, target
