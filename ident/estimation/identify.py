@@ -291,7 +291,9 @@ def identify(
             motor=needs_motor,
         )
         problems.append(
-            observe([whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units)
+            observe(
+                [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units
+            )
         )
         motion = None if settings.signals.average_periods else commanded(session, whole)
         prepared.append(whole.without_samples())

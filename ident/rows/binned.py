@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
-from ident.dynamics.structure import ModelStructure, Side
+from ident.dynamics.structure import Coulomb, ModelStructure, Side
 from ident.rows.prepare import PreparedSession, TorqueChannel
 
 _CHUNK = 2000
@@ -24,7 +24,8 @@ class BinnedRows:
     """Rows of one side of one session in the order of time.
 
     matrix : (n, m, C) by joint. torque, speed : (m, n) [Nm, rad/s]. known : (m, n), bins of known samples only.
-    measured : (m, n), bins without a flagged sample, beside reversals too. time : (m,) [s].
+    measured : (m, n), bins without a flagged sample, beside reversals too. time : (m,) [s]. samples : (N, n) speed
+    of each sample; width : samples in a bin.
     """
 
     side: Side
@@ -34,6 +35,12 @@ class BinnedRows:
     known: NDArray[np.bool_]
     measured: NDArray[np.bool_]
     time: Floats
+    samples: Floats
+    width: int
+
+    def turned(self, law: Coulomb) -> Floats:
+        """Coulomb column (m, n) of a friction law."""
+        return bins(law(self.samples), self.width)
 
 
 def bins(values: Floats, width: int) -> Floats:
@@ -110,6 +117,8 @@ def observe_bins(
                     bins(some.known.astype(float), width) > 1.0 - 1e-9,
                     bins((~some.flagged).astype(float), width) > 1.0 - 1e-9,
                     bins(some.times[:, None], width)[:, 0],
+                    some.qd,
+                    width,
                 )
             )
     return found

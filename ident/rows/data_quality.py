@@ -84,7 +84,20 @@ def stale(columns: JointColumns) -> Flags:
     Either all joints repeat their last torques, or most moving joints jolt at once, like positions a part of a sample
     old. A few such samples are no finding, but derivatives of the positions are wrong there.
     """
-    old = _jolts(columns.position)
+    stamps = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
+    steps = np.diff(stamps, prepend=stamps[:1])
+    # Positions jolt beside a lost sample, too.
+    gap = (
+        np.abs(steps[1:] - np.median(steps[1:])) > 0.5 * np.median(steps[1:])
+        if len(steps) > 2
+        else np.zeros(0, bool)
+    )
+    beside = (
+        binary_dilation(np.concatenate([[False], gap]), iterations=_NEAR)
+        if len(gap)
+        else np.zeros(len(steps), bool)
+    )
+    old = _jolts(columns.position) & ~beside
     if _repeated(columns.effort):
         old |= _same(columns.effort)
     return old

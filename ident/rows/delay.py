@@ -38,6 +38,10 @@ _KNOWN = 0.4
 _LEAST_ROWS = 16
 # Half the step of the derivative by the delay [s].
 _STEP_S = 1e-3
+# Largest Fvm / stiffness of strain-wave joints, 17 Nm s/rad over 8 kNm/rad: so early an elastic joint looks [s].
+_ELASTIC_S = 2e-3
+# Likelihood ratio (twice the log) of a delay at the edge of the search against none that is no chance.
+_DECISIVE = 25.0
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
 
@@ -82,8 +86,8 @@ class Delay:
 
     @property
     def early(self) -> bool:
-        """Whether the estimate is negative beyond its interval: another channel is late, or the model is wrong."""
-        return self.estimate < -3.0 * max(self.std, 1e-9)
+        """Whether the estimate is negative beyond its interval and beyond the elasticity of joints."""
+        return self.estimate < -3.0 * self.std - _ELASTIC_S
 
     def __str__(self) -> str:
         low, high = (1e3 * bound for bound in self.interval)
@@ -121,7 +125,8 @@ def estimate_delay(
 ) -> Delay:
     """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t.
 
-    Raises DataError when the best delay lies at the edge of +- `search_s`, or no joint moves long enough.
+    A motion too short or too weak for an estimate gives zero, with the sample time of the motor channel as its
+    standard deviation. Raises DataError when the data clearly prefer a delay at the edge of +- `search_s`.
     """
     parts = [part for data in stretches if (part := _Rows.of(data, cutoff_hz, search_s)) is not None]
     joints = [
@@ -130,15 +135,14 @@ def estimate_delay(
         if sum(int(part.known_rows[:, j].sum()) for part in parts) >= _LEAST_ROWS
     ]
     if not joints:
-        raise DataError(
-            "the delay of the motor channel cannot be estimated: no joint moves long enough between two reversals; "
-            "record a longer motion"
-        )
+        return _unknown(stretches, "the motion is too short or too slow to tell")
     grid = np.linspace(-search_s, search_s, _GRID)
     coarse = [part.thinned(cutoff_hz) for part in parts]
     cost = [_misfit(coarse, joints, delay) for delay in grid]
     best = int(np.argmin(cost))
     if best in (0, len(grid) - 1):
+        if cost[_GRID // 2] - cost[best] < _DECISIVE:
+            return _unknown(stretches, "the motion is too weak to tell")
         raise DataError(
             "the motor channel fits the joint channel best at the edge of the searched delays, "
             f"{1e3 * grid[best]:.0f} ms; check the channel's clock and sign, raise `delay_search_s`, or "
@@ -162,6 +166,11 @@ def estimate_delay(
     found = Delay.of(delay, std * disagreement, "from the torque difference", by_joint, disagreement)
     logger.info("motor channel %s", found)
     return found
+
+
+def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:
+    period = max((float(np.median(np.diff(data.motor_times))) for data in stretches), default=0.0)
+    return Delay(0.0, period, why)
 
 
 @dataclass(frozen=True)

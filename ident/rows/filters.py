@@ -82,7 +82,9 @@ class SignalSettings:
             if value is not None and not value > 0:
                 raise ConfigurationError(f"`{name}` is {value}, it must be positive")
         if self.stiffness_nm_rad is not None and min(self.stiffness_nm_rad, default=0.0) <= 0.0:
-            raise ConfigurationError(f"`stiffness_nm_rad` is {self.stiffness_nm_rad}, every value must be positive")
+            raise ConfigurationError(
+                f"`stiffness_nm_rad` is {self.stiffness_nm_rad}, every value must be positive"
+            )
         if self.reversal_s is not None and not self.reversal_s >= 0.0:
             raise ConfigurationError(f"`reversal_s` is {self.reversal_s}, it must be zero or positive")
         if None not in (self.decimate_hz, self.cutoff_hz) and self.decimate > self.cutoff:

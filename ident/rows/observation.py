@@ -139,26 +139,26 @@ def _side(
     session: PreparedSession,
 ) -> _Part | None:
     if side == "joint":
-        matrix, target = _filtered(passage.joint, passage.rows, side, structure, payload, columns, session)
-        return _Part(matrix, target, np.zeros_like(target), passage.joint_valid, passage.index)
-    if passage.motor is None or passage.motor_valid is None:
+        channel, valid = passage.joint, passage.joint_valid
+    elif passage.motor is not None and passage.motor_valid is not None:
+        channel, valid = passage.motor, passage.motor_valid
+        if side == "difference":
+            channel, valid = _difference(passage.joint, channel), valid & passage.joint_valid
+    else:
         return None
-    matrix, target = _filtered(passage.motor, passage.rows, side, structure, payload, columns, session)
-    valid = passage.motor_valid
-    slope = _slope(passage.motor, passage.rows, session)
-    if side == "difference":
-        # The joint torque is taken at the motor channel's own times: both then see the same reversals.
-        joint, settings = passage.joint, session.settings
-        start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
-        inside = (passage.motor.times >= start) & (passage.motor.times <= joint.times[-1])
-        times = passage.motor.times[inside]
-        factor = thinning(times, settings.decimate)
-        torque = block_means(interpolate_uniform(joint.torque, start, dt, times), factor)
-        means = block_means(times, factor)
-        parallel = ParallelFilter(means, passage.rows, settings.decimate, settings.attenuation_db)
-        target = target - parallel.apply(torque)
-        valid = valid & passage.joint_valid
+    matrix, target = _filtered(channel, passage.rows, side, structure, payload, columns, session)
+    slope = np.zeros_like(target) if side == "joint" else _slope(channel, passage.rows, session)
     return _Part(matrix, target, slope, valid, passage.index)
+
+
+def _difference(joint: TorqueChannel, motor: TorqueChannel) -> TorqueChannel:
+    """The motor channel less the joint torque at its own times."""
+    start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
+    inside = (motor.times >= start) & (motor.times <= joint.times[-1])
+    drive = None if motor.drive is None else motor.drive.at(np.flatnonzero(inside))
+    names = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
+    kept = replace(motor, **{name: getattr(motor, name)[inside] for name in names}, drive=drive)
+    return replace(kept, torque=kept.torque - interpolate_uniform(joint.torque, start, dt, kept.times))
 
 
 def _slope(channel: TorqueChannel, rows: Floats, session: PreparedSession) -> Floats:

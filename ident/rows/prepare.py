@@ -157,17 +157,17 @@ def prepare(
     effort_flags, also = flag_outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
-    old = stale(session.joint)
-    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
-    parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
-    if not parts:
-        raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
     names = moving(position, session.joint_names)
     if not names:
         raise DataError(
             f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone does "
             "not show inertia and friction"
         )
+    old = stale(session.joint)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
+    parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
+    if not parts:
+        raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
     windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
     count, resampled = len(parts), any(part.resampled for part in parts)
@@ -187,6 +187,12 @@ def prepare(
                 f"{name}: the joints disagree about the motor channel's delay ({spread} ms), "
                 f"{delay.disagreement:.1f} times beyond their standard deviations; elastic joints do that, "
                 "and the stated deviation of the delay allows for it"
+            )
+        if delay.early:
+            warnings.append(
+                f"{name}: the motor torque looks early by {-1e3 * delay.estimate:.1f} ms, as no channel can be, and "
+                "elastic joints do by one or two at most: the joint torque is late, or the stamps are wrong. It is "
+                "taken as not late; correct the stamps, or state `motor_delay_s`"
             )
     passages = [
         passage

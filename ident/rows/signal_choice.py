@@ -152,7 +152,8 @@ def _with_decimation(
 class _Rows:
     """Rows of one joint and side of all sessions.
 
-    ends : (rows of each stretch). measured : (m,), neither bridged nor outliers. even : (m,), of the fitted blocks.
+    measured : (m,), neither bridged nor outliers. even : (m,), of the fitted blocks. parts, stretches : the rows of all
+    joints of each stretch, and their places here.
     """
 
     matrix: Floats
@@ -160,6 +161,7 @@ class _Rows:
     speed: Floats
     measured: NDArray[np.bool_]
     even: NDArray[np.bool_]
+    parts: tuple[BinnedRows, ...]
     stretches: tuple[slice, ...]
 
     def known(self, bins: int, standstill_rad_s: float) -> NDArray[np.bool_]:
@@ -189,7 +191,9 @@ class _Bench:
         """Rows by side and joint."""
         parts: dict[str, list[BinnedRows]] = {}
         for session, payload, delay in zip(self.sessions, self.payloads, self.delays, strict=True):
-            prepared = prepare(session, replace(settings, motor_delay_s=delay, reversal_s=0.0), motor=self.motor)
+            prepared = prepare(
+                session, replace(settings, motor_delay_s=delay, reversal_s=0.0), motor=self.motor
+            )
             for rows in observe_bins(prepared, payload, self.structure, self.columns, _BIN_S):
                 parts.setdefault(rows.side, []).append(rows)
         found = {}
@@ -206,6 +210,7 @@ class _Bench:
                         np.concatenate([rows.speed[:, j] for rows in some]),
                         measured,
                         even,
+                        tuple(some),
                         stretches,
                     )
         return found
@@ -220,7 +225,9 @@ class _Bench:
             away = {key: own.known(_WINDOWS[-1] // 2, still) for key, own in rows.items()}
             errors.append(_error(rows, _fit(rows, away), away))
         best = int(np.argmin(errors))
-        chosen = next(one for one, error in zip(ladder, errors, strict=True) if error < errors[best] + _TOLERANCE)
+        chosen = next(
+            one for one, error in zip(ladder, errors, strict=True) if error < errors[best] + _TOLERANCE
+        )
         listed = ", ".join(
             f"{100.0 * np.expm1(error - errors[best]):+.1f} % at {one:g} Hz"
             for one, error in zip(ladder, errors, strict=True)
@@ -262,9 +269,10 @@ class _Bench:
         found = {}
         for (side, j), own in rows.items():
             matrix = own.matrix.copy()
+            turned = np.concatenate([part.turned(law)[:, j] for part in own.parts])
             for place, (symbol, link, *_) in enumerate(names):
                 if symbol in ("Fcl", "Fcm") and link == j + 1 and np.any(matrix[:, place]):
-                    matrix[:, place] = law(own.speed)
+                    matrix[:, place] = turned
             found[side, j] = replace(own, matrix=matrix)
         return found
 

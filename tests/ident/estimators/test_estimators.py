@@ -176,15 +176,15 @@ def test_hac_is_the_double_sum_of_its_definition():
 def test_jackknife_is_the_scatter_of_estimates_without_a_block():
     matrices = design(records=1, samples=64)
     case = problem(matrices, CHI, white(4, matrices))
-    estimate = WeightedLeastSquares(CovarianceSettings("jackknife", block_s=1.6)).fit(case)
+    estimate = WeightedLeastSquares(CovarianceSettings("jackknife", block_s=0.2)).fit(case)
     rows = np.vstack([g.matrix * np.sqrt(estimate.weights[k]) for k, g in enumerate(case.groups)])
     target = np.concatenate([g.target * np.sqrt(estimate.weights[k]) for k, g in enumerate(case.groups)])
     time = np.tile(np.arange(64), 3)
     shifts = []
-    for block in range(8):
-        rest = time // 8 != block
+    for block in range(64):
+        rest = time != block
         shifts.append(np.linalg.lstsq(rows[rest], target[rest], rcond=None)[0] - estimate.values)
-    expected = np.sqrt(7 / 8 * np.sum(np.square(shifts), axis=0))
+    expected = np.sqrt(63 / 64 * np.sum(np.square(shifts), axis=0))
     np.testing.assert_allclose(estimate.std, expected, rtol=1e-6)
 
 
