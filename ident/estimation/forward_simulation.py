@@ -23,7 +23,8 @@ from ident.dynamics import regressor
 from ident.dynamics.parameters import PER_LINK, Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular, rows_of
-from ident.estimation.validate import mounted, prepared_session, resampled
+from ident.estimation.scores import resampled
+from ident.estimation.validate import mounted, prepared_session
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
