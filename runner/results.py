@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fri.errors import ConfigurationError, DataError
+from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.identify import Identification, IdentificationSettings, identify
@@ -20,7 +20,7 @@ from ident.estimation.scores import by_side
 from ident.estimation.validate import validate
 from ident.estimators.estimate import Estimate
 from ident.model import DynamicModel
-from ident.model.model_file import write_checked, write_model
+from ident.model.model_file import write_model
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
@@ -28,7 +28,7 @@ from runner.computer import software, versions
 from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
-from runner.terminal import plain, to_json
+from runner.terminal import write_json
 from sim_backend.robot import truth
 
 
@@ -167,21 +167,6 @@ def write_results(
     (folder / "report.txt").write_text(report, encoding="utf-8")
     write_json(folder / "summary.json", summary)
     return report
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write `plain(content)` as JSON in one step, read back first; ConfigurationError if it cannot be written."""
-    expected = plain(content)
-
-    def check(text: str) -> None:
-        try:
-            again = json.loads(text)
-        except ValueError as error:
-            raise DataError(f"no JSON: {error}") from error
-        if again != expected:
-            raise DataError("the content read back differs from that written")
-
-    write_checked(path, to_json(content) + "\n", check)
 
 
 def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
