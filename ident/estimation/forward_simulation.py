@@ -216,13 +216,14 @@ def simulate(
 class _Friction:
     """Friction along directions of the joint velocity: one a joint, and the sum of two for coupled drives.
 
-    directions (m, n); viscous, coulomb (m,); offset (n,).
+    directions (m, n); viscous, coulomb (m,); offset (n,). width : of the Coulomb function [rad/s].
     """
 
     directions: Floats
     viscous: Floats
     coulomb: Floats
     offset: Floats
+    width: float = _WIDTH_RAD_S
 
     @classmethod
     def of(cls, model: DynamicModel, motor: bool) -> _Friction:
@@ -239,13 +240,15 @@ class _Friction:
                 viscous.append(model.standard[first + 1 : first + 2])
                 coulomb.append(model.standard[first + 2 : first + 3])
         offset = drive["offl"] + (drive["offm"] if motor else 0.0)
-        return cls(np.vstack(directions), np.concatenate(viscous), np.concatenate(coulomb), offset)
+        # A jump of the torque cannot be integrated, so a narrow function stands for it.
+        width = structure.coulomb.width if structure.coulomb.kind == "tanh" else _WIDTH_RAD_S
+        return cls(np.vstack(directions), np.concatenate(viscous), np.concatenate(coulomb), offset, width)
 
     def __call__(self, qd: Floats) -> tuple[Floats, Floats]:
         """Torque (n,) against the motion and its derivative (n, n) by the velocity."""
         speed = self.directions @ qd
-        smooth = np.tanh(speed / _WIDTH_RAD_S)
-        steep = self.viscous + self.coulomb * (1.0 - smooth**2) / _WIDTH_RAD_S
+        smooth = np.tanh(speed / self.width)
+        steep = self.viscous + self.coulomb * (1.0 - smooth**2) / self.width
         torque = self.directions.T @ (self.viscous * speed + self.coulomb * smooth) + self.offset
         return torque, (self.directions.T * steep) @ self.directions
 

@@ -118,7 +118,7 @@ def write_model(model: DynamicModel, path: str | Path) -> None:
     write_checked(path, model_text(model), lambda text: _check_read(model, text))
 
 
-def write_checked(path: str | Path, text: str, check: Callable[[str], None]) -> None:
+def write_checked(path: str | Path, text: str, check: Callable[[str], object]) -> None:
     """Write `text` (UTF-8) to `path` in one step, after `check` of the text as read back from the disk.
 
     check : raises LwrError for a file of no use; an existing file then stays, the draft lies beside it.

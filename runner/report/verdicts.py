@@ -21,6 +21,7 @@ _TRACKING_LOOK_RAD = 0.02
 _LATE_LOOK = 1e-3
 _SLOWEST_S = 2e-3
 _MOVING_LIMIT = 0.05
+_LISTED = 2
 _WITHIN_3_SIGMA = 0.99
 """Least share within 3 standard deviations; nominal for a normal error: 99.7 %."""
 
@@ -128,20 +129,25 @@ def _torque_error(subject: str, unseen: bool, results: ResultFolder) -> Verdict 
     shown = [one for one in results.curves if one.unseen == unseen]
     if model is None or not shown:
         return None
-    limits = {(one.session, one.side): _torque_limit(one, model) for one in shown}
     parts, wanted = [], []
     level: Level = "good"
-    for side in dict.fromkeys(one.side for one in shown):
-        mine = [one for one in shown if one.side == side]
-        worst = max(mine, key=lambda one: one.relative / limits[one.session, side])
-        limit = limits[worst.session, side]
-        where = f" ({worst.session})" if len(mine) > 1 else ""
-        still = 100 * worst.whole.standstill_error[side]
-        parts.append(f"{side} {100 * worst.relative:.2f} %{where}, {still:.0f} % of its square at standstill")
-        wanted.append(f"{side} {100 * limit:.1f} %")
-        if worst.relative > limit:
+    for side in (side for side in model.structure.sides if any(one.side == side for one in shown)):
+        mine = sorted((one for one in shown if one.side == side), key=lambda one: -one.relative)
+        limits = [_torque_limit(one, model) for one in mine]
+        ratios = [one.relative / limit for one, limit in zip(mine, limits, strict=True)]
+        named = [f"{100 * one.relative:.2f} %" + f" ({one.session})" * (len(mine) > 1) for one in mine]
+        listed = ", ".join(named) if len(mine) <= _LISTED else f"at most {named[0]}"
+        samples, squares = (
+            100 * max(shares[side] for shares in (getattr(one.whole, key) for one in mine))
+            for key in ("standstill", "standstill_error")
+        )
+        parts.append(
+            f"{side} {listed}; at standstill {samples:.1f} % of the samples, {squares:.0f} % of the squared error"
+        )
+        wanted.append(f"{side} {100 * limits[int(np.argmax(ratios))]:.1f} %")
+        if not max(ratios) <= 1.0:
             level = "look"
-    return Verdict(subject, "; ".join(parts), f"below {', '.join(wanted)}", level, "torque")
+    return Verdict(subject, ". ".join(map(_capital, parts)), f"below {', '.join(wanted)}", level, "torque")
 
 
 def _torque_limit(one: Curves, model: DynamicModel) -> float:
@@ -271,3 +277,7 @@ def _leading(text: str) -> float:
 
 def _listed(names: list[str]) -> str:
     return ", ".join(dict.fromkeys(names))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
