@@ -194,7 +194,6 @@ def test_the_torque_error_is_that_of_all_samples_of_all_joints(truth_model: Any,
         assert value == pytest.approx(np.sqrt(squares.sum() / torques.sum()), rel=1e-9)
         held = np.array([score.standstill_error for score in mine])
         assert result.standstill_error[side] == pytest.approx((squares * held).sum() / squares.sum())
-        assert result.moving_relative[side] < value
     content = result.to_dict()
     assert content["torque_error"] == dict(result.relative)
     assert f"torque error, all joints and samples: motor {100 * result.relative['motor']:.2f} %" in str(
@@ -202,26 +201,20 @@ def test_the_torque_error_is_that_of_all_samples_of_all_joints(truth_model: Any,
     )
 
 
-def test_standstill_counts_and_is_named(truth_model: Any, bench: Any) -> None:
-    session = bench.session("resting", seed=9)
-    rest = np.zeros(len(session.motor), dtype=bool)
-    position = session.joint.position.copy()
-    third = len(position) // 3
-    # A rest of a third of the motion, with a friction of 5 Nm that no model of the motion computes.
-    position[third : 2 * third] = position[third]
-    times = session.motor.log_time
-    rest = (times > session.joint.log_time[third]) & (times < session.joint.log_time[2 * third])
-    effort = session.motor.effort.copy()
-    effort[rest] += 5.0
-    changed = replace(
-        session,
-        joint=replace(session.joint, position=position),
-        motor=replace(session.motor, effort=effort),
-    )
-    found, before = (validate(truth_model, [one], settings=PLAIN).scores[0] for one in (changed, session))
-    assert found.standstill["motor"] > 0.2
-    assert found.standstill_error["motor"] > 0.5
-    assert found.relative["motor"] > 2.0 * before.relative["motor"]
+def test_standstill_counts_and_is_named(truth_model: Any, bench: Any, unloaded: Any) -> None:
+    t, _, qd, _ = bench.motion(1, 26.0, 250.0, 12.0)
+    times = (unloaded.motor.log_time - unloaded.joint.log_time[0]) * 1e-9
+    slow = np.abs(np.column_stack([np.interp(times, t, column) for column in qd.T])) < 0.04
+    # Friction that no model of the motion computes.
+    effort = unloaded.motor.effort + np.where(slow, 1.0, 0.0)
+    changed = replace(unloaded, motor=replace(unloaded.motor, effort=effort))
+    settings = replace(PLAIN, standstill_rad_s=0.05)
+    found, before = (validate(truth_model, [one], settings=settings).scores[0] for one in (changed, unloaded))
+    assert found.standstill["motor"] == before.standstill["motor"] > 0.01
+    assert found.standstill_error["motor"] > 5.0 * before.standstill_error["motor"]
+    assert found.relative["motor"] > 1.05 * before.relative["motor"]
+    assert found.moving_relative["motor"] == pytest.approx(before.moving_relative["motor"], rel=0.02)
+    assert f"{100 * found.standstill_error['motor']:.1f} % of the squared error" in str(found)
 
 
 def test_a_session_without_a_score_leaves_the_others(truth_model: Any, bench: Any, unloaded: Any) -> None:
