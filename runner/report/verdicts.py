@@ -153,7 +153,7 @@ def _torque_error(subject: str, unseen: bool, results: ResultFolder) -> Verdict 
 def _torque_limit(one: Curves, model: DynamicModel) -> float:
     """Largest torque error of a good model of this session.
 
-    Real arms that move are predicted to 1 to 4 % by their identified models (docs/real_data.md). A resting joint
+    Moving real arms are predicted to a few per cent by their identified models (docs/real_data.md). A resting joint
     holds any torque up to its Coulomb friction, so that friction in its share of the samples comes on top.
     """
     drive = model.drive()
