@@ -212,8 +212,8 @@ class SessionScore(Tabular):
         )
         return (
             f"torque error, all joints and samples: {by_side(self.relative)}",
-            f"standstill: {still}; moving samples only: {by_side(self.moving_relative)}; in band: below "
-            f"{self.band_hz:g} Hz",
+            f"standstill: {still}",
+            f"moving samples only: {by_side(self.moving_relative)}; in band: below {self.band_hz:g} Hz",
         )
 
 
