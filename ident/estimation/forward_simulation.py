@@ -93,13 +93,13 @@ class ForwardSimulation(Tabular):
     def __repr__(self) -> str:
         return (
             f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
-            f"relative error {100 * self.relative:.2f} %, {len(self.times)} samples"
+            f"simulated torque error {100 * self.relative:.2f} %, {len(self.times)} samples"
         )
 
     def __str__(self) -> str:
         lines = [
             f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
-            f"{100 * self.relative:.2f} %",
+            f"simulated torque error {100 * self.relative:.2f} %",
             f"  {'joint':<14}{'torque rms Nm':>14}{'position rms mrad':>19}",
         ]
         for joint, torque, position in zip(self.joint_names, self.torque_rms, self.position_rms, strict=True):

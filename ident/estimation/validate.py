@@ -314,8 +314,9 @@ def cross_validate(
         except DataError as error:
             skipped.append(f"{session.path.name}: the others do not identify a model: {error}")
             continue
-        fold = validate(found.model, [session], settings=settings.signals)
+        fold = validate(found.model, [session], keep_going=True)
         scores += list(fold.scores)
+        skipped += [f"{one}; not scored" for one in fold.unscored]
     if not scores:
         raise DataError("no session can be predicted by the others: " + "; ".join(skipped))
     return CrossValidation(tuple(scores), tuple(skipped))
