@@ -132,9 +132,9 @@ def _torque_error(subject: str, unseen: bool, results: ResultFolder) -> Verdict 
     parts, wanted = [], []
     level: Level = "good"
     for side in (side for side in model.structure.sides if any(one.side == side for one in shown)):
-        mine = sorted((one for one in shown if one.side == side), key=lambda one: -one.relative)
-        limits = [_torque_limit(one, model) for one in mine]
-        ratios = [one.relative / limit for one, limit in zip(mine, limits, strict=True)]
+        sought = {one: _torque_limit(one, model) for one in shown if one.side == side}
+        mine = sorted(sought, key=lambda one: -one.relative / sought[one])
+        limits = [sought[one] for one in mine]
         named = [f"{100 * one.relative:.2f} %" + f" ({one.session})" * (len(mine) > 1) for one in mine]
         listed = ", ".join(named) if len(mine) <= _LISTED else f"at most {named[0]}"
         samples, squares = (
@@ -144,10 +144,11 @@ def _torque_error(subject: str, unseen: bool, results: ResultFolder) -> Verdict 
         parts.append(
             f"{side} {listed}; at standstill {samples:.1f} % of the samples, {squares:.0f} % of the squared error"
         )
-        wanted.append(f"{side} {100 * limits[int(np.argmax(ratios))]:.1f} %")
-        if not max(ratios) <= 1.0:
+        shown_limits = limits if len(mine) <= _LISTED else [limits[0]]
+        wanted.append(f"{side} {', '.join(dict.fromkeys(f'{100 * limit:.1f} %' for limit in shown_limits))}")
+        if not all(one.relative <= limit for one, limit in sought.items()):
             level = "look"
-    return Verdict(subject, ". ".join(map(_capital, parts)), f"below {', '.join(wanted)}", level, "torque")
+    return Verdict(subject, ". ".join(map(_capital, parts)), f"below {'; '.join(wanted)}", level, "torque")
 
 
 def _torque_limit(one: Curves, model: DynamicModel) -> float:
@@ -258,8 +259,8 @@ _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
     _link,
     _limits,
     _tracking,
-    partial(_torque_error, "torque error, estimate", False),
-    partial(_torque_error, "torque error, held-out motion", True),
+    partial(_torque_error, "torque error (estimate)", False),
+    partial(_torque_error, "torque error (held-out motion)", True),
     _unscored,
     _assumptions,
     _essential,
