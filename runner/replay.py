@@ -49,7 +49,8 @@ class Replayed:
 
     delay_s : of the commands against their log, estimated from the positions. commanded : whether the log has
     commands; otherwise the measured positions were commanded. exact : whether the model itself was simulated, or the
-    nearest physically possible one. duration_s : of the simulation.
+    nearest physically possible one. borrowed : whether the drives (inertia, friction, offset of the motor side) are
+    the emulated arm's, for a model without motor side. duration_s : of the simulation.
     """
 
     position: Floats
@@ -58,6 +59,7 @@ class Replayed:
     delay_s: float
     commanded: bool
     exact: bool
+    borrowed: bool
     duration_s: float
 
 
@@ -83,6 +85,7 @@ class Replay:
         self._failed: dict[str, dict[str, None]] = {}
         self._uncommanded: dict[str, None] = {}
         self._stood_in: dict[str, None] = {}
+        self._borrowed: dict[str, None] = {}
         self._order = sorted(session.start for session in sessions)
         self._delays: dict[int, float] = {}
         self.first: list[tuple[str, Replayed]] = []
@@ -113,6 +116,8 @@ class Replay:
                 self._uncommanded[name] = None
             if not done.exact:
                 self._stood_in[name] = None
+            if done.borrowed:
+                self._borrowed[name] = None
             for k, part in enumerate((done.position, done.motor, done.joint)):
                 if part is not None:
                     squares[k] += np.nansum(part**2, axis=0)
@@ -136,6 +141,13 @@ class Replay:
             found.append(
                 f"replay of {', '.join(self._stood_in)}: the estimated inertias are physically impossible, so the "
                 "nearest possible arm was simulated; a more exciting motion would improve the estimate"
+            )
+        if self._borrowed:
+            found.append(
+                f"replay of {', '.join(self._borrowed)}: the model has no motor side, so drive inertia, motor friction "
+                "and motor offset are those of the emulated arm, its true ones for a session of the emulator; the "
+                "position and motor errors say nothing about the drives of this arm. Identify Model 2 from a log with "
+                "motor torques"
             )
         return tuple(found)
 
@@ -193,7 +205,7 @@ def replay(
     if joint.effort.shape[1]:
         joint_error = _binned(_resampled(joint.log_time, joint.effort, grid) - link)
     errors = _binned(measured - position), motor_error, joint_error
-    return Replayed(*errors, delay, source is not None, bench.exact, len(grid) * CYCLE_S)
+    return Replayed(*errors, delay, source is not None, bench.exact, bench.borrowed, len(grid) * CYCLE_S)
 
 
 class _Bench:
@@ -221,6 +233,7 @@ class _Bench:
         self.number, self.begin_s, self.model = number, begin_s - _SETTLE * CYCLE_S, model
         poses = session.joint.position[:: max(1, len(session.joint) // _POSES)]
         self.exact = is_possible(model, poses)
+        self.borrowed = "motor" not in model.structure.sides
         self.links, self.drive = arm_of(
             model,
             chain(find(arm.urdf_path)),
@@ -228,7 +241,7 @@ class _Bench:
             stiffness=stiffness,
             damping=damping,
             poses=poses,
-            motors=true_arm(config, robot_file(config))[1],
+            motors=true_arm(config, robot_file(config))[1] if self.borrowed else None,
         )
         self.load = _announced_load(session)
 

@@ -14,7 +14,9 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.scores import by_side
 from ident.estimation.validate import validate
 from ident.estimators.estimate import Estimate
 from ident.model import DynamicModel
@@ -26,7 +28,7 @@ from runner.computer import software, versions
 from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
-from runner.terminal import to_json
+from runner.terminal import write_json
 from sim_backend.robot import truth
 
 
@@ -67,6 +69,30 @@ def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> floa
     return sum(inside) / len(inside) if inside else math.nan
 
 
+def coverage(parameters: Sequence[dict[str, Any]], joints: int) -> dict[str, dict[str, int]]:
+    """By kind of parameter, how many 95 % intervals hold the truth (`inside`) of how many (`count`).
+
+    parameters : with `truth` and `interval_95`. joints : number of joints; links beyond are payloads.
+    """
+    found: dict[str, dict[str, int]] = {}
+    for entry in parameters:
+        if "truth" in entry:
+            tally = found.setdefault(_kind(entry["name"], joints), {"inside": 0, "count": 0})
+            low, high = entry["interval_95"]
+            tally["inside"] += bool(low <= entry["truth"] <= high)
+            tally["count"] += 1
+    return found
+
+
+def _kind(name: str, joints: int) -> str:
+    symbol, link, _ = split_name(name)
+    if symbol in DRIVE:
+        return symbol
+    if link > joints:
+        return "payload"
+    return "first moments" if symbol.startswith("M") else "inertias"
+
+
 def summarise(
     experiment: Experiment, records: Sequence[Record], found: Identification | None
 ) -> dict[str, Any]:
@@ -88,19 +114,28 @@ def summarise(
     }
     if found is None:
         return summary
-    tested = [record.path for record in records if record.name in unseen and record.status == "success"]
-    summary.update(estimated(found, [read_session(path) for path in tested]))
+    logs: dict[bool, list[Session]] = {False: [], True: []}
+    for record in records:
+        if record.status == "success":
+            logs[record.name in unseen].append(read_session(record.path, status=False))
+    summary.update(estimated(found, found.model, logs[False], logs[True]))
     known = true_base(experiment, found)
     for entry in summary["parameters"]:
         if entry["name"] in known:
             entry["truth"] = known[entry["name"]]
     if known:
         summary["within_3_sigma"] = agreement(summary["parameters"])
+        summary["intervals_95_hold"] = coverage(summary["parameters"], found.structure.chain.n)
     return summary
 
 
-def estimated(found: Identification, tested: Sequence[Session]) -> dict[str, Any]:
-    """Content of a summary from an estimate. tested : held-out sessions."""
+def estimated(
+    found: Identification, model: DynamicModel, fitted: Sequence[Session], tested: Sequence[Session]
+) -> dict[str, Any]:
+    """Content of a summary from an estimate and its model. fitted : its sessions. tested : held-out sessions.
+
+    A session that cannot be scored is listed with its reason in `unscored`.
+    """
     content = found.to_dict()
     content["signals"] = content.pop("sessions")
     content["excitation"] = characteristics(found)
@@ -108,8 +143,13 @@ def estimated(found: Identification, tested: Sequence[Session]) -> dict[str, Any
         entry["interval_95"] = interval
     if found.essential is not None:
         content["essential"]["parameters"] = _estimates(found.essential.estimate)
-    if tested:
-        content["validation"] = [score.to_dict() for score in validate(found.model, tested).scores]
+    scores = {"fit": fitted, "validation": tested}
+    content["unscored"] = []
+    for key, sessions in scores.items():
+        if sessions:
+            scored = validate(model, sessions, allow_seen=key == "fit", keep_going=True).to_dict()
+            content[key] = scored["sessions"]
+            content["unscored"] += scored["unscored"]
     return content
 
 
@@ -125,7 +165,7 @@ def write_results(
     if found is not None:
         write_model(named_model(found.model, arm.name), folder / "model.yaml")
     (folder / "report.txt").write_text(report, encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
     return report
 
 
@@ -174,13 +214,18 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
     if found is None:
         return "\n".join(lines) + "\n"
     if "within_3_sigma" in summary:
+        held = summary["intervals_95_hold"].values()
+        inside, count = (sum(tally[key] for tally in held) for key in ("inside", "count"))
         lines.append(
-            f"  {100 * summary['within_3_sigma']:.1f} % of the estimates lie within 3 standard deviations "
-            "of the emulated arm's true parameters"
+            f"  against the emulated arm's true parameters: {100 * summary['within_3_sigma']:.1f} % of the "
+            f"estimates within 3 standard deviations, {100 * inside / count:.1f} % of the 95 % intervals hold"
         )
-    for score in summary.get("validation", ()):
-        errors = ", ".join(f"{side} {100 * value:.2f} %" for side, value in score["relative"].items())
-        lines.append(f"  torque error of {score['session']}, held out: {errors}")
+    for score in (*summary.get("validation", ()), *summary.get("fit", ())):
+        kind = "session of the estimate" if score["seen"] else "held out"
+        lines.append(f"  torque error of {score['session']}, {kind}: {by_side(score['torque_error'])}")
+    lines += [
+        f"  no torque error of {one['session']}: {one['reason']}" for one in summary.get("unscored", ())
+    ]
     return "\n".join([*lines, "", found.summary()]) + "\n"
 
 
@@ -227,11 +272,11 @@ def write_log_results(
         "sessions": entries,
         "link": {},
         "versions": versions(),
-        **estimated(found, tested),
+        **estimated(found, model, sessions, tested),
     }
     write_model(model, folder / "model.yaml")
     (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
-    (folder / "summary.json").write_text(to_json(summary) + "\n", encoding="utf-8")
+    write_json(folder / "summary.json", summary)
     from runner.report.page import write_report
 
     return write_report(folder)

@@ -17,6 +17,8 @@ from typing import Any, Self, TextIO
 import click
 import numpy as np
 
+from fri.errors import DataError
+
 PATH = click.Path(path_type=Path)
 _BAR = 24
 
@@ -76,6 +78,24 @@ def plain(value: Any) -> Any:
 def to_json(value: Any) -> str:
     """`plain(value)` as text."""
     return json.dumps(plain(value), indent=1)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write `plain(content)` in one step, read back first; ConfigurationError for a place that cannot be written."""
+    # Imported on first use: the help pages need no models.
+    from ident.model.model_file import write_checked
+
+    expected = plain(content)
+
+    def check(text: str) -> None:
+        try:
+            again = json.loads(text)
+        except ValueError as error:
+            raise DataError(f"no JSON: {error}") from error
+        if again != expected:
+            raise DataError("the content read back differs from that written")
+
+    write_checked(path, to_json(content) + "\n", check)
 
 
 class StatusLine:

@@ -14,16 +14,16 @@ from ident.estimation.identify import (
 )
 from ident.estimation.mounting import Mounting, find_mounting
 from ident.estimation.payload import PayloadEstimate, identify_payload, with_payload
+from ident.estimation.scores import Score, SessionScore, score_session, torque_error
 from ident.estimation.validate import (
     CrossValidation,
-    Score,
-    SessionScore,
+    Unscored,
     Validation,
     cross_validate,
     mounted,
     predictor,
     prepared_session,
-    score_session,
+    signals_for,
     validate,
 )
 
@@ -39,6 +39,7 @@ __all__ = [
     "PayloadEstimate",
     "Score",
     "SessionScore",
+    "Unscored",
     "Validation",
     "compare",
     "competitor_scores",
@@ -50,7 +51,9 @@ __all__ = [
     "predictor",
     "prepared_session",
     "score_session",
+    "signals_for",
     "simulate_session",
+    "torque_error",
     "validate",
     "with_payload",
 ]

@@ -28,14 +28,8 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
-from ident.estimation.validate import (
-    SessionScore,
-    finite,
-    mounted,
-    predictor,
-    prepared_session,
-    score_session,
-)
+from ident.estimation.scores import SessionScore, finite, score_session
+from ident.estimation.validate import mounted, predictor, prepared_session
 from ident.estimators.estimate import normal_tail
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
@@ -349,19 +343,21 @@ def competitor_scores(
     settings: SignalSettings | None = None,
     others: Sequence[DynamicModel] = (),
 ) -> tuple[SessionScore, ...]:
-    """Scores of every competitor available for each session; joints and URDF are those of the model."""
+    """Scores of every competitor available for each session; joints and URDF are those of the model.
+
+    The controller's model and the URDF compete where the session has joint torques, another model on the sides
+    common to both. Raises ConfigurationError for another model without a side in common.
+    """
     found = []
     for session in as_sessions(sessions):
-        prepared = prepared_session(model, session, settings)
-        if not any(passage.joint.torque.shape[1] for passage in prepared.passages):
-            continue
-        controller = score_controller_model(prepared, session)
-        if controller is not None:
-            found.append(controller)
-        if model.structure.chain.urdf is not None:
-            found.append(score_cad(model, prepared, session))
-        for other in others:
-            found.append(_score_other(other, session, settings))
+        if session.joint.effort.shape[1] and "joint" in model.structure.sides:
+            prepared = prepared_session(model, session, settings)
+            controller = score_controller_model(prepared, session)
+            if controller is not None:
+                found.append(controller)
+            if model.structure.chain.urdf is not None:
+                found.append(score_cad(model, prepared, session))
+        found += [_score_other(model, other, session, settings) for other in others]
     return tuple(found)
 
 
@@ -423,11 +419,16 @@ def _matched(samples: Floats, times: Floats) -> tuple[NDArray[np.int64], NDArray
     return picked, np.flatnonzero(close)[first]
 
 
-def _score_other(other: DynamicModel, session: Session, settings: SignalSettings | None) -> SessionScore:
-    if "joint" not in other.structure.sides:
+def _score_other(
+    model: DynamicModel, other: DynamicModel, session: Session, settings: SignalSettings | None
+) -> SessionScore:
+    common = tuple(side for side in other.structure.sides if side in model.structure.sides)
+    if not common:
+        own, theirs = (" and ".join(one.structure.sides) for one in (model, other))
         raise ConfigurationError(
-            f"the model of {other.robot} has no joint torque and cannot compete; use Model 1 or 2"
+            f"the model of {other.robot} computes the torque of the {theirs} side, the tested one that of the "
+            f"{own} side, so they cannot compete; choose models with a side in common"
         )
     prepared = prepared_session(other, session, settings)
     predict = predictor(other, mounted(other, session))
-    return score_session(prepared, predict, ("joint",), session, f"model of {other.robot}")
+    return score_session(prepared, predict, common, session, f"model of {other.robot}")

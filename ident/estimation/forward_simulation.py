@@ -23,7 +23,8 @@ from ident.dynamics import regressor
 from ident.dynamics.parameters import PER_LINK, Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular, rows_of
-from ident.estimation.validate import mounted, prepared_session, resampled
+from ident.estimation.scores import resampled
+from ident.estimation.validate import mounted, prepared_session
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
@@ -92,13 +93,13 @@ class ForwardSimulation(Tabular):
     def __repr__(self) -> str:
         return (
             f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
-            f"relative error {100 * self.relative:.2f} %, {len(self.times)} samples"
+            f"simulated torque error {100 * self.relative:.2f} %, {len(self.times)} samples"
         )
 
     def __str__(self) -> str:
         lines = [
             f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
-            f"{100 * self.relative:.2f} %",
+            f"simulated torque error {100 * self.relative:.2f} %",
             f"  {'joint':<14}{'torque rms Nm':>14}{'position rms mrad':>19}",
         ]
         for joint, torque, position in zip(self.joint_names, self.torque_rms, self.position_rms, strict=True):
@@ -215,13 +216,14 @@ def simulate(
 class _Friction:
     """Friction along directions of the joint velocity: one a joint, and the sum of two for coupled drives.
 
-    directions (m, n); viscous, coulomb (m,); offset (n,).
+    directions (m, n); viscous, coulomb (m,); offset (n,). width : of the Coulomb function [rad/s].
     """
 
     directions: Floats
     viscous: Floats
     coulomb: Floats
     offset: Floats
+    width: float = _WIDTH_RAD_S
 
     @classmethod
     def of(cls, model: DynamicModel, motor: bool) -> _Friction:
@@ -238,13 +240,15 @@ class _Friction:
                 viscous.append(model.standard[first + 1 : first + 2])
                 coulomb.append(model.standard[first + 2 : first + 3])
         offset = drive["offl"] + (drive["offm"] if motor else 0.0)
-        return cls(np.vstack(directions), np.concatenate(viscous), np.concatenate(coulomb), offset)
+        # A jump of the torque cannot be integrated, so a narrow function stands for it.
+        width = structure.coulomb.width if structure.coulomb.kind == "tanh" else _WIDTH_RAD_S
+        return cls(np.vstack(directions), np.concatenate(viscous), np.concatenate(coulomb), offset, width)
 
     def __call__(self, qd: Floats) -> tuple[Floats, Floats]:
         """Torque (n,) against the motion and its derivative (n, n) by the velocity."""
         speed = self.directions @ qd
-        smooth = np.tanh(speed / _WIDTH_RAD_S)
-        steep = self.viscous + self.coulomb * (1.0 - smooth**2) / _WIDTH_RAD_S
+        smooth = np.tanh(speed / self.width)
+        steep = self.viscous + self.coulomb * (1.0 - smooth**2) / self.width
         torque = self.directions.T @ (self.viscous * speed + self.coulomb * smooth) + self.offset
         return torque, (self.directions.T * steep) @ self.directions
 

@@ -25,6 +25,7 @@ from ident.estimators.estimate import Estimate, Estimator
 from ident.estimators.physical import cad_prior
 from ident.estimators.problem import Problem
 from ident.model.dynamic_model import DynamicModel
+from ident.model.signals import signals_entry
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
@@ -121,8 +122,7 @@ class Identification(Tabular):
                 {"file": session.name, "uid": session.uid, "payload": payload or "none"}
                 for session, payload in zip(self.prepared, self.payloads, strict=True)
             ],
-            "cutoff_hz": self.settings.signals.cutoff_hz,
-            "decimate_hz": self.settings.signals.decimate_hz,
+            "signals": signals_entry(self.settings.signals, self.prepared),
         }
         matrix = found.covariance.matrix
         return DynamicModel(self.robot, self.structure, names, found.values, matrix, self.base, provenance)

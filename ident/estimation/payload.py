@@ -25,6 +25,7 @@ from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, to_com
 from ident.dynamics.physical import project, reference_bodies
 from ident.dynamics.structure import Condition, ModelStructure
 from ident.dynamics.tables import Tabular, rows_of
+from ident.estimation.validate import seen_sessions, signals_for
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem
@@ -200,6 +201,7 @@ def identify_payload(
     """Estimate the payload of one or more sessions with the same payload, given a model of the arm.
 
     model : a model or the path of its file. sessions : a session, the path of a log, or several of either.
+    settings : of the signals; default those of the model.
     free_offsets : estimate new torque offsets too, because sensor zeros move between mountings.
 
     Raises DataError for a session without payload, for different payloads or other joints, and for a motion
@@ -217,7 +219,8 @@ def identify_payload(
     payload = _payload_name(sessions)
     structure, arm_columns, body, offset_columns = _structure(model, payload, free_offsets)
     chosen = [session.select(structure.chain.joint_names) for session in sessions]
-    prepared = [prepare(session, settings, motor="motor" in structure.sides) for session in chosen]
+    signals = signals_for(model, settings)
+    prepared = [prepare(session, signals, motor="motor" in structure.sides) for session in chosen]
     known = _arm_parameters(model)
     columns = np.concatenate([arm_columns, body, offset_columns])
     names = [structure.names[c] for c in columns]
@@ -236,6 +239,15 @@ def identify_payload(
         arm = influence @ model.covariance[np.ix_(known, known)] @ influence.T
         cross = -influence @ model.covariance[known]
         notes = ()
+    flags = seen_sessions(model, sessions)
+    shared = [session.path.name for session, flag in zip(sessions, flags, strict=True) if flag]
+    if shared:
+        notes = (
+            *notes,
+            f"WARNING: the arm model was fitted to {', '.join(shared)} too, so the errors of arm and payload are not "
+            "independent and the standard deviations too small; take an arm model of other sessions, or the payload "
+            "estimate that is part of this one.",
+        )
     whole = fitted.covariance.matrix + arm
     values = fitted.values[:_BODY]
     if values[9] <= 0.0:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, DataError
 from ident.excitation.check import Check, Margin
 from ident.excitation.motions import (
     Array,
@@ -22,6 +22,7 @@ from ident.excitation.motions import (
     Samples,
     SplineMotion,
 )
+from ident.model.model_file import write_checked
 from lwr_driver.configuration import read_mapping
 
 _SCHEMA = 1
@@ -118,13 +119,22 @@ class ExcitationPlan:
         return yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=True)
 
     def save(self, path: Path) -> None:
-        """Write the plan file."""
-        path.write_text(self.to_yaml(), encoding="utf-8")
+        """Write the plan file, read back first."""
+
+        def check(text: str) -> None:
+            if ExcitationPlan.from_mapping(yaml.safe_load(text), "plan").to_yaml() != text:
+                raise DataError("the plan read back differs from the one written")
+
+        write_checked(path, self.to_yaml(), check)
 
     @classmethod
     def load(cls, path: Path) -> ExcitationPlan:
         """Read a plan file; ConfigurationError with path and fault otherwise."""
-        content = read_mapping(path)
+        return cls.from_mapping(read_mapping(path), str(path))
+
+    @classmethod
+    def from_mapping(cls, content: Any, path: str) -> ExcitationPlan:
+        """The plan of a file's content; ConfigurationError with path and fault otherwise."""
         try:
             if content["schema_version"] != _SCHEMA or content["kind"] != "excitation plan":
                 raise ConfigurationError("not an excitation plan of schema_version 1")

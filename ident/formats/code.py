@@ -241,15 +241,29 @@ def _bound(operand: tuple[str, int, int], strength: int) -> str:
 def _head(program: Program) -> list[str]:
     count = program.operations
     model = program.model
-    return [
+    lines = [
         f"Inverse dynamics of {model.title or 'a serial arm'}.",
         "Generated code: change the model, not this file.",
         f"Joints, base to tip: {' '.join(model.chain.joint_names)}. SI units: rad, rad/s, rad/s^2, Nm.",
         *(f"{output}: {_MEANING[output]}" for output in program.outputs),
         f"{count['multiplications']} multiplications, {count['additions']} additions, "
         f"{count['functions']} functions.",
+        f"Coulomb friction: {_COULOMB[model.coulomb_kind].format(model.coulomb_width)}.",
         *model.notes,
     ]
+    return [_comment(line) for line in lines]
+
+
+def _comment(text: str) -> str:
+    """One line without the ends of a C comment or a Python docstring."""
+    return " ".join(text.split()).replace("*/", "* /").replace("\\", "/").replace('"""', "'")
+
+
+_COULOMB = {
+    "sign": "sign of the speed",
+    "deadband": "sign of the speed, zero up to {0:g} rad/s",
+    "tanh": "tanh(speed / {0:g} rad/s) for the sign of the speed",
+}
 
 
 _MEANING = {

@@ -64,6 +64,11 @@ def comment(model: StandardModel, notes: tuple[str, ...]) -> str:
     for k, joint in enumerate(names):
         inertia, joint_offset, motor_offset = model.drive[k, [0, 3, 6]]
         rows.append(f"  {joint}  {inertia:.6g}  {joint_offset:.6g}  {motor_offset:.6g}")
+    if model.coulomb_kind != "sign":
+        law = f"{model.coulomb_kind} with width {model.coulomb_width:g} rad/s"
+        rows.append(
+            f"The friction was estimated as a {law}; the simulator has a law of its own near zero speed."
+        )
     rows += [*model.notes, *notes]
     return "\n     ".join(rows).replace("--", "- -") + " "
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from fri.errors import ConfigurationError
 from ident.formats.code import to_c, to_numpy
 from ident.formats.description import to_mjcf, to_urdf
+from ident.formats.read_back import check_c, check_mjcf, check_numpy, check_urdf
 from ident.formats.standard import StandardModel, standard_model
-from ident.model.model_file import Model, as_model
+from ident.model.model_file import Model, as_model, write_checked
 
 FORMATS = {".urdf": "URDF", ".xml": "MJCF", ".c": "C", ".py": "numpy"}
 """Name of the format by ending of the file name."""
@@ -29,8 +32,10 @@ def export(
 
     Returns the exported numbers, with `title` and `notes`. URDF and MJCF need physically consistent bodies, the
     nearest ones where the estimate is not; the notes say so.
+    Each file is read back and computed with before it takes its name; C is compiled where there is a compiler.
     Raises ConfigurationError for an unknown ending, payload or model, and for a file that exists or cannot be
-    written; nothing is written unless all endings are known.
+    written; nothing is written unless all endings are known. Raises DataError for a file of other torques than
+    the model's.
     """
     paths = []
     for output in outputs:
@@ -55,10 +60,13 @@ def export(
         ".c": lambda: to_c(plain, name),
         ".py": lambda: to_numpy(plain),
     }
+    notes: list[str] = []
+    checks: dict[str, Callable[[str], object]] = {
+        ".urdf": lambda text: check_urdf(text, bodies),
+        ".xml": lambda text: check_mjcf(text, bodies),
+        ".c": lambda text: notes.append(check_c(text, source, payload, name)),
+        ".py": lambda text: check_numpy(text, source, payload),
+    }
     for path in paths:
-        text = writers[path.suffix]()
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ConfigurationError(f"output {path} cannot be written: {error.strerror}") from error
-    return bodies
+        write_checked(path, writers[path.suffix](), checks[path.suffix])
+    return replace(bodies, notes=(*bodies.notes, *filter(None, notes)))

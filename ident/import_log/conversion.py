@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.import_log.mapping import Floats, LogMapping, Signal, TimeBase
+from ident.import_log.read_back import check_written
 from lwr_driver.configuration import find
 from lwr_driver.session import SessionWriter, session_metadata
 
@@ -316,6 +317,7 @@ def import_log(
         attachments=attachments,
     ) as writer:
         _write(writer, channels)
+    check_written(Path(output), {key: (one.times, one.values) for key, one in channels.items()})
     written = {
         topic: len(channels[key].times)
         for topic, key in (

@@ -238,7 +238,7 @@ class DynamicModel(Tabular):
         stamps = time - time[0] if len(time) else time
 
         def friction(speed: Floats) -> Floats:
-            return drive["Fvm"] * speed + drive["Fcm"] * np.sign(speed)
+            return drive["Fvm"] * speed + drive["Fcm"] * self.structure.coulomb(speed)
 
         return ArmMotion(
             chain=chain,

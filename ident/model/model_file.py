@@ -13,13 +13,14 @@ Layout (schema_version 1)::
     effects: []
     urdf: |  the text of the robot description, when there is one
 
-Values keep all their digits; standard deviations and covariances ten.
+Values keep all their digits; standard deviations and covariances ten. `provenance.signals` holds the signal
+settings of the estimate (`ident.model.signals`).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -27,11 +28,12 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import yaml
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, DataError, LwrError
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
+from ident.model.covariance import DIGITS, nearest_covariance, rounded
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import parse, read_mapping
 
@@ -108,11 +110,49 @@ class _File:
 
 
 def write_model(model: DynamicModel, path: str | Path) -> None:
-    """Write a model to `path` (YAML, UTF-8), replacing an existing file in one step."""
+    """Write a model to `path` (YAML, UTF-8), replacing an existing file in one step.
+
+    The file is read back first. Raises DataError for a model that does not survive, and ConfigurationError for
+    a place that cannot be written.
+    """
+    write_checked(path, model_text(model), lambda text: _check_read(model, text))
+
+
+def write_checked(path: str | Path, text: str, check: Callable[[str], object]) -> None:
+    """Write `text` (UTF-8) to `path` in one step, after `check` of the text as read back from the disk.
+
+    check : raises LwrError for a file of no use; an existing file then stays, the draft lies beside it.
+    """
     target = Path(path)
-    beside = target.with_name(target.name + ".part")
-    beside.write_text(model_text(model), encoding="utf-8")
-    beside.replace(target)
+    draft = target.with_name(target.name + ".part")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        again = draft.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(
+            f"{target} cannot be written: {error.strerror}; choose another place"
+        ) from error
+    try:
+        check(again)
+    except LwrError as error:
+        raise DataError(
+            f"{target}: the file cannot be read back, so it was not put in place (draft: {draft.name}): {error}"
+        ) from error
+    try:
+        draft.replace(target)
+    except OSError as error:
+        raise ConfigurationError(
+            f"{target} cannot be written: {error.strerror}; choose another place"
+        ) from error
+
+
+def _check_read(model: DynamicModel, text: str) -> None:
+    """Compare the model of a file's text with the written one."""
+    again = read_model(yaml.safe_load(text))
+    if again.names != model.names or not np.array_equal(again.values, model.values):
+        raise DataError("the parameters read back differ from those written")
+    if model_text(again) != text:
+        raise DataError("the content read back differs from that written")
 
 
 def model_text(model: DynamicModel) -> str:
@@ -135,10 +175,15 @@ def model_text(model: DynamicModel) -> str:
         content["conditions"] = [
             {"payload": c.payload, "sides": list(structure.condition_sides(c))} for c in model.base.conditions
         ]
-    content["parameters"] = _parameter_entries(model)
+    covariance = None
     if model.covariance is not None:
+        covariance = rounded(
+            nearest_covariance(model.covariance, f"covariance of the model of {model.robot}")
+        )
+    content["parameters"] = _parameter_entries(model, covariance)
+    if covariance is not None:
         content["covariance"] = [
-            " ".join(f"{value:.10g}" for value in row[: k + 1]) for k, row in enumerate(model.covariance)
+            " ".join(f"{value:.{DIGITS}g}" for value in row[: k + 1]) for k, row in enumerate(covariance)
         ]
     content["provenance"] = _plain(model.provenance)
     content["effects"] = [_plain(effect) for effect in model.effects]
@@ -147,13 +192,13 @@ def model_text(model: DynamicModel) -> str:
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
-def _parameter_entries(model: DynamicModel) -> list[dict[str, Any]]:
+def _parameter_entries(model: DynamicModel, covariance: Floats | None) -> list[dict[str, Any]]:
     entries = []
     for k, (name, unit, value) in enumerate(zip(model.names, model.units, model.values, strict=True)):
         entry: dict[str, Any] = {"name": name, "unit": unit, "value": float(value)}
-        if model.covariance is not None:
+        if covariance is not None:
             # The root of the written variance, so that a file read and written again stays the same.
-            entry["std"] = float(f"{np.sqrt(float(f'{model.covariance[k, k]:.10g}')):.10g}")
+            entry["std"] = float(rounded(np.sqrt(covariance[k, k])))
         entry["kind"] = model.kind
         entries.append(entry)
     return entries
@@ -174,8 +219,9 @@ def as_model(value: Model, name: str = "model") -> DynamicModel:
 def read_model(source: str | Path | Mapping[str, Any]) -> DynamicModel:
     """Read a model from a file, or from its content as a mapping.
 
-    Strict: unknown or missing keys, unknown names, wrong units, a covariance inconsistent with its standard
-    deviations or not positive semi-definite raise ConfigurationError with the file, the key and the remedy.
+    Strict: unknown or missing keys, unknown names, wrong units and a covariance inconsistent with its standard
+    deviations raise ConfigurationError with the file, the key and the remedy. A covariance that is not positive
+    semi-definite becomes the nearest one (`nearest_covariance`).
     """
     if isinstance(source, Mapping):
         content, where = dict(source), "model"
@@ -189,12 +235,12 @@ def read_model(source: str | Path | Mapping[str, Any]) -> DynamicModel:
         )
     file = parse(_File, content, where)
     try:
-        return _model(file, content)
+        return _model(file, content, where)
     except ConfigurationError as error:
         raise ConfigurationError(f"{where}: {error}") from error
 
 
-def _model(file: _File, content: Mapping[str, Any]) -> DynamicModel:
+def _model(file: _File, content: Mapping[str, Any], where: str) -> DynamicModel:
     structure = ModelStructure(
         Chain.from_dict(content["chain"], urdf=file.urdf),
         file.model.number,
@@ -221,7 +267,7 @@ def _model(file: _File, content: Mapping[str, Any]) -> DynamicModel:
         structure,
         tuple(entry.name for entry in file.parameters),
         np.array([entry.value for entry in file.parameters]),
-        None if file.covariance is None else _covariance(file.covariance, file.parameters),
+        None if file.covariance is None else _covariance(file.covariance, file.parameters, where),
         base,
         file.provenance,
         file.effects,
@@ -237,7 +283,7 @@ def _model(file: _File, content: Mapping[str, Any]) -> DynamicModel:
     return model
 
 
-def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...]) -> Floats:
+def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...], where: str) -> Floats:
     count = len(entries)
     if len(rows) != count:
         raise ConfigurationError(f"`covariance` has {len(rows)} rows for {count} parameters")
@@ -261,9 +307,15 @@ def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...]) -> 
                 "the file was edited by hand: correct one of the two"
             )
     scale = np.where(std > 0.0, std, 1.0)
-    if np.linalg.eigvalsh(full / np.outer(scale, scale))[0] < -1e-6:
-        raise ConfigurationError("`covariance` is not positive semi-definite; a row was changed or lost")
-    return full
+    correlation = full / np.outer(scale, scale)
+    first, second = divmod(int(np.argmax(np.abs(correlation))), max(count, 1))
+    # Beyond 2, the nearest possible correlation is further away than the whole scale is long.
+    if abs(correlation[first, second]) > 2.0:
+        raise ConfigurationError(
+            f"`covariance` is not positive semi-definite: the correlation of {entries[first].name} and "
+            f"{entries[second].name} is {correlation[first, second]:.3g}; a row was changed or lost"
+        )
+    return nearest_covariance(full, f"{where}: `covariance`")
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
+from fri.errors import ConfigurationError, DataError, LwrError, OperatorError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from runner.diagnosis.after_run import conclude_run
@@ -110,6 +110,10 @@ def command(
     click.echo(to_json({**summary, "folder": str(folder)}) if as_json else f"{text}\n{folder}")
     if not done:
         raise _failure(records[-1], folder)
+    if summary.get("unscored"):
+        raise DataError(
+            "; ".join(f"{one['session']} was not scored: {one['reason']}" for one in summary["unscored"])
+        )
 
 
 @contextmanager

@@ -111,14 +111,19 @@ def command(
     content, text = found.to_dict(), found.summary()
     if mounting is not None:
         content["mounting"], text = mounting.to_dict(), f"{text}\n\n{mounting}"
-    if tested:
-        validation = validate(result, tested)
-        content["validation"] = validation.to_dict()["sessions"]
+    # The model first: nothing in a test session may cost it.
+    if out is not None:
+        write_model(result, out)
+    validation = None if not tested else validate(result, tested, keep_going=True)
+    if validation is not None:
+        whole = validation.to_dict()
+        content |= {"validation": whole["sessions"], "unscored": whole["unscored"]}
         text = f"{text}\n\n{validation}"
     click.echo(to_json(content) if as_json else text)
     if out is not None:
-        write_model(result, out)
         click.echo(str(out), err=as_json)
     if results is not None:
         page = write_log_results(results, found, logs, tested, result, text=text)
         click.echo(str(page), err=as_json)
+    if validation is not None:
+        validation.require_all()

@@ -22,7 +22,12 @@ from runner.terminal import PATH, json_option, to_json
 )
 @click.option("--forward", is_flag=True, help="Simulate along the commanded motion too.")
 @click.option("--cross", is_flag=True, help="Cross-validate over the sessions too.")
-@click.option("--settings", metavar="FILE", help="Settings of `identify`; its `signals` are used here.")
+@click.option(
+    "--settings", metavar="FILE", help="Settings of `identify`; its `signals` replace those of the model."
+)
+@click.option(
+    "--estimate-delay", is_flag=True, help="Estimate the motor channel's delay anew in each session."
+)
 def validate_command(
     model: Path,
     sessions: tuple[Path, ...],
@@ -32,11 +37,13 @@ def validate_command(
     forward: bool,
     cross: bool,
     settings: str | None,
+    estimate_delay: bool,
 ) -> None:
     """Test MODEL on SESSIONS it was not fitted to: torque residuals per joint and side.
 
-    Competitors are scored as well: the controller's own mass matrix and gravity (logged through FRI), the
-    inertials of the URDF, other models. A session of the model's own estimate is refused.
+    The signals are filtered as for the estimate of MODEL, and its delay of the motor channel is taken. Competitors
+    are scored as well: the controller's own mass matrix and gravity (logged through FRI), the inertials of the URDF,
+    other models. A session of the model's own estimate is refused.
 
     \b
     lwr-run validate model.yaml check.mcap
@@ -45,7 +52,7 @@ def validate_command(
     from ident.estimation.compare import competitor_scores
     from ident.estimation.forward_simulation import simulate_session
     from ident.estimation.identify import IdentificationSettings
-    from ident.estimation.validate import cross_validate, validate
+    from ident.estimation.validate import cross_validate, signals_for, validate
     from ident.model.model_file import read_model
     from lwr_driver.session import read_session
     from runner.estimation import IdentifySettings
@@ -53,6 +60,8 @@ def validate_command(
     tested = read_model(model)
     logs = [read_session(path) for path in sessions]
     signals = None if settings is None else IdentifySettings.load(settings).signals
+    if estimate_delay:
+        signals = signals_for(tested, signals, estimate_delay=True)
     result = validate(tested, logs, settings=signals, allow_seen=allow_seen)
     others = [read_model(path) for path in against]
     result = replace(result, competitors=competitor_scores(tested, logs, settings=signals, others=others))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
@@ -38,6 +37,7 @@ from runner.diagnosis.records import (
 )
 from runner.estimation import couplings
 from runner.replay import Replay
+from runner.terminal import write_json
 
 DIAGNOSIS = "diagnosis.json"
 DETAILS = "details.json"
@@ -114,8 +114,8 @@ class Study:
         kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAY)
         for stale in (path for kind in kinds for path in folder.glob(kind)):
             stale.unlink()
-        _write_json(self.diagnosis.to_dict(), folder / DIAGNOSIS)
-        _write_json(self.details(), folder / DETAILS)
+        write_json(folder / DIAGNOSIS, self.diagnosis.to_dict())
+        write_json(folder / DETAILS, self.details())
         write_model(self.diagnosis.extended_model, folder / EXTENDED)
         (folder / TEXT).write_text(f"{self}\n", encoding="utf-8")
         self.residuals.save(folder / RESIDUALS)
@@ -241,10 +241,6 @@ def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:
     compliance = np.zeros(0) if healthy is None else healthy.compliance
     usable = len(compliance) == len(arm.stiffness) and bool(np.all(compliance > 0.0))
     return replace(arm, stiffness=1.0 / compliance) if usable else arm
-
-
-def _write_json(content: dict[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def chain_of(sessions: Sequence[Session], urdf: Path | None) -> Chain:

@@ -81,34 +81,33 @@ def motion_figure(results: Results, session: str | None = None, side: str = "joi
 
 
 def torque_figure(results: Results, session: str | None = None, side: str | None = None) -> Figure:
-    """Figure 3 of the paper: measured and computed torque with the relative error, by joint.
+    """Figure 3 of the paper: measured and computed torque with their difference, by joint.
 
     session : name; by default a held-out one, else the loaded one. side : "joint" (default if present) or
     "motor".
-    The relative error is the residual over the largest measured torque of the joint in the session. Measured
-    and computed torque passed the same low-pass; the samples as logged stand behind them.
+    Measured and computed torque passed the same low-pass; the samples as logged stand behind them. The torque
+    error of the text is that of all samples as logged.
     """
     one = _choose(results, session, side, unseen_first=True)
 
     def panel(k: int, joint: str) -> Panel:
-        error = one.relative_error(k)
         score = one.scores[k]
-        rms = float(np.sqrt(np.nanmean(error**2)))
+        error = one.measured[:, k] - one.computed[:, k]
         marks = (
             _line("logged", "as logged", one.time, one.torque[:, k]),
             _line("measured", "measured", one.grid, one.measured[:, k]),
             _line("computed", "computed", one.grid, one.computed[:, k]),
-            _line("error", "relative error", one.grid, error, lower=True),
+            _line("error", "residual", one.grid, error, lower=True),
         )
         alt = (
-            f"Measured and computed {one.side} torque of {joint}, session {one.session}: residual "
-            f"{score.band_rms:.3g} Nm rms in the band of the estimation, relative error {rms:.2f} % rms."
+            f"Measured and computed {one.side} torque of {joint}, session {one.session}: torque error "
+            f"{100 * score.relative:.2f} %, {score.rms:.3g} Nm rms."
         )
-        note = f"residual {score.band_rms:.2g} Nm, error {rms:.2f} %"
-        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, note, lower_label="error [%]")
+        note = f"torque error {100 * score.relative:.2f} %, {score.rms:.2g} Nm"
+        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, note, lower_label="residual [Nm]")
 
     kind = "held-out session" if one.unseen else "session"
-    caption = f"Measured and computed {one.side} torque with relative error, {kind} {one.session}"
+    caption = f"Measured and computed {one.side} torque, {kind} {one.session}"
     return _by_joint(one, f"torque-{one.session}-{one.side}", caption, panel)
 
 
@@ -127,14 +126,13 @@ def residual_figure(
     residual = one.measured - one.computed
 
     def panel(k: int, joint: str) -> Panel:
-        rms = float(np.sqrt(np.nanmean(residual[:, k] ** 2)))
         marks: tuple[Mark, ...] = (
             _line("logged", "as logged", one.time, one.error[:, k]),
             _line("measured", f"low-pass {one.cutoff_hz:g} Hz", one.grid, residual[:, k]),
         )
         if against != "time":
             marks = _binned(one, residual[:, k], k, against)
-        note = f"{rms:.3g} Nm rms"
+        note = f"{one.scores[k].rms:.3g} Nm rms, all samples"
         alt = f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {note}."
         return Panel(joint, labels[against], "residual [Nm]", marks, alt, note)
 

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError, LwrError
 from ident.dynamics.structure import Side
-from ident.estimation.validate import Score, mounted, predictor, prepared_session, score_session
+from ident.estimation.scores import Score, SessionScore, score_session
+from ident.estimation.validate import mounted, predictor, prepared_session, signals_for
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
+from ident.model.signals import signal_settings
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
@@ -36,9 +38,7 @@ class Curves:
     time (m,) [s], torque, error, q, qd (m, n) : every sample as logged [Nm]; error is measured minus computed.
     raw_velocity : (m, n) differences of the logged positions [rad/s]; empty (m, 0) on the motor side.
     grid (k,) [s], measured, computed (k, n) : torque and its prediction, both through the same low-pass [Nm].
-    error and computed are NaN for a resting joint.
-    cutoff_hz : of the low-pass. scores : of the computed-torque test by joint. unseen : held-out session.
-    relative : residual over torque of all joints.
+    cutoff_hz : of the low-pass. whole : the computed-torque test of the session. unseen : held-out session.
     """
 
     session: str
@@ -56,8 +56,7 @@ class Curves:
     grid: Floats
     measured: Floats
     computed: Floats
-    scores: tuple[Score, ...]
-    relative: float
+    whole: SessionScore
     unseen: bool = False
 
     @property
@@ -65,10 +64,15 @@ class Curves:
         """Session and side in words."""
         return f"{self.session}, {self.side} torque{', held out' if self.unseen else ''}"
 
-    def relative_error(self, joint: int) -> Floats:
-        """(k,) error in percent of the largest measured torque of the joint in this session."""
-        largest = float(np.max(np.abs(self.measured[:, joint]))) or 1.0
-        return 100.0 * (self.measured[:, joint] - self.computed[:, joint]) / largest
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """The test by joint."""
+        return tuple(score for score in self.whole.scores if score.side == self.side)
+
+    @property
+    def relative(self) -> float:
+        """The torque error of all joints."""
+        return float(self.whole.relative[self.side])
 
 
 def curves(
@@ -76,15 +80,14 @@ def curves(
     session: Session,
     name: str,
     *,
-    cutoff_hz: float | None = None,
+    settings: SignalSettings | None = None,
     unseen: bool = False,
 ) -> list[Curves]:
     """Curves of a session for each side common to model and session.
 
-    cutoff_hz : cut-off of the position filter, as in the estimation; None takes the default. unseen : held out.
+    settings : of the signals; default those of the model. unseen : held out.
     """
     payload = mounted(model, session)
-    settings = None if cutoff_hz is None else SignalSettings(cutoff_hz=cutoff_hz)
     prepared = prepared_session(model, session, settings)
     predict = predictor(model, payload)
     scored = score_session(prepared, predict, model.structure.sides, session, "identified model")
@@ -109,8 +112,7 @@ def curves(
                 joint_names=prepared.joint_names,
                 cutoff_hz=prepared.cutoff_hz,
                 raw_velocity=_velocity(chosen, time) if side == "joint" else np.empty((len(time), 0)),
-                scores=tuple(score for score in scored.scores if score.side == side),
-                relative=float(scored.relative[side]),
+                whole=scored,
                 unseen=unseen,
                 **columns,
             )
@@ -125,26 +127,21 @@ def _part(
     if channel is None or not len(passage.rows) or not channel.torque.shape[1]:
         return {}
     computed = predictor(model, payload)(channel, side)
-    # At rest the Coulomb torque is unknown.
-    settings = prepared.settings
-    resting = np.abs(channel.qd) < settings.standstill_rad_s
     first, last = passage.rows[0], passage.rows[-1]
     inside = (channel.times >= first) & (channel.times <= last)
     step = float(np.median(np.diff(channel.times)))
     cutoff = min(prepared.cutoff_hz, 0.2 / step)
     grid = np.arange(first, last, 1.0 / (_RATE_PER_CUTOFF * cutoff))
     low_pass = ParallelFilter(channel.times, grid, cutoff, _ATTENUATION_DB)
-    filtered = low_pass.apply(computed)
-    filtered[low_pass.share(resting) > settings.standstill_share] = np.nan
     return {
         "time": channel.times[inside],
         "torque": channel.torque[inside],
-        "error": np.where(resting, np.nan, channel.torque - computed)[inside],
+        "error": (channel.torque - computed)[inside],
         "q": channel.q[inside],
         "qd": channel.qd[inside],
         "grid": grid,
         "measured": low_pass.apply(channel.torque),
-        "computed": filtered,
+        "computed": low_pass.apply(computed),
     }
 
 
@@ -243,13 +240,21 @@ class ResultFolder:
         """Measured and computed torque by session and side: held-out sessions last, loaded ones first."""
         if self.model is None:
             return ()
-        cutoffs = {entry["name"]: entry["cutoff_hz"] for entry in self.summary.get("signals", [])}
+        # A model of an earlier version has its cut-off in the summary only.
+        stated = [entry["cutoff_hz"] for entry in self.summary.get("signals", [])]
+        settings = signals_for(self.model)
+        if signal_settings(self.model) is None and stated:
+            settings = replace(settings, cutoff_hz=float(np.median(stated)))
         found = []
         for entry in self.summary["sessions"]:
             session = self.sessions.get(entry["name"])
             if session is not None and entry["exit_status"] == "success":
-                cutoff, unseen = cutoffs.get(session.path.name), bool(entry.get("validation"))
-                found += curves(self.model, session, entry["name"], cutoff_hz=cutoff, unseen=unseen)
+                unseen = bool(entry.get("validation"))
+                try:
+                    found += curves(self.model, session, entry["name"], settings=settings, unseen=unseen)
+                except DataError:
+                    # Listed with its reason under `unscored` of the summary.
+                    continue
         return tuple(sorted(found, key=lambda one: (one.unseen, one.payload is None, one.session, one.side)))
 
     @cached_property

@@ -113,6 +113,11 @@ def table_1_section(results: ResultFolder) -> str:
     sets = {"base": "all base parameters it is", "essential": "the essential ones of this run"}
     others = [f"over {of} {condition[key]:.1f}" for key, of in sets.items() if condition.get(key)]
     note += ", ".join(others) + "." if others else ""
+    if _printed_truths(results)[0]:
+        note += (
+            " Agreement by construction: the emulated arm has the parameters of Table 2, so equal motions give "
+            "about equal torques; only the condition number is a result of the motion itself."
+        )
     return section(
         "table-1",
         "Table 1: the exciting motion",
@@ -176,9 +181,27 @@ def table_2_section(results: ResultFolder) -> str:
         forms = {"estimate": ".4g", "rsd_percent": ".1f", "f": ".2f"}
         lines = [[e["name"], *_numbers(e, forms), e["reason"]] for e in eliminated]
         parts.append(fold(title, table(("parameter", "estimate", "RSD %", "F", "reason"), lines, title)))
-    source = f"Published: {SOURCE}; the arm and the payload were others than those of this run."
+    printed_truths, truths = _printed_truths(results)
+    if printed_truths:
+        text = (
+            f"Agreement by construction: the emulated arm was built from this table, and {printed_truths} of its "
+            f"{truths} true values here are the printed ones. The difference to the published values is therefore "
+            "the error of this estimate on the emulated arm. It says nothing about the paper or about a real arm."
+        )
+        parts.insert(0, paragraph(text))
+        source = f"Published: {SOURCE}."
+    else:
+        source = f"Published: {SOURCE}; the arm and the payload were others than those of this run."
     parts.append(paragraph(source, "soft"))
     return section("table-2", "Table 2: essential base parameters", *parts)
+
+
+def _printed_truths(results: ResultFolder) -> tuple[int, int]:
+    """How many true values of the emulated arm are those of Table 2, to its two decimals, and of how many."""
+    printed = {entry.name: entry.estimate for entry in TABLE_2}
+    known = [e for e in results.summary.get("parameters", []) if "truth" in e and e["name"] in printed]
+    same = [e for e in known if abs(e["truth"] - printed[e["name"]]) <= 0.005 + 1e-9]
+    return len(same), len(known)
 
 
 def _why_absent(results: ResultFolder, absent: list[str]) -> str:
@@ -210,7 +233,8 @@ def torque_section(results: ResultFolder) -> str:
     if not results.curves:
         return ""
     head = (
-        "joint", "rms [Nm]", "rms, % of torque", "bias [Nm]", "worst [Nm]", "at [s]", "in the band [Nm]", "floor [Nm]",
+        "joint", "torque error %", "rms [Nm]", "bias [Nm]", "worst [Nm]", "at [s]", "moving samples only [Nm]",
+        "standstill, % of samples", "standstill, % of squared error", "in the band [Nm]", "repeatability floor [Nm]",
     )  # fmt: skip
     if any(one.unseen for one in results.curves):
         origin = "The held-out motion is first."
@@ -222,26 +246,33 @@ def torque_section(results: ResultFolder) -> str:
     parts = [
         paragraph(
             "Computed torque from the filtered measured motion, and measured torque. Both lines passed the same "
-            f"low-pass; the logged samples are behind them, with every spike. {origin} The relative error is in "
-            "percent of the largest torque of the joint. In the band: in the pass band of the estimation; floor: "
-            "scatter between the periods of the motion, beyond any model."
-        )
+            f"low-pass; the logged samples are behind them, with every spike. {origin}"
+        ),
+        paragraph(
+            "Torque error: rms of measured minus computed torque over rms of the measured torque, all samples as "
+            "logged, standstill and reversals included. It has the same value in the first table, in the terminal "
+            "and in summary.json (`torque_error`). A resting joint holds any torque up to its Coulomb friction, "
+            "beyond any model of the motion; the columns on standstill show its share. In the band: both torques "
+            "through the low-pass of the estimation "
+            f"({results.curves[0].whole.band_hz:g} Hz); repeatability floor: scatter between the periods there."
+        ),
     ]
     for index, one in enumerate(sorted(results.curves, key=lambda one: not one.unseen)):
         rows: list[list[Cell]] = [
             [
                 score.joint,
-                Number(score.rms, ".3f"),
                 Number(100 * score.relative, ".2f"),
-                *(Number(v, ".3f") for v in (score.bias, score.worst)),
+                *(Number(v, ".3f") for v in (score.rms, score.bias, score.worst)),
                 Number(score.worst_time_s, ".2f"),
+                Number(score.moving_rms, ".3f"),
+                *(Number(100 * v, ".1f") for v in (score.standstill, score.standstill_error)),
                 *(Number(v, ".4f") for v in (score.band_rms, score.floor_rms)),
             ]
             for score in one.scores
         ]
         parts.append(
             fold(
-                f"{one.label}: relative error of all joints {100 * one.relative:.2f} % as logged",
+                f"{one.label}: torque error of all joints {100 * one.relative:.2f} %",
                 figure_html(torque_figure(results, one.session, one.side)),
                 table(head, rows, f"Residuals, {one.label}"),
                 is_open=index < 2,

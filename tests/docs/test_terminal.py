@@ -425,6 +425,22 @@ def test_options_that_make_no_sense_are_refused(
     assert message in " ".join(text.split())
 
 
+def test_a_failed_test_session_never_costs_the_model(workplace: Callable[[], Path]) -> None:
+    place = workplace()
+    write_settings(place, essential=None)
+    command = ["identify", *SESSIONS, *SETTINGS, "--out", "m.yaml", "--test", "loaded.mcap"]
+    code, text = run(*command)
+    assert code == 7
+    assert read_model(place / "m.yaml").value("M8") > 3.0
+    assert "M8" in text
+    assert "not validated: loaded.mcap: the model was fitted to this session" in " ".join(text.split())
+    code, text = run(*command, "--json")
+    assert code == 7
+    content = json.loads(text[: text.rindex("}") + 1])
+    assert content["unscored"][0]["session"] == "loaded.mcap"
+    assert content["parameters"]
+
+
 def test_the_payload_of_a_log_can_be_corrected(workplace: Callable[[], Path]) -> None:
     write_settings(workplace(), essential=None)
     code, text = run("identify", *SESSIONS, *SETTINGS, "--json", "--payload", "loaded.mcap=block:3.3")

@@ -127,7 +127,7 @@ def test_results_have_a_short_form(results: dict[str, Any], bench: Any, found: A
         assert "array(" not in text, name
     assert " base, " in repr(results["identification"])
     assert "least certain parameters" in repr(results["estimate"])
-    assert "relative error" in repr(results["validation"])
+    assert "torque error" in repr(results["validation"])
     assert repr(bench.chain).startswith("Chain of 7 joints (RRRRRRR)")
 
 

@@ -229,3 +229,16 @@ def test_commands_work_on_files(
     assert refused.exit_code == ConfigurationError.exit_code
     refused = CliRunner().invoke(main, ["export", str(whole), str(tmp_path / "lwr.sdf")])
     assert "ending says the format" in refused.output
+
+
+def test_a_payload_from_a_session_of_the_arm_model_is_warned_about(
+    estimated: Callable[..., DynamicModel], loaded: Any
+) -> None:
+    arm = replace(
+        bare(estimated(3, 0.005)), provenance={"sessions": [{"uid": loaded.metadata["uid"], "file": "x"}]}
+    )
+    found = identify_payload(arm, [loaded], settings=PLAIN)
+    assert any("the arm model was fitted to carrying.mcap too" in note for note in found.notes)
+    assert "standard deviations too small" in str(found)
+    other = replace(arm, provenance={"sessions": [{"uid": "another", "file": "another.mcap"}]})
+    assert not identify_payload(other, [loaded], settings=PLAIN).notes

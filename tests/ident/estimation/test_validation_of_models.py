@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.base_set import numeric_base
 from ident.estimation.compare import competitor_scores
 from ident.estimation.forward_simulation import simulate, simulate_session
 from ident.estimation.identify import IdentificationSettings, identify
@@ -17,6 +18,14 @@ from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
+SIDES = ("motor", "joint")
+
+
+def side_of(model: DynamicModel, side: Any) -> DynamicModel:
+    """The model with one side, and its parameters there."""
+    structure = replace(model.structure, sides=(side,))
+    base = numeric_base(structure)
+    return DynamicModel(model.robot, structure, base.names, base.reduce(model.standard), None, base)
 
 
 @pytest.fixture(scope="module")
@@ -142,8 +151,9 @@ def test_results_print_and_serialise(truth_model: Any, unloaded: Any) -> None:
 def test_competitors_leave_what_they_do_not_describe(truth_model: Any, unloaded: Any) -> None:
     found = competitor_scores(truth_model, [unloaded], settings=PLAIN, others=[truth_model])
     by_name = {score.predictor: score for score in found}
-    other = [s.rms for s in by_name["model of LWR4+"].scores]
-    np.testing.assert_allclose(other, 0.05, rtol=0.06)
+    other = {side: [s.rms for s in by_name["model of LWR4+"].scores if s.side == side] for side in SIDES}
+    np.testing.assert_allclose(other["joint"], 0.05, rtol=0.06)
+    np.testing.assert_allclose(other["motor"], 0.2, rtol=0.06)
     # The controller's matrices are the true ones here: friction and centrifugal terms remain.
     rms = {s.joint: s.rms for s in by_name["controller's M(q), g(q)"].scores}
     friction = truth_model.drive()
@@ -152,11 +162,70 @@ def test_competitors_leave_what_they_do_not_describe(truth_model: Any, unloaded:
     assert by_name["CAD (URDF), no friction"].relative["joint"] > 0.02
 
 
-def test_a_competitor_without_joint_torque_is_refused(truth_model: Any, unloaded: Any) -> None:
-    structure = replace(truth_model.structure, sides=("motor",))
-    motor_only = DynamicModel("motors", structure, ("Fvm1",), np.array([1.0]))
-    with pytest.raises(ConfigurationError, match="cannot compete"):
-        competitor_scores(truth_model, [unloaded], settings=PLAIN, others=[motor_only])
+def test_models_of_the_motor_side_compete_there(truth_model: Any, unloaded: Any) -> None:
+    motor_only = side_of(truth_model, "motor")
+    alone = replace(unloaded, joint=replace(unloaded.joint, effort=np.empty((len(unloaded.joint), 0))))
+    for model, session in ((truth_model, unloaded), (motor_only, unloaded), (motor_only, alone)):
+        found = competitor_scores(model, [session], settings=PLAIN, others=[motor_only])
+        score = next(one for one in found if one.predictor == "model of LWR4+")
+        assert list(score.relative) == ["motor"]
+        result = replace(validate(model, [session], settings=PLAIN), competitors=found)
+        assert "unloaded.mcap, motor side" in str(result)
+    with pytest.raises(
+        ConfigurationError, match="so they cannot compete; choose models with a side in common"
+    ):
+        competitor_scores(side_of(truth_model, "joint"), [unloaded], settings=PLAIN, others=[motor_only])
+
+
+def test_a_session_of_motor_torques_alone_has_no_joint_rows(truth_model: Any, unloaded: Any) -> None:
+    alone = replace(unloaded, joint=replace(unloaded.joint, effort=np.empty((len(unloaded.joint), 0))))
+    result = validate(truth_model, [alone], settings=PLAIN)
+    assert {score.side for score in result.scores[0].scores} == {"motor"}
+    assert "joint" not in result.scores[0].to_dict()["torque_error"]
+    assert " joint " not in str(result)
+
+
+def test_the_torque_error_is_that_of_all_samples_of_all_joints(truth_model: Any, unloaded: Any) -> None:
+    result = validate(truth_model, [unloaded], settings=PLAIN).scores[0]
+    for side, value in result.relative.items():
+        mine = [score for score in result.scores if score.side == side]
+        squares = np.array([score.samples * score.rms**2 for score in mine])
+        torques = np.array([score.samples * (score.rms / score.relative) ** 2 for score in mine])
+        assert value == pytest.approx(np.sqrt(squares.sum() / torques.sum()), rel=1e-9)
+        held = np.array([score.standstill_error for score in mine])
+        assert result.standstill_error[side] == pytest.approx((squares * held).sum() / squares.sum())
+    content = result.to_dict()
+    assert content["torque_error"] == dict(result.relative)
+    assert f"torque error, all joints and samples: motor {100 * result.relative['motor']:.2f} %" in str(
+        result
+    )
+
+
+def test_standstill_counts_and_is_named(truth_model: Any, bench: Any, unloaded: Any) -> None:
+    t, _, qd, _ = bench.motion(1, 26.0, 250.0, 12.0)
+    times = (unloaded.motor.log_time - unloaded.joint.log_time[0]) * 1e-9
+    slow = np.abs(np.column_stack([np.interp(times, t, column) for column in qd.T])) < 0.04
+    # Friction that no model of the motion computes.
+    effort = unloaded.motor.effort + np.where(slow, 1.0, 0.0)
+    changed = replace(unloaded, motor=replace(unloaded.motor, effort=effort))
+    settings = replace(PLAIN, standstill_rad_s=0.05)
+    found, before = (validate(truth_model, [one], settings=settings).scores[0] for one in (changed, unloaded))
+    assert found.standstill["motor"] == before.standstill["motor"] > 0.01
+    assert found.standstill_error["motor"] > 5.0 * before.standstill_error["motor"]
+    assert found.relative["motor"] > 1.05 * before.relative["motor"]
+    assert found.moving_relative["motor"] == pytest.approx(before.moving_relative["motor"], rel=0.02)
+    assert f"{100 * found.standstill_error['motor']:.1f} % of the squared error" in str(found)
+
+
+def test_a_session_without_a_score_leaves_the_others(truth_model: Any, bench: Any, unloaded: Any) -> None:
+    strange = replace(unloaded, metadata={**unloaded.metadata, "payload": "gripper"})
+    result = validate(truth_model, [strange, unloaded], settings=PLAIN, keep_going=True)
+    assert len(result.scores) == 1
+    assert "not validated: unloaded.mcap: payload 'gripper' is not in the model" in str(result)
+    assert result.to_dict()["unscored"][0]["session"] == "unloaded.mcap"
+    with pytest.raises(DataError, match=r"not validated: unloaded\.mcap: payload 'gripper'"):
+        result.require_all()
+    validate(truth_model, [unloaded], settings=PLAIN).require_all()
 
 
 def test_forward_simulation_reproduces_the_measured_torque(truth_model: Any, loaded: Any) -> None:

@@ -15,6 +15,7 @@ import yaml
 from click.testing import CliRunner
 
 from fri.errors import DataError
+from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
@@ -135,6 +136,19 @@ def test_the_replay_finds_when_commands_act_and_lives_without_them(done: Done) -
     assert error is not None
     assert np.all(error.position < 0.01)
     assert any("no commands in the log" in note for note in follower.notes)
+
+
+def test_a_replay_with_borrowed_drives_says_so(done: Done) -> None:
+    model = read_model(done.folder / "model.yaml")
+    structure = dataclasses.replace(model.structure, model=1, sides=("joint",))
+    standard = dict(zip(model.structure.names, model.standard.tolist(), strict=True))
+    values = [standard[name] for name in structure.names]
+    alone = DynamicModel(model.robot, structure, structure.names, np.array(values))
+    session = read_session(done.folder / "unloaded.mcap")
+    for one, borrowed in ((model, False), (alone, True)):
+        follower = Replay(Arm.load(), [session], longest_s=1.0)
+        assert follower(one, [session]) is not None
+        assert any("the model has no motor side" in note for note in follower.notes) is borrowed
 
 
 def test_errors_of_the_replay_are_kept_over_time_and_drawn(done: Done) -> None:

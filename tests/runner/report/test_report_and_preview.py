@@ -108,6 +108,49 @@ def test_every_number_of_the_tables_is_that_of_the_summary(finished: Path, repor
     assert "excitation.condition.paper" in keys
 
 
+def test_the_torque_error_has_one_value_in_terminal_page_and_json(finished: Path, report: Seen) -> None:
+    summary = json.loads((finished / "summary.json").read_text())
+    said = (finished / "report.txt").read_text()
+    page = report.page
+    first = " ".join(page.locator("table.verdicts tr", has_text="torque error").all_inner_texts())
+    titles = page.locator("#torque details > summary").all_inner_texts()
+    notes = page.locator("#torque figcaption").all_text_contents()
+    rows = page.locator("#torque tbody tr").all_text_contents()
+    assert len(summary["validation"]) == 1
+    assert len(summary["fit"]) == 2
+    for score in (*summary["fit"], *summary["validation"]):
+        by_side = ", ".join(f"{side} {100 * value:.2f} %" for side, value in score["torque_error"].items())
+        assert f"torque error of {score['session']}, " in said
+        assert by_side in said
+        name = score["session"].removesuffix(".mcap")
+        for side, value in score["torque_error"].items():
+            assert f"{100 * value:.2f} %" in first
+            label = f"{name}, {side} torque{'' if score['seen'] else ', held out'}"
+            assert f"{label}: torque error of all joints {100 * value:.2f} %" in titles
+        for one in score["scores"]:
+            value = f"{100 * one['torque_error']:.2f}"
+            assert any(note.startswith(f"{one['joint']} torque error {value} %") for note in notes)
+            assert any(row.startswith(f"{one['joint']}{value}{one['rms']:.3f}") for row in rows)
+    done = CliRunner().invoke(
+        main, ["validate", str(finished / "model.yaml"), str(finished / "check.mcap"), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    again = json.loads(done.output)["sessions"][0]
+    for key in ("torque_error", "moving_torque_error", "standstill", "standstill_error"):
+        assert again[key] == pytest.approx(summary["validation"][0][key], rel=1e-9)
+    # No other share of the torque on the page goes by that name.
+    text = page.inner_text("body")
+    assert "unexplained" not in text
+    assert "relative error" not in text
+
+
+def test_the_page_says_where_emulator_and_paper_agree_by_construction(report: Seen) -> None:
+    second = report.page.inner_text("#table-2")
+    assert "Agreement by construction: the emulated arm was built from this table" in second
+    assert "49 of its 49 true values" in second
+    assert "Agreement by construction" in report.page.inner_text("#table-1")
+
+
 def looked_up(content: Any, key: str) -> float:
     """The entry of nested content under a dotted key; file names have dots of their own."""
     while key:
@@ -138,7 +181,7 @@ def test_a_motion_that_the_estimate_has_not_seen_stands_first_in_figure_3(
     assert [(score["session"], score["seen"]) for score in summary["validation"]] == [("check.mcap", False)]
     titles = report.page.locator("#torque details > summary").all_inner_texts()
     assert titles[0].startswith("check, joint torque, held out: ")
-    shown = f"{100 * summary['validation'][0]['relative']['joint']:.2f} %"
+    shown = f"{100 * summary['validation'][0]['torque_error']['joint']:.2f} %"
     assert shown in titles[0]
     row = report.page.locator("table.verdicts tr", has_text="held-out motion").inner_text()
     assert "motor" in row
@@ -235,7 +278,7 @@ def test_a_figure_is_interactive_in_a_notebook(finished: Path) -> None:
     assert figure._repr_svg_().startswith("<svg")
     chart = figure.plotly(columns=3)
     names = [trace.name for trace in chart.data]
-    assert names.count("measured") == names.count("computed") == names.count("relative error") == 7
+    assert names.count("measured") == names.count("computed") == names.count("residual") == 7
     measured = next(trace for trace in chart.data if trace.name == "measured")
     assert np.ptp(measured.y) > 0.1
 

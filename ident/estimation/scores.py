@@ -1,0 +1,406 @@
+"""The residual of a predictor in a session: the torque error and the figures beside it.
+
+One figure leads everywhere:
+
+torque error : rms of measured minus computed torque over rms of the measured torque, all measured samples of the
+    excitation, standstill and reversals included, all joints of a side together (`torque_error`). The measured
+    torque is not filtered; the computed one is that of the filtered measured motion.
+
+The others are named for what they are: moving samples only (standstill left out joint by joint); in the band
+(both torques through the parallel low-pass of the estimation); repeatability floor (scatter between the periods
+in the band, beyond any model of the motion alone). Standstill is shown by its share of the samples and of the
+squared error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError, DataError
+from ident.dynamics.parameters import Floats
+from ident.dynamics.structure import Side
+from ident.dynamics.tables import Tabular
+from ident.rows.filters import ParallelFilter, SignalSettings
+from ident.rows.prepare import Passage, PreparedSession, TorqueChannel
+from ident.rows.sessions import payload_name
+from lwr_driver.notebook import subplots
+from lwr_driver.session import Session
+
+_DRAWN = 3000
+"""Most samples of a trace."""
+
+Predictor = Callable[[TorqueChannel, Side], Floats]
+"""The torque (N, n) [Nm] of a side at the samples of a channel, from its times and motion."""
+
+
+def torque_error(measured: Floats, computed: Floats, used: NDArray[np.bool_] | None = None) -> float:
+    """The torque error: rms of measured minus computed torque over rms of the measured torque.
+
+    measured, computed : (N, n) or (N,) [Nm], unfiltered. used : samples that count, of the same shape; default
+    all. NaN without samples or torque.
+    """
+    where = np.ones(np.shape(measured), dtype=bool) if used is None else used
+    whole = float(np.linalg.norm(measured[where]))
+    return float(np.linalg.norm((measured - computed)[where])) / whole if whole > 0.0 else math.nan
+
+
+@dataclass(frozen=True)
+class Score:
+    """Residual (measured minus computed) of one joint and side in one session [Nm].
+
+    samples : number of measured samples. rms, bias : root mean square and mean over all of them.
+    relative : the joint's torque error, rms over rms of the torque.
+    worst, worst_time_s : largest residual and its time from the first sample of the log.
+    moving_rms, moving_relative : the same, moving samples only.
+    standstill, standstill_error : share of standstill in the samples and in the squared error.
+    band_rms : rms in the band of the estimation. floor_rms : scatter between periods there, NaN without periods.
+    """
+
+    joint: str
+    side: str
+    samples: int
+    rms: float
+    relative: float
+    bias: float
+    worst: float
+    worst_time_s: float
+    moving_rms: float
+    moving_relative: float
+    standstill: float
+    standstill_error: float
+    band_rms: float
+    floor_rms: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content; missing figures are null."""
+        content = {key: finite(value) for key, value in self.__dict__.items()}
+        return {_JSON_NAMES.get(key, key): value for key, value in content.items()}
+
+
+_JSON_NAMES = {"relative": "torque_error", "moving_relative": "moving_torque_error"}
+
+
+class Trace(NamedTuple):
+    """Times (m,) [s], measured and computed torque (m, n) [Nm] of one side, thinned for a figure.
+
+    computed : NaN for samples without a score.
+    """
+
+    times: Floats
+    measured: Floats
+    computed: Floats
+
+
+@dataclass(frozen=True)
+class SessionScore(Tabular):
+    """Residuals of one model in one session.
+
+    seen : whether the model was fitted to this session. relative : by side, the torque error of all joints.
+    moving_relative : by side, moving samples only. standstill, standstill_error : by side, share of standstill in
+        the samples and in the squared error. band_hz : upper end of the band. traces : by side, for `plot`.
+    """
+
+    session: str
+    uid: str
+    payload: str | None
+    predictor: str
+    seen: bool
+    scores: tuple[Score, ...]
+    relative: Mapping[str, float]
+    moving_relative: Mapping[str, float]
+    standstill: Mapping[str, float]
+    standstill_error: Mapping[str, float]
+    band_hz: float
+    notes: tuple[str, ...] = ()
+    traces: Mapping[str, Trace] = field(default_factory=dict, repr=False, compare=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        by_side = {
+            "torque_error": self.relative,
+            "moving_torque_error": self.moving_relative,
+            "standstill": self.standstill,
+            "standstill_error": self.standstill_error,
+        }
+        return {
+            "session": self.session,
+            "uid": self.uid,
+            "payload": self.payload,
+            "predictor": self.predictor,
+            "seen": self.seen,
+            **{key: {side: finite(v) for side, v in table.items()} for key, table in by_side.items()},
+            "band_hz": self.band_hz,
+            "scores": [score.to_dict() for score in self.scores],
+            "notes": list(self.notes),
+        }
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row for each joint and side."""
+        head = {"session": self.session, "predictor": self.predictor, "seen": self.seen}
+        return [head | score.__dict__ for score in self.scores]
+
+    def plot(self, side: str | None = None) -> Any:
+        """Measured and computed torque of each joint over time; the matplotlib Axes, one for each joint.
+
+        side : `joint` or `motor`; default the first of the model. Raises ConfigurationError for a side without
+        scores, or without matplotlib.
+        """
+        side = next(iter(self.traces), "") if side is None else side
+        if side not in self.traces:
+            known = ", ".join(self.traces) or "none"
+            raise ConfigurationError(
+                f"plot of {self.session}: side {side!r} has no torque; choose of: {known}"
+            )
+        trace = self.traces[side]
+        joints = [score.joint for score in self.scores if score.side == side]
+        size = (8.0, 1.3 * len(joints))
+        axes = subplots(f"{type(self).__name__}: plot()", "records()", len(joints), sharex=True, figsize=size)
+        for k, (axis, joint) in enumerate(zip(axes, joints, strict=True)):
+            axis.plot(trace.times, trace.measured[:, k], linewidth=0.8, label="measured")
+            axis.plot(trace.times, trace.computed[:, k], linewidth=0.8, label=self.predictor)
+            axis.set_ylabel(joint, fontsize="small")
+        head = f"{self.session}, payload {self.payload or 'none'}: {side} torque [Nm]"
+        axes[0].set_title(head, fontsize="medium")
+        axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small")
+        axes[-1].set_xlabel("time [s]")
+        return axes
+
+    def __repr__(self) -> str:
+        worst = max(self.scores, key=lambda s: -1.0 if math.isnan(s.relative) else s.relative)
+        return (
+            f"{self.session}, payload {self.payload or 'none'}, {self.predictor}"
+            f"{' (fitted to it)' if self.seen else ''}: torque error {by_side(self.relative)}; largest "
+            f"{worst.joint} {worst.side} {100 * worst.relative:.1f} %"
+        )
+
+    def __str__(self) -> str:
+        label = "  SEEN BY THE ESTIMATE: no validation" if self.seen else ""
+        lines = [f"{self.session}, payload {self.payload or 'none'}: {self.predictor}{label}"]
+        floor = any(math.isfinite(score.floor_rms) for score in self.scores)
+        rows: list[tuple[str, ...]] = [
+            ("", "error", "rms", "bias", "worst", "at", "moving", "standstill", "in band"),
+            ("", "%", "Nm", "Nm", "Nm", "s", "Nm", "% of error", "Nm"),
+        ]
+        for s in self.scores:
+            figures = (s.rms, s.bias, s.worst, s.worst_time_s, s.moving_rms)
+            shown = (f"{100 * s.relative:.2f}", *(f"{value:.3f}" for value in figures))
+            rows.append(
+                (f"{s.joint} {s.side}", *shown, f"{100 * s.standstill_error:.1f}", f"{s.band_rms:.3f}")
+            )
+        last = ["floor", "Nm", *(f"{score.floor_rms:.3f}" for score in self.scores)]
+        for row, end in zip(rows, last, strict=True):
+            line = f"  {row[0]:<14}" + "".join(
+                f"{cell:>{w}}" for cell, w in zip(row[1:], _WIDTHS, strict=True)
+            )
+            lines.append(line + (f"{end:>8}" if floor else ""))
+        lines += [f"  {sentence}" for sentence in self.sentences]
+        lines += [f"  {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The torque error of all joints in words, and beside it the figures with other names."""
+        still = ", ".join(
+            f"{side} {100 * self.standstill[side]:.1f} % of the samples and {100 * part:.1f} % of the squared error"
+            for side, part in self.standstill_error.items()
+        )
+        return (
+            f"torque error, all joints and samples: {by_side(self.relative)}",
+            f"standstill: {still}",
+            f"moving samples only: {by_side(self.moving_relative)}; in band: below {self.band_hz:g} Hz",
+        )
+
+
+_WIDTHS = (8, 8, 9, 9, 9, 9, 12, 9)
+
+
+def by_side(shares: Mapping[str, float]) -> str:
+    """Shares by side in percent, as in "motor 3.41 %, joint 1.20 %"."""
+    return ", ".join(f"{side} {100 * value:.2f} %" for side, value in shares.items())
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Residuals of one side of one passage: at the samples (m, n), and in the band (K, n) with validity.
+
+    used : measured samples of the excitation. moving : those of a moving joint.
+    """
+
+    times: Floats
+    error: Floats
+    torque: Floats
+    used: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
+    band: Floats
+    valid: NDArray[np.bool_]
+    index: NDArray[np.int64]
+
+
+def score_session(
+    prepared: PreparedSession,
+    predict: Predictor,
+    sides: Sequence[Side],
+    session: Session,
+    name: str,
+    *,
+    seen: bool = False,
+    notes: tuple[str, ...] = (),
+) -> SessionScore:
+    """Residuals of any predictor in one session, per joint and side.
+
+    Raises DataError when the session has no channel for any of the sides.
+    """
+    scores: list[Score] = []
+    names = ("relative", "moving_relative", "standstill", "standstill_error")
+    figures: dict[str, dict[str, float]] = {name: {} for name in names}
+    traces: dict[str, Trace] = {}
+    for side in sides:
+        # A motor-only session has no joint torque; its prepared one is a placeholder.
+        if side != "motor" and not session.joint.effort.shape[1]:
+            continue
+        rows = [
+            r for p in prepared.passages if (r := _residuals(p, predict, side, prepared.settings)) is not None
+        ]
+        if not rows:
+            continue
+        keys = ("times", "error", "torque", "used", "moving")
+        times, error, torque, used, moving = (np.concatenate([getattr(r, key) for r in rows]) for key in keys)
+        computed = torque - error
+        thin = slice(None, None, -(-len(times) // _DRAWN))
+        traces[side] = Trace(times[thin].copy(), torque[thin].copy(), np.where(used, computed, np.nan)[thin])
+        figures["relative"][side] = torque_error(torque, computed, used)
+        figures["moving_relative"][side] = torque_error(torque, computed, moving)
+        figures["standstill"][side], figures["standstill_error"][side] = _standstill(error, used, moving)
+        for k, joint in enumerate(prepared.joint_names):
+            columns = (times, error[:, k], torque[:, k], used[:, k], moving[:, k])
+            scores.append(_score(joint, side, k, rows, columns, prepared))
+    if not scores:
+        raise DataError(
+            f"{prepared.name}: no usable {' or '.join(sides)} torque; this session has no channel of the "
+            "model, choose another session or a model of the other side"
+        )
+    return SessionScore(
+        session=prepared.name,
+        uid=session.metadata.get("uid", ""),
+        payload=payload_name(session),
+        predictor=name,
+        seen=seen,
+        scores=tuple(scores),
+        **figures,
+        band_hz=prepared.settings.decimate_hz,
+        notes=notes,
+        traces=traces,
+    )
+
+
+def _residuals(passage: Passage, predict: Predictor, side: Side, settings: SignalSettings) -> _Rows | None:
+    if not len(passage.rows):
+        return None
+    if side == "joint":
+        channel, valid = passage.joint, passage.joint_valid
+    elif passage.motor is not None and passage.motor_valid is not None:
+        channel, valid = passage.motor, passage.motor_valid
+    else:
+        return None
+    if not channel.torque.shape[1]:
+        return None
+    torque, flagged = channel.torque, channel.flagged
+    if side == "difference":
+        joint = passage.joint
+        torque = torque - resampled(joint.times, joint.torque, channel.times)
+    error = torque - predict(channel, side)
+    parallel = ParallelFilter(channel.times, passage.rows, settings.decimate_hz, settings.attenuation_db)
+    inside = _inside(channel, passage)
+    used = inside[:, None] & ~flagged
+    moving = used & (np.abs(channel.qd) >= settings.standstill_rad_s)
+    return _Rows(channel.times, error, torque, used, moving, parallel.apply(error), valid, passage.index)
+
+
+def _standstill(error: Floats, used: NDArray[np.bool_], moving: NDArray[np.bool_]) -> tuple[float, float]:
+    """Share of standstill in the samples used, and in their squared error."""
+    squares = float(np.sum(error[used] ** 2))
+    share = 1.0 - _ratio(np.count_nonzero(moving), np.count_nonzero(used))
+    return share, 1.0 - _ratio(float(np.sum(error[moving] ** 2)), squares)
+
+
+def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
+    """Columns of `values` at the times `wanted`, by linear interpolation."""
+    return np.column_stack([np.interp(wanted, times, column) for column in values.T])
+
+
+def _inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
+    """Samples in the part of the passage with rows."""
+    step = float(np.median(np.diff(passage.rows))) if len(passage.rows) > 1 else 1.0
+    nearest = np.clip(np.searchsorted(passage.rows, channel.times), 0, len(passage.rows) - 1)
+    before = np.maximum(nearest - 1, 0)
+    distance = np.minimum(
+        np.abs(passage.rows[nearest] - channel.times), np.abs(passage.rows[before] - channel.times)
+    )
+    return distance <= step
+
+
+def _score(
+    joint: str,
+    side: str,
+    k: int,
+    rows: Sequence[_Rows],
+    samples: tuple[Floats, Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]],
+    prepared: PreparedSession,
+) -> Score:
+    """samples : times, residual, torque, samples used and moving ones, each (m,)."""
+    times, error, torque, used, moving = samples
+    if not used.any():
+        return Score(joint, side, 0, *[math.nan] * 11)
+    e = error[used]
+    worst = int(np.argmax(np.abs(e)))
+    band = np.concatenate([r.band[r.valid[:, k], k] for r in rows])
+    standstill, standstill_error = _standstill(error, used, moving)
+    return Score(
+        joint=joint,
+        side=side,
+        samples=len(e),
+        rms=_rms(e),
+        relative=torque_error(torque, torque - error, used),
+        bias=float(e.mean()),
+        worst=float(e[worst]),
+        worst_time_s=float(times[used][worst]),
+        moving_rms=_rms(error[moving]),
+        moving_relative=torque_error(torque, torque - error, moving),
+        standstill=standstill,
+        standstill_error=standstill_error,
+        band_rms=_rms(band),
+        floor_rms=_floor(np.concatenate([r.index[r.valid[:, k]] for r in rows]), band, prepared),
+    )
+
+
+def _floor(index: NDArray[np.int64], band: Floats, prepared: PreparedSession) -> float:
+    """Scatter between periods [Nm] of the residual in the band, at rows of these numbers."""
+    if prepared.period_rows is None or prepared.periods < 2:
+        return math.nan
+    phase = index % prepared.period_rows
+    counts = np.bincount(phase, minlength=prepared.period_rows)
+    means = np.bincount(phase, band, prepared.period_rows) / np.maximum(counts, 1)
+    repeated = counts[phase] > 1
+    freedom = int(repeated.sum() - np.count_nonzero(counts > 1))
+    if freedom < 1:
+        return math.nan
+    return float(np.sqrt(np.sum((band - means[phase])[repeated] ** 2) / freedom))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _ratio(part: Any, whole: Any) -> float:
+    return float(part / whole) if whole > 0 else math.nan
+
+
+def finite(value: Any) -> Any:
+    """The value, or None for a float that is not finite, for JSON."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,55 @@
+"""The signal settings that a model carries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fri.errors import ConfigurationError
+from ident.estimation import IdentificationSettings, identify, signals_for, validate
+from ident.model.model_file import read_model, write_model
+from ident.model.signals import signal_settings
+from ident.rows.filters import SignalSettings
+
+
+@pytest.fixture(scope="module")
+def found(bench: Any) -> Any:
+    sessions = [bench.session("one", seed=31), bench.session("two", seed=32, payload="load")]
+    signals = SignalSettings(cutoff_hz=8.0, decimate_hz=1.5, standstill_rad_s=3e-3)
+    return identify(sessions, bench.chain, IdentificationSettings(signals=signals, essential=None))
+
+
+def test_a_model_knows_how_its_sessions_were_filtered_and_timed(found: Any, tmp_path: Path) -> None:
+    write_model(found.model, tmp_path / "m.yaml")
+    signals = signal_settings(read_model(tmp_path / "m.yaml"))
+    assert signals is not None
+    assert (signals.cutoff_hz, signals.decimate_hz, signals.standstill_rad_s) == (8.0, 1.5, 3e-3)
+    delays = [session.delay for session in found.prepared]
+    assert min(d.seconds for d in delays) <= signals.motor_delay_s <= max(d.seconds for d in delays)
+
+
+def test_validation_takes_the_settings_and_the_delay_of_the_model(found: Any, bench: Any) -> None:
+    session = bench.session("third", seed=33)
+    own = validate(found.model, session)
+    assert own.scores[0].band_hz == 1.5
+    given = validate(found.model, session, settings=signal_settings(found.model))
+    assert own.to_dict() == given.to_dict()
+    assert signals_for(found.model, estimate_delay=True).motor_delay_s == "estimate"
+    estimated = validate(found.model, session, estimate_delay=True)
+    assert estimated.scores[0].relative["joint"] == own.scores[0].relative["joint"]
+    assert estimated.scores[0].relative["motor"] != own.scores[0].relative["motor"]
+
+
+def test_a_model_without_settings_has_the_defaults(found: Any) -> None:
+    older = replace(found.model, provenance={"sessions": []})
+    assert signal_settings(older) is None
+    assert signals_for(older) == SignalSettings()
+
+
+def test_settings_of_no_use_name_the_model(found: Any) -> None:
+    wrong = replace(found.model, provenance={"signals": {"cutoff_hz": -1.0, "a_later_key": 5}})
+    with pytest.raises(ConfigurationError, match=r"`provenance\.signals` cannot be used: `cutoff_hz` is -1"):
+        signal_settings(wrong)
