@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
-from ident.dynamics.kinematics import Chain
+from ident.dynamics.session_chain import session_chain
 from ident.estimation.identify import identify
 from ident.estimation.mounting import find_mounting
 from ident.estimation.validate import validate
@@ -40,6 +40,8 @@ _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for nam
     help="Payload of a session, in place of its metadata; `none`: the bare arm.",
 )
 @click.option("--urdf", type=click.Path(path_type=Path), help="Kinematics; default: from the first session.")
+@click.option("--base", metavar="LINK", help="First link of the arm; gravity points down in its axes.")
+@click.option("--tip", metavar="LINK", help="Last link of the arm; default: behind the last measured joint.")
 @click.option("--tilt", is_flag=True, help="Estimate the tilt of the base too.")
 @click.option("--essential", is_flag=True, help="Reduce the model to its essential parameters.")
 @click.option(
@@ -68,6 +70,8 @@ def command(
     estimator: str,
     payload: tuple[str, ...],
     urdf: Path | None,
+    base: str | None,
+    tip: str | None,
     tilt: bool,
     essential: bool,
     test: tuple[Path, ...],
@@ -100,9 +104,7 @@ def command(
         new_folder(results)
     logs = announced([read_session(path, status=False) for path in (*sessions, *test)], payload)
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
-    if urdf is None and logs[0].robot_description is None:
-        raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
-    chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
+    chain = session_chain(logs[0], urdf, base=base, tip=tip)
     mounting = find_mounting(logs, chain, wanted) if tilt else None
     found = identify(logs, chain, wanted) if mounting is None else mounting.identification
     result = named_model(
