@@ -147,7 +147,14 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return _convert_union(arguments, value, where)
     if origin is typing.Literal:
         if value not in arguments:
-            raise ConfigurationError(f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}")
+            near = difflib.get_close_matches(
+                str(value).lower(), [str(word).lower() for word in arguments], n=1
+            )
+            meant = next((word for word in arguments if [str(word).lower()] == near), None)
+            hint = "" if meant is None else f"; did you mean `{meant}`?"
+            raise ConfigurationError(
+                f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}{hint}"
+            )
         return value
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
