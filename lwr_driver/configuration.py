@@ -42,7 +42,9 @@ for _kind_of_yaml in (_Loader, _Dumper):
 
 def yaml_text(content: Any) -> str:
     """Plain content as YAML that `read_yaml` reads back, keys in their order."""
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    return yaml.dump(
+        content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+    )
 
 
 def expect(value: Any, kind: type, subject: str, advice: str) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.urdf import read_urdf
+from ident.dynamics.urdf import Urdf, read_urdf
 from lwr_driver.session import Session
 
 
@@ -18,8 +18,8 @@ def session_chain(
     urdf : a path, or the text; default: the description in the session.
     base, tip : first and last link; default: those in the session's metadata, then root and last joint.
 
-    A session with further joints, of a gripper not in the URDF say, does with the only chain of the URDF or the
-    chain to `tip`, if it has measured all of it. Raises ConfigurationError for unknown names, with the nearest.
+    A session may have further joints, such as those of a gripper, if it has all of one arm of the URDF, or of the
+    chain to `tip`. Raises ConfigurationError for unknown names, with the nearest.
     """
     source = session.robot_description if urdf is None else urdf
     if source is None:
@@ -27,10 +27,23 @@ def session_chain(
     root = base or session.metadata.get("base") or None
     end = tip or session.metadata.get("tip") or None
     read = read_urdf(source)
-    measured = set(session.joint_names)
     try:
-        only = [joint.name for joint in read.chain(root, end) if joint.driven]
-        joints = only if measured.issuperset(only) else session.joint_names
+        return Chain.from_urdf(read.text, root=root, tip=end, joints=session.joint_names)
     except ConfigurationError:
-        joints = session.joint_names
-    return Chain.from_urdf(source, root=root, tip=end, joints=joints)
+        joints = _whole_arm(read, session.joint_names, root, end)
+        if joints is None:
+            raise
+        return Chain.from_urdf(read.text, root=root, tip=end, joints=joints)
+
+
+def _whole_arm(
+    read: Urdf, measured: tuple[str, ...], root: str | None, tip: str | None
+) -> tuple[str, ...] | None:
+    """The one arm with all its joints among the measured ones, or None."""
+    try:
+        if tip is None:
+            return read.arm(names=measured, root=root)
+        joints = tuple(joint.name for joint in read.chain(root, tip) if joint.driven)
+        return joints if set(joints) <= set(measured) else None
+    except ConfigurationError:
+        return None

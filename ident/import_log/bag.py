@@ -21,6 +21,7 @@ from lwr_driver.session.session import stamp
 
 _FIELDS = ("position", "velocity", "effort")
 _JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
+_OWN_TOPICS = frozenset({"/motor_states", "/joint_command", "/experiment/phase", "/fri/status"})
 _STRING = ("std_msgs/msg/String", "std_msgs/String")
 
 
@@ -54,11 +55,15 @@ class JointStates:
 
 @dataclass(frozen=True)
 class Bag:
-    """Joint states of a bag, those with the most joints first, and its robot description, if recorded."""
+    """Joint states of a bag, those with most arrays and joints first, and its robot description, if recorded.
+
+    is_session : whether it has topics or metadata of a session log.
+    """
 
     path: Path
     states: tuple[JointStates, ...]
     robot_description: str | None
+    is_session: bool
 
     def tables(self) -> dict[str, Table]:
         """Arrays `TOPIC/position`, `TOPIC/velocity`, `TOPIC/effort`, `TOPIC/stamp` and `TOPIC/log_time` [s].
@@ -82,6 +87,7 @@ def read_bag(path: Path) -> Bag:
     groups: dict[tuple[str, tuple[str, ...]], _Group] = {}
     description: str | None = None
     topics: dict[str, str] = {}
+    described = False
     for file in bag_files(path):
         scan = Scan(file)
         layouts: dict[tuple[int, int], list[tuple[Layout, tuple[str, ...]]]] = {}
@@ -97,12 +103,13 @@ def read_bag(path: Path) -> Bag:
                     description = CdrReader(block.message(int(rows[0]))).text()
                 elif kind in _JOINT_STATE:
                     _take(file, channel, block, rows, layouts, groups)
+        described |= any(name == "session" for name, _ in scan.metadata)
     if not groups:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
         raise DataError(f"{path}: no messages of sensor_msgs/JointState; topics: {listed}")
     states = [group.states(topic, names) for (topic, names), group in groups.items()]
     states.sort(key=lambda group: (-len(group.values), -len(group.names), -len(group.log_time)))
-    return Bag(path, tuple(states), description)
+    return Bag(path, tuple(states), description, described or not _OWN_TOPICS.isdisjoint(topics))
 
 
 def _take(

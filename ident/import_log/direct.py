@@ -1,0 +1,72 @@
+"""Sessions from logs of any origin: session logs, and ROS 2 bags read as they are."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fri.errors import DataError
+from ident.import_log.bag import Bag, bag_files, read_bag
+from ident.import_log.conversion import import_log
+from ident.import_log.mapping import LogMapping, Signal, TimeBase
+from lwr_driver.session import Session, read_session
+from lwr_driver.session.writer import LIBRARY
+
+_HEAD_BYTES = 256
+
+
+def read_recording(path: str | os.PathLike[str], *, status: bool = True) -> Session:
+    """The session in a session log, or in a ROS 2 bag: an MCAP file, or the folder of a split bag.
+
+    From a bag, the topic of `sensor_msgs/JointState` with most arrays and joints is taken, `effort` as joint torque,
+    header stamps as times if they rise with every message. Joints with values missing are left out.
+    status : as in `read_session`. Raises DataError for an unreadable file or a bag without torques.
+    """
+    source = Path(path)
+    files = bag_files(source)
+    if not files or (source.is_file() and _ours(source)):
+        return read_session(source, status=status)
+    bag = read_bag(source)
+    if bag.is_session:
+        return read_session(source, status=status)
+    mapping = bag_mapping(bag)
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / f"{source.stem}.mcap"
+        import_log(mapping, source, target, urdf=None)
+        session = read_session(target, status=status)
+    return replace(session, path=source, robot_description=bag.robot_description)
+
+
+def bag_mapping(bag: Bag, *, motor: bool = False) -> LogMapping:
+    """The mapping of a bag. motor : whether `effort` is the motors' torque, already at the joint."""
+    states = bag.states[0]
+    if not {"position", "effort"} <= set(states.values):
+        found = "; ".join(f"{group.topic}: {', '.join(group.values) or 'names only'}" for group in bag.states)
+        raise DataError(
+            f"{bag.path}: no topic has `position` and `effort` ({found}); torques must be recorded"
+        )
+    whole = np.all([np.isfinite(values).all(axis=0) for values in states.values.values()], axis=0)
+    joints = tuple(name for name, good in zip(states.names, whole, strict=True) if good)
+    if not joints:
+        raise DataError(f"{bag.path}: {states.topic} has missing values (nan) in every joint")
+    signals = {
+        name: Signal(unit, array=f"{states.topic}/{name}", columns=joints)
+        for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("effort", "Nm"))
+        if name in states.values
+    }
+    signals["motor_torque" if motor else "joint_torque"] = signals.pop("effort")
+    return LogMapping(
+        robot=bag.path.stem,
+        joints=joints,
+        time=TimeBase(column=f"{states.topic}/{states.clock}", zero="unix"),
+        **signals,
+    )
+
+
+def _ours(path: Path) -> bool:
+    with path.open("rb") as file:
+        return LIBRARY.split()[0].encode() in file.read(_HEAD_BYTES)
