@@ -120,6 +120,9 @@ def import_log(
     attachments = {"mapping.yaml": yaml_text(mapping.content()).encode()}
     if described is not None:
         attachments["robot.urdf"] = described.encode()
+    gears = () if mapping.transmission is None else mapping.transmission.coupling
+    couplings = " ".join(f"{entry.joint}:{entry.motor}" for entry in gears)
+    more = {"base": base or "", "tip": tip or "", "couplings": couplings}
     start = datetime.datetime.fromtimestamp(int(joint.times[0]) * 1e-9, datetime.UTC).isoformat()
     metadata = session_metadata(
         robot=mapping.robot,
@@ -134,7 +137,7 @@ def import_log(
         imported_rows="all" if rows is None else f"{rows[0]}:{rows[1]} of {total}",
         imported_sha256=" ".join(f"{name}={value}" for name, value in recording.digests.items()),
         source=mapping.source,
-        **{name: link for name, link in (("base", base), ("tip", tip)) if link is not None},
+        **{name: value for name, value in more.items() if value},
     )
     with SessionWriter(
         Path(output),

@@ -83,6 +83,7 @@ def command(
     from runner.diagnosis import arm_data, asked, chain_of, known_arm, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
+    from runner.estimation import recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
 
@@ -98,7 +99,7 @@ def command(
         chain,
         test=held,
         arm=known,
-        data=arm_data(known, chain, coupling, gear_ratio),
+        data=arm_data(known, chain, coupling or recorded_couplings(logs), gear_ratio),
         model=None if model is None else read_model(model),
         reference=None if reference is None else read_model(reference),
         simulate=not no_simulation,

@@ -15,7 +15,7 @@ from ident.estimation.mounting import find_mounting
 from ident.estimation.validate import validate
 from ident.estimators import ESTIMATORS
 from ident.model.model_file import write_model
-from runner.estimation import IdentifySettings, announced
+from runner.estimation import IdentifySettings, announced, couplings, recorded_couplings
 from runner.recordings import GUESSED, guess_options, read_recordings
 from runner.results import named_model, new_folder, write_log_results
 from runner.terminal import GroupedCommand, json_option, to_json
@@ -120,6 +120,8 @@ def command(
     logs = announced(logs, payload)
     if model is None and all(log.motor is None for log in logs):
         wanted = replace(wanted, model=1)
+    if not wanted.couplings:
+        wanted = replace(wanted, couplings=couplings(recorded_couplings(logs)))
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     chain = session_chain(logs[0], urdf, base=base, tip=tip)
     mounting = find_mounting(logs, chain, wanted) if tilt else None
