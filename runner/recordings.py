@@ -117,10 +117,15 @@ def read_recordings(
     return sessions
 
 
+def at_terminal() -> bool:
+    """Whether a person can answer."""
+    return sys.stdin.isatty()
+
+
 def _confirm(guess: Guess, yes: bool) -> None:
     if yes:
         click.echo(str(guess), err=True)
-    elif not sys.stdin.isatty():
+    elif not at_terminal():
         raise ConfigurationError(
             f"the columns of {guess.source} are a guess, to be confirmed at a terminal or with --yes:\n{guess}\n"
             f"or correct this mapping file and use `lwr-run import`:\n\n{guess.text}"

@@ -9,6 +9,9 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.urdf import Urdf, read_urdf
 from lwr_driver.session import Session
 
+AS_RECORDED = "as recorded"
+"""Metadata `joints` of a session with the joints of a bag, which nobody has chosen."""
+
 
 def session_chain(
     session: Session, urdf: str | Path | None = None, *, base: str | None = None, tip: str | None = None
@@ -19,7 +22,9 @@ def session_chain(
     base, tip : first and last link; default: those in the session's metadata, then root and last joint.
 
     A session may have further joints, such as those of a gripper, if it has all of one arm of the URDF, or of the
-    chain to `tip`. Raises ConfigurationError for unknown names, with the nearest.
+    chain to `tip`; with the joints of a bag, that arm is meant anyhow.
+
+    Raises ConfigurationError for unknown names, with the nearest.
     """
     source = session.robot_description if urdf is None else urdf
     if source is None:
@@ -27,13 +32,15 @@ def session_chain(
     root = base or session.metadata.get("base") or None
     end = tip or session.metadata.get("tip") or None
     read = read_urdf(source)
+    whole = _whole_arm(read, session.joint_names, root, end)
+    if whole is not None and session.metadata.get("joints") == AS_RECORDED:
+        return Chain.from_urdf(read.text, root=root, tip=end, joints=whole)
     try:
         return Chain.from_urdf(read.text, root=root, tip=end, joints=session.joint_names)
     except ConfigurationError:
-        joints = _whole_arm(read, session.joint_names, root, end)
-        if joints is None:
+        if whole is None:
             raise
-        return Chain.from_urdf(read.text, root=root, tip=end, joints=joints)
+        return Chain.from_urdf(read.text, root=root, tip=end, joints=whole)
 
 
 def _whole_arm(

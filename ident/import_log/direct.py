@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fri.errors import DataError
+from ident.dynamics.session_chain import AS_RECORDED
 from ident.import_log.bag import Bag, bag_files, read_bag
 from ident.import_log.conversion import import_log
 from ident.import_log.mapping import LogMapping, Signal, TimeBase
@@ -38,7 +39,8 @@ def read_recording(path: str | os.PathLike[str], *, status: bool = True) -> Sess
         target = Path(folder) / f"{source.stem}.mcap"
         import_log(mapping, source, target, urdf=None)
         session = read_session(target, status=status)
-    return replace(session, path=source, robot_description=bag.robot_description)
+    metadata = {**session.metadata, "joints": AS_RECORDED}
+    return replace(session, path=source, metadata=metadata, robot_description=bag.robot_description)
 
 
 def bag_mapping(bag: Bag, *, motor: bool = False) -> LogMapping:
