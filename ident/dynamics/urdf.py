@@ -217,8 +217,8 @@ class Urdf:
 def _unknown(name: str, known: Collection[str]) -> str:
     """A name that is not known, with the nearest one and all others."""
     near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"{name!r}; {hint}It has {', '.join(known)}"
+    hint = f"did you mean {near[0]!r}? It" if near else "it"
+    return f"{name!r}; {hint} has {', '.join(known)}"
 
 
 def read_urdf(source: str | Path) -> Urdf:

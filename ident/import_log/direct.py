@@ -6,6 +6,7 @@ import os
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from fri.errors import DataError
 from ident.dynamics.session_chain import AS_RECORDED
 from ident.import_log.bag import Bag, bag_files, read_bag
 from ident.import_log.conversion import import_log
-from ident.import_log.mapping import LogMapping, Signal, TimeBase
+from ident.import_log.mapping import LogMapping, Signal, TimeBase, Unit
 from lwr_driver.session import Session, read_session
 from lwr_driver.session.writer import LIBRARY
 
@@ -55,9 +56,10 @@ def bag_mapping(bag: Bag, *, motor: bool = False) -> LogMapping:
     joints = tuple(name for name, good in zip(states.names, whole, strict=True) if good)
     if not joints:
         raise DataError(f"{bag.path}: {states.topic} has missing values (nan) in every joint")
-    signals = {
+    units: dict[str, Unit] = {"position": "rad", "velocity": "rad/s", "effort": "Nm"}
+    signals: dict[str, Any] = {
         name: Signal(unit, array=f"{states.topic}/{name}", columns=joints)
-        for name, unit in (("position", "rad"), ("velocity", "rad/s"), ("effort", "Nm"))
+        for name, unit in units.items()
         if name in states.values
     }
     signals["motor_torque" if motor else "joint_torque"] = signals.pop("effort")

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 
@@ -123,7 +123,7 @@ class _Guesser:
         angle = position.values * (math.pi / 180.0 if unit == "deg" else 1.0)
         velocity = self._best("velocity", joints)
         time, period = self._time(angle, velocity, unit)
-        signals = {"position": self._take("position", position, unit, reason)}
+        signals: dict[str, Any] = {"position": self._take("position", position, unit, reason)}
         if velocity is not None and (rate := _rate_unit(angle, velocity.values, period)) is not None:
             name, factor = rate
             signals["velocity"] = self._take(
