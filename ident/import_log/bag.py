@@ -37,7 +37,7 @@ def bag_files(path: Path) -> list[Path]:
 class JointStates:
     """All messages of one topic with the same joints: `names` sorted; log_time, stamp (n,) int64 [ns].
 
-    values : position, velocity and effort (n, joints) as far as recorded.
+    values : position, velocity and effort (n, joints) as far as recorded, and not zero throughout.
     """
 
     topic: str
@@ -95,9 +95,11 @@ def read_bag(path: Path) -> Bag:
             for number in np.unique(block.channel).tolist():
                 channel = scan.channels.get(number)
                 kind = channel.schema.name if channel is not None and channel.schema is not None else ""
-                if channel is None or channel.encoding != "cdr":
+                if channel is None:
                     continue
-                topics[channel.topic] = kind
+                topics[channel.topic] = f"{kind} in {channel.encoding}" if channel.encoding != "cdr" else kind
+                if channel.encoding != "cdr":
+                    continue
                 rows = np.flatnonzero(block.channel == number)
                 if kind in _STRING and channel.topic.endswith("robot_description"):
                     description = CdrReader(block.message(int(rows[0]))).text()
@@ -106,7 +108,7 @@ def read_bag(path: Path) -> Bag:
         described |= any(name == "session" for name, _ in scan.metadata)
     if not groups:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
-        raise DataError(f"{path}: no messages of sensor_msgs/JointState; topics: {listed}")
+        raise DataError(f"{path}: no messages of sensor_msgs/JointState in CDR (ROS 2); topics: {listed}")
     states = [group.states(topic, names) for (topic, names), group in groups.items()]
     states.sort(key=lambda group: (-len(group.values), -len(group.names), -len(group.log_time)))
     return Bag(path, tuple(states), description, described or not _OWN_TOPICS.isdisjoint(topics))
@@ -180,5 +182,6 @@ class _Group:
             names,
             joined["log_time"][order],
             joined["stamp"][order],
-            {name: joined[name][order] for name in self.fields},
+            # Drivers fill what they do not measure with zeros.
+            {name: joined[name][order] for name in self.fields if name == "position" or joined[name].any()},
         )

@@ -25,7 +25,8 @@ def read_recording(path: str | os.PathLike[str], *, status: bool = True) -> Sess
     """The session in a session log, or in a ROS 2 bag: an MCAP file, or the folder of a split bag.
 
     From a bag, the topic of `sensor_msgs/JointState` with most arrays and joints is taken, `effort` as joint torque,
-    header stamps as times if they rise with every message. Joints with values missing are left out.
+    header stamps as times if they rise with every message, else the recorder's times, equal ones spread. Joints with
+    values missing are left out.
     status : as in `read_session`. Raises DataError for an unreadable file or a bag without torques.
     """
     source = Path(path)
@@ -66,7 +67,7 @@ def bag_mapping(bag: Bag, *, motor: bool = False) -> LogMapping:
     return LogMapping(
         robot=bag.path.stem,
         joints=joints,
-        time=TimeBase(column=f"{states.topic}/{states.clock}", zero="unix"),
+        time=TimeBase(column=f"{states.topic}/{states.clock}", zero="unix", equal="spread"),
         **signals,
     )
 

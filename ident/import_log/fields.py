@@ -145,6 +145,8 @@ def _in_file(recording: Recording, file: str | None, joints: Sequence[str]) -> I
             continue
         groups: dict[str, list[tuple[str, int]]] = {}
         for index, column in enumerate(names):
+            if np.isnan(values[:, index]).all():
+                continue
             stem, label = split_name(column, joints)
             groups.setdefault(stem, []).append((label, index))
         for stem, members in groups.items():

@@ -119,6 +119,12 @@ class _Guesser:
                 f"{', '.join(joints)}; name the joints of the columns with --joints"
             )
         position = picked
+        bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
+        if len(bad):
+            raise DataError(
+                f"{self.source}: {position.shown} has missing values in {len(bad)} rows, first in row {bad[0]}; write a "
+                "mapping file and leave them out with `lwr-run import --rows`"
+            )
         unit, reason = self._angle_unit(position, joints)
         angle = position.values * (math.pi / 180.0 if unit == "deg" else 1.0)
         velocity = self._best("velocity", joints)

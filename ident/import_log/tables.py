@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,13 +30,10 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
     """A text table: comma, semicolon, tab or blanks, a decimal comma where the comma separates nothing.
 
     header : whether the first row holds names; None decides by its content. Comment lines begin with # or %; the
-    one before the numbers has the names if it has as many words as columns. DataError with line and column.
+    one before the numbers has the names if it has as many words as columns. Rows of words below the names, such as
+    units, are passed over, and a column that begins with a word is nan. DataError with line and column.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not readable as text: {error}") from error
-    rows = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    rows = [(number, line) for number, line in enumerate(_lines(path), 1) if line.strip()]
     comment = next((k for k, (_, line) in enumerate(rows) if line.lstrip()[0] not in _COMMENTS), len(rows))
     above = rows[comment - 1][1].strip().lstrip("".join(_COMMENTS)) if comment else ""
     rows = [(number, line) for number, line in rows[comment:] if line.lstrip()[0] not in _COMMENTS]
@@ -51,15 +49,33 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
         raise DataError(f"{path}: holds no rows of numbers")
     names = tuple(_split(first, mark)) if named else ()
     rows = [(number, line.replace(point, ".")) for number, line in rows[named:]]
+    while named and len(rows) > 1 and not any(map(_is_number, _split(rows[0][1], mark))):
+        rows = rows[1:]
     width = len(names) if named else len(_split(rows[0][1], mark))
     if not named and len(_split(above, mark)) == width and not all(map(_is_number, _split(above, mark))):
         names = tuple(_split(above, mark))
     values = _fast(rows, mark, width)
     if values is None:
         values = np.empty((len(rows), width))
+        words = {k for k, part in enumerate(_split(rows[0][1], mark)) if part and not _is_number(part)}
         for index, (number, line) in enumerate(rows):
-            values[index] = _row(path, number, _split(line, mark), width, names)
+            values[index] = _row(path, number, _split(line, mark), width, names, words if named else set())
     return Table(names or _numbers(width), values)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: not readable as text: {error}") from error
+    for encoding in ("utf-16",) if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252"):
+        try:
+            text = data.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        if "\0" not in text:
+            return text.splitlines()
+    raise DataError(f"{path}: not readable as text, neither UTF-8 nor Windows text")
 
 
 def _numbers(width: int) -> tuple[str, ...]:
@@ -90,13 +106,19 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _row(path: Path, number: int, parts: list[str], width: int, names: tuple[str, ...]) -> list[float]:
+def _row(
+    path: Path, number: int, parts: list[str], width: int, names: tuple[str, ...], words: Collection[int]
+) -> list[float]:
+    """The numbers of a row; those of the columns `words` are nan."""
     if len(parts) != width:
         raise DataError(
             f"{path}: line {number} has {len(parts)} columns, the first has {width}; the file is not whole"
         )
     values = []
     for index, part in enumerate(parts):
+        if index in words:
+            values.append(math.nan)
+            continue
         if not _is_number(part):
             column = names[index] if names else str(index + 1)
             shown = "is empty" if not part else f"holds {part!r}"

@@ -119,15 +119,27 @@ def test_a_file_for_each_joint_with_one_value_a_line(tmp_path: Path) -> None:
         ("% made by hand, on a day\n1\t2\t\n", ("1", "2"), [1, 2]),
         ("a;b\n0,5;-1,25e1\n", ("a", "b"), [0.5, -12.5]),
         ("1.5\n2.5\n", ("1",), [1.5]),
+        ("q [\u00b0],b\nrad,Nm\n1,2\n", ("q [\u00b0]", "b"), [1, 2]),
     ],
 )
 def test_text_tables_of_every_habit(
     tmp_path: Path, text: str, names: tuple[str, ...], first: list[float]
 ) -> None:
-    (tmp_path / "a.txt").write_text(text)
-    table = read_text(tmp_path / "a.txt")
-    assert table.names == names
-    assert table.values[0].tolist() == first
+    for encoding in ("utf-8", "utf-8-sig", "cp1252", "utf-16"):
+        (tmp_path / "a.txt").write_text(text, encoding=encoding)
+        table = read_text(tmp_path / "a.txt")
+        assert table.names == names
+        assert table.values[0].tolist() == first
+
+
+def test_a_column_of_words_does_not_keep_the_others_from_being_read(tmp_path: Path) -> None:
+    write_csv(tmp_path, mode=["run", "run", "stop", "run"])
+    _, session = imported(tmp_path, tmp_path, mapping())
+    assert len(session.joint) == 4
+    with pytest.raises(DataError, match="is nan in row 0"):
+        import_log(
+            mapping(position=PLAIN["position"] | {"columns": ["qa", "mode"]}), tmp_path, tmp_path / "y.mcap"
+        )
 
 
 @pytest.mark.parametrize("start", [-0.007, -1.0, -3.0e-9])
@@ -287,6 +299,6 @@ def test_a_bag_without_stamps_has_the_time_of_its_recorder(tmp_path: Path) -> No
         writer.write_message("/note", text, {"data": "x"}, log_time=1, publish_time=1)
         writer.finish()
     with pytest.raises(
-        DataError, match=r"no messages of sensor_msgs/JointState; topics: /note \(std_msgs/msg/String\)"
+        DataError, match=r"no messages of sensor_msgs/JointState .*; topics: /note \(std_msgs/msg/String\)"
     ):
         read_bag(tmp_path / "none.mcap")
