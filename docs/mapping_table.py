@@ -21,6 +21,11 @@ KEYS = {
     "serial": ("serial number of the arm", "", "F07_2611"),
     "joints": ("joint names as in the URDF; they choose the chain", "", "[joint_1, joint_2]"),
     "urdf": ("URDF of the arm, beside the mapping file; null: joint names are not checked", "", "arm.urdf"),
+    "held": (
+        "where other joints between them rest; those not named are at 0",
+        "rad or m",
+        "{joint_3: -1.57}",
+    ),
     "base": (
         "first link of the arm, gravity points down in its axes; null: the root of the URDF",
         "",

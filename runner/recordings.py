@@ -6,15 +6,17 @@ The guess is shown and confirmed. Mapping and session logs are written, so the i
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.session_chain import recorded_rests
 from ident.import_log import Guess, Known, guess_mapping, import_log, read_recording
 from ident.import_log.bag import bag_files
+from ident.import_log.guess import RESTING_RAD
 from lwr_driver.session import Session, read_session
 
 GUESSED = ("yes", "joints", "rate_hz", "torque", "torque_constant", "gear_ratio")
@@ -87,7 +89,10 @@ def read_recordings(
     """
     foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
     if not foreign:
-        return [read_recording(path, status=False) for path in paths]
+        logs = [read_recording(path, status=False) for path in paths]
+        for log in logs[1:]:
+            _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
+        return logs
     if urdf is None:
         raise ConfigurationError(
             f"{foreign[0]}: no session log; name the arm's URDF with --urdf to import it"
@@ -95,6 +100,8 @@ def read_recordings(
     named = () if joints is None else tuple(name.strip() for name in joints.split(","))
     known = Known(named, base, tip, rate_hz, torque, torque_constant, gear_ratio)
     guess = guess_mapping(foreign[0], urdf, known)
+    for other in foreign[1:] if guess.mapping.held else ():
+        _same_rests(guess.mapping.held or {}, guess_mapping(other, urdf, known).mapping.held or {}, other)
     _confirm(guess, yes)
     folder.mkdir(parents=True, exist_ok=True)
     mapping = folder / f"{foreign[0].stem}.mapping.yaml"
@@ -104,17 +111,28 @@ def read_recordings(
         )
     mapping.write_text(guess.text, encoding="utf-8")
     click.echo(f"{mapping}\n", err=True)
-    logs = dict(zip(foreign, _names(foreign), strict=True))
+    names = dict(zip(foreign, _names(foreign), strict=True))
     sessions = []
     for path in paths:
-        if path not in logs:
+        if path not in names:
             sessions.append(read_recording(path, status=False))
             continue
-        target = folder / f"{logs[path]}.mcap"
+        target = folder / f"{names[path]}.mcap"
         _clear(target)
         click.echo(f"{import_log(guess.mapping, path, target)}\n", err=True)
         sessions.append(read_session(target, status=False))
     return sessions
+
+
+def _same_rests(first: Mapping[str, float], other: Mapping[str, float], path: Path) -> None:
+    """Refuse recordings with joints at rest elsewhere than in the first: their kinematics differ."""
+    for name in first.keys() | other.keys():
+        places = [rests.get(name) for rests in (first, other)]
+        if None in places or abs(float(places[0] or 0.0) - float(places[1] or 0.0)) > RESTING_RAD:
+            raise ConfigurationError(
+                f"{path}: joint {name} rests at {places[1]} rad, in the first recording at {places[0]} rad; identify "
+                "them one by one"
+            )
 
 
 def at_terminal() -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.urdf import Urdf, read_urdf
+from ident.dynamics.urdf import Urdf, held, read_urdf
 from lwr_driver.session import Session
 
 AS_RECORDED = "as recorded"
@@ -16,7 +17,7 @@ AS_RECORDED = "as recorded"
 def session_chain(
     session: Session, urdf: str | Path | None = None, *, base: str | None = None, tip: str | None = None
 ) -> Chain:
-    """Chain of the session's joints; joints of the URDF without measurements are held at zero.
+    """Chain of the session's joints; others of the URDF are held, at zero or where they rested.
 
     urdf : a path, or the text; default: the description in the session.
     base, tip : first and last link; default: those in the session's metadata, then root and last joint.
@@ -32,6 +33,9 @@ def session_chain(
     root = base or session.metadata.get("base") or None
     end = tip or session.metadata.get("tip") or None
     read = read_urdf(source)
+    rests = recorded_rests(session.metadata)
+    if rests:
+        read = read_urdf(held(read.text, rests))
     whole = _whole_arm(read, session.joint_names, root, end)
     if whole is not None and session.metadata.get("joints") == AS_RECORDED:
         return Chain.from_urdf(read.text, root=root, tip=end, joints=whole)
@@ -41,6 +45,12 @@ def session_chain(
         if whole is None:
             raise
         return Chain.from_urdf(read.text, root=root, tip=end, joints=whole)
+
+
+def recorded_rests(metadata: Mapping[str, str]) -> dict[str, float]:
+    """Positions of joints that rested during an imported session and are no coordinates of it [rad or m]."""
+    pairs = (entry.partition("=") for entry in metadata.get("held", "").split())
+    return {name: float(value) for name, _, value in pairs}
 
 
 def _whole_arm(

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import difflib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
@@ -212,6 +213,34 @@ class Urdf:
             if joint.parent == link and joint.name not in stop:
                 total += parameters.transform(self.lumped_inertial(joint.child, stop), joint.origin)
         return total
+
+
+def held(text: str, positions: Mapping[str, float]) -> str:
+    """The URDF with joints fixed at positions [rad or m]. ConfigurationError for joints that cannot move."""
+    urdf = read_urdf(text)
+    urdf.require(positions)
+    tree = ElementTree.fromstring(text)
+    known = {joint.name: joint for joint in urdf.joints}
+    for element in tree.findall("joint"):
+        name = element.get("name", "")
+        if name not in positions:
+            continue
+        joint, value = known[name], positions[name]
+        motion = np.eye(4)
+        if joint.kind == "prismatic":
+            motion[:3, 3] = value * joint.axis
+        else:
+            motion[:3, :3] = Rotation.from_rotvec(value * joint.axis).as_matrix()
+        pose = joint.origin @ motion
+        # URDF: rotations about the fixed axes x, y, z in this order.
+        angles = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", suppress_warnings=True)
+        for old in [child for child in element if child.tag in ("origin", "axis", "limit", "mimic")]:
+            element.remove(old)
+        words = {"xyz": pose[:3, 3], "rpy": angles}
+        origin = {key: " ".join(repr(float(x)) for x in values) for key, values in words.items()}
+        element.insert(0, ElementTree.Element("origin", origin))
+        element.set("type", "fixed")
+    return ElementTree.tostring(tree, encoding="unicode")
 
 
 def _unknown(name: str, known: Collection[str]) -> str:

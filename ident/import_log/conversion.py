@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.urdf import read_urdf
+from ident.dynamics.urdf import held, read_urdf
 from ident.import_log.mapping import LogMapping, Signal, TimeBase
 from ident.import_log.recording import Recording
 from ident.import_log.tables import Floats
@@ -122,7 +122,8 @@ def import_log(
         attachments["robot.urdf"] = described.encode()
     gears = () if mapping.transmission is None else mapping.transmission.coupling
     couplings = " ".join(f"{entry.joint}:{entry.motor}" for entry in gears)
-    more = {"base": base or "", "tip": tip or "", "couplings": couplings}
+    rests = " ".join(f"{name}={value!r}" for name, value in (mapping.held or {}).items())
+    more = {"base": base or "", "tip": tip or "", "couplings": couplings, "held": rests}
     start = datetime.datetime.fromtimestamp(int(joint.times[0]) * 1e-9, datetime.UTC).isoformat()
     metadata = session_metadata(
         robot=mapping.robot,
@@ -184,12 +185,19 @@ def _described(
         return None, ["no URDF: the joint names are not checked; give `urdf` in the mapping or --urdf"]
     source: str | Path = urdf if urdf is not None else find(str(mapping.urdf), beside=beside)
     read = read_urdf(source)
+    rests = mapping.held or {}
+    both = [name for name in rests if name in mapping.joints]
+    if both:
+        raise ConfigurationError(
+            f"`held` and `joints` both name {both[0]!r}; a joint either rests or was measured"
+        )
+    plain, read = read, read_urdf(held(read.text, rests)) if rests else read
     Chain.from_urdf(read.text, root=base, tip=tip, joints=mapping.joints)
     way = read.chain(base, tip, mapping.joints)
-    held = [joint.name for joint in way if joint.movable and joint.name not in mapping.joints]
-    if not held:
-        return read.text, []
-    return read.text, [f"{', '.join(held)} on the chain, without measurement, held at 0"]
+    at_zero = [joint.name for joint in way if joint.movable and joint.name not in mapping.joints]
+    if not at_zero:
+        return plain.text, []
+    return plain.text, [f"{', '.join(at_zero)} on the chain, without measurement, held at 0"]
 
 
 def _read(

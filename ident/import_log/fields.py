@@ -94,8 +94,14 @@ class Field:
         """The columns of these joints if the labels are joint names, else all if they are as many; or None."""
         if set(joints) <= set(self.labels):
             picked = [self.labels.index(name) for name in joints]
-            columns = None if self.columns is None else tuple(self.columns[k] for k in picked)
-            return replace(self, labels=tuple(joints), values=self.values[:, picked], columns=columns)
+            file, columns = self.file, self.columns
+            if isinstance(file, tuple):
+                file = tuple(file[k] for k in picked)
+            elif columns is not None or len(picked) < len(self.labels):
+                columns = tuple(k + 1 if columns is None else columns[k] for k in picked)
+            return replace(
+                self, labels=tuple(joints), values=self.values[:, picked], file=file, columns=columns
+            )
         return self if self.values.shape[1] == len(joints) else None
 
     @property
@@ -108,6 +114,8 @@ class Field:
             inner = first if first == last else f"{first} ... {last}"
         elif self.columns == (1,):
             inner = "" if self.file else "column 1"
+        elif self.columns is not None and len(self.columns) == 1:
+            inner = f"column {self.columns[0]}"
         elif self.columns is not None:
             inner = f"columns {self.columns[0]} to {self.columns[-1]}"
         else:

@@ -32,6 +32,8 @@ _LARGEST_CURRENT_A = 200.0
 _UNIX_S = 1e9
 _SLACK = 0.05
 """Share of a joint's range by which positions may exceed it."""
+RESTING_RAD = 1e-2
+"""Largest range of a joint at rest; `identify` counts a joint as moving beyond it."""
 _TURNS = 4.0 * math.pi
 
 
@@ -79,7 +81,11 @@ class Guess:
         ]
         left = [f"  not used: {', '.join(self.unused)}"] if self.unused else []
         return "\n".join(
-            [f"{self.source.name}: {len(self.mapping.joints)} joints of {self.mapping.robot}", *lines, *left]
+            [
+                f"{self.source.name}: {len(self.mapping.joints)} joint(s) of {self.mapping.robot}",
+                *lines,
+                *left,
+            ]
         )
 
 
@@ -112,20 +118,30 @@ class _Guesser:
         if position is None:
             raise self._unknown("position")
         joints, why = self._joints(position)
+        rests: dict[str, float] | None = None
+        if (
+            self.known.joints
+            and position.values.shape[1] > len(joints)
+            and not set(joints) <= set(position.labels)
+        ):
+            self._name_columns(position.values.shape[1])
+            position = self._best("position") or position
         picked = position.of(joints)
         if picked is None:
             raise DataError(
                 f"{self.source}: {position.shown} has {position.values.shape[1]} columns for the {len(joints)} joints "
                 f"{', '.join(joints)}; name the joints of the columns with --joints"
             )
-        position = picked
+        whole, position = position, picked
         bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
         if len(bad):
             raise DataError(
-                f"{self.source}: {position.shown} has missing values in {len(bad)} rows, first in row {bad[0]}; write a "
-                "mapping file and leave them out with `lwr-run import --rows`"
+                f"{self.source}: {position.shown} has missing values in {len(bad)} rows, first in row {bad[0]}; "
+                "write a mapping file and leave them out with `lwr-run import --rows`"
             )
         unit, reason = self._angle_unit(position, joints)
+        if self.known.joints and picked is not whole:
+            rests = self._rests(whole, joints, unit)
         angle = position.values * (math.pi / 180.0 if unit == "deg" else 1.0)
         velocity = self._best("velocity", joints)
         time, period = self._time(angle, velocity, unit)
@@ -136,28 +152,54 @@ class _Guesser:
                 "velocity", velocity, name, f"{factor:.2f} times dq/dt in this unit"
             )
         signals |= self._torques(joints)
-        self.rows.append(("joints", f"{joints[0]} ... {joints[-1]}", "", why))
+        self.rows.append(("joints", _span(joints), "", why))
         gear = any(signal.before_gear for signal in signals.values())
         mapping = LogMapping(
             robot=self.robot.name,
             joints=joints,
             time=time,
             urdf=str(Path(self.urdf).resolve()),
+            held=rests or None,
             base=self.known.base,
             tip=self.known.tip,
             transmission=Transmission(_each("gear_ratio", self.known.gear_ratio, joints)) if gear else None,
             **signals,
         )
-        order = ("time", "position", "velocity", "joint_torque", "motor_torque", "joints")
+        order = ("time", "position", "velocity", "joint_torque", "motor_torque", "joints", "held")
         self.rows.sort(key=lambda row: order.index(row[0]))
-        unused = tuple(one.shown for one in self.fields if one.shown not in self.used)
+        unused = tuple(one.shown for one in self.fields if one.name not in self.used)
         return Guess(self.source, mapping, tuple(self.rows), unused)
+
+    def _name_columns(self, count: int) -> None:
+        """Call the columns of every field with `count` of them by the joints of the arm."""
+        names = self.robot.arm(count=count, root=self.known.base)
+        self.fields = [
+            replace(one, labels=names) if one.values.shape[1] == count else one for one in self.fields
+        ]
+
+    def _rests(self, position: Field, joints: Sequence[str], unit: str) -> dict[str, float]:
+        """Where the recorded joints rest that are no joints of the model, to four digits."""
+        size = math.pi / 180.0 if unit == "deg" else 1.0
+        found = {}
+        arm = self.robot.arm(names=position.labels, root=self.known.base)
+        for k, name in enumerate(position.labels):
+            values = position.values[:, k] * size
+            if name in joints or name not in arm:
+                continue
+            if np.ptp(values) > RESTING_RAD:
+                raise DataError(
+                    f"{self.source}: {name} moves by {np.ptp(values):.3g} rad; name it in --joints, which leaves "
+                    "out joints at rest only"
+                )
+            found[name] = round(float(np.mean(values)), 4)
+        self.rows.append(("held", _span(tuple(found)), "rad", "at rest, not in --joints"))
+        return found
 
     def _take(
         self, quantity: str, field: Field, unit: str, why: str, constant: tuple[float, ...] = ()
     ) -> Signal:
         """The signal of a field, noted in the table."""
-        self.used.add(field.shown)
+        self.used.add(field.name)
         self.rows.append((quantity, field.shown, unit, self.why.get(field.name, why)))
         return Signal(
             cast(Unit, unit), field.file, field.columns, field.array, torque_constant=constant or None
@@ -275,7 +317,7 @@ class _Guesser:
             equal="spread" if equal else "refuse",
         )
         why = f"steps of {step:.4g} on average" + (", equal times spread" if equal else "")
-        self.used.add(clock.shown)
+        self.used.add(clock.name)
         self.rows.append(("time", clock.shown, unit, why))
         return found, step * base.seconds
 
@@ -355,6 +397,10 @@ class _Guesser:
             else []
         )
         return [*times, *found, replace(parts[0], name="torque")]
+
+
+def _span(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
 
 
 def _slope(rate: Floats, change: Floats) -> tuple[float, float]:

@@ -212,7 +212,7 @@ class LogMapping:
     velocity, motor_position, command : measured velocity, motor position, commanded position.
     offset_rad : added to the positions of each joint after the gear, to meet the zero of the URDF.
     urdf : file of the arm, found as configuration files are, attached to the session. Its other joints, those of
-        a gripper say, are held at zero.
+        a gripper say, are held at zero, or where `held` says [rad or m].
     base, tip : first and last link of the arm in it; None: its root, and behind the last joint.
     delimiter : of text files; None tries semicolon, comma, tab and blanks.
     header : whether text files name their columns in the first row; None looks whether it holds numbers.
@@ -236,6 +236,7 @@ class LogMapping:
     transmission: Transmission | None = None
     offset_rad: tuple[float, ...] | None = None
     urdf: str | None = None
+    held: dict[str, float] | None = None
     base: str | None = None
     tip: str | None = None
     delimiter: str | None = None
@@ -313,6 +314,8 @@ def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         kept = [f for f in dataclasses.fields(value) if getattr(value, f.name) != f.default]
         return {f.name: _plain(getattr(value, f.name)) for f in kept}
+    if isinstance(value, dict):
+        return dict(value)
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 

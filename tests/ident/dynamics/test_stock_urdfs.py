@@ -12,7 +12,7 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
-from ident.dynamics.urdf import read_urdf
+from ident.dynamics.urdf import held, read_urdf
 from lwr_driver.session import SessionWriter, read_session, session_metadata
 from tests.ident.stock_panda import JOINTS, joint, link, stock_panda
 
@@ -144,3 +144,21 @@ def test_the_chain_of_a_session_has_its_joints(tmp_path: Path) -> None:
 def test_the_metadata_of_a_session_name_base_and_tip(tmp_path: Path) -> None:
     session = session_of(tmp_path / "a.mcap", (*JOINTS, "gripper_of_another_file"), tip="panda_link7")
     assert session_chain(session).joint_names == JOINTS
+
+
+def test_joints_held_where_they_rest_leave_the_same_arm() -> None:
+    rests = {"panda_joint2": 0.4, "panda_joint4": -1.3, "panda_joint6": 1.1, "panda_finger_joint1": 0.03}
+    kept = ("panda_joint1", "panda_joint3", "panda_joint5", "panda_joint7")
+    chain = Chain.from_urdf(held(stock_panda(), rests), joints=kept)
+    full = pin.buildModelFromXML(stock_panda())
+    q0 = pin.neutral(full)
+    for name, value in rests.items():
+        q0[full.joints[full.getJointId(name)].idx_q] = value
+    away = [full.getJointId(name) for name in (*rests, "panda_finger_joint2")]
+    reduced = pin.buildReducedModel(full, away, q0)
+    ours = chain.to_pinocchio(chain.urdf_inertials())
+    q, qd, qdd = np.random.default_rng(4).normal(size=(3, 4))
+    expected = pin.rnea(reduced, reduced.createData(), q, qd, qdd)
+    np.testing.assert_allclose(pin.rnea(ours, ours.createData(), q, qd, qdd), expected, atol=2e-6)
+    with pytest.raises(ConfigurationError, match="has no joint 'panda_joint9'"):
+        held(stock_panda(), {"panda_joint9": 0.0})

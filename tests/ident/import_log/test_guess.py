@@ -10,6 +10,7 @@ import pytest
 from scipy.io import savemat
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.session_chain import session_chain
 from ident.import_log import Guess, Known, LogMapping, guess_mapping, import_log
 from ident.import_log.fields import Field, split_name
 from lwr_driver.session import read_session
@@ -195,6 +196,23 @@ def test_extra_columns_of_fingers_are_left_out(arm: Path, tmp_path: Path) -> Non
     np.testing.assert_allclose(read.joint.effort, TAU, rtol=1e-10)
 
 
+def test_joints_at_rest_are_held_where_they_rest(arm: Path, tmp_path: Path) -> None:
+    kept = ("panda_joint2", "panda_joint4")
+    moving = np.isin(PHASE, (1, 3))
+    q = np.where(moving, Q, 0.1 * PHASE + 0.001 * np.sin(T[:, None]))
+    path = write(tmp_path / "run.csv", ["t", *columns("q{k}"), *columns("tau{k}")], T, q, TAU)
+    guess = guess_mapping(path, arm, Known(joints=kept))
+    rests = {name: 0.1 * k for k, name in enumerate(JOINTS) if name not in kept}
+    assert guess.mapping.held == pytest.approx(rests, abs=2e-3)
+    read = session(guess, path, tmp_path)
+    np.testing.assert_allclose(read.joint.effort, TAU[:, moving], rtol=1e-10)
+    assert session_chain(read).joint_names == kept
+    fixed = {name for name in JOINTS if f'name="{name}" type="fixed"' in str(session_chain(read).urdf)}
+    assert fixed == set(rests)
+    with pytest.raises(DataError, match=r"panda_joint4 moves by .* rad; name it in --joints"):
+        guess_mapping(path, arm, Known(joints=kept[:1]))
+
+
 @pytest.mark.parametrize(
     ("names", "blocks", "known", "message"),
     [
@@ -202,7 +220,7 @@ def test_extra_columns_of_fingers_are_left_out(arm: Path, tmp_path: Path) -> Non
         (["t", *columns("q{k}")], (T, Q), {}, "no torque by its name"),
         ([*columns("q{k}"), *columns("tau{k}")], (Q, TAU), {}, "give the rate of the samples with --rate-hz"),
         (["t", *columns("q{k}"), *columns("tau{k}")], (T, 6e3 * Q, TAU), {}, "outside the limits .*A motor's angle"),
-        (["t", *columns("q{k}"), *columns("tau{k}")], (T, Q, TAU), {"joints": JOINTS[:6]}, "7 columns for the 6"),
+        (["t", *columns("q{k}")[:6], *columns("tau{k}")], (T, Q[:, :6], TAU), {"joints": JOINTS}, "6 columns for"),
         (["t", *columns("q{k}"), *columns("tau{k}")], (T * 1e5, Q, TAU), {}, None),
         (["t", *columns("q{k}")[:6], *columns("tau{k}")[:6]], (T, Q[:, :6], TAU[:, :6]), {}, "no serial arms with 6"),
     ],
