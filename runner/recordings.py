@@ -89,7 +89,12 @@ def read_recordings(
     """
     foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
     if not foreign:
-        logs = [read_recording(path, status=False) for path in paths]
+        if yes or joints or rate_hz or torque_constant or gear_ratio:
+            raise ConfigurationError(
+                f"{paths[0]} names its joints and quantities; --yes, --joints, --rate-hz, --torque-constant and "
+                "--gear-ratio are for recordings with guessed columns"
+            )
+        logs = [read_recording(path, status=False, motor=torque == "motor") for path in paths]
         for log in logs[1:]:
             _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
         return logs
@@ -115,7 +120,7 @@ def read_recordings(
     sessions = []
     for path in paths:
         if path not in names:
-            sessions.append(read_recording(path, status=False))
+            sessions.append(read_recording(path, status=False, motor=torque == "motor"))
             continue
         target = folder / f"{names[path]}.mcap"
         _clear(target)

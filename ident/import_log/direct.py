@@ -21,12 +21,13 @@ from lwr_driver.session.writer import LIBRARY
 _HEAD_BYTES = 256
 
 
-def read_recording(path: str | os.PathLike[str], *, status: bool = True) -> Session:
+def read_recording(path: str | os.PathLike[str], *, status: bool = True, motor: bool = False) -> Session:
     """The session in a session log, or in a ROS 2 bag: an MCAP file, or the folder of a split bag.
 
     From a bag, the topic of `sensor_msgs/JointState` with most arrays and joints is taken, `effort` as joint torque,
     header stamps as times if they rise with every message, else the recorder's times, equal ones spread. Joints with
     values missing are left out.
+    motor : whether `effort` of a bag is the motors' torque, already at the joint, instead of the sensors'.
     status : as in `read_session`. Raises DataError for an unreadable file or a bag without torques.
     """
     source = Path(path)
@@ -36,7 +37,7 @@ def read_recording(path: str | os.PathLike[str], *, status: bool = True) -> Sess
     bag = read_bag(source)
     if bag.is_session:
         return read_session(source, status=status)
-    mapping = bag_mapping(bag)
+    mapping = bag_mapping(bag, motor=motor)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / f"{source.stem}.mcap"
         import_log(mapping, source, target, urdf=None)

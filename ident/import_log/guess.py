@@ -252,14 +252,18 @@ class _Guesser:
         limits = np.array([by_name[name].limits or (-math.inf, math.inf) for name in joints])
         slack = _SLACK * np.nan_to_num(limits[:, 1] - limits[:, 0], posinf=0.0)
         turning = np.array([by_name[name].kind == "revolute" for name in joints])
+        known = "the limits of the URDF" if np.isfinite(limits).any() else "two turns"
         for unit, size in (("rad", 1.0), ("deg", math.pi / 180.0)):
-            values = position.values * np.where(turning, size, 1.0)
-            if np.all(
+            values = position.values * size
+            inside = (
                 (values >= limits[:, 0] - slack) & (values <= limits[:, 1] + slack) & (abs(values) < _TURNS)
-            ):
-                return unit, "within the limits of the URDF" if np.isfinite(
-                    limits
-                ).any() else "within two turns"
+            )
+            # Lengths in m beside angles in deg have no unit in common; a mapping's `scale` can tell them apart.
+            if inside.all() and (unit == "rad" or turning.all()):
+                return (
+                    unit,
+                    f"within {known}" if unit == "rad" else f"beyond {known} in rad, within them in deg",
+                )
         beyond = position.values - np.clip(position.values, limits[:, 0] - slack, limits[:, 1] + slack)
         joint = int(np.argmax(np.abs(beyond).max(axis=0)))
         low, high = position.values[:, joint].min(), position.values[:, joint].max()

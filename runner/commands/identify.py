@@ -23,12 +23,24 @@ from runner.terminal import GroupedCommand, json_option, to_json
 _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for name, kind in ESTIMATORS.items())
 
 
-@click.command(
-    "identify",
-    epilog=_EPILOG,
-    cls=GroupedCommand,
-    groups={"Recordings of other arms": ("base", "tip", *GUESSED)},
-)
+_GROUPS = {
+    "Estimation": (
+        "model",
+        "estimator",
+        "payload",
+        "urdf",
+        "tilt",
+        "essential",
+        "test",
+        "settings",
+        "out",
+        "results",
+    ),
+    "Recordings of other arms": ("base", "tip", *GUESSED),
+}
+
+
+@click.command("identify", epilog=_EPILOG, cls=GroupedCommand, groups=_GROUPS)
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--model",

@@ -170,6 +170,14 @@ def test_bags_are_read_as_they_are(first: Result, lab: Path) -> None:
     assert error_of(model) < 0.1
 
 
+def test_the_effort_of_a_bag_may_be_the_motors(lab: Path) -> None:
+    done = run("identify", lab / "one.mcap", "--urdf", lab / "arm.urdf", "--torque", "motor", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["model"] == 2
+    refused = run("identify", lab / "one.mcap", "--urdf", lab / "arm.urdf", "--rate-hz", "100")
+    assert "names its joints and quantities" in refused.output
+
+
 def test_a_folder_with_a_split_bag_is_one_recording(lab: Path, tmp_path: Path) -> None:
     from ident.import_log import read_recording
 
