@@ -89,9 +89,9 @@ def read_recordings(
     """
     foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
     if not foreign:
-        if yes or joints or rate_hz or torque_constant or gear_ratio:
+        if joints or rate_hz or torque_constant or gear_ratio:
             raise ConfigurationError(
-                f"{paths[0]} names its joints and quantities; --yes, --joints, --rate-hz, --torque-constant and "
+                f"{paths[0]} names its joints and quantities; --joints, --rate-hz, --torque-constant and "
                 "--gear-ratio are for recordings with guessed columns"
             )
         logs = [read_recording(path, status=False, motor=torque == "motor") for path in paths]
