@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 from mcap_ros2.writer import Writer
 from scipy.io import savemat
 
@@ -18,6 +19,7 @@ from ident.import_log.tables import read_text
 from lwr_driver.configuration import parse
 from lwr_driver.session import read_session
 from lwr_driver.session.messages import JOINT_STATE, STRING
+from runner.cli import main
 from tests.ident.import_log.test_import_log import PLAIN, mapping, write_csv
 from tests.ident.stock_panda import JOINTS, stock_panda
 
@@ -302,3 +304,22 @@ def test_a_bag_without_stamps_has_the_time_of_its_recorder(tmp_path: Path) -> No
         DataError, match=r"no messages of sensor_msgs/JointState .*; topics: /note \(std_msgs/msg/String\)"
     ):
         read_bag(tmp_path / "none.mcap")
+
+
+def test_the_command_takes_urdf_base_and_tip(tmp_path: Path) -> None:
+    (tmp_path / "panda.urdf").write_text(stock_panda())
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(PLAIN | {"joints": list(JOINTS[:2])}))
+    words = [
+        "import",
+        tmp_path / "map.yaml",
+        write_csv(tmp_path),
+        tmp_path / "x.mcap",
+        "--urdf",
+        tmp_path / "panda.urdf",
+    ]
+    refused = CliRunner().invoke(main, [*map(str, words), "--tip", "panda_hnad"])
+    assert refused.exit_code == 2
+    assert "did you mean 'panda_hand'?" in refused.output
+    done = CliRunner().invoke(main, [*map(str, words), "--tip", "panda_hand", "--base", "panda_link0"])
+    assert done.exit_code == 0, done.output
+    assert read_session(tmp_path / "x.mcap").robot_description == stock_panda()
