@@ -98,6 +98,9 @@ def read_recordings(
         for log in logs[1:]:
             _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
         return logs
+    missing = [path for path in foreign if not path.exists()]
+    if missing:
+        raise DataError(f"{missing[0]}: no such file or folder")
     if urdf is None:
         raise ConfigurationError(
             f"{foreign[0]}: no session log; name the arm's URDF with --urdf to import it"
