@@ -80,7 +80,7 @@ class Recordings:
         mapping = dataclasses.replace(mapping, joints=self.chain(urdf).joint_names)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"run_{run}.mcap"
-            import_log(mapping, self.folder / f"measurements_{run}.npz", path)
+            import_log(mapping, self.folder / f"measurements_{run}.npz", path, urdf=self.chain(urdf).urdf)
             return read_session(path)
 
     def sessions(self, runs: Runs, urdf: str = "") -> list[Session]:

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import math
 import os
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -21,6 +22,29 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 _LONGEST_SHOWN = 80
 
 T = TypeVar("T")
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader with the numbers of YAML 1.2: `5e-05` is one too, without a point and without a sign."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that quotes every text `_Loader` would read as a number."""
+
+
+for _kind_of_yaml in (_Loader, _Dumper):
+    _kind_of_yaml.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+$"),
+        list("-+.0123456789"),
+    )
+
+
+def yaml_text(content: Any) -> str:
+    """Plain content as YAML that `read_yaml` reads back, keys in their order."""
+    return yaml.dump(
+        content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+    )
 
 
 def expect(value: Any, kind: type, subject: str, advice: str) -> None:
@@ -70,13 +94,13 @@ def _shown(name: str | Path) -> str:
 
 
 def read_yaml(path: Path) -> Any:
-    """Parsed content of a YAML file (`safe_load`), with the position of a syntax error in the message."""
+    """Parsed content of a YAML file (safe types only), with the position of a syntax error in the message."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: cannot be read: {error}") from error
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigurationError(f"{path}: not valid YAML: {error}") from error
 
@@ -125,7 +149,14 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return _convert_union(arguments, value, where)
     if origin is typing.Literal:
         if value not in arguments:
-            raise ConfigurationError(f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}")
+            near = difflib.get_close_matches(
+                str(value).lower(), [str(word).lower() for word in arguments], n=1
+            )
+            meant = next((word for word in arguments if [str(word).lower()] == near), None)
+            hint = "" if meant is None else f"; did you mean `{meant}`?"
+            raise ConfigurationError(
+                f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}{hint}"
+            )
         return value
     if origin is tuple:
         return _convert_tuple(arguments, value, where)

@@ -33,7 +33,7 @@ VERBS = {
     "info": "summary of a session log",
     "recover": "repair the log of a killed recorder",
     "attach": "add a controller's trace file to a session log",
-    "import": "convert CSV and NPZ recordings to a session log",
+    "import": "convert recordings of other programs to a session log",
     "completion": "completion script for bash, zsh or fish",
 }
 FAMILIES = {

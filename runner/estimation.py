@@ -229,6 +229,13 @@ def couplings(texts: Sequence[str]) -> tuple[Coupling, ...]:
     return tuple(found)
 
 
+def recorded_couplings(sessions: Sequence[Session]) -> tuple[str, ...]:
+    """Coupled pairs of joints in the metadata of imported sessions, each as `A5:A6`."""
+    return tuple(
+        dict.fromkeys(pair for one in sessions for pair in one.metadata.get("couplings", "").split())
+    )
+
+
 def announced(sessions: Sequence[Session], payloads: Sequence[str]) -> list[Session]:
     """The sessions with the payloads given as `FILE=NAME[:KG]` in place of their metadata."""
     corrected = list(sessions)

@@ -14,7 +14,7 @@ inertial parameters both ways.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -300,30 +300,33 @@ class Chain(Tabular):
         *,
         root: str | None = None,
         tip: str | None = None,
+        joints: Collection[str] | None = None,
         gravity: ArrayLike = STANDARD_GRAVITY,
         snap_rad: float = 1e-5,
     ) -> Chain:
         """Chain from a URDF: a path, or the text itself (it begins with `<`).
 
-        root, tip : link names; default the root of the tree and the end of its only chain of movable joints.
+        root, tip : link names; default the root of the tree and the end of its only chain of driven joints.
+        joints : names of the joints of the chain, in any order; all others are held at zero, gripper, mimic
+            and floating root included. Without a tip the chain ends at the last of them.
         gravity : (3,) in the axes of the root link [m/s^2].
         snap_rad : angles alpha and theta this near to a multiple of pi/2 are rounded to it, because files
             write 1.5708; 0 takes every digit as it stands.
 
-        Fixed joints are merged. Raises ConfigurationError for an unreadable file, a tree without a unique
-        chain or joints other than revolute, continuous, prismatic and fixed.
+        Fixed joints, and those held at zero, are merged. Raises ConfigurationError for an unreadable file,
+        unknown joints or links, or a tree without a unique chain.
         """
         urdf = read_urdf(source)
-        joints = urdf.chain(root, tip)
-        movable = [joint for joint in joints if joint.movable]
+        path = urdf.chain(root, tip, joints)
+        movable = [joint for joint in path if (joint.driven if joints is None else joint.name in joints)]
         if not movable:
             raise ConfigurationError(
                 f"robot {urdf.name!r}: no movable joint between {root or urdf.root!r} and the tip"
             )
         local, pending = [], np.eye(4)
-        for joint in joints:
+        for joint in path:
             pending = pending @ joint.origin
-            if joint.movable:
+            if joint in movable:
                 local.append(pending)
                 pending = np.eye(4)
         table = table_as_is(local, movable, snap_rad)

@@ -1,28 +1,41 @@
 """Inertials of the links and the tree of joints from a URDF, read with plain XML.
 
 Positions, axes and inertia are taken as written (roll-pitch-yaw as in the URDF specification); meshes,
-visuals and extensions are ignored, so a file reads without its packages.
+visuals and extensions are ignored, so a file reads without its packages. Floating and planar joints are held
+at zero, as are all joints off the chain; a mimic joint has no coordinate unless the chain names it.
 """
 
 from __future__ import annotations
 
+import difflib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.parameters import Floats
 
-_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+_KINDS = {
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "fixed": "fixed",
+    "floating": "fixed",
+    "planar": "fixed",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """One joint: kind ("revolute", "prismatic", "fixed"), parent and child, origin (4, 4), unit axis (3,)."""
+    """One joint: kind ("revolute", "prismatic", "fixed"), parent and child, origin (4, 4), unit axis (3,).
+
+    mimic : name of the joint it follows, or None. limits : lower and upper position [rad or m], or None.
+    """
 
     name: str
     kind: str
@@ -30,11 +43,18 @@ class Joint:
     child: str
     origin: Floats
     axis: Floats
+    mimic: str | None = None
+    limits: tuple[float, float] | None = None
 
     @property
     def movable(self) -> bool:
-        """Whether the joint has a coordinate."""
+        """Whether the joint can move, by itself or after another."""
         return self.kind != "fixed"
+
+    @property
+    def driven(self) -> bool:
+        """Whether the joint has a coordinate of its own."""
+        return self.movable and self.mimic is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +75,104 @@ class Urdf:
             raise ConfigurationError(f"robot {self.name!r}: {len(roots)} root links; a tree has exactly one")
         return roots[0]
 
-    def chain(self, root: str | None = None, tip: str | None = None) -> list[Joint]:
-        """Joints from `root` to `tip`; without a tip, the one chain through all movable joints."""
+    def chain(
+        self, root: str | None = None, tip: str | None = None, joints: Collection[str] | None = None
+    ) -> list[Joint]:
+        """All joints from `root` to `tip`, fixed ones included.
+
+        joints : names that must lie on the way; without a tip it ends behind the last of them. Without both,
+            the one chain through all driven joints.
+
+        Raises ConfigurationError for unknown names, joints without a common chain, and a mimic joint between
+        them that follows one of them.
+        """
         start = root if root is not None else self.root
         for link in (start, tip):
             if link is not None and link not in self.inertials:
+                raise ConfigurationError(f"robot {self.name!r} has no link {_unknown(link, self.inertials)}")
+        if joints is None:
+            return self._path(start, self._only_tip(start) if tip is None else tip)
+        self.require(joints)
+        paths = [self._path(start, joint.child) for joint in self.joints if joint.name in joints]
+        longest = max(paths, key=len) if tip is None else self._path(start, tip)
+        on_it = {joint.name for joint in longest}
+        off = [name for name in joints if name not in on_it]
+        if off:
+            raise ConfigurationError(
+                f"robot {self.name!r}: joint {off[0]!r} is not on the chain from link {start!r} to "
+                f"{longest[-1].child!r}; leave it out of `joints`, or give another `tip`"
+            )
+        for joint in longest:
+            if joint.mimic in joints and joint.name not in joints:
                 raise ConfigurationError(
-                    f"robot {self.name!r} has no link {link!r}; links: {', '.join(self.inertials)}"
+                    f"robot {self.name!r}: joint {joint.name!r} on the chain follows {joint.mimic!r} (mimic), and a "
+                    "chain has independent joints only; name it in `joints` with its measured position"
                 )
-        if tip is None:
-            tip = self._only_tip(start)
+        return longest
+
+    def require(self, names: Collection[str]) -> None:
+        """Raise ConfigurationError unless every name is a joint that can move."""
+        movable = [joint.name for joint in self.joints if joint.movable]
+        fixed = {joint.name for joint in self.joints if not joint.movable}
+        for name in names:
+            if name in fixed:
+                raise ConfigurationError(
+                    f"joint {name!r} of robot {self.name!r} is fixed and cannot have been measured"
+                )
+            if name not in movable:
+                raise ConfigurationError(f"robot {self.name!r} has no joint {_unknown(name, movable)}")
+
+    def arm(
+        self, *, count: int | None = None, names: Collection[str] | None = None, root: str | None = None
+    ) -> tuple[str, ...]:
+        """Names of the driven joints of a serial piece of the tree, base to tip.
+
+        A piece begins at the root or a branching and ends at a later branching or a leaf. Any movable joint
+        branches, a mimic too, so a gripper with two fingers ends the arm before it.
+
+        count : the only piece with that many joints.
+        names : the longest unbranched piece with all its joints among them, and the named joints below it.
+
+        Raises ConfigurationError, with the pieces, if there is none or more than one.
+        """
+        pieces: dict[tuple[str, ...], bool] = {}
+        for piece, direct in self._pieces(root):
+            if piece:
+                key = tuple(joint.name for joint in piece)
+                # A piece on to a mimic joint has the same joints as the one that ends before it.
+                pieces[key] = direct or pieces.get(key, False)
+        if count is not None:
+            found = [piece for piece in pieces if len(piece) == count]
+            wanted = f"with {count} joints"
+        else:
+            covered = {piece: direct for piece, direct in pieces.items() if set(piece) <= set(names or ())}
+            longest = max((len(piece) for piece, direct in covered.items() if direct), default=0)
+            found = [piece for piece, direct in covered.items() if direct and len(piece) == longest]
+            if len(found) == 1:
+                found = [max((piece for piece in covered if piece[-longest:] == found[0]), key=len)]
+            wanted = f"among the joints {', '.join(names or ())}"
+        if len(found) != 1:
+            choice = "; ".join(f"{len(piece)}: {', '.join(piece)}" for piece in found or pieces)
+            raise ConfigurationError(
+                f"robot {self.name!r} has {len(found) or 'no'} serial arms {wanted} ({choice}); name the `joints`"
+            )
+        return found[0]
+
+    def _pieces(self, root: str | None) -> Iterator[tuple[tuple[Joint, ...], bool]]:
+        """Driven joints of each piece, and whether it is without a branching."""
+
+        def walk(link: str, above: list[list[Joint]]) -> Iterator[tuple[tuple[Joint, ...], bool]]:
+            branches = [joint for joint in self._below(link) if joint.movable]
+            if len(branches) != 1:
+                for piece in above:
+                    yield tuple(joint for joint in piece if joint.driven), piece is above[-1]
+                above = [*above, []]
+            for joint in branches:
+                yield from walk(joint.child, [[*piece, joint] for piece in above])
+
+        yield from walk(root if root is not None else self.root, [[]])
+
+    def _path(self, start: str, tip: str) -> list[Joint]:
         parent_joint = {joint.child: joint for joint in self.joints}
         path: list[Joint] = []
         link = tip
@@ -77,11 +185,11 @@ class Urdf:
 
     def _only_tip(self, start: str) -> str:
         link = start
-        while branches := [joint for joint in self._below(link) if joint.movable]:
+        while branches := [joint for joint in self._below(link) if joint.driven]:
             if len(branches) > 1:
                 named = ", ".join(joint.name for joint in branches)
                 raise ConfigurationError(
-                    f"robot {self.name!r} branches at link {link!r} (joints {named}); give the arm's `tip`"
+                    f"robot {self.name!r} branches at link {link!r} (joints {named}); give the arm's `joints` or `tip`"
                 )
             link = branches[0].child
         return link
@@ -105,6 +213,41 @@ class Urdf:
             if joint.parent == link and joint.name not in stop:
                 total += parameters.transform(self.lumped_inertial(joint.child, stop), joint.origin)
         return total
+
+
+def held(text: str, positions: Mapping[str, float]) -> str:
+    """The URDF with joints fixed at positions [rad or m]. ConfigurationError for joints that cannot move."""
+    urdf = read_urdf(text)
+    urdf.require(positions)
+    tree = ElementTree.fromstring(text)
+    known = {joint.name: joint for joint in urdf.joints}
+    for element in tree.findall("joint"):
+        name = element.get("name", "")
+        if name not in positions:
+            continue
+        joint, value = known[name], positions[name]
+        motion = np.eye(4)
+        if joint.kind == "prismatic":
+            motion[:3, 3] = value * joint.axis
+        else:
+            motion[:3, :3] = Rotation.from_rotvec(value * joint.axis).as_matrix()
+        pose = joint.origin @ motion
+        # URDF: rotations about the fixed axes x, y, z in this order.
+        angles = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", suppress_warnings=True)
+        for old in [child for child in element if child.tag in ("origin", "axis", "limit", "mimic")]:
+            element.remove(old)
+        words = {"xyz": pose[:3, 3], "rpy": angles}
+        origin = {key: " ".join(repr(float(x)) for x in values) for key, values in words.items()}
+        element.insert(0, ElementTree.Element("origin", origin))
+        element.set("type", "fixed")
+    return ElementTree.tostring(tree, encoding="unicode")
+
+
+def _unknown(name: str, known: Collection[str]) -> str:
+    """A name that is not known, with the nearest one and all others."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]!r}? It" if near else "it"
+    return f"{name!r}; {hint} has {', '.join(known)}"
 
 
 def read_urdf(source: str | Path) -> Urdf:
@@ -193,6 +336,8 @@ def _joint(element: ElementTree.Element, place: str) -> Joint:
     length = float(np.linalg.norm(axis))
     if _KINDS[kind] != "fixed" and length < 1e-9:
         raise ConfigurationError(f"{where}: the axis has no length")
+    mimic, limit = element.find("mimic"), element.find("limit")
+    bounded = limit is not None and kind != "continuous" and limit.get("lower") != limit.get("upper")
     return Joint(
         name,
         _KINDS[kind],
@@ -200,4 +345,8 @@ def _joint(element: ElementTree.Element, place: str) -> Joint:
         child.get("link", ""),
         _pose(element.find("origin"), where),
         axis / max(length, 1e-300),
+        None if mimic is None else mimic.get("joint"),
+        (float(_numbers(limit, "lower", (0.0,), where)[0]), float(_numbers(limit, "upper", (0.0,), where)[0]))
+        if bounded
+        else None,
     )

@@ -1,22 +1,28 @@
-"""Import of recordings made elsewhere: CSV and NPZ files to a session log, through a mapping file.
+"""Recordings made elsewhere: text, NPZ and MATLAB files and ROS 2 bags to session logs.
 
-`LogMapping.load` reads the mapping file, `import_log` writes the session. Nothing is filtered, resampled or
-repaired on the way: a value is converted (unit, sign, scale, gear, offset) and written, or the import stops
-with an error.
+`LogMapping.load` reads the mapping file, `import_log` writes the session, `guess_mapping` guesses a mapping from names,
+`read_recording` reads session logs and bags alike. Nothing is filtered, resampled or repaired on the way: a value
+is converted (unit, sign, scale, gear, offset) and written, or the import stops with an error.
 """
 
 from __future__ import annotations
 
 from ident.import_log.conversion import ImportReport, import_log
+from ident.import_log.direct import read_recording
+from ident.import_log.guess import Guess, Known, guess_mapping
 from ident.import_log.mapping import Coupling, LogMapping, Signal, TimeBase, Transmission, mapping_path
 
 __all__ = [
     "Coupling",
+    "Guess",
     "ImportReport",
+    "Known",
     "LogMapping",
     "Signal",
     "TimeBase",
     "Transmission",
+    "guess_mapping",
     "import_log",
     "mapping_path",
+    "read_recording",
 ]

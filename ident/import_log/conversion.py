@@ -1,214 +1,25 @@
-"""From a recording and its mapping to a session log: reading, conversion to SI at the joint, checks, writing.
-
-Recordings are CSV (any delimiter, with or without header) or NPZ files; incomplete ones are refused.
-"""
+"""From a recording and its mapping to a session log: conversion to SI at the joint, checks, writing."""
 
 from __future__ import annotations
 
 import datetime
 import hashlib
-import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
-from ident.import_log.mapping import Floats, LogMapping, Signal, TimeBase
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.urdf import held, read_urdf
+from ident.import_log.mapping import LogMapping, Signal, TimeBase
 from ident.import_log.read_back import check_written
-from lwr_driver.configuration import find
+from ident.import_log.recording import Recording
+from ident.import_log.tables import Floats
+from lwr_driver.configuration import find, yaml_text
 from lwr_driver.session import SessionWriter, session_metadata
-
-
-@dataclass
-class ImportedRecording:
-    """The files of a recording, each read once.
-
-    source : a file, or the folder of the files named in the mapping.
-    """
-
-    source: Path
-    delimiter: str | None = None
-    header: bool = True
-    _tables: dict[Path, tuple[tuple[str, ...], Floats]] = field(default_factory=dict, repr=False)
-    _archives: dict[Path, dict[str, Floats]] = field(default_factory=dict, repr=False)
-    _digests: dict[Path, str] = field(default_factory=dict, repr=False)
-
-    def path(self, file: str | None) -> Path:
-        """The file named by a signal, or the source itself."""
-        if file is None:
-            if self.source.is_dir():
-                raise DataError(
-                    f"{self.source} is a folder and the mapping names no `file`; give the file itself"
-                )
-            path = self.source
-        else:
-            path = (self.source if self.source.is_dir() else self.source.parent) / file
-        if not path.is_file():
-            raise DataError(f"{path}: no such file; the mapping needs it")
-        return path
-
-    @property
-    def digests(self) -> dict[str, str]:
-        """SHA-256 of every file read, by name."""
-        return {path.name: digest for path, digest in self._digests.items()}
-
-    def column(self, file: str | None, column: str | int) -> Floats:
-        """One column (n,), or one-dimensional NPZ array."""
-        path = self.path(file)
-        if path.suffix == ".npz":
-            values = self._array(path, str(column))
-            values = values.reshape(-1) if values.ndim == 2 and 1 in values.shape else values
-            if values.ndim != 1:
-                raise DataError(
-                    f"{path}: array {column!r} has shape {values.shape}; times are one-dimensional"
-                )
-            return values
-        names, values = self._table(path)
-        return values[:, _number(path, names, column)]
-
-    def columns(self, signal: Signal, joints: int, what: str) -> Floats:
-        """The columns (n, joints) of a signal, as they stand in the file."""
-        path = self.path(signal.file)
-        if path.suffix == ".npz":
-            if signal.array is None:
-                raise DataError(f"{path}: `{what}` needs `array`, the name of the array in the archive")
-            values = self._array(path, signal.array)
-            label = f"{path}: array {signal.array!r}"
-            names = tuple(str(k + 1) for k in range(values.shape[-1]))
-        else:
-            if signal.array is not None:
-                raise DataError(
-                    f"{path}: `{what}` names the array {signal.array!r}, but the file is no NPZ archive"
-                )
-            names, values = self._table(path)
-            label = str(path)
-        if values.ndim != 2:
-            raise DataError(
-                f"{label} has shape {values.shape}; rows of samples with a column for each joint are needed"
-            )
-        if signal.columns is not None:
-            return values[:, [_number(path, names, column) for column in signal.columns]]
-        if values.shape[1] != joints:
-            raise DataError(
-                f"{label} has {values.shape[1]} columns for {joints} joints; "
-                f"name them in `columns` of `{what}`"
-            )
-        return values
-
-    def _array(self, path: Path, name: str) -> Floats:
-        if path not in self._archives:
-            self._digest(path)
-            try:
-                with np.load(path, allow_pickle=False) as archive:
-                    self._archives[path] = {key: archive[key] for key in archive.files}
-            except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-                raise DataError(f"{path}: not a readable NPZ archive: {error}") from error
-        arrays = self._archives[path]
-        if name not in arrays:
-            raise DataError(f"{path}: no array {name!r}; it has {', '.join(arrays)}")
-        values = arrays[name]
-        if values.dtype.kind not in "fiu":
-            raise DataError(f"{path}: array {name!r} has type {values.dtype}; numbers are needed")
-        return values.astype(np.float64)
-
-    def _table(self, path: Path) -> tuple[tuple[str, ...], Floats]:
-        if path not in self._tables:
-            self._digest(path)
-            self._tables[path] = _read_csv(path, self.delimiter, self.header)
-        return self._tables[path]
-
-    def _digest(self, path: Path) -> None:
-        try:
-            self._digests[path] = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _number(path: Path, names: tuple[str, ...], column: str | int) -> int:
-    if isinstance(column, int):
-        if not 1 <= column <= len(names):
-            raise DataError(f"{path}: no column {column}; columns are numbered 1 to {len(names)}")
-        return column - 1
-    if names.count(column) > 1:
-        raise DataError(f"{path}: {names.count(column)} columns are called {column!r}; name them by number")
-    if column not in names:
-        raise DataError(f"{path}: no column {column!r}; it has {', '.join(names)}")
-    return names.index(column)
-
-
-def _read_csv(path: Path, delimiter: str | None, header: bool) -> tuple[tuple[str, ...], Floats]:
-    """Column names (numbers from 1 without a header) and the values (n, m) of a text table."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not readable as text: {error}") from error
-    rows = [
-        (number, line) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"
-    ]
-    if len(rows) < 1 + header:
-        raise DataError(f"{path}: holds no rows of numbers")
-    first = rows[0][1]
-    found = next((m for m in (",", ";", "\t") if m in first.strip()), None)
-    mark = found if delimiter is None else delimiter
-    names: tuple[str, ...] = ()
-    if header:
-        names = tuple(_split(first, mark))
-        rows = rows[1:]
-        if all(_is_number(name) for name in names):
-            raise DataError(
-                f"{path}: the first row {first[:60]!r} holds numbers, no names; set `header: false`"
-            )
-    width = len(names) if header else len(_split(first, mark))
-    values = _fast(path, rows, mark, width)
-    if values is None:
-        values = np.empty((len(rows), width))
-        for index, (number, line) in enumerate(rows):
-            values[index] = _row(path, number, _split(line, mark), width, names)
-    return names or tuple(str(k + 1) for k in range(width)), values
-
-
-def _fast(path: Path, rows: list[tuple[int, str]], mark: str | None, width: int) -> Floats | None:
-    """The table by numpy's own reader; None unless every row is a plain row of numbers."""
-    try:
-        values = np.loadtxt(
-            [line.strip().rstrip(mark or " ") for _, line in rows], delimiter=mark, ndmin=2, comments=None
-        )
-    except ValueError:
-        return None
-    return values if values.shape == (len(rows), width) else None
-
-
-def _split(line: str, mark: str | None) -> list[str]:
-    parts = [part.strip().strip('"') for part in line.strip().split(mark)]
-    return parts[:-1] if len(parts) > 1 and parts[-1] == "" else parts
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _row(path: Path, number: int, parts: list[str], width: int, names: tuple[str, ...]) -> list[float]:
-    if len(parts) != width:
-        raise DataError(
-            f"{path}: line {number} has {len(parts)} columns, the first has {width}; the file is not whole"
-        )
-    values = []
-    for index, part in enumerate(parts):
-        if not _is_number(part):
-            column = names[index] if names else str(index + 1)
-            shown = "is empty" if not part else f"holds {part!r}"
-            raise DataError(f"{path}: line {number}, column {column!r} {shown}; a number is needed")
-        values.append(float(part))
-    return values
-
 
 _ONCE = ("position", "velocity", "joint_torque")
 
@@ -220,6 +31,8 @@ class ImportReport:
     rows : samples written of each topic. rows_in_source : samples of the recording.
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
     holes : intervals longer than 1.75 periods, probably with lost samples.
+    repeated : samples equal to the one before in every value; they are kept.
+    notes : decisions on the way that the user should know.
     """
 
     path: Path
@@ -233,6 +46,8 @@ class ImportReport:
     shortest_s: float
     longest_s: float
     holes: int
+    repeated: int
+    notes: tuple[str, ...]
     conversions: tuple[str, ...]
     digests: Mapping[str, str]
 
@@ -240,12 +55,18 @@ class ImportReport:
         written = ", ".join(f"{topic} {count}" for topic, count in self.rows.items())
         jitter = "regular" if self.longest_s - self.shortest_s < 1e-6 else "kept as recorded"
         lost = [f"  holes     {self.holes} intervals longer than 1.75 periods: lost samples"]
+        share = 100.0 * self.repeated / self.rows["/joint_states"]
+        again = [
+            f"  repeated  {self.repeated} samples ({share:.2g} %) equal to the one before, kept as they are"
+        ]
         lines = [
             f"{self.robot}: {len(self.joints)} joints, {self.duration_s:.3f} s",
             f"  rows      {written} (recording: {self.rows_in_source})",
             f"  period    median {self.period_s * 1e3:.4g} ms, {self.shortest_s * 1e3:.4g} to "
             f"{self.longest_s * 1e3:.4g} ms, {jitter}",
             *(lost if self.holes else ()),
+            *(again if self.repeated else ()),
+            *(f"  note      {note}" for note in self.notes),
             *(f"  {line}" for line in self.conversions),
             *(f"  read      {name}  sha256 {digest[:16]}" for name, digest in self.digests.items()),
             f"  written   {self.path}  uid {self.uid}",
@@ -269,31 +90,41 @@ def import_log(
     payload: str | None = None,
     payload_mass: float | None = None,
     serial: str | None = None,
+    urdf: str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
     beside: Path | None = None,
 ) -> ImportReport:
-    """Write the recording `source` (a file, or the folder of the mapping's files) as the session `output`.
+    """Write the recording `source` (a file, a bag, or the folder of the mapping's files) as the session `output`.
 
     rows : first and one past the last row of every file to take (from 0); None takes all.
-    payload, payload_mass [kg], serial : instead of the mapping's.
+    payload, payload_mass [kg], serial, base, tip : instead of the mapping's.
+    urdf : instead of the mapping's; a path, or the text itself.
     beside : folder of the mapping file, for its URDF.
 
     The session's uid follows from the content of the files and the rows taken, so a second import of the same
     recording is recognised. Raises DataError with file, column and row for non-finite values, times that do not
-    increase, files of unequal length or missing columns; ConfigurationError for an existing output.
+    increase, files of unequal length or missing columns; ConfigurationError for an existing output, and for joints
+    or links that the URDF does not have.
     """
     source = Path(source)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder; give the recording of the mapping")
-    recording = ImportedRecording(source, mapping.delimiter, mapping.header)
+    base, tip = base or mapping.base, tip or mapping.tip
+    described, notes = _described(mapping, urdf, base, tip, beside)
+    recording = Recording(source, mapping.delimiter, mapping.header, notes=notes)
     total, channels = _read(mapping, recording, rows)
     joint = channels["position"]
     digest = hashlib.sha256(
         repr((sorted(recording.digests.values()), rows, mapping.joints)).encode()
     ).hexdigest()
-    attachments = {"mapping.yaml": yaml.safe_dump(_plain(asdict(mapping)), sort_keys=False).encode()}
-    if mapping.urdf is not None:
-        urdf = find(mapping.urdf, beside=beside).read_text(encoding="utf-8")
-        attachments["robot.urdf"] = urdf.encode()
+    attachments = {"mapping.yaml": yaml_text(mapping.content()).encode()}
+    if described is not None:
+        attachments["robot.urdf"] = described.encode()
+    gears = () if mapping.transmission is None else mapping.transmission.coupling
+    couplings = " ".join(f"{entry.joint}:{entry.motor}" for entry in gears)
+    rests = " ".join(f"{name}={value!r}" for name, value in (mapping.held or {}).items())
+    more = {"base": base or "", "tip": tip or "", "couplings": couplings, "held": rests}
     start = datetime.datetime.fromtimestamp(int(joint.times[0]) * 1e-9, datetime.UTC).isoformat()
     metadata = session_metadata(
         robot=mapping.robot,
@@ -308,6 +139,7 @@ def import_log(
         imported_rows="all" if rows is None else f"{rows[0]}:{rows[1]} of {total}",
         imported_sha256=" ".join(f"{name}={value}" for name, value in recording.digests.items()),
         source=mapping.source,
+        **{name: value for name, value in more.items() if value},
     )
     with SessionWriter(
         Path(output),
@@ -340,21 +172,47 @@ def import_log(
         shortest_s=float(steps.min()),
         longest_s=float(steps.max()),
         holes=int(np.count_nonzero(steps > 1.75 * np.median(steps))),
+        repeated=_repeated(channels),
+        notes=(*recording.notes, *_strange_rate(float(np.median(steps)))),
         conversions=_conversions(mapping),
         digests=recording.digests,
     )
 
 
+def _described(
+    mapping: LogMapping, urdf: str | Path | None, base: str | None, tip: str | None, beside: Path | None
+) -> tuple[str | None, list[str]]:
+    """Text of the URDF, its joints checked against the mapping's, and notes."""
+    if urdf is None and mapping.urdf is None:
+        return None, ["no URDF: the joint names are not checked; give `urdf` in the mapping or --urdf"]
+    source: str | Path = urdf if urdf is not None else find(str(mapping.urdf), beside=beside)
+    read = read_urdf(source)
+    rests = mapping.held or {}
+    both = [name for name in rests if name in mapping.joints]
+    if both:
+        raise ConfigurationError(
+            f"`held` and `joints` both name {both[0]!r}; a joint either rests or was measured"
+        )
+    plain, read = read, read_urdf(held(read.text, rests)) if rests else read
+    Chain.from_urdf(read.text, root=base, tip=tip, joints=mapping.joints)
+    way = read.chain(base, tip, mapping.joints)
+    at_zero = [joint.name for joint in way if joint.movable and joint.name not in mapping.joints]
+    if not at_zero:
+        return plain.text, []
+    return plain.text, [f"{', '.join(at_zero)} on the chain, without measurement, held at 0"]
+
+
 def _read(
-    mapping: LogMapping, recording: ImportedRecording, rows: tuple[int, int] | None
+    mapping: LogMapping, recording: Recording, rows: tuple[int, int] | None
 ) -> tuple[int, dict[str, _Channel]]:
     """Rows of the recording, and every channel converted to joint side and SI."""
-    joints = len(mapping.joints)
-    channels: dict[str, _Channel] = {}
+    first = 0 if rows is None else rows[0]
+    raws: dict[str, Floats] = {}
+    clocks: dict[str, NDArray[np.int64]] = {}
     total = 0
     for name, signal in mapping.signals.items():
-        raw = recording.columns(signal, joints, name)
-        place = f"{recording.path(signal.file)}: `{name}`"
+        raw = recording.columns(signal, mapping.joints, name)
+        place = f"{recording.path(_one(signal.file))}: `{name}`"
         base = signal.time if signal.time is not None else mapping.time
         clock = _clock(base, signal, recording, len(raw), place)
         total = len(raw) if name == "position" else total
@@ -362,68 +220,123 @@ def _read(
             raise DataError(
                 f"{place} has {len(raw)} rows, the positions have {total}; the recording is not whole"
             )
-        raw, clock = _cut(raw, rows, place), _cut(clock, rows, place)
-        _refuse_non_finite(raw, mapping.joints, place, 0 if rows is None else rows[0])
-        times = _log_times(mapping, base, clock, place, 0 if rows is None else rows[0])
-        channels[name] = _Channel(
-            times, _published(mapping, base, times), _convert(mapping, name, signal, raw)
+        raws[name] = _cut(raw, rows, place)
+        _refuse_non_finite(raws[name], mapping.joints, place, first)
+        clocks[name] = _nanoseconds(base, _cut(clock, rows, place), place, first, recording.notes)
+    if len(raws["position"]) < 2:
+        raise DataError(f"{recording.source}: {len(raws['position'])} samples are no motion; two at least")
+    free = [clocks[name] for name in clocks if _origin_ns(mapping, _base(mapping, name)) is None]
+    early = -min((int(clock[0]) for clock in free), default=0)
+    if early > 0:
+        recording.notes.append(
+            f"the clock begins at {-early * 1e-9:.9g} s; all times moved by {early * 1e-9:.9g} s, to begin at 0"
         )
-    if len(channels["position"].times) < 2:
-        raise DataError(
-            f"{recording.source}: {len(channels['position'].times)} samples are no motion; two at least"
+    channels = {}
+    for name, signal in mapping.signals.items():
+        origin = _origin_ns(mapping, _base(mapping, name))
+        shift = max(early, 0) if origin is None else origin
+        times = clocks[name] + shift
+        if times[0] < 0:
+            raise DataError(
+                f"{recording.path(_one(signal.file))}: `{name}`: times begin at {clocks[name][0] * 1e-9:.9g} s, before "
+                "1970; correct `start_utc`, or `zero: unix` of a clock that counts from a moment of its own"
+            )
+        # The source's own clock, counted from the first sample if it begins below zero.
+        published = times - (0 if origin is None else origin)
+        channels[name] = _Channel(
+            times, published - min(0, int(published[0])), _convert(mapping, name, signal, raws[name])
         )
     return total, channels
 
 
-def _clock(base: TimeBase, signal: Signal, recording: ImportedRecording, count: int, place: str) -> Floats:
+def _base(mapping: LogMapping, name: str) -> TimeBase:
+    own = mapping.signals[name].time
+    return mapping.time if own is None else own
+
+
+def _one(file: str | tuple[str, ...] | None) -> str | None:
+    return file[0] if isinstance(file, tuple) else file
+
+
+def _repeated(channels: Mapping[str, _Channel]) -> int:
+    """Samples equal to the one before in every value of `/joint_states`."""
+    values = np.hstack([channels[name].values for name in _ONCE if name in channels])
+    return int(np.count_nonzero((np.diff(values, axis=0) == 0.0).all(axis=1)))
+
+
+def _strange_rate(period: float) -> list[str]:
+    """A note on a rate outside 10 Hz to 10 kHz, a factor of two beyond slow loggers and fast servo loops."""
+    if 1e-4 <= period <= 0.1:
+        return []
+    likely = next(
+        (unit for unit in ("ms", "us", "ns") if 1e-4 <= period * TimeBase(1, unit=unit).seconds <= 0.1), None
+    )
+    hint = f"; is the `unit` of `time` `{likely}`?" if likely else ""
+    return [f"samples are {period:.4g} s apart (median), unusual for the log of an arm{hint}"]
+
+
+def _clock(base: TimeBase, signal: Signal, recording: Recording, count: int, place: str) -> Floats:
     """Times of the samples (n,) [s] by the source's clock."""
     if base.column is None:
         assert base.rate_hz is not None
         return np.arange(count) / base.rate_hz
-    file = base.file if base.file is not None else signal.file
+    file = base.file if base.file is not None else _one(signal.file)
     times = recording.column(file, base.column) * base.seconds
     if len(times) != count:
         raise DataError(f"{place} has {count} rows, its time column {base.column!r} has {len(times)}")
     return times
 
 
-def _log_times(
-    mapping: LogMapping, base: TimeBase, clock: Floats, place: str, first: int
+def _nanoseconds(
+    base: TimeBase, clock: Floats, place: str, first: int, notes: list[str]
 ) -> NDArray[np.int64]:
-    """UTC [ns] of each sample, strictly increasing. DataError with the rows otherwise."""
+    """Times [ns] by the source's clock, strictly increasing. DataError with the rows otherwise."""
     if not np.isfinite(clock).all():
         row = int(np.flatnonzero(~np.isfinite(clock))[0])
         raise DataError(
             f"{place}: time in row {first + row} is {clock[row]}; a log needs the time of every sample"
         )
-    origin = _origin_ns(mapping, base)
     # Whole seconds and the rest apart: a double holds unix time to 0.2 us only once, not twice.
     whole = np.floor(clock)
-    times = whole.astype(np.int64) * 10**9 + np.rint((clock - whole) * 1e9).astype(np.int64) + origin
-    backwards = np.flatnonzero(np.diff(times) <= 0)
+    times = whole.astype(np.int64) * 10**9 + np.rint((clock - whole) * 1e9).astype(np.int64)
+    steps = np.diff(times)
+    if base.equal == "spread" and (steps == 0).any() and (steps > 0).any():
+        notes.append(
+            f"{place.rpartition('`: `')[2].strip('`'):<15} {int((steps == 0).sum())} samples share the time of the one "
+            "before and are spread evenly up to the next time"
+        )
+        times = _spread(times)
+        steps = np.diff(times)
+    backwards = np.flatnonzero(steps <= 0)
     if len(backwards):
         row = int(backwards[0])
+        advice = (
+            "set `equal: spread` in `time` if the clock has coarse steps"
+            if (steps >= 0).all()
+            else "repair the clock of the recording"
+        )
         raise DataError(
             f"{place}: time {clock[row + 1]:.9g} s in row {first + row + 1} follows {clock[row]:.9g} s; "
-            f"times must increase ({len(backwards)} such rows); repair the clock of the recording or import "
-            "without it by `rate_hz`"
-        )
-    if times[0] < 0:
-        raise DataError(
-            f"{place}: times begin at {clock[0]:.9g} s, before 1970; give `start_utc`, the UTC of time 0"
+            f"times must increase ({len(backwards)} such rows); {advice}, or import without it by `rate_hz`"
         )
     return times
 
 
-def _published(mapping: LogMapping, base: TimeBase, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The source's own clock [ns], counted from the first sample if it begins below zero."""
-    published = times - _origin_ns(mapping, base)
-    return published - min(0, int(published[0]))
+def _spread(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Samples of one time, spread evenly up to the next; those of the last time by the median step."""
+    stamps, start, count = np.unique(times, return_index=True, return_counts=True)
+    if len(stamps) < 2 or (np.diff(times) < 0).any():
+        return times
+    length = np.append(np.diff(stamps), np.median(np.diff(stamps)).astype(np.int64))
+    place = np.arange(len(times)) - np.repeat(start, count)
+    return np.asarray(times + place * np.repeat(length, count) // np.repeat(count, count))
 
 
-def _origin_ns(mapping: LogMapping, base: TimeBase) -> int:
-    """UTC [ns] of the source's time 0."""
-    return _utc_ns(mapping.start_utc) if base.zero == "start" and mapping.start_utc is not None else 0
+def _origin_ns(mapping: LogMapping, base: TimeBase) -> int | None:
+    """UTC [ns] of the source's time 0; None if unknown."""
+    if base.zero == "unix":
+        return 0
+    return None if mapping.start_utc is None else _utc_ns(mapping.start_utc)
 
 
 def _utc_ns(text: str) -> int:
@@ -462,7 +375,7 @@ def _refuse_non_finite(values: Floats, joints: tuple[str, ...], place: str, firs
 def _convert(mapping: LogMapping, name: str, signal: Signal, raw: Floats) -> Floats:
     """Values (n, joints) at the joint: the formulas at the head of `ident.import_log.mapping`."""
     values = raw * signal.factors(len(mapping.joints), name)
-    if signal.side == "motor":
+    if signal.before_gear:
         matrix = mapping.matrix
         values = values @ (matrix if signal.quantity == "torque" else np.linalg.inv(matrix).T)
     return values + mapping.offset if signal.quantity == "angle" else values
@@ -493,14 +406,6 @@ def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
         writer.write_joint_command(command.times, command.values, publish_time=command.published)
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items() if item is not None}
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return value
-
-
 def _conversions(mapping: LogMapping) -> tuple[str, ...]:
     lines = []
     for name, signal in mapping.signals.items():
@@ -509,7 +414,9 @@ def _conversions(mapping: LogMapping) -> tuple[str, ...]:
             steps.append(f"x {signal.scale}")
         if signal.sign != 1:
             steps.append(f"sign {signal.sign}")
-        if signal.side == "motor":
+        if signal.torque_constant is not None:
+            steps.append(f"x torque constant {signal.torque_constant} Nm/A")
+        if signal.before_gear:
             steps.append("motor side, through the gear")
         if signal.quantity == "angle" and mapping.offset_rad is not None:
             steps.append("+ offset")

@@ -5,28 +5,28 @@ Conventions of the conversion, with R the matrix of the transmission, q_motor = 
     R[i, i] = reduction of joint i (negative if motor and joint turn against each other)
     R[m, j] = further ratios: turns of motor m for a turn of joint j (coupled drives of a wrist)
 
-    y = sign * scale * unit * x
+    y = sign * scale * torque constant * unit * x
     position   joint side:  y + offset      motor side:  inv(R) y + offset
     velocity   joint side:  y               motor side:  inv(R) y
     torque     joint side:  y               motor side:  R' y
 
-The torque rule is the power balance tau' qd = tau_motor' qd_motor.
+The torque rule is the power balance tau' qd = tau_motor' qd_motor. A torque constant [Nm/A] is the motor's own,
+so a current with one is on the motor side. docs/import_mapping.md has all keys with unit, default and example.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from ident.import_log.tables import Floats
 from lwr_driver.configuration import find, parse, read_mapping
-
-Floats = NDArray[np.float64]
 
 # fmt: off
 _QUANTITIES = {
@@ -37,6 +37,7 @@ _QUANTITIES = {
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _UNITS = {
     "rad": ("angle", 1.0),
+    "mrad": ("angle", 1e-3),
     "deg": ("angle", math.pi / 180.0),
     "rev": ("angle", 2.0 * math.pi),
     "counts": ("angle", None),
@@ -49,8 +50,12 @@ _UNITS = {
     "mNm": ("torque", 1e-3),
     "N": ("torque", 1.0),
     "A": ("torque", None),
+    "mA": ("torque", None),
 }
-Unit = Literal["rad", "deg", "rev", "counts", "m", "rad/s", "deg/s", "rpm", "m/s", "Nm", "mNm", "N", "A"]
+_CURRENTS = {"A": 1.0, "mA": 1e-3}
+Unit = Literal[
+    "rad", "mrad", "deg", "rev", "counts", "m", "rad/s", "deg/s", "rpm", "m/s", "Nm", "mNm", "N", "A", "mA"
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -58,9 +63,11 @@ class TimeBase:
     """Times of the samples: a column of the recording, or a fixed rate.
 
     file : file of the column, relative to the source; None is the source itself (or the signal's own file).
-    column : name or number (from 1) of a CSV column, or name of an NPZ array; kept as it is, jitter included.
+    column : name or number (from 1) of a column, or name of an array; kept as it is, jitter included.
     unit : of the column. rate_hz : of a recording without a time column.
     zero : "start" if the column counts from a moment of its own, "unix" if it counts from 1970-01-01 UTC.
+    equal : samples with one and the same time, from a clock of coarse steps: "refuse" them, or "spread" them evenly
+        up to the next time.
     """
 
     column: str | int | None = None
@@ -68,6 +75,7 @@ class TimeBase:
     unit: Literal["s", "ms", "us", "ns"] = "s"
     rate_hz: float | None = None
     zero: Literal["start", "unix"] = "start"
+    equal: Literal["refuse", "spread"] = "refuse"
 
     def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):
@@ -85,35 +93,57 @@ class TimeBase:
 class Signal:
     """One quantity of all joints.
 
-    file : file, relative to the source; None is the source itself.
-    columns : names or numbers (from 1) of CSV columns, one a joint; None takes all columns in their order.
-    array : name of a two-dimensional NPZ array (rows are samples); `columns` are then numbers (from 1).
-    unit : of the numbers. `counts` and `A` have no size of their own and need `scale` (rad a count, Nm/A).
-    side : `motor` before the gear, `joint` after it.
+    file : file, relative to the source, or one for each joint; None is the source itself.
+    columns : names or numbers (from 1) of columns, one a joint; None takes the columns called like the joints, or
+        all columns in their order.
+    array : name of a two-dimensional array of an NPZ or MATLAB file or a bag (rows are samples).
+    unit : of the numbers. `counts` need `scale` (rad a count), `A` and `mA` `torque_constant` or `scale` (Nm/A at
+        the joint).
+    side : `motor` before the gear, `joint` after it; None is `motor` with a torque constant, else `joint`.
     sign : 1 or -1, one a joint or one for all. scale : factor, one a joint or one for all.
+    torque_constant : of the motors [Nm/A], one a joint or one for all.
     time : a clock of its own; None takes that of the mapping.
     """
 
     unit: Unit
-    file: str | None = None
+    file: str | tuple[str, ...] | None = None
     columns: tuple[str | int, ...] | None = None
     array: str | None = None
-    side: Literal["joint", "motor"] = "joint"
+    side: Literal["joint", "motor"] | None = None
     sign: int | tuple[int, ...] = 1
     scale: float | tuple[float, ...] | None = None
+    torque_constant: float | tuple[float, ...] | None = None
     time: TimeBase | None = None
 
     def __post_init__(self) -> None:
         signs = self.sign if isinstance(self.sign, tuple) else (self.sign,)
         if any(sign not in (1, -1) for sign in signs):
             raise ConfigurationError(f"`sign` is {self.sign}, it must be 1 or -1 for each joint")
-        if _UNITS[self.unit][1] is None and self.scale is None:
+        for name in ("scale", "torque_constant"):
+            value = getattr(self, name)
+            if value is not None and 0.0 in (value if isinstance(value, tuple) else (value,)):
+                raise ConfigurationError(f"`{name}` is 0 and would erase the measurement")
+        if self.torque_constant is not None and self.unit not in _CURRENTS:
             raise ConfigurationError(
-                f"unit `{self.unit}` has no size of its own; give `scale` (rad a count, Nm/A)"
+                f"`torque_constant` goes with a current, and the unit is `{self.unit}`; use `A` or `mA`"
             )
-        scales = self.scale if isinstance(self.scale, tuple) else (self.scale,)
-        if any(scale is not None and scale == 0.0 for scale in scales):
-            raise ConfigurationError("`scale` is 0 and would erase the measurement")
+        if self.torque_constant is not None and self.side == "joint":
+            raise ConfigurationError(
+                "`torque_constant` is the motor's, before the gear, and `side` is `joint`; leave `side` out, or give "
+                "`scale` in Nm of the joint for an ampere"
+            )
+        if _UNITS[self.unit][1] is None and self.scale is None and self.torque_constant is None:
+            advice = "`scale` (rad a count)"
+            if self.unit in _CURRENTS:
+                advice = (
+                    "`torque_constant` (Nm/A, the gear is in `transmission`) or `scale` (Nm/A at the joint)"
+                )
+            raise ConfigurationError(f"unit `{self.unit}` has no size of its own; give {advice}")
+
+    @property
+    def before_gear(self) -> bool:
+        """Whether the numbers are those of the motor."""
+        return self.side == "motor" or (self.side is None and self.torque_constant is not None)
 
     @property
     def quantity(self) -> str:
@@ -121,10 +151,11 @@ class Signal:
         return _UNITS[self.unit][0]
 
     def factors(self, joints: int, where: str) -> Floats:
-        """sign x scale x unit for each joint (n,)."""
+        """sign x scale x torque constant x unit for each joint (n,)."""
         size = _UNITS[self.unit][1]
-        factors = np.full(joints, 1.0 if size is None else size)
-        for name, value in (("sign", self.sign), ("scale", self.scale)):
+        factors = np.full(joints, _CURRENTS.get(self.unit, 1.0) if size is None else size)
+        for name in ("sign", "scale", "torque_constant"):
+            value = getattr(self, name)
             if value is None:
                 continue
             values = np.atleast_1d(np.array(value, dtype=np.float64))
@@ -180,9 +211,11 @@ class LogMapping:
     joint_torque : joint torque sensor. motor_torque : motor torque or current.
     velocity, motor_position, command : measured velocity, motor position, commanded position.
     offset_rad : added to the positions of each joint after the gear, to meet the zero of the URDF.
-    urdf : file of the arm, found as configuration files are, attached to the session.
-    delimiter : of CSV files; None tries comma, semicolon, tab and blanks.
-    header : whether CSV files name their columns in the first row.
+    urdf : file of the arm, found as configuration files are, attached to the session. Its other joints, those of
+        a gripper say, are held at zero, or where `held` says [rad or m].
+    base, tip : first and last link of the arm in it; None: its root, and behind the last joint.
+    delimiter : of text files; None tries semicolon, comma, tab and blanks.
+    header : whether text files name their columns in the first row; None looks whether it holds numbers.
     """
 
     robot: str
@@ -203,8 +236,11 @@ class LogMapping:
     transmission: Transmission | None = None
     offset_rad: tuple[float, ...] | None = None
     urdf: str | None = None
+    held: dict[str, float] | None = None
+    base: str | None = None
+    tip: str | None = None
     delimiter: str | None = None
-    header: bool = True
+    header: bool | None = None
 
     def __post_init__(self) -> None:
         if not self.joints or len(set(self.joints)) != len(self.joints):
@@ -215,17 +251,22 @@ class LogMapping:
             )
         for name, signal in self.signals.items():
             if signal.quantity != _QUANTITIES[name]:
-                raise ConfigurationError(f"`{name}` cannot have the unit `{signal.unit}`")
+                known = ", ".join(unit for unit, (kind, _) in _UNITS.items() if kind == _QUANTITIES[name])
+                raise ConfigurationError(f"`{name}` cannot have the unit `{signal.unit}`; use one of {known}")
+            if isinstance(signal.file, tuple) and len(signal.file) != len(self.joints):
+                raise ConfigurationError(
+                    f"`{name}`: {len(signal.file)} files in `file` for {len(self.joints)} joints; name one each"
+                )
             if signal.columns is not None and len(signal.columns) != len(self.joints):
                 raise ConfigurationError(
                     f"`{name}`: {len(signal.columns)} `columns` for {len(self.joints)} joints; name one each"
                 )
-            if signal.side == "motor" and self.transmission is None:
+            if signal.before_gear and self.transmission is None:
                 raise ConfigurationError(
-                    f"`{name}` is on the motor side; the gear is needed, give `transmission`"
+                    f"`{name}` is on the motor side; the gear is needed, give `transmission: {{reduction: [...]}}`"
                 )
             signal.factors(len(self.joints), f"`{name}`")
-        if self.joint_torque is not None and self.joint_torque.side == "motor":
+        if self.joint_torque is not None and self.joint_torque.before_gear:
             raise ConfigurationError(
                 "`joint_torque` is the sensor behind the gear, it cannot be on the motor side; "
                 "is it `motor_torque`?"
@@ -258,11 +299,24 @@ class LogMapping:
         """Offsets of the positions (n,) [rad]."""
         return np.zeros(len(self.joints)) if self.offset_rad is None else np.array(self.offset_rad)
 
+    def content(self) -> dict[str, Any]:
+        """Plain content of a mapping file, without keys at their defaults."""
+        return {"schema_version": self.schema_version, **_plain(self)}
+
     @classmethod
     def load(cls, name: str | Path) -> LogMapping:
         """Read a mapping file, looked for as given, in `configs/` and in `configs/imports/`."""
         path = mapping_path(name)
         return parse(cls, read_mapping(path), str(path))
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        kept = [f for f in dataclasses.fields(value) if getattr(value, f.name) != f.default]
+        return {f.name: _plain(getattr(value, f.name)) for f in kept}
+    if isinstance(value, dict):
+        return dict(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def mapping_path(name: str | Path) -> Path:

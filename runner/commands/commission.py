@@ -68,7 +68,7 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
-    from lwr_driver.session import read_session
+    from ident.import_log import read_recording
     from runner.diagnosis import arm_data, chain_of, known_arm
     from runner.experiment_file import DEFAULT, Experiment
 
@@ -88,7 +88,7 @@ def command(
         experiment = Experiment.load(file if file is not None else DEFAULT)
         folder, count = out.with_name(f"{out.stem}_sessions"), sets or _RECORDED_SETS
         paths = record_sets(experiment, folder, count, assume_yes=yes, allow_non_realtime=allow_non_realtime)
-    parts = [[read_session(path, status=False) for path in part] for part in paths]
+    parts = [[read_recording(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
     found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
     found.save(out)

@@ -78,17 +78,18 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis.statements import SURE
+    from ident.import_log import read_recording
     from ident.model.model_file import read_model
-    from lwr_driver.session import read_session
     from runner.diagnosis import arm_data, asked, chain_of, known_arm, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
+    from runner.estimation import recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
 
     replaceable(out)
-    logs = [read_session(path) for path in sessions]
-    held = [read_session(path) for path in test]
+    logs = [read_recording(path) for path in sessions]
+    held = [read_recording(path) for path in test]
     chain = chain_of(logs, urdf)
     known = known_arm(arm, chain)
     pairs = [(asked(a, chain.joint_names), asked(b, chain.joint_names)) for a, b in compare]
@@ -98,7 +99,7 @@ def command(
         chain,
         test=held,
         arm=known,
-        data=arm_data(known, chain, coupling, gear_ratio),
+        data=arm_data(known, chain, coupling or recorded_couplings(logs), gear_ratio),
         model=None if model is None else read_model(model),
         reference=None if reference is None else read_model(reference),
         simulate=not no_simulation,

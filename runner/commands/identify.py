@@ -2,33 +2,51 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
 from fri.errors import ConfigurationError
-from ident.dynamics.kinematics import Chain
+from ident.dynamics.session_chain import session_chain
 from ident.estimation.identify import identify
 from ident.estimation.mounting import find_mounting
 from ident.estimation.validate import validate
 from ident.estimators import ESTIMATORS
 from ident.model.model_file import write_model
-from lwr_driver.session import read_session
-from runner.estimation import IdentifySettings, announced
+from runner.estimation import IdentifySettings, announced, couplings, recorded_couplings
+from runner.recordings import GUESSED, guess_options, read_recordings
 from runner.results import named_model, new_folder, write_log_results
-from runner.terminal import json_option, to_json
+from runner.terminal import GroupedCommand, json_option, to_json
 
 _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for name, kind in ESTIMATORS.items())
 
 
-@click.command("identify", epilog=_EPILOG)
+_GROUPS = {
+    "Estimation": (
+        "model",
+        "estimator",
+        "payload",
+        "urdf",
+        "tilt",
+        "essential",
+        "test",
+        "settings",
+        "out",
+        "results",
+    ),
+    "Recordings of other arms": ("base", "tip", *GUESSED),
+}
+
+
+@click.command("identify", epilog=_EPILOG, cls=GroupedCommand, groups=_GROUPS)
 @click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--model",
     type=click.IntRange(1, 3),
-    default=2,
-    show_default=True,
-    help="1: joint torques; 2: motor and joint torques; 3: their difference.",
+    help="1: joint torques; 2: motor torques, with joint torques if measured; 3: their difference. "
+    "Default: 2, or 1 without motor torques.",
 )
 @click.option(
     "--estimator", type=click.Choice(tuple(ESTIMATORS)), default="wls", show_default=True, help="See below."
@@ -40,6 +58,8 @@ _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for nam
     help="Payload of a session, in place of its metadata; `none`: the bare arm.",
 )
 @click.option("--urdf", type=click.Path(path_type=Path), help="Kinematics; default: from the first session.")
+@click.option("--base", metavar="LINK", help="First link of the arm; gravity points down in its axes.")
+@click.option("--tip", metavar="LINK", help="Last link of the arm; default: behind the last measured joint.")
 @click.option("--tilt", is_flag=True, help="Estimate the tilt of the base too.")
 @click.option("--essential", is_flag=True, help="Reduce the model to its essential parameters.")
 @click.option(
@@ -61,13 +81,16 @@ _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for nam
     metavar="FOLDER",
     help="Folder for summary.json, model.yaml and report.html, as of an experiment.",
 )
+@guess_options
 @json_option
 def command(
     sessions: tuple[Path, ...],
-    model: int,
+    model: int | None,
     estimator: str,
     payload: tuple[str, ...],
     urdf: Path | None,
+    base: str | None,
+    tip: str | None,
     tilt: bool,
     essential: bool,
     test: tuple[Path, ...],
@@ -75,8 +98,13 @@ def command(
     out: Path | None,
     results: Path | None,
     as_json: bool,
+    **known: Any,
 ) -> None:
     """Estimate the base parameters of an arm from its SESSIONS, stacked.
+
+    A session is a log of this program, a ROS 2 bag with sensor_msgs/JointState, or, with --urdf, a CSV, NPZ or
+    MATLAB file or a folder of text files: its columns are guessed by their names and shown for confirmation. The
+    guessed mapping and the session log are written beside the results.
 
     The payload of each session is in its metadata. Sessions without and with payloads together identify each
     payload separately from the last link.
@@ -89,20 +117,25 @@ def command(
     lwr-run identify unloaded.mcap loaded.mcap --test another.mcap --results monday
     lwr-run identify short.mcap --model 1 --estimator physical --tilt
     lwr-run identify unloaded.mcap loaded.mcap --essential --settings my_settings.yaml
+    lwr-run identify data.csv --urdf arm.urdf --results first      another arm, columns guessed
     """
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
-    wanted = read.identification(model, estimator, file=settings or "")
+    wanted = read.identification(model or 2, estimator, file=settings or "")
     if essential and wanted.essential is None:
         raise ConfigurationError(
             f"--essential needs the essential parameters, and {settings} has `essential: null`; leave one out"
         )
     if results is not None:
         new_folder(results)
-    logs = announced([read_session(path, status=False) for path in (*sessions, *test)], payload)
+    folder = results if results is not None else Path() if out is None else out.parent
+    logs = read_recordings((*sessions, *test), urdf=urdf, folder=folder, base=base, tip=tip, **known)
+    logs = announced(logs, payload)
+    if model is None and all(log.motor is None for log in logs):
+        wanted = replace(wanted, model=1)
+    if not wanted.couplings:
+        wanted = replace(wanted, couplings=couplings(recorded_couplings(logs)))
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
-    if urdf is None and logs[0].robot_description is None:
-        raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
-    chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
+    chain = session_chain(logs[0], urdf, base=base, tip=tip)
     mounting = find_mounting(logs, chain, wanted) if tilt else None
     found = identify(logs, chain, wanted) if mounting is None else mounting.identification
     result = named_model(

@@ -90,6 +90,9 @@ def _rows(context: click.Context, parameter: click.Parameter, value: str | None)
 @click.option("--payload", help="Name of the payload; `none`: the bare arm.")
 @click.option("--payload-mass", type=float, metavar="KG", help="Weighed mass of the payload.")
 @click.option("--serial", help="Serial number of the arm.")
+@click.option("--urdf", type=PATH, help="URDF of the arm, instead of the mapping's.")
+@click.option("--base", metavar="LINK", help="First link of the arm; gravity points down in its axes.")
+@click.option("--tip", metavar="LINK", help="Last link of the arm; default: behind the last joint.")
 @json_option
 def import_command(
     mapping: str,
@@ -99,12 +102,16 @@ def import_command(
     payload: str | None,
     payload_mass: float | None,
     serial: str | None,
+    urdf: Path | None,
+    base: str | None,
+    tip: str | None,
     as_json: bool,
 ) -> None:
-    """Convert a CSV or NPZ recording to a session log.
+    """Convert a recording (CSV, text, NPZ, MATLAB, ROS 2 bag) to a session log.
 
     MAPPING is a mapping file (columns, units, signs, gears, time base) or the name of one in configs/imports.
-    SOURCE is the recording: a file, or the folder of the files named by the mapping. OUTPUT is the new log.
+    SOURCE is the recording: a file, a bag, or the folder of the files named by the mapping. OUTPUT is the new log.
+    All keys of a mapping are in docs/import_mapping.md; `lwr-run identify` guesses one from the names of columns.
 
     \b
     lwr-run import lwr4_flobaroid measurements_1.npz run_1.mcap
@@ -123,6 +130,9 @@ def import_command(
         payload=payload,
         payload_mass=payload_mass,
         serial=serial,
+        urdf=urdf,
+        base=base,
+        tip=tip,
         beside=mapping_path(mapping).parent,
     )
     click.echo(to_json(done) if as_json else str(done))

@@ -53,12 +53,12 @@ def validate_command(
     from ident.estimation.forward_simulation import simulate_session
     from ident.estimation.identify import IdentificationSettings
     from ident.estimation.validate import cross_validate, signals_for, validate
+    from ident.import_log import read_recording
     from ident.model.model_file import read_model
-    from lwr_driver.session import read_session
     from runner.estimation import IdentifySettings
 
     tested = read_model(model)
-    logs = [read_session(path) for path in sessions]
+    logs = [read_recording(path) for path in sessions]
     signals = None if settings is None else IdentifySettings.load(settings).signals
     if estimate_delay:
         signals = signals_for(tested, signals, estimate_delay=True)
@@ -129,13 +129,13 @@ def payload_command(
     lwr-run payload model.yaml loaded.mcap --out with_payload.yaml
     """
     from ident.estimation.payload import identify_payload, with_payload
+    from ident.import_log import read_recording
     from ident.model.model_file import read_model, write_model
-    from lwr_driver.session import read_session
 
     if out is not None and out.exists():
         raise ConfigurationError(f"file {out} exists; choose another name")
     arm = read_model(model)
-    found = identify_payload(arm, [read_session(path) for path in sessions], free_offsets=free_offsets)
+    found = identify_payload(arm, [read_recording(path) for path in sessions], free_offsets=free_offsets)
     click.echo(to_json(found.to_dict()) if as_json else str(found))
     if out is not None:
         write_model(with_payload(arm, found), out)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
 from ident.diagnosis.look_alikes import LookAlikes, Place, look_alikes
 from ident.diagnosis.statements import SURE, statements
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
@@ -244,11 +244,8 @@ def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:
 
 
 def chain_of(sessions: Sequence[Session], urdf: Path | None) -> Chain:
-    """Kinematics from a URDF file, or from the first session."""
-    text = sessions[0].robot_description
-    if urdf is None and text is None:
-        raise ConfigurationError(f"{sessions[0].path}: holds no robot description; name the URDF with --urdf")
-    return Chain.from_urdf(os.fspath(urdf) if urdf is not None else str(text))
+    """Kinematics of the first session's joints, from a URDF file or from the session."""
+    return session_chain(sessions[0], urdf)
 
 
 def known_arm(name: str | None, chain: Chain) -> Arm | None:

@@ -18,6 +18,7 @@ import yaml
 from click.testing import CliRunner
 
 from fri.errors import LwrError
+from ident.import_log import LogMapping
 from runner.cli import VERBS, main
 from runner.estimation import KEYS, IdentifySettings
 from runner.experiment_file import Experiment
@@ -114,6 +115,10 @@ def test_yaml_files_in_documents_are_valid(document: Path, tmp_path: Path) -> No
         if document.name == "identify_settings.md":
             path.write_text(block.text)
             IdentifySettings.load(path)
+            continue
+        if document.name == "import_mapping.md":
+            path.write_text(block.text)
+            LogMapping.load(path)
             continue
         content = {"name": "example", **yaml.safe_load(block.text)}
         path.write_text(yaml.safe_dump(content))

@@ -9,7 +9,7 @@ from typing import Literal
 import pytest
 
 from fri.errors import ConfigurationError
-from lwr_driver.configuration import find, parse, read_mapping
+from lwr_driver.configuration import find, parse, read_mapping, read_yaml, yaml_text
 
 
 @dataclass(frozen=True)
@@ -82,3 +82,18 @@ def test_a_name_that_no_file_can_have_is_refused_in_short(name: str, words: str)
     with pytest.raises(ConfigurationError, match=words) as caught:
         find(name)
     assert len(str(caught.value)) < 250
+
+
+@pytest.mark.parametrize("text", ["5e-05", "5E-5", "-1e3", "1.5e3", "+.5e2", "2.e4", "5.0e-05"])
+def test_a_number_with_an_exponent_is_a_number(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(f"value: {text}\nname: '{text}'\n")
+    content = read_yaml(tmp_path / "a.yaml")
+    assert content == {"value": float(text), "name": text}
+    (tmp_path / "b.yaml").write_text(yaml_text(content))
+    assert read_yaml(tmp_path / "b.yaml") == content
+
+
+@pytest.mark.parametrize("text", ["e5", "5e", "1e5abc", "A1e5", "5e-", "1.2.3e4"])
+def test_a_text_that_only_resembles_a_number_stays_text(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(f"value: {text}\n")
+    assert read_yaml(tmp_path / "a.yaml") == {"value": text}

@@ -174,7 +174,7 @@ def test_part_of_a_tree_is_chosen_by_its_tip():
         ("<robot name='a'><link name='l'/>", "not well-formed"),
         ("<sdf/>", "begins with <robot>"),
         ("<robot name='a'><link name='l'/></robot>", "no movable joint"),
-        (urdf([{"type": "floating"}]), "'floating' is not supported"),
+        (urdf([{"type": "ball"}]), "'ball' is not supported"),
         (urdf([{"axis": "0 0 0"}]), "axis has no length"),
         (urdf([{"xyz": "0 0"}]), "must hold 3 finite numbers"),
         (urdf([{}]).replace('parent link="l0"', 'parent link="nowhere"'), "'nowhere', missing in the file"),

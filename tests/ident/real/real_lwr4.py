@@ -41,7 +41,7 @@ def session(run: int, urdf: str = "") -> Session:
     mapping = dataclasses.replace(LogMapping.load("lwr4_flobaroid"), joints=chain(urdf).joint_names)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"run_{run}.mcap"
-        import_log(mapping, DATA / f"measurements_{run}.npz", path)
+        import_log(mapping, DATA / f"measurements_{run}.npz", path, urdf=chain(urdf).urdf)
         return read_session(path)
 
 

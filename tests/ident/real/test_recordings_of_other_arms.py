@@ -141,7 +141,7 @@ def test_lwr4_repeat_is_predicted_and_another_trajectory_less_so(tmp_path: Path)
     sessions = []
     for number in (1, 2, 3):
         path = tmp_path / f"run_{number}.mcap"
-        import_log(mapping, source / f"measurements_{number}.npz", path)
+        import_log(mapping, source / f"measurements_{number}.npz", path, urdf=chain.urdf)
         sessions.append(read_session(path))
     found = identify(sessions[:1], chain, IdentificationSettings(model=1))
     result = validate(found.model, sessions[1:])

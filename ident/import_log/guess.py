@@ -1,0 +1,447 @@
+"""A mapping guessed from the names in a recording, the URDF, and the numbers themselves; for a person to confirm.
+
+Names give the quantities, the URDF the joints. Numbers decide units: positions must keep the limits of the URDF,
+dq/dt must be the velocity, and the median step of the times must lie between 0.1 ms and 0.1 s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+
+from fri.errors import ConfigurationError, DataError
+from ident.dynamics.urdf import Urdf, read_urdf
+from ident.import_log.fields import Field, fields
+from ident.import_log.mapping import LogMapping, Signal, TimeBase, Transmission, Unit
+from ident.import_log.recording import Recording
+from ident.import_log.tables import Floats
+from lwr_driver.configuration import yaml_text
+
+_RATES = {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "rpm": 30.0 / math.pi}
+_SHORTEST_S, _LONGEST_S = 1e-4, 0.1
+_ALIKE = 0.9
+"""Least correlation of a channel with the derivative of another, to be taken for it."""
+_RATIO = 1.5
+"""Largest factor between dq/dt and a velocity in the right unit; the units are factors of 5 apart."""
+_LARGEST_CURRENT_A = 200.0
+_UNIX_S = 1e9
+_SLACK = 0.05
+"""Share of a joint's range by which positions may exceed it."""
+RESTING_RAD = 1e-2
+"""Largest range of a joint at rest; `identify` counts a joint as moving beyond it."""
+_TURNS = 4.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the user knows beyond the names.
+
+    joints : of the columns, in their order. base, tip : links of the URDF. rate_hz : of a recording without times.
+    torque : whether a plain torque is that of the joint's sensor or of the motor, already at the joint.
+    torque_constant : of the motors [Nm/A]; gear_ratio : motor turns for one of the joint; one or one a joint.
+    """
+
+    joints: tuple[str, ...] = ()
+    base: str | None = None
+    tip: str | None = None
+    rate_hz: float | None = None
+    torque: str = "joint"
+    torque_constant: tuple[float, ...] = ()
+    gear_ratio: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A guessed mapping. rows : quantity, place, unit and reason of each signal; unused : other fields."""
+
+    HEAD: ClassVar[str] = "# Guessed from the names in "
+
+    source: Path
+    mapping: LogMapping
+    rows: tuple[tuple[str, str, str, str], ...]
+    unused: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """The mapping file."""
+        head = f"{self.HEAD}{self.source.name}; check it. Keys: docs/import_mapping.md\n"
+        return head + yaml_text(self.mapping.content())
+
+    def __str__(self) -> str:
+        table = [("quantity", "from", "unit", "why"), *self.rows]
+        widths = [max(len(row[k]) for row in table) for k in range(3)]
+        lines = [
+            "  " + "  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]])
+            for row in table
+        ]
+        left = [f"  not used: {', '.join(self.unused)}"] if self.unused else []
+        return "\n".join(
+            [
+                f"{self.source.name}: {len(self.mapping.joints)} joint(s) of {self.mapping.robot}",
+                *lines,
+                *left,
+            ]
+        )
+
+
+def guess_mapping(source: str | Path, urdf: str | Path, known: Known | None = None) -> Guess:
+    """The mapping of the recording `source` for the arm in the URDF.
+
+    source : a text, NPZ or MATLAB file, or a folder of such files.
+
+    Raises DataError if positions, torques or times cannot be told, with what was found and the remedy.
+    """
+    return _Guesser(Path(source), urdf, known or Known()).guess()
+
+
+class _Guesser:
+    def __init__(self, source: Path, urdf: str | Path, known: Known) -> None:
+        if not source.exists():
+            raise DataError(f"{source}: no such file or folder")
+        self.source, self.urdf, self.known = source, urdf, known
+        self.robot: Urdf = read_urdf(urdf)
+        movable = [joint.name for joint in self.robot.joints if joint.movable]
+        self.fields = fields(Recording(source), movable)
+        self.why: dict[str, str] = {}
+        if len(self.fields) == 1 and not any(self.fields[0].labels) and self.fields[0].array is None:
+            self.fields = self._blocks(self.fields[0])
+        self.rows: list[tuple[str, str, str, str]] = []
+        self.used: set[str] = set()
+
+    def guess(self) -> Guess:
+        position = self._best("position")
+        if position is None:
+            raise self._unknown("position")
+        joints, why = self._joints(position)
+        rests: dict[str, float] | None = None
+        if (
+            self.known.joints
+            and position.values.shape[1] > len(joints)
+            and not set(joints) <= set(position.labels)
+        ):
+            self._name_columns(position.values.shape[1])
+            position = self._best("position") or position
+        picked = position.of(joints)
+        if picked is None:
+            raise DataError(
+                f"{self.source}: {position.shown} has {position.values.shape[1]} columns for the {len(joints)} joints "
+                f"{', '.join(joints)}; name the joints of the columns with --joints"
+            )
+        whole, position = position, picked
+        bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
+        if len(bad):
+            raise DataError(
+                f"{self.source}: {position.shown} has missing values in {len(bad)} rows, first in row {bad[0]}; "
+                "write a mapping file and leave them out with `lwr-run import --rows`"
+            )
+        unit, reason = self._angle_unit(position, joints)
+        if self.known.joints and picked is not whole:
+            rests = self._rests(whole, joints, unit)
+        angle = position.values * (math.pi / 180.0 if unit == "deg" else 1.0)
+        velocity = self._best("velocity", joints)
+        time, period = self._time(angle, velocity, unit)
+        signals: dict[str, Any] = {"position": self._take("position", position, unit, reason)}
+        if velocity is not None and (rate := _rate_unit(angle, velocity.values, period)) is not None:
+            name, factor = rate
+            signals["velocity"] = self._take(
+                "velocity", velocity, name, f"{factor:.2f} times dq/dt in this unit"
+            )
+        signals |= self._torques(joints)
+        self.rows.append(("joints", _span(joints), "", why))
+        gear = any(signal.before_gear for signal in signals.values())
+        mapping = LogMapping(
+            robot=self.robot.name,
+            joints=joints,
+            time=time,
+            urdf=str(Path(self.urdf).resolve()),
+            held=rests or None,
+            base=self.known.base,
+            tip=self.known.tip,
+            transmission=Transmission(_each("gear_ratio", self.known.gear_ratio, joints)) if gear else None,
+            **signals,
+        )
+        order = ("time", "position", "velocity", "joint_torque", "motor_torque", "joints", "held")
+        self.rows.sort(key=lambda row: order.index(row[0]))
+        unused = tuple(one.shown for one in self.fields if one.name not in self.used)
+        return Guess(self.source, mapping, tuple(self.rows), unused)
+
+    def _name_columns(self, count: int) -> None:
+        """Call the columns of every field with `count` of them by the joints of the arm."""
+        names = self.robot.arm(count=count, root=self.known.base)
+        self.fields = [
+            replace(one, labels=names) if one.values.shape[1] == count else one for one in self.fields
+        ]
+
+    def _rests(self, position: Field, joints: Sequence[str], unit: str) -> dict[str, float]:
+        """Where the recorded joints rest that are no joints of the model, to four digits."""
+        size = math.pi / 180.0 if unit == "deg" else 1.0
+        found = {}
+        arm = self.robot.arm(names=position.labels, root=self.known.base)
+        for k, name in enumerate(position.labels):
+            values = position.values[:, k] * size
+            if name in joints or name not in arm:
+                continue
+            if np.ptp(values) > RESTING_RAD:
+                raise DataError(
+                    f"{self.source}: {name} moves by {np.ptp(values):.3g} rad; name it in --joints, which leaves "
+                    "out joints at rest only"
+                )
+            found[name] = round(float(np.mean(values)), 4)
+        self.rows.append(("held", _span(tuple(found)), "rad", "at rest, not in --joints"))
+        return found
+
+    def _take(
+        self, quantity: str, field: Field, unit: str, why: str, constant: tuple[float, ...] = ()
+    ) -> Signal:
+        """The signal of a field, noted in the table."""
+        self.used.add(field.name)
+        self.rows.append((quantity, field.shown, unit, self.why.get(field.name, why)))
+        return Signal(
+            cast(Unit, unit), field.file, field.columns, field.array, torque_constant=constant or None
+        )
+
+    def _best(
+        self, quantity: str, joints: Sequence[str] | None = None, *, motor: bool | None = None
+    ) -> Field | None:
+        """The preferred field of a quantity, with columns of these joints, of the motor or not."""
+        fitting = [
+            fit
+            for one in self.fields
+            if one.quantity == quantity and (motor is None or one.of_motor == motor)
+            if (fit := one if joints is None else one.of(joints)) is not None
+        ]
+        return max(fitting, key=lambda one: (one.rank, one.values.shape[1]), default=None)
+
+    def _unknown(self, quantity: str) -> DataError:
+        listed = "; ".join(f"{one.shown} ({one.values.shape[1]})" for one in self.fields) or "nothing"
+        return DataError(
+            f"{self.source}: no {quantity} by its name. Found, with the number of columns: {listed}. Write a mapping "
+            "file for `lwr-run import`; docs/import_mapping.md has its keys and an example"
+        )
+
+    def _joints(self, position: Field) -> tuple[tuple[str, ...], str]:
+        """Names of the joints and the reason."""
+        root = self.known.base
+        if self.known.joints:
+            self.robot.chain(root, self.known.tip, self.known.joints)
+            return self.known.joints, "as given"
+        if self.known.tip is not None:
+            way = self.robot.chain(root, self.known.tip)
+            return tuple(joint.name for joint in way if joint.driven), f"driven joints up to {self.known.tip}"
+        if all(position.labels) and not any(label.isdigit() for label in position.labels):
+            try:
+                self.robot.chain(root, None, position.labels)
+                return position.labels, "named in the columns"
+            except ConfigurationError:
+                return self.robot.arm(names=position.labels, root=root), "the arm named in the columns"
+        count = position.values.shape[1]
+        return self.robot.arm(count=count, root=root), f"the arm of {count} joints in the URDF"
+
+    def _angle_unit(self, position: Field, joints: Sequence[str]) -> tuple[str, str]:
+        """rad or deg, by the name or by the limits of the URDF."""
+        words = set(position.words)
+        for unit in ("deg", "rad"):
+            if words & {unit, f"{unit}ree", f"{unit}ian"}:
+                return unit, "by its name"
+        by_name = {joint.name: joint for joint in self.robot.joints}
+        limits = np.array([by_name[name].limits or (-math.inf, math.inf) for name in joints])
+        slack = _SLACK * np.nan_to_num(limits[:, 1] - limits[:, 0], posinf=0.0)
+        turning = np.array([by_name[name].kind == "revolute" for name in joints])
+        known = "the limits of the URDF" if np.isfinite(limits).any() else "two turns"
+        for unit, size in (("rad", 1.0), ("deg", math.pi / 180.0)):
+            values = position.values * size
+            inside = (
+                (values >= limits[:, 0] - slack) & (values <= limits[:, 1] + slack) & (abs(values) < _TURNS)
+            )
+            # Lengths in m beside angles in deg have no unit in common; a mapping's `scale` can tell them apart.
+            if inside.all() and (unit == "rad" or turning.all()):
+                return (
+                    unit,
+                    f"within {known}" if unit == "rad" else f"beyond {known} in rad, within them in deg",
+                )
+        beyond = position.values - np.clip(position.values, limits[:, 0] - slack, limits[:, 1] + slack)
+        joint = int(np.argmax(np.abs(beyond).max(axis=0)))
+        low, high = position.values[:, joint].min(), position.values[:, joint].max()
+        raise DataError(
+            f"{self.source}: {position.shown} runs from {low:.4g} to {high:.4g} at {joints[joint]}, outside the limits "
+            f"{limits[joint, 0]:.4g} to {limits[joint, 1]:.4g} rad in rad and in deg. A motor's angle, or another zero "
+            "or order of joints? Write a mapping file for `lwr-run import` (`transmission`, `offset_rad`, `joints`)"
+        )
+
+    def _time(self, angle: Floats, velocity: Field | None, unit: str) -> tuple[TimeBase, float]:
+        """Times, and the mean time between samples [s]."""
+        count = len(angle)
+        if self.known.rate_hz is not None:
+            self.rows.append(("time", "", "", f"{self.known.rate_hz:g} Hz, as given"))
+            return TimeBase(rate_hz=self.known.rate_hz), 1.0 / self.known.rate_hz
+        clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
+        clocks = [one for one in clocks if (np.diff(one.values[:, 0]) >= 0).all() and np.ptp(one.values) > 0]
+        if clocks:
+            # Of a date split in two, the finer part.
+            clock = min(clocks, key=lambda one: int(np.sum(np.diff(one.values[:, 0]) == 0)))
+            return self._clock(clock)
+        if velocity is not None:
+            slope, alike = _slope(velocity.values, np.diff(angle, axis=0))
+            period = slope * (math.pi / 180.0 if unit == "deg" else 1.0)
+            if alike > _ALIKE and _SHORTEST_S <= period <= _LONGEST_S:
+                rate = float(f"{1.0 / period:.3g}")
+                self.rows.append(
+                    ("time", "", "", f"{rate:g} Hz, from the positions against {velocity.shown}")
+                )
+                return TimeBase(rate_hz=rate), 1.0 / rate
+        raise DataError(
+            f"{self.source}: no rising column of times; give the rate of the samples with --rate-hz"
+        )
+
+    def _clock(self, clock: Field) -> tuple[TimeBase, float]:
+        times = clock.values[:, 0]
+        step = float(times[-1] - times[0]) / (len(times) - 1)
+        units: tuple[Literal["s", "ms", "us", "ns"], ...] = ("s", "ms", "us", "ns")
+        unit = next(
+            (u for u in units if _SHORTEST_S <= step * TimeBase(1, unit=u).seconds < _LONGEST_S), None
+        )
+        if unit is None:
+            raise DataError(
+                f"{self.source}: the times {clock.shown} are {step:.4g} apart, in no unit a rate from 10 Hz to 10 kHz; "
+                "give the rate with --rate-hz"
+            )
+        base = TimeBase(1, unit=unit)
+        column: str | int = clock.array or (clock.columns[0] if clock.columns else 1)
+        equal = bool((np.diff(times) == 0).any())
+        found = TimeBase(
+            column=column,
+            file=clock.file if isinstance(clock.file, str) else None,
+            unit=unit,
+            zero="unix" if times[0] * base.seconds > _UNIX_S else "start",
+            equal="spread" if equal else "refuse",
+        )
+        why = f"steps of {step:.4g} on average" + (", equal times spread" if equal else "")
+        self.used.add(clock.name)
+        self.rows.append(("time", clock.shown, unit, why))
+        return found, step * base.seconds
+
+    def _torques(self, joints: Sequence[str]) -> dict[str, Signal]:
+        """Signals of the torques and currents."""
+        plain = self._best("torque", joints, motor=False)
+        motor = self._best("torque", joints, motor=True)
+        current = self._best("current", joints)
+        found: dict[str, Signal] = {}
+        if plain is not None and (motor is None or self.known.torque == "joint"):
+            key = f"{self.known.torque}_torque"
+            why = (
+                f"a torque; taken at the {'sensor of the joint' if self.known.torque == 'joint' else 'motor'}"
+            )
+            found[key] = self._take(key, plain, _torque_unit(plain), why)
+        if motor is not None:
+            found["motor_torque"] = self._take(
+                "motor_torque", motor, _torque_unit(motor), "of the motor, by its name"
+            )
+        elif current is not None and self.known.torque_constant and "motor_torque" not in found:
+            constant = _each("torque_constant", self.known.torque_constant, joints)
+            large = bool(np.abs(current.values).max() > _LARGEST_CURRENT_A)
+            unit = "mA" if large or "ma" in current.words else "A"
+            found["motor_torque"] = self._take("motor_torque", current, unit, "a current", constant)
+        if not found and current is not None:
+            raise DataError(
+                f"{self.source}: {current.shown} is a current; give --torque-constant [Nm/A of the motor] and "
+                "--gear-ratio, one number or one for each joint"
+            )
+        if not found:
+            raise self._unknown("torque")
+        return found
+
+    def _blocks(self, table: Field) -> list[Field]:
+        """A table without names, split by the joints of the longest arm: times, positions, and their derivatives."""
+        names = self.known.joints or self.robot.arm(
+            names=[joint.name for joint in self.robot.joints if joint.driven]
+        )
+        width, count = table.values.shape[1], len(names)
+        start = width % count
+        if start > 1 or width < 2 * count:
+            raise DataError(
+                f"{self.source}: {width} columns without names are no positions and torques of {count} joints; write a "
+                "mapping file for `lwr-run import`, or name the columns in a first row"
+            )
+        parts = [
+            replace(
+                table,
+                values=table.values[:, at : at + count],
+                columns=tuple(range(at + 1, at + count + 1)),
+                labels=tuple(str(k + 1) for k in range(count)),
+            )
+            for at in range(start, width, count)
+        ]
+        parts = [part for part in parts if np.ptp(part.values, axis=0).max() > 0.0]
+        found = [replace(parts.pop(0), name="position")]
+        for quantity in ("velocity", "acceleration"):
+            if not parts:
+                break
+            scores = [_slope(part.values, np.diff(found[-1].values, axis=0))[1] for part in parts]
+            if max(scores) > _ALIKE:
+                found.append(replace(parts.pop(int(np.argmax(scores))), name=quantity))
+                self.why[quantity] = f"correlates {max(scores):.3f} with the change of {found[-2].shown}"
+            else:
+                break
+        if len(parts) != 1:
+            listed = "; ".join(part.shown for part in parts) or "none"
+            raise DataError(
+                f"{self.source}: of the columns without names these may be torques: {listed}. Write a mapping file for "
+                "`lwr-run import`, or name the columns in a first row"
+            )
+        self.why["position"] = "the first columns"
+        self.why["torque"] = "the columns left"
+        times = (
+            [replace(table, name="time", values=table.values[:, :1], columns=(1,), labels=("",))]
+            if start
+            else []
+        )
+        return [*times, *found, replace(parts[0], name="torque")]
+
+
+def _span(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
+
+
+def _slope(rate: Floats, change: Floats) -> tuple[float, float]:
+    """Least-squares factor from a rate (n, k) to the change between samples (n-1, k), and their correlation."""
+    mean = 0.5 * (rate[1:] + rate[:-1])
+    power = float(np.sum(mean * mean))
+    product = float(np.sum(mean * change))
+    whole = math.sqrt(power * float(np.sum(change * change)))
+    return (product / power, product / whole) if whole > 0.0 else (0.0, 0.0)
+
+
+def _rate_unit(angle: Floats, rate: Floats, period: float) -> tuple[str, float] | None:
+    """Unit of a velocity by dq/dt, and its ratio to that in the unit; None if it is no velocity of these joints."""
+    # Over a fiftieth of a second, so that steps of an encoder and repeated samples count little.
+    width = max(1, min(round(0.02 / period), len(angle) // 4))
+    total = np.vstack([np.zeros(rate.shape[1]), np.cumsum(0.5 * (rate[1:] + rate[:-1]), axis=0)])
+    mean, change = (
+        (total[width:] - total[:-width]) / width,
+        (angle[width:] - angle[:-width]) / (width * period),
+    )
+    power = float(np.sum(change * change))
+    whole = math.sqrt(power * float(np.sum(mean * mean)))
+    if whole == 0.0 or float(np.sum(mean * change)) < _ALIKE * whole:
+        return None
+    ratio = float(np.sum(mean * change)) / power
+    unit, size = min(_RATES.items(), key=lambda item: abs(math.log(ratio / item[1])))
+    return (unit, ratio / size) if abs(math.log(ratio / size)) < math.log(_RATIO) else None
+
+
+def _torque_unit(field: Field) -> str:
+    return "mNm" if "mnm" in field.words else "Nm"
+
+
+def _each(name: str, values: tuple[float, ...], joints: Sequence[str]) -> tuple[float, ...]:
+    if len(values) not in (1, len(joints)):
+        option = f"--{name.replace('_', '-')}"
+        raise ConfigurationError(
+            f"{option} has {len(values)} numbers for {len(joints)} joints; give one, or one for each"
+        )
+    return values * len(joints) if len(values) == 1 else values

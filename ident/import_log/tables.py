@@ -1,0 +1,188 @@
+"""Tables of numbers in files: text (CSV, one value a line), NPZ and NPY archives, MATLAB files."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+
+Floats = NDArray[np.float64]
+_COMMENTS = ("#", "%")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of a file: names (numbers from 1 without a header) and values (n, m)."""
+
+    names: tuple[str, ...]
+    values: Any
+
+
+def read_text(path: Path, delimiter: str | None = None, header: bool | None = None) -> Table:
+    """A text table: comma, semicolon, tab or blanks, a decimal comma where the comma separates nothing.
+
+    header : whether the first row holds names; None decides by its content. Comment lines begin with # or %; the
+    one before the numbers has the names if it has as many words as columns. Rows of words below the names, such as
+    units, are passed over, and a column that begins with a word is nan. DataError with line and column.
+    """
+    rows = [(number, line) for number, line in enumerate(_lines(path), 1) if line.strip()]
+    comment = next((k for k, (_, line) in enumerate(rows) if line.lstrip()[0] not in _COMMENTS), len(rows))
+    above = rows[comment - 1][1].strip().lstrip("".join(_COMMENTS)) if comment else ""
+    rows = [(number, line) for number, line in rows[comment:] if line.lstrip()[0] not in _COMMENTS]
+    first = rows[0][1] if rows else ""
+    found = next((m for m in (";", ",", "\t") if m in first.strip()), None)
+    mark = found if delimiter is None else delimiter
+    point = "." if mark == "," else ","
+    titled = bool(rows) and not any(map(_is_number, _split(first.replace(point, "."), mark)))
+    if header and rows and not titled:
+        raise DataError(f"{path}: the first row {first[:60]!r} holds numbers, no names; leave `header` out")
+    named = titled if header is None else header
+    if len(rows) < 1 + named:
+        raise DataError(f"{path}: holds no rows of numbers")
+    names = tuple(_split(first, mark)) if named else ()
+    rows = [(number, line.replace(point, ".")) for number, line in rows[named:]]
+    while named and len(rows) > 1 and not any(map(_is_number, _split(rows[0][1], mark))):
+        rows = rows[1:]
+    width = len(names) if named else len(_split(rows[0][1], mark))
+    if not named and len(_split(above, mark)) == width and not all(map(_is_number, _split(above, mark))):
+        names = tuple(_split(above, mark))
+    values = _fast(rows, mark, width)
+    if values is None:
+        values = np.empty((len(rows), width))
+        words = {k for k, part in enumerate(_split(rows[0][1], mark)) if part and not _is_number(part)}
+        for index, (number, line) in enumerate(rows):
+            values[index] = _row(path, number, _split(line, mark), width, names, words if named else set())
+    return Table(names or _numbers(width), values)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: not readable as text: {error}") from error
+    for encoding in ("utf-16",) if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252"):
+        try:
+            text = data.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        if "\0" not in text:
+            return text.splitlines()
+    raise DataError(f"{path}: not readable as text, neither UTF-8 nor Windows text")
+
+
+def _numbers(width: int) -> tuple[str, ...]:
+    return tuple(str(k + 1) for k in range(width))
+
+
+def _fast(rows: list[tuple[int, str]], mark: str | None, width: int) -> Floats | None:
+    """The table by numpy's own reader; None unless every row is a plain row of numbers."""
+    try:
+        values = np.loadtxt(
+            [line.strip().rstrip(mark or " ") for _, line in rows], delimiter=mark, ndmin=2, comments=None
+        )
+    except ValueError:
+        return None
+    return values if values.shape == (len(rows), width) else None
+
+
+def _split(line: str, mark: str | None) -> list[str]:
+    parts = [part.strip().strip('"') for part in line.strip().split(mark)]
+    return parts[:-1] if len(parts) > 1 and parts[-1] == "" else parts
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _row(
+    path: Path, number: int, parts: list[str], width: int, names: tuple[str, ...], words: Collection[int]
+) -> list[float]:
+    """The numbers of a row; those of the columns `words` are nan."""
+    if len(parts) != width:
+        raise DataError(
+            f"{path}: line {number} has {len(parts)} columns, the first has {width}; the file is not whole"
+        )
+    values = []
+    for index, part in enumerate(parts):
+        if index in words:
+            values.append(math.nan)
+            continue
+        if not _is_number(part):
+            column = names[index] if names else str(index + 1)
+            shown = "is empty" if not part else f"holds {part!r}"
+            raise DataError(f"{path}: line {number}, column {column!r} {shown}; a number is needed")
+        values.append(float(part))
+    return values
+
+
+def read_arrays(path: Path) -> dict[str, Table]:
+    """The arrays of an NPZ, NPY or MATLAB file by name, those of structures as `structure.field`.
+
+    One-dimensional arrays have one column. DataError for an unreadable file.
+    """
+    arrays = _READERS[path.suffix.lower()](path)
+    tables = {}
+    for name, values in arrays.items():
+        if values.dtype.kind in "fiub" and values.ndim in (1, 2) and values.size:
+            values = values.reshape(len(values), -1).astype(np.float64)
+            tables[name] = Table(_numbers(values.shape[1]), values)
+        else:
+            tables[name] = Table((), values)
+    return tables
+
+
+def _numpy_arrays(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            found = np.load(file, allow_pickle=False)
+            if isinstance(found, np.ndarray):
+                return {path.stem: found}
+            return {key: found[key] for key in found.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise DataError(f"{path}: not a readable {path.suffix[1:].upper()} archive: {error}") from error
+
+
+def _matlab_arrays(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except NotImplementedError:
+        raise DataError(
+            f"{path}: a MATLAB file of version 7.3 (HDF5); save it again with `save('{path.name}', '-v7')`"
+        ) from None
+    except (OSError, ValueError, TypeError, KeyError, IndexError, EOFError, MatReadError) as error:
+        raise DataError(f"{path}: not a readable MATLAB file: {error}") from error
+    found: dict[str, Any] = {}
+
+    def collect(name: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key, item in value.items():
+                collect(f"{name}.{key}" if name else str(key), item)
+        elif isinstance(value, np.ndarray):
+            found[name] = value
+
+    collect("", {key: value for key, value in content.items() if not key.startswith("__")})
+    return found
+
+
+_READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ".npz": _numpy_arrays,
+    ".npy": _numpy_arrays,
+    ".mat": _matlab_arrays,
+}
+ARCHIVES = frozenset(_READERS)
+"""Suffixes of files with named arrays."""

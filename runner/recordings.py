@@ -1,0 +1,184 @@
+"""Recordings on the command line: session logs, ROS 2 bags, and others through a guessed mapping.
+
+The guess is shown and confirmed. Mapping and session logs are written, so the import can be repeated and corrected.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fri.errors import ConfigurationError, DataError
+from ident.dynamics.session_chain import recorded_rests
+from ident.import_log import Guess, Known, guess_mapping, import_log, read_recording
+from ident.import_log.bag import bag_files
+from ident.import_log.guess import RESTING_RAD
+from lwr_driver.session import Session, read_session
+
+GUESSED = ("yes", "joints", "rate_hz", "torque", "torque_constant", "gear_ratio")
+"""Parameters of `guess_options`."""
+
+
+def _numbers(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, ...]:
+    try:
+        return () if value is None else tuple(float(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"{value!r} is no list of numbers such as 100,101", context, parameter
+        ) from None
+
+
+def guess_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of a command that takes recordings other than session logs."""
+    options = (
+        click.option("--yes", is_flag=True, help="Take the guessed columns without asking."),
+        click.option(
+            "--joints",
+            metavar="A,B,...",
+            help="Joints of the columns, as in the URDF; default: by name or number.",
+        ),
+        click.option(
+            "--rate-hz",
+            type=click.FloatRange(min=0, min_open=True),
+            help="Rate of a recording without times.",
+        ),
+        click.option(
+            "--torque",
+            type=click.Choice(["joint", "motor"]),
+            default="joint",
+            show_default=True,
+            help="A plain torque is the joint sensor's, or the motor's after the gear.",
+        ),
+        click.option(
+            "--torque-constant", callback=_numbers, metavar="K[,K...]", help="Motors' Nm/A, for currents."
+        ),
+        click.option(
+            "--gear-ratio",
+            callback=_numbers,
+            metavar="N[,N...]",
+            help="Motor turns per joint turn, for currents.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def read_recordings(
+    paths: Sequence[Path],
+    *,
+    urdf: Path | None,
+    folder: Path,
+    base: str | None = None,
+    tip: str | None = None,
+    yes: bool = False,
+    joints: str | None = None,
+    rate_hz: float | None = None,
+    torque: str = "joint",
+    torque_constant: tuple[float, ...] = (),
+    gear_ratio: tuple[float, ...] = (),
+) -> list[Session]:
+    """Sessions from paths of any kind, in their order.
+
+    folder : for `NAME.mapping.yaml` and the session logs of recordings that need a mapping. The first of these gives
+        the columns of all. Raises ConfigurationError without a URDF, or without a confirmation.
+    """
+    foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
+    if not foreign:
+        if joints or rate_hz or torque_constant or gear_ratio:
+            raise ConfigurationError(
+                f"{paths[0]} names its joints and quantities; --joints, --rate-hz, --torque-constant and "
+                "--gear-ratio are for recordings with guessed columns"
+            )
+        logs = [read_recording(path, status=False, motor=torque == "motor") for path in paths]
+        for log in logs[1:]:
+            _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
+        return logs
+    missing = [path for path in foreign if not path.exists()]
+    if missing:
+        raise DataError(f"{missing[0]}: no such file or folder")
+    if urdf is None:
+        raise ConfigurationError(
+            f"{foreign[0]}: no session log; name the arm's URDF with --urdf to import it"
+        )
+    named = () if joints is None else tuple(name.strip() for name in joints.split(","))
+    known = Known(named, base, tip, rate_hz, torque, torque_constant, gear_ratio)
+    guess = guess_mapping(foreign[0], urdf, known)
+    for other in foreign[1:] if guess.mapping.held else ():
+        _same_rests(guess.mapping.held or {}, guess_mapping(other, urdf, known).mapping.held or {}, other)
+    _confirm(guess, yes)
+    folder.mkdir(parents=True, exist_ok=True)
+    mapping = folder / f"{foreign[0].stem}.mapping.yaml"
+    if mapping.exists() and not mapping.read_text(encoding="utf-8").startswith(Guess.HEAD):
+        raise ConfigurationError(
+            f"{mapping} exists and was not guessed; use it with `lwr-run import`, or remove it"
+        )
+    mapping.write_text(guess.text, encoding="utf-8")
+    click.echo(f"{mapping}\n", err=True)
+    names = dict(zip(foreign, _names(foreign), strict=True))
+    sessions = []
+    for path in paths:
+        if path not in names:
+            sessions.append(read_recording(path, status=False, motor=torque == "motor"))
+            continue
+        target = folder / f"{names[path]}.mcap"
+        _clear(target)
+        click.echo(f"{import_log(guess.mapping, path, target)}\n", err=True)
+        sessions.append(read_session(target, status=False))
+    return sessions
+
+
+def _same_rests(first: Mapping[str, float], other: Mapping[str, float], path: Path) -> None:
+    """Refuse recordings with joints at rest elsewhere than in the first: their kinematics differ."""
+    for name in first.keys() | other.keys():
+        places = [rests.get(name) for rests in (first, other)]
+        if None in places or abs(float(places[0] or 0.0) - float(places[1] or 0.0)) > RESTING_RAD:
+            raise ConfigurationError(
+                f"{path}: joint {name} rests at {places[1]} rad, in the first recording at {places[0]} rad; identify "
+                "them one by one"
+            )
+
+
+def at_terminal() -> bool:
+    """Whether a person can answer."""
+    return sys.stdin.isatty()
+
+
+def _confirm(guess: Guess, yes: bool) -> None:
+    if yes:
+        click.echo(str(guess), err=True)
+    elif not at_terminal():
+        raise ConfigurationError(
+            f"the columns of {guess.source} are a guess, to be confirmed at a terminal or with --yes:\n{guess}\n"
+            f"or correct this mapping file and use `lwr-run import`:\n\n{guess.text}"
+        )
+    else:
+        click.echo(str(guess), err=True)
+        if not click.confirm("Is this right?", err=True):
+            raise ConfigurationError(f"correct this mapping file and use `lwr-run import`:\n\n{guess.text}")
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of the session logs: that of the recording, with its folder's where two are alike."""
+    stems = [path.stem for path in paths]
+    return [
+        path.stem if stems.count(path.stem) == 1 else f"{path.resolve().parent.name}_{path.stem}"
+        for path in paths
+    ]
+
+
+def _clear(target: Path) -> None:
+    """Remove an earlier import; ConfigurationError for any other file of that name."""
+    if not target.exists():
+        return
+    try:
+        imported = read_session(target, status=False).metadata.get("experiment") == "import"
+    except DataError:
+        imported = False
+    if not imported:
+        raise ConfigurationError(f"{target} exists and is no import; choose another folder with --results")
+    target.unlink()

@@ -1,0 +1,255 @@
+"""Guessed columns: quantity by name, joints by the URDF, units by the numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from fri.errors import ConfigurationError, DataError
+from ident.dynamics.session_chain import session_chain
+from ident.import_log import Guess, Known, LogMapping, guess_mapping, import_log
+from ident.import_log.fields import Field, split_name
+from lwr_driver.session import read_session
+from tests.ident.stock_panda import JOINTS, stock_panda
+
+N, RATE = 400, 250.0
+T = np.arange(N) / RATE
+PHASE = np.arange(7)
+Q = 0.8 * np.sin(2.0 * T[:, None] + PHASE)
+QD = 1.6 * np.cos(2.0 * T[:, None] + PHASE)
+QDD = -3.2 * np.sin(2.0 * T[:, None] + PHASE)
+TAU = np.cos(3.0 * T[:, None]) * np.arange(1.0, 8.0) + 5.0
+DEG = 180.0 / np.pi
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    (tmp_path / "panda.urdf").write_text(stock_panda(floating=True, head=True))
+    return tmp_path / "panda.urdf"
+
+
+def write(path: Path, names: list[str] | None, *blocks: np.ndarray, mark: str = ",") -> Path:
+    table = np.hstack([block.reshape(N, -1) for block in blocks])
+    lines = [mark.join(f"{value:.12g}" for value in row) for row in table]
+    head = [mark.join(names)] if names else []
+    path.write_text("\n".join(head + lines) + "\n")
+    return path
+
+
+def columns(pattern: str, first: int = 1) -> list[str]:
+    return [pattern.format(k=k + first, joint=JOINTS[k]) for k in range(7)]
+
+
+def session(guess: Guess, source: Path, folder: Path):
+    import_log(guess.mapping, source, folder / "out.mcap")
+    return read_session(folder / "out.mcap")
+
+
+HABITS: dict[str, tuple[str, str, str, str]] = {
+    "letters": ("t", "q{k}", "dq{k}", "tau{k}"),
+    "words": ("Time", "Position{k}", "Velocity{k}", "TorqueSm{k}"),
+    "joint names": ("stamp", "{joint}_pos", "{joint}_vel", "{joint}_effort"),
+    "brackets": ("timestamp_s", "state.q[{k}]", "state.qd[{k}]", "state.tau_J[{k}]"),
+    "between": ("time", "joint_{k}_position", "joint_{k}_velocity", "joint_{k}_torque"),
+    "angles": ("clock", "th_{k}", "thd_{k}", "trq_{k}"),
+}
+
+
+@pytest.mark.parametrize("habit", HABITS)
+def test_columns_are_known_by_their_names(habit: str, arm: Path, tmp_path: Path) -> None:
+    time, q, qd, tau = HABITS[habit]
+    aside = ["tau_J_d{k}", "target_q_{k}", "temp_{k}", "q_filtered{k}"]
+    names = [time, *(name for pattern in (*aside, q, qd, tau) for name in columns(pattern))]
+    path = write(tmp_path / "run.csv", names, T, TAU + 9, Q + 9, Q * 0, Q * 1.1, Q, QD, TAU)
+    guess = guess_mapping(path, arm)
+    read = session(guess, path, tmp_path)
+    assert read.joint_names == JOINTS
+    for found, expected in ((read.joint.position, Q), (read.joint.velocity, QD), (read.joint.effort, TAU)):
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+    assert len(guess.unused) == 4
+    assert all(
+        place in str(guess) for place in (q.format(k=1, joint=JOINTS[0]), "not used:", "within the limits")
+    )
+
+
+def test_the_mapping_file_of_a_guess_repeats_it(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("tau{k}")]
+    guess = guess_mapping(write(tmp_path / "run.csv", names, T, Q, TAU), arm)
+    (tmp_path / "run.yaml").write_text(guess.text)
+    assert LogMapping.load(tmp_path / "run.yaml") == guess.mapping
+
+
+@pytest.mark.parametrize(
+    ("angle", "rate", "units"),
+    [
+        (1.0, 1.0, ("rad", "rad/s")),
+        (DEG, DEG, ("deg", "deg/s")),
+        (DEG, 1.0, ("deg", "rad/s")),
+        (1.0, DEG / 6, ("rad", "rpm")),
+    ],
+)
+def test_units_of_angles_and_rates_follow_from_limits_and_derivative(
+    angle: float, rate: float, units: tuple[str, str], arm: Path, tmp_path: Path
+) -> None:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    path = write(tmp_path / "run.csv", names, T, Q * angle, QD * rate, TAU)
+    guess = guess_mapping(path, arm)
+    assert guess.mapping.velocity is not None
+    assert (guess.mapping.position.unit, guess.mapping.velocity.unit) == units
+    np.testing.assert_allclose(session(guess, path, tmp_path).joint.velocity, QD, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("unit", "size"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_the_unit_of_time_follows_from_its_steps(
+    unit: str, size: float, start: float, arm: Path, tmp_path: Path
+) -> None:
+    times = [f"{(start + t) * size:.6f}" for t in T]
+    rows = [
+        ",".join([time, *map(str, q), *map(str, tau)]) for time, q, tau in zip(times, Q, TAU, strict=True)
+    ]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join([",".join(["t", *columns("q{k}"), *columns("tau{k}")]), *rows]))
+    found = guess_mapping(path, arm).mapping.time
+    assert (found.unit, found.zero) == (unit, "unix" if start else "start")
+
+
+def test_coarse_stamps_are_spread(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("tau{k}")]
+    path = write(tmp_path / "run.csv", names, np.floor(T * 100) / 100, Q, TAU)
+    guess = guess_mapping(path, arm)
+    assert guess.mapping.time.equal == "spread"
+    assert "equal times spread" in str(guess)
+    np.testing.assert_allclose(session(guess, path, tmp_path).joint.log_time * 1e-9, T, atol=5.1e-3)
+
+
+def test_a_table_without_names_is_told_by_its_derivatives(arm: Path, tmp_path: Path) -> None:
+    path = write(tmp_path / "run.csv", None, Q, QD, QDD, TAU)
+    guess = guess_mapping(path, arm)
+    assert guess.mapping.time.rate_hz == RATE
+    assert guess.mapping.joint_torque is not None
+    assert guess.mapping.joint_torque.columns == tuple(range(22, 29))
+    read = session(guess, path, tmp_path)
+    np.testing.assert_allclose(read.joint.velocity, QD, rtol=1e-9, atol=1e-9)
+    with pytest.raises(DataError, match="these may be torques: columns 8 to 14; columns 15 to 21"):
+        guess_mapping(write(tmp_path / "two.csv", None, Q, TAU, 2 * TAU + Q), arm)
+    with pytest.raises(DataError, match="5 columns without names"):
+        guess_mapping(write(tmp_path / "few.csv", None, Q[:, :5]), arm)
+
+
+def test_arrays_of_npz_and_matlab_files(arm: Path, tmp_path: Path) -> None:
+    content = {"times": T, "positions": Q, "torques": TAU, "target_positions": Q + 1}
+    np.savez(tmp_path / "run.npz", **content)
+    savemat(tmp_path / "run.mat", {"log": {"t": T, "q": Q.T, "tau": TAU.T}})
+    for name, position in (("run.npz", "positions"), ("run.mat", "log.q")):
+        guess = guess_mapping(tmp_path / name, arm)
+        assert guess.mapping.position.array == position
+        (tmp_path / "out.mcap").unlink(missing_ok=True)
+        np.testing.assert_array_equal(session(guess, tmp_path / name, tmp_path).joint.position, Q)
+
+
+@pytest.mark.parametrize("one_a_joint", [False, True])
+def test_a_folder_of_text_files(one_a_joint: bool, arm: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    np.savetxt(folder / "time.txt", T, fmt="%.17g")
+    for name, values in (("joint_position_measured", Q), ("joint_torque", TAU)):
+        for k in range(7 if one_a_joint else 0):
+            np.savetxt(folder / f"{name}_{k}.txt", values[:, k], fmt="%.17g")
+        if not one_a_joint:
+            np.savetxt(folder / f"{name}.txt", values, fmt="%.17g", delimiter="\t")
+    guess = guess_mapping(folder, arm)
+    np.testing.assert_array_equal(session(guess, folder, tmp_path).joint.effort, TAU)
+
+
+def test_currents_need_their_constant_and_gear(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("current{k}")]
+    path = write(tmp_path / "run.csv", names, T, Q, 1000 * TAU)
+    with pytest.raises(DataError, match="is a current; give --torque-constant"):
+        guess_mapping(path, arm)
+    with pytest.raises(ConfigurationError, match="--gear-ratio has 2 numbers for 7 joints"):
+        guess_mapping(path, arm, Known(torque_constant=(0.1,), gear_ratio=(1.0, 2.0)))
+    guess = guess_mapping(path, arm, Known(torque_constant=(0.1,), gear_ratio=(100.0,)))
+    motor = session(guess, path, tmp_path).motor
+    assert motor is not None
+    np.testing.assert_allclose(motor.effort, 10 * TAU)
+
+
+@pytest.mark.parametrize(("torque", "channel"), [("joint", "joint_torque"), ("motor", "motor_torque")])
+def test_the_side_of_a_plain_torque_is_the_users_word(
+    torque: str, channel: str, arm: Path, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "run.csv", ["t", *columns("q{k}"), *columns("tau{k}")], T, Q, TAU)
+    assert set(guess_mapping(path, arm, Known(torque=torque)).mapping.signals) == {"position", channel}
+
+
+def test_extra_columns_of_fingers_are_left_out(arm: Path, tmp_path: Path) -> None:
+    joints = [*JOINTS, "panda_finger_joint1", "panda_finger_joint2"]
+    names = ["time", *(f"{joint}.{what}" for what in ("position", "effort") for joint in joints)]
+    path = write(tmp_path / "run.csv", names, T, np.hstack([Q, Q[:, :2]]), np.hstack([TAU, TAU[:, :2] * 0]))
+    read = session(guess_mapping(path, arm), path, tmp_path)
+    assert read.joint_names == JOINTS
+    np.testing.assert_allclose(read.joint.effort, TAU, rtol=1e-10)
+
+
+def test_joints_at_rest_are_held_where_they_rest(arm: Path, tmp_path: Path) -> None:
+    kept = ("panda_joint2", "panda_joint4")
+    moving = np.isin(PHASE, (1, 3))
+    q = np.where(moving, Q, 0.1 * PHASE + 0.001 * np.sin(T[:, None]))
+    path = write(tmp_path / "run.csv", ["t", *columns("q{k}"), *columns("tau{k}")], T, q, TAU)
+    guess = guess_mapping(path, arm, Known(joints=kept))
+    rests = {name: 0.1 * k for k, name in enumerate(JOINTS) if name not in kept}
+    assert guess.mapping.held == pytest.approx(rests, abs=2e-3)
+    read = session(guess, path, tmp_path)
+    np.testing.assert_allclose(read.joint.effort, TAU[:, moving], rtol=1e-10)
+    assert session_chain(read).joint_names == kept
+    fixed = {name for name in JOINTS if f'name="{name}" type="fixed"' in str(session_chain(read).urdf)}
+    assert fixed == set(rests)
+    with pytest.raises(DataError, match=r"panda_joint4 moves by .* rad; name it in --joints"):
+        guess_mapping(path, arm, Known(joints=kept[:1]))
+
+
+@pytest.mark.parametrize(
+    ("names", "blocks", "known", "message"),
+    [
+        (["t", *columns("a{k}")], (T, Q), {}, r"no position by its name. Found, .*a1 \.\.\. a7 \(7\)"),
+        (["t", *columns("q{k}")], (T, Q), {}, "no torque by its name"),
+        ([*columns("q{k}"), *columns("tau{k}")], (Q, TAU), {}, "give the rate of the samples with --rate-hz"),
+        (["t", *columns("q{k}"), *columns("tau{k}")], (T, 6e3 * Q, TAU), {}, "outside the limits .*A motor's angle"),
+        (["t", *columns("q{k}")[:6], *columns("tau{k}")], (T, Q[:, :6], TAU), {"joints": JOINTS}, "6 columns for"),
+        (["t", *columns("q{k}"), *columns("tau{k}")], (T * 1e5, Q, TAU), {}, None),
+        (["t", *columns("q{k}")[:6], *columns("tau{k}")[:6]], (T, Q[:, :6], TAU[:, :6]), {}, "no serial arms with 6"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_told_is_said(
+    names: list[str], blocks: Any, known: dict[str, Any], message: str | None, arm: Path, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "run.csv", names, *blocks)
+    if message is None:
+        assert guess_mapping(path, arm, Known(**known)).mapping.time.unit == "us"
+        return
+    with pytest.raises((DataError, ConfigurationError), match=message):
+        guess_mapping(path, arm, Known(**known))
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [
+        ("actual_q_", "position"), ("target_q_", None), ("actual_current_", "current"), ("qDot", "velocity"),
+        ("ddq", "acceleration"), ("tau_ext_hat_filtered", None), ("TorqueCur", "torque"),
+        ("currentPosition", "position"), ("actual_TCP_speed_", None), ("joint_temperatures", None),
+        ("efforts", "torque"),
+    ],
+)  # fmt: skip
+def test_words_of_a_name(name: str, quantity: str | None) -> None:
+    assert Field(name, ("",) * 3, np.zeros((2, 3))).quantity == quantity
+
+
+def test_a_joint_in_a_name_is_found_whole() -> None:
+    assert split_name("joint_10_pos", ["joint_1", "joint_10"]) == ("_pos", "joint_10")
+    assert split_name("q12", ["joint_1"]) == ("q", "12")
+    assert split_name("PANDA_JOINT1.effort", JOINTS) == (".effort", "panda_joint1")
