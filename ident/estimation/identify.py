@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,9 +30,15 @@ from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name, require, stated_mass
 from lwr_driver.session import Session, Sessions, as_sessions
 
+if TYPE_CHECKING:
+    from ident.estimation.choice import Choice
+
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
+
+AUTO = "auto"
+"""In place of the name of an estimator: the one that predicts best, see `ident.estimation.choice`."""
 
 _WIDE_CONDITION = 100.0
 
@@ -65,8 +71,8 @@ class IdentificationSettings:
     robot: str = ""
 
     def __post_init__(self) -> None:
-        if isinstance(self.estimator, str) and self.estimator not in ESTIMATORS:
-            known = ", ".join(ESTIMATORS)
+        if isinstance(self.estimator, str) and self.estimator not in (AUTO, *ESTIMATORS):
+            known = ", ".join((AUTO, *ESTIMATORS))
             raise ConfigurationError(f"estimator {self.estimator!r} is unknown; choose one of {known}")
 
 
@@ -76,7 +82,7 @@ class Identification(Tabular):
 
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
-    warnings : sentences for the report.
+    warnings : sentences for the report. choice : of the estimator, with "auto".
     """
 
     settings: IdentificationSettings
@@ -92,6 +98,7 @@ class Identification(Tabular):
     essential: Essential | None
     robot: str
     warnings: tuple[str, ...]
+    choice: Choice | None = None
 
     @cached_property
     def model(self) -> DynamicModel:
@@ -119,6 +126,8 @@ class Identification(Tabular):
             "cutoff_hz": self.settings.signals.cutoff_hz,
             "decimate_hz": self.settings.signals.decimate_hz,
         }
+        if self.choice is not None:
+            provenance["choice"] = self.choice.to_dict()
         matrix = found.covariance.matrix
         return DynamicModel(self.robot, self.structure, names, found.values, matrix, self.base, provenance)
 
@@ -171,6 +180,8 @@ class Identification(Tabular):
             "torque_rms": self.torque_rms,
             "assumptions": self.assumptions.to_dict(),
             "essential": None if self.essential is None else self.essential.to_dict(),
+            "prior_only": list(self.estimate.prior_only),
+            "choice": None if self.choice is None else self.choice.to_dict(),
             "warnings": list(self.warnings),
         }
 
@@ -212,6 +223,8 @@ class Identification(Tabular):
         lines.append(
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
         )
+        if self.choice is not None:
+            lines += ["", str(self.choice)]
         lines += ["", self.estimate.summary(), "", self.assumptions.summary()]
         if self.essential is not None:
             lines += ["", self.essential.summary()]
@@ -233,6 +246,10 @@ def identify(
     settings = settings or IdentificationSettings()
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
+    if settings.estimator == AUTO:
+        from ident.estimation.choice import choose
+
+        return choose(sessions, chain, settings)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file")
@@ -284,15 +301,18 @@ def identify(
     warnings = [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
-    normalised = problem.require_rank()
-    instrumental = None
-    if len(instruments) == len(problems):
-        matrices = [group.matrix for one in instruments for group in one.groups]
-        instrumental = InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
     # With instrumental variables, this is the WLS compared with them.
     name = settings.estimator
     factory = estimator_factory(name) if isinstance(name, str) else name
-    estimate = plain = factory(base, problem, settings.covariance).fit(problem)
+    estimator = factory(base, problem, settings.covariance)
+    needs_rank = getattr(estimator, "needs_rank", True)
+    normalised = problem.require_rank() if needs_rank else problem.normalised_condition
+    full_rank = bool(np.isfinite(normalised))
+    instrumental = None
+    if len(instruments) == len(problems) and full_rank:
+        matrices = [group.matrix for one in instruments for group in one.groups]
+        instrumental = InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
+    estimate = plain = estimator.fit(problem)
     if settings.estimator == "iv":
         if instrumental is None:
             raise DataError(
@@ -304,7 +324,7 @@ def identify(
         problem, plain, instrumental=instrumental, period_rows=_common_period(prepared)
     )
     essential = None
-    if settings.essential is not None:
+    if settings.essential is not None and full_rank:
         essential = find_essential(problem, estimate, settings.essential, settings.covariance)
     warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
     warnings += _condition_warnings(normalised, estimate)
@@ -433,6 +453,11 @@ def _payload_warnings(
 def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
     if normalised < _WIDE_CONDITION:
         return []
+    if not np.isfinite(normalised):
+        named = ", ".join(estimate.prior_only)
+        return [
+            f"the motion does not determine all parameters: it does not show {named}, known from the prior alone"
+        ]
     inverse = np.linalg.inv(estimate.correlation + 1e-12 * np.eye(len(estimate.names)))
     worst = np.argsort(-np.diag(inverse))[:8]
     names = ", ".join(estimate.names[k] for k in worst)

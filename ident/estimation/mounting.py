@@ -27,6 +27,7 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
+from ident.estimators.problem import Problem
 from ident.rows.observation import observe
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import require
@@ -175,16 +176,7 @@ def _step(
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
     columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
-    groups = tuple(
-        replace(group, matrix=np.column_stack([group.matrix, column]))
-        for group, column in zip(found.problem.groups, columns, strict=True)
-    )
-    problem = replace(
-        found.problem,
-        names=(*found.problem.names, "tilt_1", "tilt_2"),
-        groups=groups,
-        units=(*found.problem.units, "rad", "rad") if found.problem.units else (),
-    )
+    problem = with_tilt(found.problem, columns)
     estimator = MaximumAPosteriori(
         _prior(found, tilt, prior_std_rad), 1.0, CovarianceSettings(kind="jackknife")
     )
@@ -194,6 +186,25 @@ def _step(
     correlation = posterior.matrix[-2:, -2:] / np.outer(posterior.std[-2:], posterior.std[-2:])
     stated = replace(jackknife, matrix=correlation * np.outer(std, std))
     return estimate.values[-2:], stated
+
+
+def tilt_columns(found: Identification, sessions: Sequence[Session]) -> list[Floats]:
+    """d(torque) / d(tilt) (m, 2) [Nm/rad] of each row group, with the estimated parameters."""
+    gravity = found.structure.chain.gravity
+    return _columns(found, sessions, list(sideways_gravity(gravity, _axes(gravity))))
+
+
+def with_tilt(problem: Problem, columns: Sequence[Floats]) -> Problem:
+    """The problem with two further columns for the tilt."""
+    groups = tuple(
+        replace(group, matrix=np.column_stack([group.matrix, column]))
+        for group, column in zip(problem.groups, columns, strict=True)
+    )
+    names, units = (
+        (*problem.names, "tilt_1", "tilt_2"),
+        (*problem.units, "rad", "rad") if problem.units else (),
+    )
+    return replace(problem, names=names, groups=groups, units=units)
 
 
 def _columns(
