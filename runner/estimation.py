@@ -13,7 +13,7 @@ from typing import Any, Literal
 from fri.errors import ConfigurationError
 from ident.dynamics.structure import Coulomb, Coupling
 from ident.estimation.essential import EssentialSettings
-from ident.estimation.identify import IdentificationSettings, estimator_factory
+from ident.estimation.identify import AUTO, IdentificationSettings, estimator_factory
 from ident.estimators import ESTIMATORS, CovarianceSettings
 from ident.rows.filters import SignalSettings
 from lwr_driver.configuration import find, parse, read_mapping
@@ -66,7 +66,7 @@ class IdentifySettings:
         """The settings for `ident`, with the model and the estimator of the command line. file : for errors."""
         given = {name: value for name, value in vars(self.estimator).items() if value is not None}
         for name, value in given.items():
-            if name not in ESTIMATORS[estimator].options:
+            if estimator == AUTO or name not in ESTIMATORS[estimator].options:
                 takers = [other for other, kind in ESTIMATORS.items() if name in kind.options]
                 raise ConfigurationError(
                     f"{file}: `estimator.{name}` is {value}, an option of {' and '.join(takers)}, not of {estimator}; "

@@ -136,9 +136,10 @@ class Choice(Tabular):
                 f"  error [% of torque] on {self.parts} parts of the motion held back in turn, in blocks of "
                 f"{self.block_s:.1f} s",
             ]
+            width = max(len(c.title) for c in self.candidates)
             for number, c in enumerate(self.candidates):
                 mark = "  <- chosen" if number == self.chosen else ""
-                lines.append(f"  {c.title:<44}{c.held_back_percent:>8.2f}{mark}")
+                lines.append(f"  {c.title:<{width}}{c.held_back_percent:>8.2f}{mark}")
         lines += [f"  not possible: {text}" for text in self.excluded]
         lines += [f"  {text}" for text in self.advice]
         if self.disagreement is not None:
@@ -199,6 +200,7 @@ class _Comparison:
     near: Floats
     block_s: float
     full_rank: bool
+    unseen: tuple[str, ...]
 
     @classmethod
     def of(
@@ -243,6 +245,7 @@ class _Comparison:
             near,
             block * problem.sample_time_s,
             bool(np.isfinite(found.condition_normalised)),
+            found.estimate.prior_only,
         )
 
     def choice(self, tilted: Sequence[bool]) -> Choice:
@@ -252,7 +255,8 @@ class _Comparison:
             kinds += [("physical", scale, tilt) for scale in _SCALES for tilt in tilted]
         if self.full_rank:
             kinds += [("wls", None, tilt) for tilt in tilted]
-        excluded = () if self.full_rank else (self._rank_loss(),)
+        unseen = ", ".join(self.unseen) or "all parameters"
+        excluded = () if self.full_rank else (f"wls, because the motion does not show {unseen}",)
         advice = list(self._placeholder())
         if len(self.held) < 2:
             kind = kinds[0]
@@ -341,13 +345,6 @@ class _Comparison:
         precision[:p, :p] = arm.precision
         precision[range(p, p + extra), range(p, p + extra)] = std**-2
         return Prior(np.append(arm.mean, np.zeros(extra)), precision)
-
-    def _rank_loss(self) -> str:
-        names = []
-        if self.bodies is not None:
-            fit = MaximumAPosteriori(self.bodies.prior("pullback"), 1e6, _PLAIN).fit(self.problem)
-            names = list(fit.prior_only)
-        return "wls, because the motion does not show " + (", ".join(names) or "all parameters")
 
     def _placeholder(self) -> Iterator[str]:
         if self.bodies is None:

@@ -179,12 +179,16 @@ class Disagreement:
         beyond = sum(abs(z) > 2.0 for z in self.deviations)
         pairs = zip(self.names[:5], self.deviations[:5], strict=True)
         worst = ", ".join(f"{name} {z:+.1f}" for name, z in pairs)
+        single = (
+            f"{beyond} of {len(self.names)} parameters beyond two ({worst})"
+            if worst
+            else "in combinations of parameters, for no single one is known better than from the URDF"
+        )
         if self.p_value > 0.01:
             return f"the URDF's inertials and the data agree (distance {ratio:.2f} standard deviations)"
         return (
-            f"the URDF's inertials and the data disagree: {ratio:.1f} standard deviations on average, {beyond} of "
-            f"{len(self.names)} parameters beyond two ({worst}); check masses and tool of the URDF, or use looser "
-            "deviations (`estimator.prior_std`)"
+            f"the URDF's inertials and the data disagree: {ratio:.1f} standard deviations on average, {single}; check "
+            "masses and tool of the URDF, or use looser deviations (`estimator.prior_std`)"
         )
 
 

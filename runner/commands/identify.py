@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import identify
+from ident.estimation.choice import choose
+from ident.estimation.identify import AUTO, identify
 from ident.estimation.mounting import find_mounting
 from ident.estimation.validate import validate
 from ident.estimators import ESTIMATORS
@@ -18,7 +20,11 @@ from runner.estimation import IdentifySettings, announced
 from runner.results import named_model, new_folder, write_log_results
 from runner.terminal import json_option, to_json
 
-_EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for name, kind in ESTIMATORS.items())
+_SUMMARIES = {
+    AUTO: "of wls and physical, base upright or leaning, the best on held-back motion",
+    **{name: kind.summary for name, kind in ESTIMATORS.items()},
+}
+_EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {text}" for name, text in _SUMMARIES.items())
 
 
 @click.command("identify", epilog=_EPILOG)
@@ -31,7 +37,11 @@ _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for nam
     help="1: joint torques; 2: motor and joint torques; 3: their difference.",
 )
 @click.option(
-    "--estimator", type=click.Choice(tuple(ESTIMATORS)), default="wls", show_default=True, help="See below."
+    "--estimator",
+    type=click.Choice((AUTO, *ESTIMATORS)),
+    default=AUTO,
+    show_default=True,
+    help="See below. The paper's is wls.",
 )
 @click.option(
     "--payload",
@@ -40,7 +50,12 @@ _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for nam
     help="Payload of a session, in place of its metadata; `none`: the bare arm.",
 )
 @click.option("--urdf", type=click.Path(path_type=Path), help="Kinematics; default: from the first session.")
-@click.option("--tilt", is_flag=True, help="Estimate the tilt of the base too.")
+@click.option(
+    "--tilt", is_flag=True, help="Estimate the tilt of the base too; `auto` otherwise does so where it helps."
+)
+@click.option(
+    "--without", multiple=True, metavar="NAME", help="Parameter (`offm3`) or kind (`Fvl`) to leave out."
+)
 @click.option("--essential", is_flag=True, help="Reduce the model to its essential parameters.")
 @click.option(
     "--test",
@@ -69,6 +84,7 @@ def command(
     payload: tuple[str, ...],
     urdf: Path | None,
     tilt: bool,
+    without: tuple[str, ...],
     essential: bool,
     test: tuple[Path, ...],
     settings: str | None,
@@ -85,6 +101,7 @@ def command(
 
     \b
     lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
+    lwr-run identify unloaded.mcap loaded.mcap --estimator wls
     lwr-run identify unloaded.mcap --model 1 --estimator huber
     lwr-run identify unloaded.mcap loaded.mcap --test another.mcap --results monday
     lwr-run identify short.mcap --model 1 --estimator physical --tilt
@@ -92,6 +109,7 @@ def command(
     """
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
     wanted = read.identification(model, estimator, file=settings or "")
+    wanted = replace(wanted, without=(*wanted.without, *without))
     if essential and wanted.essential is None:
         raise ConfigurationError(
             f"--essential needs the essential parameters, and {settings} has `essential: null`; leave one out"
@@ -103,8 +121,14 @@ def command(
     if urdf is None and logs[0].robot_description is None:
         raise ConfigurationError(f"{sessions[0]}: holds no robot description; name the URDF with --urdf")
     chain = Chain.from_urdf(urdf if urdf is not None else str(logs[0].robot_description))
-    mounting = find_mounting(logs, chain, wanted) if tilt else None
-    found = identify(logs, chain, wanted) if mounting is None else mounting.identification
+    mounting = None
+    if estimator == AUTO:
+        found = choose(logs, chain, wanted, tilt=tilt or None)
+    elif tilt:
+        mounting = find_mounting(logs, chain, wanted)
+        found = mounting.identification
+    else:
+        found = identify(logs, chain, wanted)
     result = named_model(
         found.essential_model if essential else found.model, logs[0].metadata.get("robot", "arm")
     )
