@@ -14,6 +14,7 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
+from ident.estimation.choice import compared
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.validate import validate
 from ident.estimators.estimate import Estimate
@@ -42,7 +43,9 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     unseen = unseen_sessions(experiment)
     kept = [r.path for r in records if r.status == "success" and r.name not in unseen]
     sessions = [read_session(path, status=False) for path in kept]
-    return identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    found = identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    # Beside the experiment's own estimator, what the others would predict.
+    return dataclasses.replace(found, choice=compared(found, sessions, used=str(wanted.estimator)))
 
 
 def unseen_sessions(experiment: Experiment) -> frozenset[str]:

@@ -3,17 +3,10 @@
 Candidates are weighted least squares, and physically consistent bodies with the inertials of the URDF as prior: as
 stated, and with looser standard deviations. Each is scored with the base upright and leaning.
 
-**Parts.** An arm is asked for motions it has not made, so a part held back must differ from the rest. Neighbouring
-rows are alike, and a motion repeats itself, within a session or in the next one. Hence the rows are cut into blocks of
-time longer than the reach of the row filter and the correlation of the residual. Blocks with similar rows of the
-normalised regressor make up a part (Ward's clustering, 1963), whatever their session and time: what is held back
-then belongs to a region of the motion missing in the rest. The filters' leakage is kept out by dropping rows on both
-sides of a block. Sessions with different payloads are cut into parts of their own, one of each held back together, so
-that every payload stays in the training rows.
-
-**Choice.** The error is over all torques of all parts. Among the candidates within one standard error of the best
-(Breiman et al. 1984), the one with the most prior knowledge wins: prior as stated before looser ones before least
-squares, upright before leaning.
+**Choice.** The squared error over the squared torque counts, over all joints and parts (`ident.estimation.parts`);
+motor and joint side count alike. Among the candidates within one standard error of the best (Breiman et al. 1984), or
+within one percent of it, the one with the most prior knowledge wins: prior as stated before looser ones before least
+squares, upright before leaning. Deviations of the prior are loosened as long as the error falls.
 
 Normal equations of each part are made once, so a linear candidate costs a solution a part, a physical one a conic
 program.
@@ -21,20 +14,20 @@ program.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.optimize import linear_sum_assignment
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.estimation.identify import Identification, IdentificationSettings, estimator_factory, identify
 from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
+from ident.estimation.parts import beside, held_back_parts
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import WeightedLeastSquares
@@ -44,14 +37,16 @@ from ident.estimators.problem import Problem
 from ident.rows.filters import half_width
 from lwr_driver.session import Sessions, as_sessions
 
-PARTS = 8
-"""Number of parts. `python -m benchmarks.real_data` compares the held-back errors with those on other motions: with
-fewer parts every candidate extrapolates beyond any use, with more of them a part has its like in the rest."""
-
 _SCALES = (1.0, 10.0, 100.0)
 _TILT_STD_RAD = float(np.deg2rad(2.0))
 _GAIN_STD = 0.05
+# Errors this close count as equal, and a joint's error so much larger is worth a sentence.
+_ALIKE = 0.01
+_NOTICED = 0.1
 _PLAIN = CovarianceSettings(kind="textbook")
+
+Kind = tuple[str, float | None, bool]
+"""Estimator, factor on the variance of the prior, leaning base."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +54,8 @@ class Candidate:
     """An estimator with its error on held-back parts.
 
     estimator : "wls" or "physical". prior_scale : factor on the variance of the prior, None without one.
-    tilt : whether the base leans. held_back_percent : rms of the error over rms of the torque [%], all rows.
+    tilt : whether the base leans. held_back_percent : rms of the error over rms of the torque [%], over all joints of
+    a side; for two sides the root mean square of both.
     by_joint_percent : the same by joint and side. excess, excess_std : difference of the squared error to the best
     candidate's, over the squared torque, and its standard error over the parts.
     """
@@ -87,6 +83,7 @@ class Choice(Tabular):
     candidates : in the order of preference. chosen : number of the winner. parts, block_s : of the held-back rows.
     excluded : candidates that the data do not permit, with the reason. disagreement : between the URDF's inertials
     and the data. advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
+    used : the estimator taken instead of the winner; empty for the winner itself.
     """
 
     candidates: tuple[Candidate, ...]
@@ -97,6 +94,7 @@ class Choice(Tabular):
     disagreement: Disagreement | None = None
     advice: tuple[str, ...] = ()
     mounting: Mounting | None = None
+    used: str = ""
 
     @property
     def winner(self) -> Candidate:
@@ -113,6 +111,7 @@ class Choice(Tabular):
         """Plain content for files."""
         return {
             "chosen": self.winner.title,
+            "used": self.used or self.winner.title,
             "parts": self.parts,
             "block_s": self.block_s,
             "candidates": [
@@ -129,10 +128,11 @@ class Choice(Tabular):
         return f"Choice of the estimator: {self.winner.title}"
 
     def __str__(self) -> str:
-        lines = [f"estimator: {self.winner.title}"]
+        instead = f"; this estimate is by {self.used}" if self.used else ""
+        lines = [f"estimator: {self.winner.title}{instead}"]
         if self.parts:
             lines = [
-                f"estimator by held-back error: {self.winner.title}",
+                f"estimator by held-back error: {self.winner.title}{instead}",
                 f"  error [% of torque] on {self.parts} parts of the motion held back in turn, in blocks of "
                 f"{self.block_s:.1f} s",
             ]
@@ -166,12 +166,7 @@ def choose(
     sessions = as_sessions(sessions)
     prior = chain.urdf is not None and settings.model != 3
     first = identify(sessions, chain, replace(settings, estimator="map" if prior else "wls", essential=None))
-    leaning = settings.model != 3 and bool(np.any(chain.gravity)) and tilt is not False
-    lean = tilt_columns(first, sessions) if leaning else None
-    comparison = _Comparison.of(first, lean, cad_prior(first.base) if prior else None)
-    choice = comparison.choice(
-        tilted=(tilt,) if tilt is not None and leaning else (False, True)[: 1 + leaning]
-    )
+    choice = compared(first, sessions, tilt=tilt)
     winner = choice.winner
     options = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
     final = replace(settings, estimator=estimator_factory(winner.estimator, **options))
@@ -181,6 +176,21 @@ def choose(
     else:
         found = identify(sessions, chain, final)
     return replace(found, settings=settings, choice=choice)
+
+
+def compared(
+    found: Identification, sessions: Sessions, *, tilt: bool | None = None, used: str = ""
+) -> Choice:
+    """The candidates' errors on held-back parts of the sessions of an identification, and the best of them.
+
+    tilt : as for `choose`. used : the estimator of the identification, if it stays whatever is found.
+    """
+    chain, model = found.structure.chain, found.settings.model
+    leaning = model != 3 and bool(np.any(chain.gravity)) and tilt is not False
+    lean = tilt_columns(found, as_sessions(sessions)) if leaning else None
+    bodies = cad_prior(found.base) if chain.urdf is not None and model != 3 else None
+    tilted = (False,) if not leaning else (False, True) if tilt is None else (True,)
+    return replace(_Comparison.of(found, lean, bodies).choice(tilted), used=used)
 
 
 @dataclass(frozen=True)
@@ -232,9 +242,9 @@ class _Comparison:
             total[row_class] += matrix.T @ matrix
             for k in range(count):
                 mine = part == k
-                beside = _beside(group.time_index, mine, (block + 1) // 2)
+                around = beside(group.time_index, mine, (block + 1) // 2)
                 held[k, row_class] += matrix[mine].T @ matrix[mine]
-                near[k, row_class] += matrix[beside].T @ matrix[beside]
+                near[k, row_class] += matrix[around].T @ matrix[around]
         return cls(
             problem,
             None if lean is None else with_tilt(problem, lean),
@@ -250,27 +260,40 @@ class _Comparison:
 
     def choice(self, tilted: Sequence[bool]) -> Choice:
         """All candidates, and the preferred one within a standard error of the best."""
-        kinds: list[tuple[str, float | None, bool]] = []
-        if self.bodies is not None:
-            kinds += [("physical", scale, tilt) for scale in _SCALES for tilt in tilted]
-        if self.full_rank:
-            kinds += [("wls", None, tilt) for tilt in tilted]
-        unseen = ", ".join(self.unseen) or "all parameters"
+        bodies = self.bodies is not None
+        unseen = ", ".join(self.unseen[:8]) + (
+            f" and {len(self.unseen) - 8} more" if len(self.unseen) > 8 else ""
+        )
         excluded = () if self.full_rank else (f"wls, because the motion does not show {unseen}",)
         advice = list(self._placeholder())
         if len(self.held) < 2:
-            kind = kinds[0]
-            unknown = Candidate(*kind, float("nan"), {})
+            unknown = Candidate(
+                "physical" if bodies else "wls", 1.0 if bodies else None, tilted[0], math.nan, {}
+            )
             text = f"not compared: the motion is too short for parts of {self.block_s:.1f} s to be held back"
             return Choice((unknown,), 0, 0, self.block_s, excluded, self._disagreement(), (text, *advice))
-        squares = np.array([self._errors(*kind) for kind in kinds])
-        torque = self.held[:, :, -1, -1]
-        share = squares.sum(axis=2) / torque.sum()
+        found: dict[Kind, Floats] = {}
+        for tilt in tilted if bodies else ():
+            for scale in _SCALES:
+                found["physical", scale, tilt] = self._errors("physical", scale, tilt)
+                before = found.get(("physical", 0.1 * scale, tilt))
+                if (
+                    before is not None
+                    and self._share(before).sum() < self._share(found["physical", scale, tilt]).sum()
+                ):
+                    break
+        if self.full_rank:
+            found |= {("wls", None, tilt): self._errors("wls", None, tilt) for tilt in tilted}
+        kinds = sorted(found, key=lambda kind: (math.inf if kind[1] is None else kind[1], kind[2]))
+        squares = np.array([found[kind] for kind in kinds])
+        share = np.array([self._share(square) for square in squares])
         best = int(np.argmin(share.sum(axis=1)))
         excess, std = _paired(share - share[best])
-        chosen = next(k for k in range(len(kinds)) if excess[k] <= std[k])
+        alike = ((1.0 + _ALIKE) ** 2 - 1.0) * share[best].sum()
+        chosen = next(k for k in range(len(kinds)) if excess[k] <= max(std[k], alike))
         labels = [c.label for c in self.problem.classes]
-        joint = 100.0 * np.sqrt(squares.sum(axis=1) / np.maximum(torque.sum(axis=0), 1e-300))
+        torque = self.held[:, :, -1, -1].sum(axis=0)
+        joint = 100.0 * np.sqrt(squares.sum(axis=1) / np.maximum(torque, 1e-300))
         whole = 100.0 * np.sqrt(share.sum(axis=1))
         candidates = tuple(
             Candidate(
@@ -287,6 +310,14 @@ class _Comparison:
         return Choice(
             candidates, chosen, len(self.held), self.block_s, excluded, self._disagreement(), tuple(advice)
         )
+
+    def _share(self, squares: Floats) -> Floats:
+        """Squared error of each part (parts,) over the squared torque of a side, mean of the sides."""
+        sides = [c.side for c in self.problem.classes]
+        torque = self.held[:, :, -1, -1].sum(axis=0)
+        total = np.array([sum(t for t, s in zip(torque, sides, strict=True) if s == side) for side in sides])
+        part: Floats = (squares / np.maximum(total, 1e-300)).sum(axis=1) / len(set(sides))
+        return part
 
     def _errors(self, estimator: str, scale: float | None, tilt: bool) -> Floats:
         """Squared error (parts, classes) [Nm^2] of a candidate on each part, estimated without it."""
@@ -380,7 +411,7 @@ class _Comparison:
                 )
                 yield f"least squares predicts single joints better than the chosen estimator: {listed}"
 
-    def _gain_advice(self, kind: tuple[str, float | None, bool]) -> Iterator[str]:
+    def _gain_advice(self, kind: Kind) -> Iterator[str]:
         """Whether a gain of each joint torque sensor would help the prediction, by more than two standard errors."""
         estimator, scale, tilt = kind
         if self.bodies is None or estimator != "physical" or not len(self.gains):
@@ -396,8 +427,8 @@ class _Comparison:
         precision[: len(used), : len(used)] = plain.precision / scale
         wide = Prior(np.append(plain.mean, np.zeros(len(self.gains))), precision)
         columns = np.append(used, self.gains)
-        before = self._scores(used, weights, _scaled(plain, scale)).sum(axis=1)
-        after = self._scores(columns, weights, wide).sum(axis=1)
+        before = self._share(self._scores(used, weights, _scaled(plain, scale)))
+        after = self._share(self._scores(columns, weights, wide))
         excess, std = _paired((before - after)[None])
         if excess[0] <= 2.0 * std[0]:
             return
@@ -408,80 +439,13 @@ class _Comparison:
         gains = _solution(normal, wide)[-len(self.gains) :]
         spread = np.sqrt(np.diag(np.linalg.inv(normal[:-1, :-1] + wide.precision))[-len(self.gains) :])
         joints = list(dict.fromkeys(group.joint for group in self.problem.groups if group.side == "joint"))
-        torque = float(self.held[:, :, -1, -1].sum())
         worst = int(np.argmax(np.abs(gains) / spread))
         yield (
             f"with a gain for each joint torque sensor the held-back error would fall from "
-            f"{100 * np.sqrt(before.sum() / torque):.2f} to {100 * np.sqrt(after.sum() / torque):.2f} % "
+            f"{100 * np.sqrt(before.sum()):.2f} to {100 * np.sqrt(after.sum()):.2f} % "
             f"({joints[worst]} reads {100 * gains[worst]:+.1f} ± {100 * spread[worst]:.1f} %); `lwr-run diagnose` "
             "decides between a gain and its look-alikes, and writes a model with it"
         )
-
-
-def held_back_parts(
-    problem: Problem, payloads: Sequence[str | None], block: int, count: int = PARTS
-) -> list[NDArray[np.int64]]:
-    """Number of the part of each row, for each row group; all -1 for a motion too short for two parts.
-
-    block : rows of a block. count : number of parts, fewer for fewer than two blocks a part.
-    """
-    labels = {c.label: k for k, c in enumerate(problem.classes)}
-    size = len(problem.names)
-    scale = np.sqrt(
-        sum(np.einsum("ij,ij->j", c.factor.r[:, :-1], c.factor.r[:, :-1]) for c in problem.classes)
-    )
-    scale = np.where(scale > 0.0, scale / np.sqrt(problem.rows), 1.0)
-    sums: dict[tuple[int, int], Floats] = {}
-    rows: dict[tuple[int, int], NDArray[np.int64]] = {}
-    for group in problem.groups:
-        numbers = group.time_index // block
-        edges = np.flatnonzero(np.diff(numbers, prepend=-1))
-        if not len(edges):
-            continue
-        means = np.add.reduceat(group.matrix, edges, axis=0) / scale
-        for place, total, n in zip(edges, means, np.diff(np.append(edges, len(numbers))), strict=True):
-            key = group.record, int(numbers[place])
-            sums.setdefault(key, np.zeros((len(labels), size)))[labels[group.label]] += total
-            rows.setdefault(key, np.zeros(len(labels), dtype=np.int64))[labels[group.label]] += n
-    table: dict[tuple[int, int], int] = {}
-    centres: Floats | None = None
-    conditions = list(dict.fromkeys(payloads[record] for record, _ in sums))
-    members = {c: [key for key in sums if payloads[key[0]] == c] for c in conditions}
-    count = min(count, *(len(keys) // 2 for keys in members.values()))
-    if count < 2:
-        return [np.full(len(group.target), -1) for group in problem.groups]
-    for keys in members.values():
-        seen = np.array([rows[key] for key in keys])[:, :, None]
-        features = np.array([sums[key] for key in keys]) / np.maximum(seen, 1)
-        mean = (features * (seen > 0)).sum(axis=0) / np.maximum((seen > 0).sum(axis=0), 1)
-        # A joint without rows in a block says nothing of where the block belongs.
-        flat = np.where(seen > 0, features - mean, 0.0).reshape(len(keys), -1)
-        part = fcluster(linkage(flat, "ward"), count, "maxclust") - 1
-        own = np.array([(flat[part == k]).mean(axis=0) for k in range(int(part.max()) + 1)]) + mean.ravel()
-        if centres is None:
-            centres = own
-        else:
-            distance = np.linalg.norm(own[:, None] - centres[None], axis=2)
-            part = linear_sum_assignment(distance)[1][part]
-        table |= dict(zip(keys, part.tolist(), strict=True))
-    return [
-        np.array([table[group.record, int(t)] for t in group.time_index // block], dtype=np.int64)
-        for group in problem.groups
-    ]
-
-
-def _beside(time_index: NDArray[np.int64], chosen: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Rows chosen or within `reach` time indices of one."""
-    if not chosen.any():
-        return chosen
-    first = int(time_index[0])
-    line = np.zeros(int(time_index[-1]) - first + 1)
-    line[time_index[chosen] - first] = 1.0
-    return (
-        np.asarray(np.convolve(line, np.ones(2 * reach + 1), "same")[: len(line)][time_index - first] > 0.5)
-        if len(line) > 2 * reach
-        else np.ones_like(chosen)
-    )
 
 
 def _paired(difference: Floats) -> tuple[Floats, Floats]:
