@@ -71,7 +71,10 @@ def held_back_parts(
             centres = own
         else:
             distance = np.linalg.norm(own[:, None] - centres[None], axis=2)
-            part = linear_sum_assignment(distance)[1][part]
+            like = distance.argmin(axis=1)
+            matched, partner = linear_sum_assignment(distance)
+            like[matched] = partner
+            part = like[part]
         table |= dict(zip(keys, part.tolist(), strict=True))
     return [
         np.array([table[group.record, int(t)] for t in group.time_index // block], dtype=np.int64)
