@@ -168,7 +168,7 @@ def choose(
     first = identify(sessions, chain, replace(settings, estimator="map" if prior else "wls", essential=None))
     choice = compared(first, sessions, tilt=tilt)
     winner = choice.winner
-    options = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
+    options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
     final = replace(settings, estimator=estimator_factory(winner.estimator, **options))
     if winner.tilt:
         mounting = find_mounting(sessions, chain, final)
