@@ -44,6 +44,8 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     kept = [r.path for r in records if r.status == "success" and r.name not in unseen]
     sessions = [read_session(path, status=False) for path in kept]
     found = identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    if found.choice is not None:
+        return found
     # Beside the experiment's own estimator, what the others would predict.
     return dataclasses.replace(found, choice=compared(found, sessions, used=str(wanted.estimator)))
 
