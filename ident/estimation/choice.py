@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
@@ -40,9 +41,8 @@ from lwr_driver.session import Sessions, as_sessions
 _SCALES = (1.0, 10.0, 100.0)
 _TILT_STD_RAD = float(np.deg2rad(2.0))
 _GAIN_STD = 0.05
-# Errors this close count as equal, and a joint's error so much larger is worth a sentence.
+# Errors this close to one another count as equal, and so much of a joint's torque as nothing.
 _ALIKE = 0.01
-_NOTICED = 0.1
 _PLAIN = CovarianceSettings(kind="textbook")
 
 Kind = tuple[str, float | None, bool]
@@ -275,7 +275,11 @@ class _Comparison:
         found: dict[Kind, Floats] = {}
         for tilt in tilted if bodies else ():
             for scale in _SCALES:
-                found["physical", scale, tilt] = self._errors("physical", scale, tilt)
+                try:
+                    found["physical", scale, tilt] = self._errors("physical", scale, tilt)
+                except DataError as error:
+                    excluded = (*excluded, f"physical: {error}")
+                    break
                 before = found.get(("physical", 0.1 * scale, tilt))
                 if (
                     before is not None
@@ -402,7 +406,10 @@ class _Comparison:
                 continue
             excess, std = _paired((squares[chosen] - squares[k]).T)
             worse = [
-                c.label for c, e, s in zip(self.problem.classes, excess, std, strict=True) if e > 2.0 * s
+                c.label
+                for c, e, s in zip(self.problem.classes, excess, std, strict=True)
+                if e > 2.0 * s
+                and mine.by_joint_percent[c.label] > other.by_joint_percent[c.label] + 100.0 * _ALIKE
             ]
             if worse:
                 listed = ", ".join(
