@@ -100,7 +100,8 @@ def _errors(found: Identification, test: Session) -> str:
         text = f"validate: {error}"
     if test.joint.effort.shape[1]:
         for band in _BAND_HZ:
-            text += f", below {band:g} Hz: {low_passed_error(found.model, test, band):.2f} %"
+            error = low_passed_error(found.model, test, band)
+            text += "" if np.isnan(error) else f", below {band:g} Hz: {error:.2f} %"
     return text
 
 
@@ -112,7 +113,10 @@ def _messages(found: Identification) -> None:
 
 
 def low_passed_error(model: DynamicModel, session: Session, band_hz: float) -> float:
-    """Relative error [%] of the joint torque over all joints, position and both torques low-passed alike."""
+    """Relative error [%] of the joint torque over all joints, position and both torques low-passed alike.
+
+    NaN for a session of six periods of the band's edge or less.
+    """
     joint = session.joint
     times = 1e-9 * (joint.log_time - joint.log_time[0]).astype(np.float64)
     fresh = np.append(True, np.diff(times) > 0.0)
@@ -126,6 +130,8 @@ def low_passed_error(model: DynamicModel, session: Session, band_hz: float) -> f
     q = low_pass(q, dt, band_hz)
     computed = model.torque(q, *differentiate(q, dt), side="joint", time=even, measured=True)
     torque, computed = low_pass(torque, dt, band_hz), low_pass(computed, dt, band_hz)
+    if even[-1] <= 2.0 * _END_PERIODS / band_hz:
+        return float("nan")
     end = round(_END_PERIODS / band_hz / dt)
     inner = slice(end, len(even) - end)
     error: float = np.linalg.norm((torque - computed)[inner]) / np.linalg.norm(torque[inner])
