@@ -100,8 +100,8 @@ def _errors(found: Identification, test: Session) -> str:
         text = f"validate: {error}"
     if test.joint.effort.shape[1]:
         for band in _BAND_HZ:
-            error = low_passed_error(found.model, test, band)
-            text += "" if np.isnan(error) else f", below {band:g} Hz: {error:.2f} %"
+            figure = low_passed_error(found.model, test, band)
+            text += "" if np.isnan(figure) else f", below {band:g} Hz: {figure:.2f} %"
     return text
 
 
@@ -134,8 +134,7 @@ def low_passed_error(model: DynamicModel, session: Session, band_hz: float) -> f
         return float("nan")
     end = round(_END_PERIODS / band_hz / dt)
     inner = slice(end, len(even) - end)
-    error: float = np.linalg.norm((torque - computed)[inner]) / np.linalg.norm(torque[inner])
-    return 100.0 * float(error)
+    return 100.0 * float(np.linalg.norm((torque - computed)[inner]) / np.linalg.norm(torque[inner]))
 
 
 @contextmanager
