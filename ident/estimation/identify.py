@@ -49,7 +49,8 @@ class IdentificationSettings:
 
     model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
     estimator : one of `ESTIMATORS`, "auto" (the best on held-back parts of the motion), or a factory from base set,
-        problem and covariance settings to an estimator. "iv" takes the commanded motion as instruments. "wls" (default) uses the data alone.
+        problem and covariance settings to an estimator. "iv" takes the commanded motion as instruments. "wls"
+        (default) uses the data alone.
         "physical" (consistent bodies within 20 % of the URDF's) predicts new motions best, above all after a
         short or weakly exciting recording: on three runs of a real LWR4+ its error is 3 to 4 %, that of least
         squares 9 to 14 % (`benchmarks/real_data.py`).
