@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.real_arms import ARMS, low_passed_error
 from ident.diagnosis import ArmData, Diagnosis, diagnose
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
@@ -24,7 +25,7 @@ from ident.import_log import LogMapping, import_log
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 
-__all__ = ["iiwa14", "lwr4", "tx40"]
+__all__ = ["iiwa14", "lwr4", "tx40", "xmate"]
 
 _SWEEPS = {
     "joint 4, 0.2 rad/s": ("joint4/vel_p2",),
@@ -43,6 +44,22 @@ def lwr4(data: Any) -> None:
         _show(f"LWR4+, runs {', '.join(map(str, train))}, measured on run {test}", found, start)
         before, after = (data.model_relative(m, test) for m in (found.base_model, found.extended_model))
         print(f"  relative error over all joints {before:.2f} % -> {after:.2f} %")
+
+
+def xmate(folder: Path) -> None:
+    """Runs 1 and 2, measured on run 3, torques low-passed as in the comparison of the estimators."""
+    arm = next(arm for arm in ARMS if arm.folder == folder.name)
+    chain = Chain.from_urdf(folder / arm.urdf)
+    sessions = arm.read(folder, chain)
+    for train, test in arm.splits:
+        start = time.process_time()
+        found = diagnose([sessions[name] for name in train], chain, test=[sessions[test]])
+        _show(f"{arm.title}, runs {', '.join(train)}, measured on run {test}", found, start)
+        for band in (2.0, 10.0):
+            before, after = (
+                low_passed_error(m, sessions[test], band) for m in (found.base_model, found.extended_model)
+            )
+            print(f"  relative error over all joints below {band:g} Hz: {before:.2f} % -> {after:.2f} %")
 
 
 def tx40(folder: Path) -> None:

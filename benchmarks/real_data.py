@@ -4,7 +4,9 @@ Run `python -m benchmarks.real_data [--data FOLDER]`. The folder holds measureme
 URDF files that FloBaRoID published (github kjyv/FloBaRoID, data/KUKA/HW and model, LGPL-3): Model 1, joint
 torque sensors, 25 s a run. Runs 1 and 2 repeat one trajectory, run 3 is another, twice as fast.
 
-The diagnosis of these runs follows, and of the TX40 and iiwa 14 recordings beside them (`real_cases.py`).
+`lwr-run identify` as it comes on every arm stands first (`real_arms.py`).
+
+The diagnosis of these runs follows, and of the xMate, TX40 and iiwa 14 recordings beside them (`real_cases.py`).
 
 Each estimate is made with the settings as they come, from the training runs alone. The score is the one that
 others use on these files: the file's own q, qd, qdd, all samples from the first to the last, every ninth,
@@ -17,7 +19,8 @@ import argparse
 import dataclasses
 import os
 
-from benchmarks.real_cases import iiwa14, lwr4, tx40
+from benchmarks.real_arms import defaults
+from benchmarks.real_cases import iiwa14, lwr4, tx40, xmate
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -46,6 +49,7 @@ Runs = tuple[int, ...]
 
 EVERY = 9
 ESTIMATORS = ("ols", "wls", "huber", "map", "physical")
+AUTOMATIC = "auto"
 LEANING = "physical, leaning"
 DECIDED = "stated, data decide"
 SPLITS: tuple[tuple[Runs, int], ...] = (
@@ -127,7 +131,7 @@ def label(train: Runs, test: int) -> str:
 
 
 def held_out(data: Recordings) -> None:
-    columns = (*ESTIMATORS, LEANING)
+    columns = (*ESTIMATORS, LEANING, AUTOMATIC)
     print("Relative error on a run that was not used [%]")
     print(
         f"{'train -> test':<14}"
@@ -215,6 +219,9 @@ def main(arguments: Sequence[str]) -> int:
         "--diagnosis-only", action="store_true", help="leave out the tables of the estimators"
     )
     parser.add_argument(
+        "--defaults-only", action="store_true", help="only `lwr-run identify` as it comes, on every arm"
+    )
+    parser.add_argument(
         "--data", type=Path, default=CONFIGS.parents[1] / "shared" / "data" / "lwr4_flobaroid"
     )
     wanted = parser.parse_args(arguments)
@@ -223,12 +230,16 @@ def main(arguments: Sequence[str]) -> int:
         print(f"no recordings in {folder}: fetch them (see the head of this file) and name them with --data")
         return 2
     start = time.process_time()
+    defaults(folder.parent)
+    if wanted.defaults_only:
+        print(f"\nCPU {time.process_time() - start:.1f} s")
+        return 0
     data = Recordings(folder)
     if not wanted.diagnosis_only:
         for table in (held_out, per_joint, honesty, priors, tilts):
             table(data)
     lwr4(data)
-    for name, case in (("tx40", tx40), ("iiwa14", iiwa14)):
+    for name, case in (("xmate7p", xmate), ("tx40", tx40), ("iiwa14", iiwa14)):
         if (folder.parent / name).is_dir():
             case(folder.parent / name)
         else:

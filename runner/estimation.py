@@ -13,7 +13,7 @@ from typing import Any, Literal
 from fri.errors import ConfigurationError
 from ident.dynamics.structure import Coulomb, Coupling
 from ident.estimation.essential import EssentialSettings
-from ident.estimation.identify import IdentificationSettings, estimator_factory
+from ident.estimation.identify import AUTO, IdentificationSettings, estimator_factory
 from ident.estimators import ESTIMATORS, CovarianceSettings
 from ident.rows.filters import SignalSettings
 from lwr_driver.configuration import find, parse, read_mapping
@@ -33,12 +33,25 @@ class EstimatorOptions:
 
 
 @dataclass(frozen=True)
+class CoulombSettings:
+    """The function in place of sign(qd): "data" takes the one that predicts best."""
+
+    kind: Literal["data", "sign", "deadband", "tanh"] = "data"
+    width: float = 0.0
+
+    @property
+    def law(self) -> Coulomb | None:
+        """The law, None for a choice from the data."""
+        return None if self.kind == "data" else Coulomb(self.kind, self.width)
+
+
+@dataclass(frozen=True)
 class IdentifySettings:
     """Content of a settings file of `lwr-run identify`. `KEYS` describes each key."""
 
     without: tuple[str, ...] = ()
     couplings: tuple[tuple[str, str], ...] = ()
-    coulomb: Coulomb = field(default_factory=Coulomb)
+    coulomb: CoulombSettings = field(default_factory=CoulombSettings)
     resonance_hz: float | None = None
     estimator: EstimatorOptions = field(default_factory=EstimatorOptions)
     covariance: CovarianceSettings = field(default_factory=CovarianceSettings)
@@ -66,7 +79,7 @@ class IdentifySettings:
         """The settings for `ident`, with the model and the estimator of the command line. file : for errors."""
         given = {name: value for name, value in vars(self.estimator).items() if value is not None}
         for name, value in given.items():
-            if name not in ESTIMATORS[estimator].options:
+            if estimator == AUTO or name not in ESTIMATORS[estimator].options:
                 takers = [other for other, kind in ESTIMATORS.items() if name in kind.options]
                 raise ConfigurationError(
                     f"{file}: `estimator.{name}` is {value}, an option of {' and '.join(takers)}, not of {estimator}; "
@@ -79,7 +92,7 @@ class IdentifySettings:
             covariance=self.covariance,
             without=self.without,
             couplings=tuple(map(Coupling, self.couplings)),
-            coulomb=self.coulomb,
+            coulomb=self.coulomb.law,
             resonance_hz=self.resonance_hz,
             essential=self.essential,
         )
@@ -161,7 +174,7 @@ KEYS = (
     Key("without", "names", "parameters (`offm3`) or kinds (`Fvl`) left out of the model"),
     Key("couplings", "pairs of joints", "joints with coupled drives, such as `[[A5, A6]]`"),
     Key("resonance_hz", "Hz", "lowest resonance of the arm, for advice on cut-offs", above=0.0, otherwise="no advice"),
-    Key("coulomb.kind", "", "function in place of sign(qd) in the Coulomb friction"),
+    Key("coulomb.kind", "", "function in place of sign(qd) in the Coulomb friction; `data`: the best predictor"),
     Key("coulomb.width", "rad/s", "width of `deadband` and `tanh`, above 0 for these", least=0.0),
     Key(
         "estimator.tuning", "standard deviations", "`huber`, `tukey`: threshold of the loss", above=0.0,
@@ -195,21 +208,30 @@ KEYS = (
     ),
     Key("covariance.draws", "", "`bootstrap`: number of draws", least=2),
     Key("covariance.seed", "", "`bootstrap`: seed of the draws", least=0),
-    Key("signals.cutoff_hz", "Hz", "low-pass of the positions, -6 dB", above=0.0),
+    Key("signals.cutoff_hz", "Hz", "low-pass of the positions, -6 dB", above=0.0, otherwise="from the data"),
     Key("signals.order", "", "order of that low-pass, run forward and back", least=1),
-    Key("signals.decimate_hz", "Hz", "low-pass of the parallel decimation, at most `cutoff_hz`", above=0.0),
+    Key(
+        "signals.decimate_hz", "Hz", "low-pass of the parallel decimation, at most `cutoff_hz`", above=0.0,
+        otherwise="from the data",
+    ),
     Key("signals.rate_hz", "Hz", "rate of the rows", above=0.0, otherwise="2.5 `decimate_hz`"),
     Key("signals.attenuation_db", "dB", "stop band of the parallel low-pass", above=0.0),
-    Key("signals.choose_cutoff", "", "choose `cutoff_hz` from the spectrum of the positions"),
     Key("signals.average_periods", "", "average the periods of a periodic motion"),
     Key("signals.edge_s", "s", "time dropped at both ends of a stretch", least=0.0, otherwise="2 / `cutoff_hz`"),
     Key("signals.longest_bridge_s", "s", "longest gap closed by interpolation; longer gaps split a record", least=0.0),
-    Key("signals.bridged_share", "", "largest share of interpolated samples in a row", least=0.0, most=1.0),
+    Key(
+        "signals.reversal_s", "s", "time left out on either side of a joint's reversal", least=0.0,
+        otherwise="from the data",
+    ),
     Key("signals.standstill_rad_s", "rad/s", "speed below which the sign of friction is unknown", least=0.0),
-    Key("signals.standstill_share", "", "largest share of such samples in a row; 1 keeps all", least=0.0, most=1.0),
+    Key("signals.known_share", "", "least share of a row on samples measured and away from reversals", least=0.0, most=1.0),
     Key("signals.outlier_scale", "standard deviations", "distance of outliers from the running median", above=0.0),
     Key("signals.motor_delay_s", "s", "delay of the motor torques"),
     Key("signals.delay_search_s", "s", "largest delay considered, both ways", above=0.0),
+    Key(
+        "signals.stiffness_nm_rad", "Nm/rad", "stiffness of the joints, one value each", above=0.0,
+        otherwise="that of the arm file, else rigid joints",
+    ),
     Key("essential.significance", "", "level of the F test of a parameter against zero", above=0.0, most=1.0),
     Key("essential.largest_loss_percent", "%", "growth of the residual by all eliminations together", least=0.0),
     Key("essential.keep", "names", "parameters or kinds that stay"),

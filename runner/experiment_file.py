@@ -154,8 +154,8 @@ class Identification:
 
     model: Literal[1, 2, 3] = 2
     estimator: str = "wls"
-    cutoff_hz: float = 10.0
-    decimate_hz: float = 2.0
+    cutoff_hz: float | None = None
+    decimate_hz: float | None = None
 
 
 @dataclass(frozen=True)

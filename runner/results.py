@@ -15,6 +15,7 @@ import numpy as np
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
+from ident.estimation.choice import compared
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.scores import by_side
 from ident.estimation.validate import validate
@@ -37,14 +38,20 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     wanted = experiment.identification
     settings = IdentificationSettings(
         model=wanted.model,
-        signals=SignalSettings(cutoff_hz=wanted.cutoff_hz, decimate_hz=wanted.decimate_hz),
+        signals=SignalSettings(
+            cutoff_hz=wanted.cutoff_hz, decimate_hz=wanted.decimate_hz, stiffness_nm_rad=tuple(arm.stiffness.tolist())
+        ),
         estimator=wanted.estimator,
         resonance_hz=arm.resonance_hz,
     )
     unseen = unseen_sessions(experiment)
     kept = [r.path for r in records if r.status == "success" and r.name not in unseen]
     sessions = [read_session(path, status=False) for path in kept]
-    return identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    found = identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    if found.choice is not None:
+        return found
+    # Beside the experiment's own estimator, what the others would predict.
+    return dataclasses.replace(found, choice=compared(found, sessions, used=str(wanted.estimator)))
 
 
 def unseen_sessions(experiment: Experiment) -> frozenset[str]:

@@ -256,7 +256,7 @@ def _exogeneity(estimate: Estimate, instrumental: Estimate | None) -> Check:
 
 
 def _condition(problem: Problem) -> Check:
-    normalised = problem.require_rank()
+    normalised = problem.normalised_condition
     return Check(
         "condition number",
         normalised < _WIDE_CONDITION,

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,9 +33,15 @@ from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session, Sessions, as_sessions
 
+if TYPE_CHECKING:
+    from ident.estimation.choice import Choice
+
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
+
+AUTO = "auto"
+"""In place of the name of an estimator: the one that predicts best, see `ident.estimation.choice`."""
 
 _WIDE_CONDITION = 100.0
 
@@ -45,13 +51,15 @@ class IdentificationSettings:
     """Model, estimator and signal processing of an identification.
 
     model : 1 (joint torque), 2 (motor and joint torque), 3 (their difference).
-    estimator : one of `ESTIMATORS`, or a factory from base set, problem and covariance settings to an
-        estimator. "iv" takes the commanded motion as instruments. "wls" (default) uses the data alone.
+    estimator : one of `ESTIMATORS`, "auto" (the best on held-back parts of the motion), or a factory from base set,
+        problem and covariance settings to an estimator. "iv" takes the commanded motion as instruments. "wls"
+        (default) uses the data alone.
         "physical" (consistent bodies within 20 % of the URDF's) predicts new motions best, above all after a
         short or weakly exciting recording: on three runs of a real LWR4+ its error is 3 to 4 %, that of least
         squares 9 to 14 % (`benchmarks/real_data.py`).
     without : parameters left out of the model, by symbol or name. couplings : see `ModelStructure`.
-    coulomb : the function for sign(qd); None takes the one that predicts best, see `ident.rows.signal_choice`.
+    coulomb : the function for sign(qd) of the model; None takes the one that predicts best. row_coulomb : that of the
+        rows, if another; see `ident.rows.signal_choice`.
     resonance_hz : lowest structural resonance of the arm, for advice on the cut-offs.
     essential : settings of the search for essential parameters; None skips it.
     robot : name of the arm in the model; default from the sessions' metadata.
@@ -64,13 +72,14 @@ class IdentificationSettings:
     without: tuple[str, ...] = ()
     couplings: tuple[Coupling, ...] = ()
     coulomb: Coulomb | None = None
+    row_coulomb: Coulomb | None = None
     resonance_hz: float | None = None
     essential: EssentialSettings | None = field(default_factory=EssentialSettings)
     robot: str = ""
 
     def __post_init__(self) -> None:
-        if isinstance(self.estimator, str) and self.estimator not in ESTIMATORS:
-            known = ", ".join(ESTIMATORS)
+        if isinstance(self.estimator, str) and self.estimator not in (AUTO, *ESTIMATORS):
+            known = ", ".join((AUTO, *ESTIMATORS))
             raise ConfigurationError(f"estimator {self.estimator!r} is unknown; choose one of {known}")
 
 
@@ -80,8 +89,8 @@ class Identification(Tabular):
 
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
-    warnings : sentences for the report. signal_reasons : why the signal settings are as they are, where the data chose
-    them.
+    warnings : sentences for the report. choice : of the estimator, with "auto". signal_reasons : why the signal
+    settings are as they are, where the data chose them.
     """
 
     settings: IdentificationSettings
@@ -98,6 +107,7 @@ class Identification(Tabular):
     robot: str
     warnings: tuple[str, ...]
     signal_reasons: tuple[str, ...] = ()
+    choice: Choice | None = None
 
     @cached_property
     def model(self) -> DynamicModel:
@@ -124,6 +134,8 @@ class Identification(Tabular):
             ],
             "signals": signals_entry(self.settings.signals, self.prepared),
         }
+        if self.choice is not None:
+            provenance["choice"] = self.choice.to_dict()
         matrix = found.covariance.matrix
         return DynamicModel(self.robot, self.structure, names, found.values, matrix, self.base, provenance)
 
@@ -177,6 +189,8 @@ class Identification(Tabular):
             "torque_rms": self.torque_rms,
             "assumptions": self.assumptions.to_dict(),
             "essential": None if self.essential is None else self.essential.to_dict(),
+            "prior_only": list(self.estimate.prior_only),
+            "choice": None if self.choice is None else self.choice.to_dict(),
             "warnings": list(self.warnings),
         }
 
@@ -219,6 +233,8 @@ class Identification(Tabular):
         lines.append(
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
         )
+        if self.choice is not None:
+            lines += ["", str(self.choice)]
         lines += ["", self.estimate.summary(), "", self.assumptions.summary()]
         if self.essential is not None:
             lines += ["", self.essential.summary()]
@@ -240,6 +256,10 @@ def identify(
     settings = settings or IdentificationSettings()
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
+    if settings.estimator == AUTO:
+        from ident.estimation.choice import choose
+
+        return choose(sessions, chain, settings)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file")
@@ -276,11 +296,14 @@ def identify(
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     conditions = _conditions(structure, chosen, mounted)
     base = numeric_base(structure, conditions)
-    signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, settings.coulomb)
+    laws = (settings.coulomb, settings.row_coulomb)
+    signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, laws)
     rows_structure = replace(structure, coulomb=signals.row_coulomb)
     structure = replace(structure, coulomb=signals.coulomb)
     base = numeric_base(structure, conditions)
-    settings = replace(settings, signals=signals.settings, coulomb=signals.coulomb)
+    settings = replace(
+        settings, signals=signals.settings, coulomb=signals.coulomb, row_coulomb=signals.row_coulomb
+    )
     prepared, problems, instruments = [], [], []
     for session, payload in zip(chosen, mounted, strict=True):
         # One session after the other, so that memory holds the full-rate signals of one only.
@@ -304,15 +327,18 @@ def identify(
     warnings = [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
-    normalised = problem.require_rank()
-    instrumental = None
-    if len(instruments) == len(problems):
-        matrices = [group.matrix for one in instruments for group in one.groups]
-        instrumental = InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
     # With instrumental variables, this is the WLS compared with them.
     name = settings.estimator
     factory = estimator_factory(name) if isinstance(name, str) else name
-    estimate = plain = factory(base, problem, settings.covariance).fit(problem)
+    estimator = factory(base, problem, settings.covariance)
+    needs_rank = getattr(estimator, "needs_rank", True)
+    normalised = problem.require_rank() if needs_rank else problem.normalised_condition
+    full_rank = bool(np.isfinite(normalised))
+    instrumental = None
+    if len(instruments) == len(problems) and full_rank:
+        matrices = [group.matrix for one in instruments for group in one.groups]
+        instrumental = InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
+    estimate = plain = estimator.fit(problem)
     if settings.estimator == "iv":
         if instrumental is None:
             raise DataError(
@@ -324,7 +350,7 @@ def identify(
         problem, plain, instrumental=instrumental, period_rows=_common_period(prepared)
     )
     essential = None
-    if settings.essential is not None:
+    if settings.essential is not None and full_rank:
         essential = find_essential(problem, estimate, settings.essential, settings.covariance)
     warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
     warnings += _condition_warnings(normalised, estimate)
@@ -454,6 +480,11 @@ def _payload_warnings(
 def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
     if normalised < _WIDE_CONDITION:
         return []
+    if not np.isfinite(normalised):
+        named = ", ".join(estimate.prior_only)
+        return [
+            f"the motion does not determine all parameters: it does not show {named}, known from the prior alone"
+        ]
     inverse = np.linalg.inv(estimate.correlation + 1e-12 * np.eye(len(estimate.names)))
     worst = np.argsort(-np.diag(inverse))[:8]
     names = ", ".join(estimate.names[k] for k in worst)

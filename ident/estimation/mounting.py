@@ -27,6 +27,7 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
+from ident.estimators.problem import Problem
 from ident.rows.observation import observe
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import require
@@ -131,6 +132,9 @@ def find_mounting(
     # The steps need plausible values of all parameters, with any final estimator.
     inner = replace(settings, essential=None, estimator="wls" if chain.urdf is None else "map")
     found = identify(sessions, chain, inner)
+    reasons = found.signal_reasons
+    settings = replace(found.settings, essential=settings.essential, estimator=settings.estimator)
+    inner = found.settings
     done, converged = 0, False
     covariance = None
     while done < steps and not converged:
@@ -141,7 +145,7 @@ def find_mounting(
         found = identify(sessions, turned, inner)
         converged = bool(np.all(np.abs(step) < 0.1 * covariance.std))
     assert covariance is not None
-    found = identify(sessions, found.structure.chain, settings)
+    found = replace(identify(sessions, found.structure.chain, settings), signal_reasons=reasons)
     gravity = found.structure.chain.gravity
     return Mounting(axes, tilt, covariance, chain.gravity, gravity, found, done, converged)
 
@@ -175,16 +179,7 @@ def _step(
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
     columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
-    groups = tuple(
-        replace(group, matrix=np.column_stack([group.matrix, column]))
-        for group, column in zip(found.problem.groups, columns, strict=True)
-    )
-    problem = replace(
-        found.problem,
-        names=(*found.problem.names, "tilt_1", "tilt_2"),
-        groups=groups,
-        units=(*found.problem.units, "rad", "rad") if found.problem.units else (),
-    )
+    problem = with_tilt(found.problem, columns)
     estimator = MaximumAPosteriori(
         _prior(found, tilt, prior_std_rad), 1.0, CovarianceSettings(kind="jackknife")
     )
@@ -194,6 +189,25 @@ def _step(
     correlation = posterior.matrix[-2:, -2:] / np.outer(posterior.std[-2:], posterior.std[-2:])
     stated = replace(jackknife, matrix=correlation * np.outer(std, std))
     return estimate.values[-2:], stated
+
+
+def tilt_columns(found: Identification, sessions: Sequence[Session]) -> list[Floats]:
+    """d(torque) / d(tilt) (m, 2) [Nm/rad] of each row group, with the estimated parameters."""
+    gravity = found.structure.chain.gravity
+    return _columns(found, sessions, list(sideways_gravity(gravity, _axes(gravity))))
+
+
+def with_tilt(problem: Problem, columns: Sequence[Floats]) -> Problem:
+    """The problem with two further columns for the tilt."""
+    groups = tuple(
+        replace(group, matrix=np.column_stack([group.matrix, column]))
+        for group, column in zip(problem.groups, columns, strict=True)
+    )
+    names, units = (
+        (*problem.names, "tilt_1", "tilt_2"),
+        (*problem.units, "rad", "rad") if problem.units else (),
+    )
+    return replace(problem, names=names, groups=groups, units=units)
 
 
 def _columns(

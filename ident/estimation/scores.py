@@ -293,7 +293,7 @@ def score_session(
         seen=seen,
         scores=tuple(scores),
         **figures,
-        band_hz=prepared.settings.decimate_hz,
+        band_hz=prepared.settings.decimate,
         notes=notes,
         traces=traces,
     )
@@ -315,7 +315,7 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
         joint = passage.joint
         torque = torque - resampled(joint.times, joint.torque, channel.times)
     error = torque - predict(channel, side)
-    parallel = ParallelFilter(channel.times, passage.rows, settings.decimate_hz, settings.attenuation_db)
+    parallel = ParallelFilter(channel.times, passage.rows, settings.decimate, settings.attenuation_db)
     inside = _inside(channel, passage)
     used = inside[:, None] & ~flagged
     moving = used & (np.abs(channel.qd) >= settings.standstill_rad_s)

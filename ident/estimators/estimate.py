@@ -69,7 +69,7 @@ class Estimate(Tabular):
     values : (p,) estimates. covariance : the stated one. covariances : all computed ones by name
         ("textbook", "hac", "bootstrap"). weights : (classes,) inverse variances. residuals : y - A chi [Nm] of
         each row group. standard : standard parameters, if the estimator finds them. prior_scale : factor s on
-        the prior's covariance, with a prior.
+        the prior's covariance, with a prior. prior_only : names of the parameters known through the prior alone.
     """
 
     method: str
@@ -86,6 +86,7 @@ class Estimate(Tabular):
     units: tuple[str, ...] = ()
     standard: Floats | None = None
     prior_scale: float | None = None
+    prior_only: tuple[str, ...] = ()
 
     @property
     def std(self) -> Floats:
@@ -173,7 +174,7 @@ class Estimate(Tabular):
         for index, name in enumerate(self.names):
             lines.append(
                 f"{name:<10} {self.values[index]:>12.5g} {self.std[index]:>10.3g} {rsd[index]:>8.2f}  "
-                f"{units[index]}"
+                f"{units[index]}{', from the prior' if name in self.prior_only else ''}"
             )
         lines += ["", f"{'rows':<14} {'count':>7} {'n_eff':>7} {'consumed':>9} {'sigma Nm':>9} {'rms Nm':>9}"]
         lines += [
@@ -181,6 +182,11 @@ class Estimate(Tabular):
             for c in self.classes
         ]
         lines += [f"note: {note}" for note in self.notes]
+        if self.prior_only:
+            lines.append(
+                f"note: the motion does not show {', '.join(self.prior_only)}: value and standard deviation are "
+                "those of the prior"
+            )
         return "\n".join(lines)
 
 

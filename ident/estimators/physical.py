@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import clarabel
 import numpy as np
@@ -120,6 +120,8 @@ class PhysicallyConsistent:
         `standard` holds the standard parameters (n,).
     """
 
+    needs_rank: ClassVar[bool] = False
+
     prior: BodyPrior
     metric: Metric = "pullback"
     strength: Literal["evidence", "cross_validation"] | float = 1.0
@@ -128,18 +130,22 @@ class PhysicallyConsistent:
 
     def fit(self, problem: Problem) -> Estimate:
         """Estimate (p,) and `standard` (n,), with the standard deviations of the unconstrained problem."""
-        linear = MaximumAPosteriori(self.prior.prior(self.metric), self.strength, self.covariance).fit(
-            problem
-        )
+        normal = self.prior.prior(self.metric)
+        linear = MaximumAPosteriori(normal, self.strength, self.covariance).fit(problem)
         assert linear.prior_scale is not None
         shares = effective_rows(problem, linear.residuals) / [max(c.rows, 1) for c in linear.classes]
         consumed = np.array([fit.parameters for fit in linear.classes])
         p, projection = len(problem.names), self.prior.projection
+        # Friction and offsets that the rows leave open, as rows of their own.
+        weak = np.sqrt(np.diag(normal.completed(problem).precision - normal.precision) / linear.prior_scale)
+        open_, nothing = np.diag(weak)[weak > 0.0], np.zeros(int(np.count_nonzero(weak)))
         weights = np.minimum(linear.weights, _FINEST / _mean_squares(problem))
         for _ in range(_REWEIGHTINGS):
             # With active constraints the residual grows, so its weight must fall.
             factor = problem.weighted(weights * np.minimum(shares, 1.0))
-            standard = self._solve(linear.prior_scale, factor.r[:p, :p] @ projection, factor.r[:p, p])
+            matrix = np.vstack([factor.r[:p, :p], open_])
+            target = np.concatenate([factor.r[:p, p], nothing])
+            standard = self.solve(linear.prior_scale, matrix @ projection, target)
             values = projection @ standard
             before = weights
             weights = 1.0 / class_variances(problem, values, consumed)
@@ -162,7 +168,7 @@ class PhysicallyConsistent:
             standard=standard,
         )
 
-    def _solve(self, scale: float, quadratic: Floats, target: Floats) -> Floats:
+    def solve(self, scale: float, quadratic: Floats, target: Floats) -> Floats:
         """Standard parameters (n,) for ||quadratic x - target||^2 plus the distance to the prior over `scale`."""
         prior, n, tightness = self.prior, quadratic.shape[1], 1.0 / scale
         start = np.zeros(n)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings, effective_rows
-from ident.estimators.estimate import Covariance, Estimate
+from ident.estimators.estimate import Covariance, Estimate, chi_square_tail
 from ident.estimators.least_squares import (
     class_variances,
     consumed_parameters,
@@ -25,6 +25,9 @@ from ident.estimators.least_squares import (
     weighted_solution,
 )
 from ident.estimators.problem import Problem
+
+# The data say nothing of a parameter while this share of its prior standard deviation is left.
+_UNSEEN = 0.9
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,118 @@ class Prior:
         full[chosen] = part @ mean
         return cls(full, precision)
 
+    @property
+    def std(self) -> Floats:
+        """Standard deviations (p,) before the data, infinite for free parameters."""
+        known = np.flatnonzero(np.diag(self.precision) > 0.0)
+        scale = np.sqrt(np.diag(self.precision)[known])
+        block = np.linalg.pinv(self.precision[np.ix_(known, known)] / np.outer(scale, scale), hermitian=True)
+        result = np.full(len(self.mean), np.inf)
+        result[known] = np.sqrt(np.maximum(np.diag(block), 0.0)) / scale
+        return result
+
+    def completed(self, problem: Problem) -> Prior:
+        """The same, with a weak prior of its free parameters if the rows leave one of them open.
+
+        Its mean is zero. Its standard deviation is the value with which the parameter's torque has the root mean
+        square of the measured torque in its rows: no friction and no offset exceeds the torque.
+        """
+        factor = problem.weighted(1.0 / np.maximum([c.factor.mean_square for c in problem.classes], 1e-300))
+        norms = np.linalg.norm(factor.r[:, :-1], axis=0)
+        penalty = _root_of(self.precision)
+        stacked = np.asarray(np.linalg.qr(np.vstack([factor.r[:, :-1], penalty]), mode="r"))
+        if np.all(np.abs(np.diag(stacked)) > 1e-10 * np.linalg.norm(stacked, axis=0)):
+            return self
+        rows = np.zeros(len(norms))
+        for row_class in problem.classes:
+            rows += row_class.factor.rows * np.any(row_class.factor.r[:, :-1], axis=0)
+        free = np.diag(self.precision) == 0.0
+        weak = np.where(norms > 0.0, norms**2 / np.maximum(rows, 1.0), 1.0)
+        return replace(self, precision=self.precision + np.diag(np.where(free, weak, 0.0)))
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Distance of the data from a prior, in standard deviations of prior and data together.
+
+    chi_square, freedom : over the independent combinations of parameters that the data know better than the prior.
+    names, deviations : parameters that the data know better than the prior, the farthest from it first.
+    """
+
+    chi_square: float
+    freedom: int
+    names: tuple[str, ...]
+    deviations: tuple[float, ...]
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so large a distance from a correct prior."""
+        return chi_square_tail(self.chi_square, self.freedom) if self.freedom else 1.0
+
+    @classmethod
+    def between(cls, prior: Prior, problem: Problem, weights: Floats) -> Disagreement:
+        """Of the rows with a weight for each class, the parameters without prior left free.
+
+        With S the information of the rows and L the prior's, the rows' score at the prior's mean has the
+        covariance S L^-1 S + S if the prior holds; the eigenvectors of S relative to L make it diagonal.
+        """
+        known = np.flatnonzero(np.diag(prior.precision) > 0.0)
+        free = np.flatnonzero(np.diag(prior.precision) == 0.0)
+        r = problem.weighted(weights).r
+        norms = np.linalg.norm(r, axis=0)
+        gram = r.T @ r / np.outer(*[np.where(norms > 0.0, norms, 1.0)] * 2)
+        # The score at the prior's mean, in units of the columns' norms.
+        score = gram[:-1, -1] * norms[-1] - gram[:-1, :-1][:, known] @ (prior.mean[known] * norms[known])
+        inner, cross = gram[np.ix_(free, free)], gram[np.ix_(known, free)]
+        solve = np.linalg.pinv(inner, rcond=1e-10, hermitian=True)
+        information = gram[np.ix_(known, known)] - cross @ solve @ cross.T
+        score = score[known] - cross @ solve @ score[free]
+        size = np.where(norms[known] > 0.0, norms[known], 1.0)
+        precision = prior.precision[np.ix_(known, known)] / np.outer(size, size)
+        root = np.linalg.cholesky(np.linalg.inv(precision))
+        gain, vectors = np.linalg.eigh(root.T @ information @ root)
+        told = gain > 1.0
+        z = (vectors.T @ root.T @ score)[told] / np.sqrt(gain[told] ** 2 + gain[told])
+        alone = np.linalg.inv(information + 1e-6 * precision)
+        std = np.sqrt(np.diag(alone))
+        before = np.sqrt(np.diag(root @ root.T))
+        single = (alone @ score) / np.hypot(std, before)
+        order = [k for k in np.argsort(-np.abs(single)) if std[k] < before[k]]
+        return cls(
+            float(z @ z),
+            int(told.sum()),
+            tuple(problem.names[known[k]] for k in order),
+            tuple(float(single[k]) for k in order),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for files."""
+        return {
+            "chi_square": self.chi_square,
+            "freedom": self.freedom,
+            "p_value": self.p_value,
+            "deviations": dict(zip(self.names, self.deviations, strict=True)),
+        }
+
+    def __str__(self) -> str:
+        if not self.freedom:
+            return "the data know no inertia better than the URDF"
+        ratio = np.sqrt(self.chi_square / self.freedom)
+        beyond = sum(abs(z) > 2.0 for z in self.deviations)
+        pairs = zip(self.names[:5], self.deviations[:5], strict=True)
+        worst = ", ".join(f"{name} {z:+.1f}" for name, z in pairs)
+        single = (
+            f"{beyond} of {len(self.names)} parameters beyond two ({worst})"
+            if worst
+            else "in combinations of parameters, for no single one is known better than from the URDF"
+        )
+        if self.p_value > 0.01:
+            return f"the URDF's inertials and the data agree (distance {ratio:.2f} standard deviations)"
+        return (
+            f"the URDF's inertials and the data disagree: {ratio:.1f} standard deviations on average, {single}; check "
+            "masses and tool of the URDF, or use looser deviations (`estimator.prior_std`)"
+        )
+
 
 @dataclass(frozen=True)
 class MaximumAPosteriori:
@@ -85,7 +200,12 @@ class MaximumAPosteriori:
         1992), "cross_validation" predicts blocks of time left out, a number states it (1 takes the prior's own
         standard deviations, a smaller one trusts it more).
     blocks : number of blocks of the cross-validation.
+
+    The rows need not determine all parameters: see `Prior.completed`. The estimate names those that the prior
+    determines.
     """
+
+    needs_rank: ClassVar[bool] = False
 
     prior: Prior
     strength: Literal["evidence", "cross_validation"] | float = "evidence"
@@ -99,13 +219,14 @@ class MaximumAPosteriori:
             raise DataError(
                 f"the prior has {len(self.prior.mean)} parameters, the problem {len(problem.names)}"
             )
-        values, weights = _start(problem, self.prior)
+        prior = self.prior.completed(problem)
+        values, weights = _start(problem, prior)
         scale, converged = 1.0, False
         iteration = 0
         for iteration in range(1, self.iterations + 1):
             tempered = weights * _shares(problem, values)
-            scale_new = self._scale(problem, tempered)
-            new, root = _posterior(problem, self.prior, tempered, scale_new)
+            scale_new = self._scale(problem, prior, tempered)
+            new, root = _posterior(problem, prior, tempered, scale_new)
             consumed = consumed_parameters(problem, tempered, root)
             weights = 1.0 / class_variances(problem, new, consumed)
             change = float(np.max(np.abs(new - values) / np.linalg.norm(root, axis=1)))
@@ -116,8 +237,10 @@ class MaximumAPosteriori:
                 converged = True
                 break
         tempered = weights * _shares(problem, values)
-        values, root = _posterior(problem, self.prior, tempered, scale)
+        values, root = _posterior(problem, prior, tempered, scale)
         bread = root @ root.T
+        before = prior.std * np.sqrt(scale)
+        unseen = np.flatnonzero(np.isfinite(before) & (np.sqrt(np.diag(bread)) > _UNSEEN * before))
         how = self.strength.replace("_", "-") if isinstance(self.strength, str) else "stated"
         estimate = estimate_from(
             problem,
@@ -137,16 +260,17 @@ class MaximumAPosteriori:
             estimate,
             covariance=posterior,
             prior_scale=scale,
+            prior_only=tuple(problem.names[k] for k in unseen),
             covariances={**estimate.covariances, "posterior": posterior},
         )
 
-    def _scale(self, problem: Problem, tempered: Floats) -> float:
+    def _scale(self, problem: Problem, prior: Prior, tempered: Floats) -> float:
         if isinstance(self.strength, (int, float)):
             return float(self.strength)
         if self.strength == "evidence":
-            cost = _evidence_cost(problem, self.prior, tempered)
+            cost = _evidence_cost(problem, prior, tempered)
         else:
-            cost = _cross_validation_cost(problem, self.prior, tempered, self.blocks)
+            cost = _cross_validation_cost(problem, prior, tempered, self.blocks)
         grid = np.linspace(-12.0, 12.0, 25)
         coarse = [cost(point) for point in grid]
         best = int(np.argmin(coarse))

@@ -21,6 +21,10 @@ from ident.dynamics.parameters import Floats
 
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
+_ADVICE = (
+    "leave parameters out of the model (`--without`), or choose an estimator that takes from the URDF's "
+    "inertials whatever the data leave open (`--estimator physical`, `map`)"
+)
 
 
 @dataclass(frozen=True)
@@ -253,8 +257,7 @@ class Problem:
         empty = [self.names[i] for i in np.flatnonzero(norms == 0.0)]
         if empty:
             raise DataError(
-                f"no row depends on {_listed(empty)}; move these joints, add a session with them excited, or "
-                "leave the parameters out of the model"
+                f"no row depends on {_listed(empty)}; move these joints, add a session with them excited, {_ADVICE}"
             )
         if self.rows < p:
             raise DataError(f"{self.rows} rows cannot determine {p} parameters; record a longer motion")
@@ -263,10 +266,17 @@ class Problem:
             suspects = [self.names[i] for i in np.flatnonzero(np.abs(right[-1]) > 0.1)]
             raise DataError(
                 f"the motion cannot tell {_listed(suspects)} apart (singular value ratio "
-                f"{singular[-1] / singular[0]:.1e}); excite them, add a session (unloaded and loaded), or "
-                "regroup"
+                f"{singular[-1] / singular[0]:.1e}); excite them, add a session (unloaded and loaded), {_ADVICE}"
             )
         return float(singular[0] / singular[-1])
+
+    @property
+    def normalised_condition(self) -> float:
+        """Condition number of the column-normalised stack, infinite without full rank."""
+        try:
+            return self.require_rank()
+        except DataError:
+            return float("inf")
 
     @property
     def condition(self) -> float:

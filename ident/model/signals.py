@@ -31,7 +31,7 @@ def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] 
     """
     entry = dataclasses.asdict(settings)
     if prepared:
-        entry |= {"cutoff_hz": float(np.median([one.cutoff_hz for one in prepared])), "choose_cutoff": False}
+        entry["cutoff_hz"] = float(np.median([one.cutoff_hz for one in prepared]))
     delays = [one.delay for one in prepared if one.delay is not None]
     if delays:
         exact = [delay.seconds for delay in delays if not delay.std > 0.0]

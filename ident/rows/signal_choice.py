@@ -69,16 +69,17 @@ def choose_signals(
     structure: ModelStructure,
     columns: NDArray[np.int64],
     settings: SignalSettings,
-    coulomb: Coulomb | None,
+    laws: tuple[Coulomb | None, Coulomb | None] = (None, None),
 ) -> SignalChoice:
-    """The figures that `settings` leaves open, and the law if `coulomb` is None, for the sessions of one model.
+    """The figures that `settings` leaves open, and the friction laws, for the sessions of one model.
 
+    laws : of the model, None to choose, and of the rows, None for that of the model.
     payloads : mounted in each session. columns : base columns of the structure.
     """
-    wanted = (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s, coulomb)
-    if None not in wanted:
-        assert coulomb is not None
-        return SignalChoice(settings, coulomb, coulomb)
+    coulomb, row_coulomb = laws
+    given = None not in (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s)
+    if given and coulomb is not None:
+        return SignalChoice(settings, coulomb, row_coulomb or coulomb)
     motor = structure.sides != ("joint",)
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
     rate = min(1.0 / session.joint.period_s for session in parts)
@@ -92,7 +93,7 @@ def choose_signals(
     rows = bench.rows(found)
     if found.reversal_s is None:
         found = replace(found, reversal_s=_reversal_s(rows, band, found.standstill_rad_s, reasons))
-    law, row_law = (coulomb, coulomb) if coulomb is not None else bench.laws(rows, found, reasons)
+    law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
     for reason in reasons:
         logger.info("%s", reason)
     return SignalChoice(found, law, row_law, tuple(reasons))
@@ -309,8 +310,8 @@ def _fit(rows: _ByClass, masks: _Masks) -> Floats:
     weights = np.ones(len(grams))
     values = np.zeros(grams[0].shape[0])
     for _ in range(3):
-        normal = sum(w * gram for w, gram in zip(weights, grams, strict=True))
-        right = sum(w * target for w, target in zip(weights, targets, strict=True))
+        normal = np.tensordot(weights, np.array(grams), axes=1)
+        right = weights @ np.array(targets)
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         scaled = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
         values = np.linalg.solve(scaled, right / scale) / scale

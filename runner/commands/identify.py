@@ -10,17 +10,23 @@ import click
 
 from fri.errors import ConfigurationError
 from ident.dynamics.session_chain import session_chain
-from ident.estimation.identify import identify
+from ident.estimation.choice import choose
+from ident.estimation.identify import AUTO, identify
 from ident.estimation.mounting import find_mounting
 from ident.estimation.validate import validate
 from ident.estimators import ESTIMATORS
 from ident.model.model_file import write_model
+from runner.diagnosis import known_arm
 from runner.estimation import IdentifySettings, announced, couplings, recorded_couplings
 from runner.recordings import GUESSED, guess_options, read_recordings
 from runner.results import named_model, new_folder, write_log_results
 from runner.terminal import GroupedCommand, json_option, to_json
 
-_EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {kind.summary}" for name, kind in ESTIMATORS.items())
+_SUMMARIES = {
+    AUTO: "of wls and physical, base upright or leaning, the best on held-back motion",
+    **{name: kind.summary for name, kind in ESTIMATORS.items()},
+}
+_EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {text}" for name, text in _SUMMARIES.items())
 
 
 _GROUPS = {
@@ -49,7 +55,11 @@ _GROUPS = {
     "Default: 2, or 1 without motor torques.",
 )
 @click.option(
-    "--estimator", type=click.Choice(tuple(ESTIMATORS)), default="wls", show_default=True, help="See below."
+    "--estimator",
+    type=click.Choice((AUTO, *ESTIMATORS)),
+    default=AUTO,
+    show_default=True,
+    help="See below. The paper's is wls.",
 )
 @click.option(
     "--payload",
@@ -60,7 +70,12 @@ _GROUPS = {
 @click.option("--urdf", type=click.Path(path_type=Path), help="Kinematics; default: from the first session.")
 @click.option("--base", metavar="LINK", help="First link of the arm; gravity points down in its axes.")
 @click.option("--tip", metavar="LINK", help="Last link of the arm; default: behind the last measured joint.")
-@click.option("--tilt", is_flag=True, help="Estimate the tilt of the base too.")
+@click.option(
+    "--tilt", is_flag=True, help="Estimate the tilt of the base too; `auto` otherwise does so where it helps."
+)
+@click.option(
+    "--without", multiple=True, metavar="NAME", help="Parameter (`offm3`) or kind (`Fvl`) to leave out."
+)
 @click.option("--essential", is_flag=True, help="Reduce the model to its essential parameters.")
 @click.option(
     "--test",
@@ -92,6 +107,7 @@ def command(
     base: str | None,
     tip: str | None,
     tilt: bool,
+    without: tuple[str, ...],
     essential: bool,
     test: tuple[Path, ...],
     settings: str | None,
@@ -113,6 +129,7 @@ def command(
 
     \b
     lwr-run identify unloaded.mcap loaded.mcap --out model.yaml
+    lwr-run identify unloaded.mcap loaded.mcap --estimator wls
     lwr-run identify unloaded.mcap --model 1 --estimator huber
     lwr-run identify unloaded.mcap loaded.mcap --test another.mcap --results monday
     lwr-run identify short.mcap --model 1 --estimator physical --tilt
@@ -121,6 +138,7 @@ def command(
     """
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
     wanted = read.identification(model or 2, estimator, file=settings or "")
+    wanted = replace(wanted, without=(*wanted.without, *without))
     if essential and wanted.essential is None:
         raise ConfigurationError(
             f"--essential needs the essential parameters, and {settings} has `essential: null`; leave one out"
@@ -136,8 +154,18 @@ def command(
         wanted = replace(wanted, couplings=couplings(recorded_couplings(logs)))
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     chain = session_chain(logs[0], urdf, base=base, tip=tip)
-    mounting = find_mounting(logs, chain, wanted) if tilt else None
-    found = identify(logs, chain, wanted) if mounting is None else mounting.identification
+    arm = known_arm(None, chain)
+    if arm is not None and wanted.signals.stiffness_nm_rad is None:
+        stiffness = tuple(arm.stiffness.tolist())
+        wanted = replace(wanted, signals=replace(wanted.signals, stiffness_nm_rad=stiffness))
+    mounting = None
+    if estimator == AUTO:
+        found = choose(logs, chain, wanted, tilt=tilt or None)
+    elif tilt:
+        mounting = find_mounting(logs, chain, wanted)
+        found = mounting.identification
+    else:
+        found = identify(logs, chain, wanted)
     result = named_model(
         found.essential_model if essential else found.model, logs[0].metadata.get("robot", "arm")
     )

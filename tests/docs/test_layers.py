@@ -14,6 +14,10 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("fri", "lwr_driver", "ident", "sim_backend", "runner")
 # Imports within a function that may lead back, each with its reason.
 LATE = {
+    (
+        "ident.estimation.identify",
+        "ident.estimation.choice",
+    ): "estimator `auto` identifies with other estimators",
     ("sim_backend.robot", "sim_backend.model_arm"): "an arm without an identified model starts twice as fast",
 }
 FILES = {

@@ -384,7 +384,7 @@ def test_options_of_an_estimator_change_its_estimate(workplace: Callable[[], Pat
     [
         (
             {"estimator": {"tuning": 2.0}},
-            "`estimator.tuning` is 2.0, an option of huber and tukey, not of wls",
+            "`estimator.tuning` is 2.0, an option of huber and tukey, not of auto",
         ),
         ({"couplings": [["A5", "A5"]]}, "has A5 twice in a pair"),
         ({"couplings": [["A5"]]}, "`couplings`[0]: expected 2 entries, found 1"),

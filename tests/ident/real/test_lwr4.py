@@ -98,6 +98,17 @@ def test_with_the_tilt_the_error_falls_and_joint_1_comes_near_the_floor(train, t
     assert joint_rms(leaning, test)[0] < 1.4 * repeatability()[0] < joint_rms(upright, test)[0]
 
 
+@pytest.mark.parametrize(("train", "test", "bound"), [((1, 2), 3, 3.0), ((3,), 1, 2.5)])
+def test_the_estimator_chosen_on_the_training_runs_is_the_best_on_the_other_motion(train, test, bound):
+    found = identified(train, "auto")
+    assert found.choice is not None
+    assert found.choice.winner.tilt
+    assert found.choice.winner.estimator == "physical"
+    assert relative_percent(found, test) < bound
+    for other in ("wls", "physical"):
+        assert relative_percent(found, test) < relative_percent(identified(train, other), test)
+
+
 def test_the_command_line_does_the_same(tmp_path):
     mapping = dataclasses.replace(LogMapping.load("lwr4_flobaroid"), joints=chain().joint_names)
     import_log(mapping, DATA / "measurements_3.npz", tmp_path / "run_3.mcap")

@@ -1,0 +1,174 @@
+"""The estimator that predicts best: parts held back, the choice, its reasons, and weak motions."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from fri.errors import DataError
+from ident.dynamics.kinematics import Chain
+from ident.estimation.choice import choose
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.parts import PARTS, beside, held_back_parts
+from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
+from ident.estimators.prior import Disagreement
+from tests.ident.estimation_arm import Sensors, chain, session, true_base
+from tests.ident.regression_problems import design, problem
+
+SENSORS = Sensors(position=1e-5, joint=0.2, correlation_s=0.3)
+MODEL_1 = IdentificationSettings(model=1, estimator="auto", essential=None)
+
+
+@lru_cache
+def chosen(periods: int = 3, kilogrammes: float | None = None) -> Identification:
+    """By `auto`; with `kilogrammes` every link of the URDF has this mass."""
+    text = chain().urdf
+    assert isinstance(text, str)
+    if kilogrammes is not None:
+        text = re.sub(r'<mass value="[^"]*"', f'<mass value="{kilogrammes}"', text)
+        text = re.sub(r'<origin xyz="[^"]*"(?=[^<]*/>\s*<mass)', '<origin xyz="0 0 0"', text)
+    logs = [session(sensors=SENSORS, motor=False, periods=periods)]
+    return identify(logs, Chain.from_urdf(text), MODEL_1)
+
+
+def repeated(shift: int = 0) -> Problem:
+    """Two records of one motion of 200 rows, the second begun `shift` rows later, of two payloads or one."""
+    matrices = design(records=1, samples=200)
+    second = [np.roll(m, -shift, axis=0) for m in matrices]
+    rows = [*matrices, *second]
+    return problem(rows, np.ones(12), [np.zeros(200)] * len(rows))
+
+
+def test_a_repeated_motion_is_held_back_with_its_repeat():
+    parts = held_back_parts(repeated(), (None, None), 5)
+    np.testing.assert_array_equal(parts[0], parts[3])
+    assert set(parts[0].tolist()) == set(range(PARTS))
+    later = held_back_parts(repeated(50), (None, None), 5)
+    np.testing.assert_array_equal(later[0], np.roll(later[3], 50))
+
+
+def test_every_payload_stays_in_the_training_rows():
+    parts = held_back_parts(repeated(), (None, "load"), 5)
+    for record in (0, 3):
+        assert set(parts[record].tolist()) == set(range(PARTS))
+    np.testing.assert_array_equal(parts[0], parts[3])
+
+
+def test_a_motion_of_two_blocks_has_no_parts():
+    assert all(np.all(part == -1) for part in held_back_parts(repeated(), (None, None), 200))
+
+
+def test_rows_beside_a_part_are_left_out_by_time_not_by_number():
+    time = np.array([0, 1, 2, 3, 9, 10])
+    near = beside(time, np.array([False, False, False, True, False, False]), 2)
+    assert near.tolist() == [False, True, True, True, False, False]
+
+
+def test_a_good_prior_wins_and_the_text_says_by_how_much():
+    found = chosen()
+    assert found.choice is not None
+    winner = found.choice.winner
+    errors = {(c.estimator, c.prior_scale, c.tilt): c.held_back_percent for c in found.choice.candidates}
+    assert winner.estimator == "physical"
+    assert not winner.tilt
+    assert errors["physical", 1.0, False] < errors["wls", None, False]
+    text = found.summary()
+    for candidate in found.choice.candidates:
+        assert f"{candidate.held_back_percent:.2f}" in text
+    assert found.model.provenance["choice"]["chosen"] == winner.title
+    assert found.to_dict()["choice"]["candidates"][0]["by_joint_percent"].keys() == {
+        f"{name} joint" for name in chain().joint_names
+    }
+    assert found.settings.estimator == "auto"
+
+
+def test_a_tilt_is_found_where_it_helps():
+    log = session(sensors=SENSORS, motor=False, periods=3)
+    turn = np.deg2rad(2.0)
+    turned = Chain.from_urdf(chain().urdf, gravity=(0.0, 9.81 * np.sin(turn), -9.81 * np.cos(turn)))
+    found = choose([log], turned, MODEL_1)
+    assert found.choice is not None
+    assert found.choice.mounting is not None
+    assert np.rad2deg(np.linalg.norm(found.choice.mounting.tilt_rad)) == pytest.approx(2.0, abs=0.3)
+    assert "the base leans by" in str(found.choice)
+    upright = choose([log], turned, MODEL_1, tilt=False)
+    assert upright.choice is not None
+    assert not any(candidate.tilt for candidate in upright.choice.candidates)
+
+
+def test_a_placeholder_in_the_urdf_loses_and_is_named():
+    found = chosen(6, 1.0)
+    assert found.choice is not None
+    winner = found.choice.winner
+    assert winner.estimator == "wls" or (winner.prior_scale or 0.0) > 1.0
+    text = str(found.choice)
+    assert "same mass (1 kg)" in text
+    assert found.choice.disagreement is not None
+    assert found.choice.disagreement.p_value < 1e-6
+    assert "disagree" in text
+
+
+def test_a_weak_motion_is_identified_with_the_prior_and_names_what_it_does_not_show():
+    log = session(sensors=SENSORS, motor=False, still=(0, 2, 3))
+    arm = chain()
+    with pytest.raises(DataError, match=r"--without.*--estimator physical"):
+        WeightedLeastSquares().fit(_weak())
+    fit = MaximumAPosteriori(_prior(), 1.0).fit(_weak())
+    assert set(fit.prior_only) == {"p3", "p7"}
+    assert fit.std[3] == pytest.approx(0.5)
+    assert "from the prior" in fit.summary()
+    with pytest.raises(DataError, match="never move"):
+        identify([log], arm, MODEL_1)
+
+
+def _prior() -> Prior:
+    std = np.full(12, np.inf)
+    std[3], std[7] = 0.5, 2.0
+    return Prior.independent(np.ones(12), std)
+
+
+def _weak() -> Problem:
+    """Without any effect of p3 and p7, and with p5 hidden behind p6."""
+    case = problem(design(), np.ones(12), [0.1 * np.random.default_rng(k).normal(size=200) for k in range(6)])
+    groups = []
+    for group in case.groups:
+        matrix = group.matrix.copy()
+        matrix[:, [3, 7]] = 0.0
+        matrix[:, 5] = matrix[:, 6]
+        groups.append(RowGroup(group.joint, group.side, group.record, matrix, group.target, group.time_index))
+    return Problem(case.names, tuple(groups), case.sample_time_s)
+
+
+def test_without_prior_and_rank_the_common_torque_is_shared():
+    fit = MaximumAPosteriori(_prior(), 1.0).fit(_weak())
+    assert fit.values[5] == pytest.approx(fit.values[6], rel=1e-3)
+    assert np.all(np.isfinite(fit.std))
+
+
+def test_the_distance_from_a_right_prior_is_chi_square():
+    random = np.random.default_rng(3)
+    matrices = design()
+    prior = Prior.independent(np.zeros(12), np.full(12, 0.2))
+    found = []
+    for _ in range(60):
+        chi = 0.2 * random.normal(size=12)
+        case = problem(matrices, chi, [0.5 * random.normal(size=len(m)) for m in matrices])
+        found.append(Disagreement.between(prior, case, np.full(3, 4.0)))
+    assert found[0].freedom == 12
+    assert np.mean([f.chi_square for f in found]) == pytest.approx(12.0, rel=0.15)
+    assert 0.2 < np.mean([f.p_value < 0.5 for f in found]) < 0.8
+    wrong = problem(matrices, np.full(12, 1.0), [0.5 * random.normal(size=len(m)) for m in matrices])
+    distance = Disagreement.between(prior, wrong, np.full(3, 4.0))
+    assert distance.p_value < 1e-6
+    assert abs(distance.deviations[0]) > 4.0
+
+
+def test_least_squares_stays_one_word_away():
+    log = session(sensors=SENSORS, motor=False)
+    found = identify([log], chain(), IdentificationSettings(model=1, essential=None))
+    assert found.choice is None
+    assert found.estimate.method == "WLS"
+    assert np.abs(found.estimate.values - true_base(found)).max() < 5.0
