@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from fri.errors import FriError
+from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from lwr_driver.configuration import find
