@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
-from ident.diagnosis.data_quality import SampleLoss, sample_loss
+from ident.rows.data_quality import SampleLoss, sample_loss
 from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.held_out import HeldOut, fall, held_out, interval
 from ident.diagnosis.intervals import estimated

@@ -84,7 +84,7 @@ def _best(data: Redundancy) -> Explanation | None:
     tried = []
     for candidate in _candidates(data, fit, gains):
         torque = candidate.channel.endswith("torque")
-        after = candidate.mended.fit(normal if torque else None).score
+        after = candidate.mended.fit(normal if torque else None, doubtful=False).score
         tried.append(replace(candidate, drop=before - after))
     tried = [_refined(candidate, before) for candidate in sorted(tried, key=lambda c: -c.drop)[:3]]
     return max(tried, key=lambda c: c.drop, default=None)
@@ -205,7 +205,7 @@ def _refined(candidate: Explanation, before: float) -> Explanation:
             trial = (
                 _position_gain(data, best.joints, relative) if best.channel == "position" else _paced(data, relative)
             )
-            drop = before - trial.mended.fit().score
+            drop = before - trial.mended.fit(doubtful=False).score
             if drop > best.drop:
                 factor = best.factor * relative
                 looks = unit_of(factor) if best.channel == "position" else _paced(data, factor).looks_like

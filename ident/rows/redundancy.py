@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpstrf
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, Floats
@@ -38,8 +38,8 @@ _JOINT, _MOTOR = 3, 4
 # A residual below this share of the torque is as good as none: the accuracy of torque sensors.
 FLOOR = 0.01
 _ROUNDS = 8
-# Condition of the normal equations: what the motion does not excite stays at zero.
-_RIDGE = 1e-10
+# Square of the sine between a column and those before it, below which it is dependent.
+_DEPENDENT = 1e-9
 # Rows with a common error: two seconds at the usual rate.
 _BLOCK = 10
 _MOST_ROWS = 1200
@@ -256,30 +256,34 @@ class Redundancy:
         """(n, n), true torque = map @ measured torque."""
         return self.maps.get(side, np.eye(self.chain.n))
 
-    def fit(self, normal: Mapping[Class, _Normal] | None = None, maps: Mapping[str, Floats] | None = None) -> Fit:
+    def fit(self, normal: Mapping[Class, _Normal] | None = None, *, doubtful: bool = True) -> Fit:
         """Weighted least squares, each class weighted by its own residual.
 
-        maps : of the torques, over those of the data, so that one `normal` serves for many of them.
+        normal : of rows that differ by their `maps` alone. doubtful : whether a torque may be in a wrong unit.
         """
         normal = self.normal() if normal is None else normal
-        chosen = {side: (maps or {}).get(side, self.map_of(side)) for side in self.sides}
+        chosen = {side: self.map_of(side) for side in self.sides}
         mixed = {key: own.mixed @ chosen[key[0]][key[1]] for key, own in normal.items()}
         size = {
             key: tuple(float(chosen[key[0]][key[1]] @ part @ chosen[key[0]][key[1]]) for part in (own.scatter, own.square))
             for key, own in normal.items()
         }
         total = {key: max(scatter, 1e-12 * max(square, 1e-12)) for key, (scatter, square) in size.items()}
-        weight = {key: 1.0 / value for key, value in total.items()}
-        values, error = np.zeros(0), dict(total)
-        for _ in range(_ROUNDS):
-            matrix = sum(weight[key] * own.matrix for key, own in normal.items())
-            right = sum(weight[key] * mixed[key] for key in normal)
-            values = _solve(np.asarray(matrix), np.asarray(right))
-            for key, own in normal.items():
-                rest = size[key][1] - 2.0 * values @ mixed[key] + values @ own.matrix @ values
-                error[key] = max(float(rest), 0.0)
-            weight = {key: 1.0 / max(error[key], FLOOR**2 * total[key]) for key in normal}
-        return Fit(values, {key: float(np.sqrt(error[key] / total[key])) for key in normal}, weight)
+        common = max(total.values(), default=1.0)
+        fits = []
+        # A torque in a wrong unit is far too heavy or far too light in one of these starts.
+        for start in (total, dict.fromkeys(total, common))[: 1 + doubtful]:
+            weight, error, values = {key: 1.0 / value for key, value in start.items()}, dict(total), np.zeros(0)
+            for _ in range(_ROUNDS):
+                matrix = sum(weight[key] * own.matrix for key, own in normal.items())
+                right = sum(weight[key] * mixed[key] for key in normal)
+                values = _solve(np.asarray(matrix), np.asarray(right))
+                for key, own in normal.items():
+                    rest = size[key][1] - 2.0 * values @ mixed[key] + values @ own.matrix @ values
+                    error[key] = max(float(rest), 0.0)
+                weight = {key: 1.0 / max(error[key], FLOOR**2 * total[key]) for key in normal}
+            fits.append(Fit(values, {key: float(np.sqrt(error[key] / total[key])) for key in normal}, weight))
+        return min(fits, key=lambda fit: fit.score)
 
     def gains(self, fit: Fit, normal: Mapping[Class, _Normal]) -> dict[Class, Gain]:
         """Gain of each class against the torque that the shared parameters compute for it.
@@ -326,11 +330,11 @@ class Redundancy:
 
 
 def _solve(matrix: Floats, right: Floats) -> Floats:
+    """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
     scale = np.sqrt(np.diag(matrix))
-    scale = np.where(scale > 1e-10 * scale.max(initial=1e-300), scale, np.inf)
-    unit = matrix / scale[:, None] / scale[None, :]
-    unit[np.diag_indices_from(unit)] = 1.0 + _RIDGE
-    return np.asarray(cho_solve(cho_factor(unit, lower=True), right / scale) / scale)
-
-
-BoolArray = NDArray[np.bool_]
+    scale = np.where(scale > 1e-150, scale, np.inf)
+    factor, order, rank, _ = dpstrf(matrix / scale[:, None] / scale[None, :], tol=_DEPENDENT)
+    kept = order[:rank] - 1
+    found = np.zeros(len(right))
+    found[kept] = cho_solve((factor[:rank, :rank], False), (right / scale)[kept]) / scale[kept]
+    return found
