@@ -9,30 +9,17 @@ other motions, lengths, paces, and arms with a day's tolerances.
 
 from __future__ import annotations
 
-import argparse
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import logging
-import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fri.errors import DataError
-from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import Identification, IdentificationSettings, identify
-from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
-from tests.hidden_physics.robots import Day, session_settings
-from tests.hidden_physics.robots import Setting as Hidden
-from tests.ident.estimation.emulated_sessions import record_pair
-from tests.ident.estimation_arm import true_base
 
 Sessions = list[Session]
 Change = Callable[[Sessions], Sessions]
@@ -105,18 +92,29 @@ def constant(channel: str, field: str, value: float, *joints: str, only: int | N
 
     def change(sessions: Sessions) -> Sessions:
         done = _channel(sessions, channel, edit)
-        return done if only is None else [d if k == only else s for k, (s, d) in enumerate(zip(sessions, done))]
+        return (
+            done
+            if only is None
+            else [d if k == only else s for k, (s, d) in enumerate(zip(sessions, done, strict=True))]
+        )
 
     return change
 
 
-def paced(factor: float, channels: tuple[str, ...] = ("joint", "motor", "command"), clocks: tuple[str, ...] = ("publish_time", "log_time")) -> Change:
+def paced(
+    factor: float,
+    channels: tuple[str, ...] = ("joint", "motor", "command"),
+    clocks: tuple[str, ...] = ("publish_time", "log_time"),
+) -> Change:
     """Times and phases stretched by a factor."""
 
     def change(sessions: Sessions) -> Sessions:
         done = []
         for session in sessions:
-            origin = {"publish_time": int(session.joint.publish_time[0]), "log_time": int(session.joint.log_time[0])}
+            origin = {
+                "publish_time": int(session.joint.publish_time[0]),
+                "log_time": int(session.joint.log_time[0]),
+            }
 
             def late(clock: str, times: Any, origin: dict[str, int] = origin) -> Any:
                 return np.asarray(origin[clock] + np.rint((times - origin[clock]) * factor), dtype=np.int64)
@@ -127,7 +125,8 @@ def paced(factor: float, channels: tuple[str, ...] = ("joint", "motor", "command
                 fields[channel] = replace(columns, **{c: late(c, getattr(columns, c)) for c in clocks})
             if "log_time" in clocks:
                 fields["phases"] = tuple(
-                    phase._replace(log_time=int(late("log_time", np.int64(phase.log_time)))) for phase in session.phases
+                    phase._replace(log_time=int(late("log_time", np.int64(phase.log_time))))
+                    for phase in session.phases
                 )
             done.append(replace(session, **fields))
         return done
@@ -141,7 +140,9 @@ def labelled(*labels: str, mass: float | None = None) -> Change:
     def change(sessions: Sessions) -> Sessions:
         more = {} if mass is None else {"payload_mass": str(mass)}
         return [
-            replace(session, metadata={**session.metadata, "payload": label, **(more if label != "none" else {})})
+            replace(
+                session, metadata={**session.metadata, "payload": label, **(more if label != "none" else {})}
+            )
             for session, label in zip(sessions, labels, strict=True)
         ]
 
@@ -266,3 +267,103 @@ CASES: tuple[Case, ...] = (
     Case("bare log labelled loaded", labelled("paper_load", "paper_load"), ("payload",)),
     Case("payload stated at half its mass", labelled("none", "paper_load", mass=1.67), ("payload",)),
 )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What identification said of one set of logs.
+
+    verdict : "error", "warning" or "silent". text : all messages. deviation : largest |estimate - truth| in
+        standard deviations, of `parameter`; NaN without an estimate or a truth.
+    """
+
+    verdict: str
+    text: str
+    deviation: float = float("nan")
+    parameter: str = ""
+    seconds: float = 0.0
+
+    def names(self, words: tuple[str, ...]) -> bool:
+        """Whether the messages hold all words."""
+        return all(word in self.text for word in words)
+
+
+def outcome(sessions: Sessions, chain: Chain) -> Outcome:
+    """Identification with the settings as they come."""
+    start = time.perf_counter()
+    try:
+        found = identify(sessions, chain, IdentificationSettings(essential=None))
+    except DataError as error:
+        return Outcome("error", str(error), seconds=time.perf_counter() - start)
+    text = "\n".join(found.warnings)
+    spent = time.perf_counter() - start
+    try:
+        scores = _scores(found)
+    except (KeyError, ValueError, IndexError):
+        return Outcome("warning" if text else "silent", text, seconds=spent)
+    worst = int(np.argmax(np.abs(scores)))
+    return Outcome(
+        "warning" if text else "silent", text, abs(float(scores[worst])), found.base.names[worst], spent
+    )
+
+
+def _scores(found: Identification) -> np.ndarray:
+    return (found.estimate.values - true_base(found)) / found.estimate.std
+
+
+def healthy(number: int, folder: Path) -> Sessions:
+    """Set `number` of unchanged logs: other motions, lengths, paces, and every third an arm with a day's tolerances."""
+    period_s, periods = ((20.0, 2), (10.0, 2), (30.0, 1), (15.0, 1))[number % 4]
+    settings = session_settings(Day(number), Hidden()) if number % 3 == 2 else {}
+    return record_pair(folder, 2000 + number, period_s=period_s, periods=periods, settings=settings)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--seed", type=int, default=700)
+    parser.add_argument("--healthy", type=int, default=40)
+    parser.add_argument("--case", default="", help="only the cases with this text")
+    parser.add_argument("--messages", action="store_true", help="print the first message of each case")
+    options = parser.parse_args()
+    logging.disable(logging.WARNING)
+    chain = Chain.from_urdf(find("lwr4plus.urdf"))
+    with tempfile.TemporaryDirectory() as folder:
+        sessions = record_pair(Path(folder), options.seed)
+    plain = outcome(sessions, chain)
+    print(f"{'case':<38}{'says':<9}{'named':<7}{'worst':>10}  parameter        s")
+    print(
+        f"{'as recorded':<38}{plain.verdict:<9}{'':<7}{plain.deviation:>10.1f}  {plain.parameter:<10}{plain.seconds:>7.1f}"
+    )
+    missed = []
+    for case in CASES:
+        if options.case not in case.name:
+            continue
+        found = outcome(case.change(sessions), chain)
+        named = found.verdict != "silent" and found.names(case.words)
+        print(
+            f"{case.name:<38}{found.verdict:<9}{'yes' if named else 'NO':<7}{found.deviation:>10.1f}  "
+            f"{found.parameter:<10}{found.seconds:>7.1f}",
+            flush=True,
+        )
+        if options.messages and found.text:
+            print("    " + found.text.splitlines()[0])
+        harmless = found.deviation <= LIMIT and found.verdict == "silent"
+        if not named and not harmless:
+            missed.append(case.name)
+    print(
+        f"\n{len(missed)} of {len(CASES)} changes neither named nor harmless (beyond {LIMIT:g} sigma): {missed}"
+    )
+    alarms = 0
+    for number in range(options.healthy):
+        with tempfile.TemporaryDirectory() as folder:
+            unchanged = healthy(number, Path(folder))
+        found = outcome(unchanged, chain)
+        alarms += found.verdict != "silent"
+        if found.text:
+            print(f"healthy {number}: {found.verdict}: {found.text}", flush=True)
+    if options.healthy:
+        print(f"{alarms} of {options.healthy} healthy sets with an error or a warning")
+
+
+if __name__ == "__main__":
+    main()

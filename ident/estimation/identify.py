@@ -27,6 +27,7 @@ from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.screening import require_sound
 from ident.rows.sessions import payload_name, require, stated_mass
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -266,6 +267,7 @@ def identify(
         settings.coulomb,
         () if sensed else ("motor",),
     )
+    doubts = require_sound(chosen, chain, settings.signals, settings.couplings)
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     prepared, problems, instruments = [], [], []
@@ -281,7 +283,7 @@ def identify(
         if motion is not None:
             instruments.append(observe([motion], [payload], structure, columns=base.columns))
             del motion
-    warnings = [warning for session in prepared for warning in session.warnings]
+    warnings = doubts + [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
     normalised = problem.require_rank()

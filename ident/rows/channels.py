@@ -35,12 +35,12 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     limits = joint_limits(chain)
     for session in sessions:
         found += [*_clocks(session), *_dead(session), *_clipped(session), *_velocity(session)]
-        found += _limits(session, limits)
+        found += [*_limits(session, limits), *_pace(session, limits)]
     return found
 
 
 def joint_limits(chain: Chain) -> dict[str, dict[str, float]]:
-    """`lower`, `upper`, `velocity`, `effort` of the joints in the URDF of `chain`, as far as they are positive spans."""
+    """`lower`, `upper`, `velocity`, `effort` of the joints in the URDF of `chain`, as far as they are limits."""
     if chain.urdf is None:
         return {}
     found: dict[str, dict[str, float]] = {}
@@ -56,7 +56,9 @@ def joint_limits(chain: Chain) -> dict[str, dict[str, float]]:
                 values[key] = float("nan")
         if joint.get("type") == "continuous" or not values["upper"] > values["lower"]:
             del values["lower"], values["upper"]
-        found[joint.get("name", "")] = {k: v for k, v in values.items() if np.isfinite(v) and (v > 0 or k in ("lower", "upper"))}
+        found[joint.get("name", "")] = {
+            k: v for k, v in values.items() if np.isfinite(v) and (v > 0 or k in ("lower", "upper"))
+        }
     return found
 
 
@@ -81,7 +83,9 @@ def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
             seen = f"{a.path.name} and {b.path.name} hold the same samples ({100 * share:.0f} %)"
             if one and one == two:
                 seen += f" and the uid {one}"
-            yield Doubt("log", (), seen, "one log given twice", "give each log once; a copy is no new data", True)
+            yield Doubt(
+                "log", (), seen, "one log given twice", "give each log once; a copy is no new data", True
+            )
 
 
 def _shared_rows(a: Session, b: Session) -> float:
@@ -92,7 +96,12 @@ def _shared_rows(a: Session, b: Session) -> float:
         if session.motor is not None and not session.joint.effort.size:
             values = session.motor.effort
         moving = np.concatenate([[False], np.all(np.diff(values, axis=0) != 0.0, axis=1)])
-        rows.append({row.tobytes() for row in np.ascontiguousarray(values[moving if moving.sum() > 100 else slice(None)])})
+        rows.append(
+            {
+                row.tobytes()
+                for row in np.ascontiguousarray(values[moving if moving.sum() > 100 else slice(None)])
+            }
+        )
     fewer = min(len(part) for part in rows)
     return len(rows[0] & rows[1]) / fewer if fewer else 0.0
 
@@ -136,7 +145,11 @@ def _clocks(session: Session) -> Iterator[Doubt]:
     used = source if source > 0.0 else host
     rate = (len(joint) - 1) / max(used, 1e-12)
     if not _RATES[0] <= rate <= _RATES[1]:
-        unit = "milliseconds read as seconds" if rate < _RATES[0] else "a unit of time too large, such as minutes for seconds"
+        unit = (
+            "milliseconds read as seconds"
+            if rate < _RATES[0]
+            else "a unit of time too large, such as minutes for seconds"
+        )
         seen = f"{len(joint)} samples in {used:.4g} s, {rate:.4g} Hz"
         mend = "state the unit of time of the log when importing it"
         yield Doubt("time", (), seen, unit, mend, rate < 0.1 * _RATES[0] or rate > 5.0 * _RATES[1], name)
@@ -145,14 +158,30 @@ def _clocks(session: Session) -> Iterator[Doubt]:
         if abs(ratio - 1.0) > _CLOCKS:
             seen = f"the source's clock passes {source:.2f} s while the host's passes {host:.2f} s"
             mend = "repair the clock of the source, or state its rate when importing"
-            yield Doubt("time", (), seen, f"a rate wrong by {ratio:.3g}", mend, abs(np.log(ratio)) > 0.1, name)
+            yield Doubt(
+                "time", (), seen, f"a rate wrong by {ratio:.3g}", mend, abs(np.log(ratio)) > 0.1, name
+            )
     motor = session.motor
-    if motor is not None and len(motor) > 16 and used > _LONG_S and np.ptp(motor.publish_time) > 0 and source > 0.0:
+    if (
+        motor is not None
+        and len(motor) > 16
+        and used > _LONG_S
+        and np.ptp(motor.publish_time) > 0
+        and source > 0.0
+    ):
         other = float(motor.publish_time[-1] - motor.publish_time[0]) * 1e-9
         if abs(np.log(other / used)) > 0.2:
             seen = f"the motor channel spans {other:.2f} s, the joint channel {used:.2f} s"
             mend = "state the unit of time of both channels when importing"
-            yield Doubt("time", (), seen, "different units or rates of the channels", mend, abs(np.log(other / used)) > 1, name)
+            yield Doubt(
+                "time",
+                (),
+                seen,
+                "different units or rates of the channels",
+                mend,
+                abs(np.log(other / used)) > 1,
+                name,
+            )
 
 
 def _dead(session: Session) -> Iterator[Doubt]:
@@ -174,20 +203,34 @@ def _clipped(session: Session) -> Iterator[Doubt]:
         for joint, level in enumerate(clipped_at(session.joint)):
             if np.isfinite(level) and joint not in silent:
                 seen = f"stays at its largest value, {level:.4g} Nm, again and again"
-                yield Doubt("joint torque", (session.joint_names[joint],), seen, "saturation", mend, False, name)
+                yield Doubt(
+                    "joint torque", (session.joint_names[joint],), seen, "saturation", mend, False, name
+                )
     if session.motor is not None and session.motor.effort.size:
         silent = set(dead(session.motor))
         levels: dict[int, list[str]] = {}
         for stuck in stuck_at(session.motor, session.joint):
             if stuck.joint not in silent:
                 share = 100.0 * stuck.count / max(stuck.samples, 1)
-                levels.setdefault(stuck.joint, []).append(f"{stuck.value:.4g} Nm ({share:.0f} % of the motion)")
+                levels.setdefault(stuck.joint, []).append(
+                    f"{stuck.value:.4g} Nm ({share:.0f} % of the motion)"
+                )
         for joint, texts in levels.items():
             seen = f"stays at {' and '.join(texts)}"
-            yield Doubt("motor torque", (session.joint_names[joint],), seen, "saturation or a dead zone", mend, False, name)
+            yield Doubt(
+                "motor torque",
+                (session.joint_names[joint],),
+                seen,
+                "saturation or a dead zone",
+                mend,
+                False,
+                name,
+            )
     for joint, level in _flat_tops(session.joint):
         seen = f"stops abruptly at {level:.4g} again and again"
-        mend = "check the range of the sensor and of the column; the samples at the level are not the position"
+        mend = (
+            "check the range of the sensor and of the column; the samples at the level are not the position"
+        )
         yield Doubt("position", (session.joint_names[joint],), seen, "saturation", mend, False, name)
 
 
@@ -208,8 +251,13 @@ def _flat_tops(columns: JointColumns) -> Iterator[tuple[int, float]]:
         for level in (float(values.min()), float(values.max())):
             at = np.concatenate([[False], values == level, [False]])
             edges = np.flatnonzero(at[1:] != at[:-1]).reshape(-1, 2)
-            tops = [(a, b) for a, b in edges if b - a >= max(_TOP, lag) and a >= lag and b + lag <= len(values)]
-            sharp = [max(abs(values[a - lag] - level), abs(values[b + lag - 1] - level)) > _SHARP * usual for a, b in tops]
+            tops = [
+                (a, b) for a, b in edges if b - a >= max(_TOP, lag) and a >= lag and b + lag <= len(values)
+            ]
+            sharp = [
+                max(abs(values[a - lag] - level), abs(values[b + lag - 1] - level)) > _SHARP * usual
+                for a, b in tops
+            ]
             if sum(sharp) >= _CORNERS:
                 yield joint, level
 
@@ -228,7 +276,9 @@ def _velocity(session: Session) -> Iterator[Doubt]:
     sums = np.vstack([np.zeros(joint.velocity.shape[1]), np.cumsum(joint.velocity, axis=0)])
     # The trapezoidal mean of the velocity over a block is the difference of its positions.
     ends = places[1:]
-    inner = (sums[ends + 1] - sums[places[:-1]] - 0.5 * (joint.velocity[ends] + joint.velocity[places[:-1]])) / size
+    inner = (
+        sums[ends + 1] - sums[places[:-1]] - 0.5 * (joint.velocity[ends] + joint.velocity[places[:-1]])
+    ) / size
     slope = np.diff(joint.position[places], axis=0) / np.diff(time[places])[:, None]
     if not np.isfinite(inner).all():
         return
@@ -237,13 +287,22 @@ def _velocity(session: Session) -> Iterator[Doubt]:
     for k in np.flatnonzero(moved):
         speed, own = slope[:, k], inner[:, k]
         if not own.any():
-            seen, mend = "reads 0 while the joint moves", "repair the column, or import the log without velocities"
+            seen, mend = (
+                "reads 0 while the joint moves",
+                "repair the column, or import the log without velocities",
+            )
             yield Doubt("velocity", (session.joint_names[k],), seen, "a dead channel", mend, False, name)
             continue
         related = _correlation(speed, own)
         if abs(related) < _CORRELATED:
-            others = [j for j in np.flatnonzero(moved) if j != k and abs(_correlation(slope[:, j], own)) > 0.95]
-            looks = f"the velocity of {session.joint_names[others[0]]}" if others else "another joint or another time"
+            others = [
+                j for j in np.flatnonzero(moved) if j != k and abs(_correlation(slope[:, j], own)) > 0.95
+            ]
+            looks = (
+                f"the velocity of {session.joint_names[others[0]]}"
+                if others
+                else "another joint or another time"
+            )
             seen = f"follows dq/dt of the position with a correlation of {related:.2f}"
             mend = "check the columns of position and velocity of this joint"
             if others or abs(related) < 0.5:
@@ -260,7 +319,11 @@ def _velocity(session: Session) -> Iterator[Doubt]:
         return
     for k, factor in wrong.items():
         seen = f"is {factor:.4g} times dq/dt of the position"
-        looks = "a reversed sign of one of the two" if abs(factor + 1.0) < _SPEEDS else "a wrong unit of one of the two"
+        looks = (
+            "a reversed sign of one of the two"
+            if abs(factor + 1.0) < _SPEEDS
+            else "a wrong unit of one of the two"
+        )
         mend = "check sign and unit of position and velocity of this joint"
         yield Doubt("velocity", (session.joint_names[k],), seen, looks, mend, False, name)
 
@@ -285,9 +348,12 @@ def _limits(session: Session, limits: dict[str, dict[str, float]]) -> Iterator[D
             over = max(high - middle, middle - low) / half
             if over > _OVER:
                 degrees = np.radians(1.0) * max(high - middle, middle - low) < 1.1 * half and over > 3.0
-                seen = f"ranges from {low:.4g} to {high:.4g}, beyond {limit['lower']:.4g} to {limit['upper']:.4g} of the URDF"
+                seen = f"ranges from {low:.4g} to {high:.4g}, beyond "
+                seen += f"{limit['lower']:.4g} to {limit['upper']:.4g} of the URDF"
                 looks = "degrees for radians" if degrees else "another zero, unit or joint"
-                yield Doubt("position", (own,), seen, looks, "state unit and offset when importing", over > 3.0, name)
+                yield Doubt(
+                    "position", (own,), seen, looks, "state unit and offset when importing", degrees, name
+                )
         for channel, columns in _torques(session):
             if limit.get("effort", 0.0) > 0.0:
                 size = float(np.quantile(np.abs(columns.effort[:, k]), 1.0 - _OUTLIERS))
@@ -295,4 +361,26 @@ def _limits(session: Session, limits: dict[str, dict[str, float]]) -> Iterator[D
                 if over > 3.0:
                     seen = f"reaches {size:.4g} Nm, {over:.3g} times the limit of the URDF"
                     looks = "mNm for Nm, or a gain" if over > 100.0 else "a unit or gain"
-                    yield Doubt(channel, (own,), seen, looks, "state the unit when importing", over > 100.0, name)
+                    yield Doubt(
+                        channel, (own,), seen, looks, "state the unit when importing", over > 100.0, name
+                    )
+
+
+def _pace(session: Session, limits: dict[str, dict[str, float]]) -> Iterator[Doubt]:
+    """Speeds of all joints against the limits of the URDF: a wrong unit of time or position makes all too fast."""
+    joint = session.joint
+    if len(joint) < 100:
+        return
+    clock = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
+    time = (clock - clock[0]) * 1e-9
+    step = max(1, len(time) // 500)
+    speed = (
+        np.abs(np.diff(joint.position[::step], axis=0)) / np.maximum(np.diff(time[::step]), 1e-12)[:, None]
+    )
+    own = [limits.get(name, {}).get("velocity", np.inf) for name in session.joint_names]
+    over = float(np.max(np.quantile(speed, 0.9, axis=0) / np.array(own)))
+    if over > 3.0:
+        seen = f"the joints move at up to {over:.3g} times their speed limits of the URDF"
+        looks = "a unit of time too large, such as minutes for seconds, or positions in a unit too small"
+        mend = "state the units of time and position when importing"
+        yield Doubt("time", (), seen, looks, mend, over > 10.0, session.path.name)

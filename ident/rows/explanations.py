@@ -8,13 +8,13 @@ the search goes on in the mended data, because two channels may be wrong.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.rows.redundancy import FLOOR, Class, Fit, Gain, Redundancy
+from ident.rows.redundancy import Class, Gain, Redundancy
 
 # Ratios of units that are mixed up, and what they look like.
 UNITS = {
@@ -27,8 +27,10 @@ UNITS = {
 }
 """Factor of the recorded over the true value, and its usual cause."""
 _NEAR = 0.1
+# Residual over torque of an arm whose channels agree; beyond it explanations are sought.
+AGREES = 0.1
 # Least gain error that is looked at, and its standard deviations: sensors are calibrated to a few per cent.
-_GAIN, _DEVIATIONS = 0.1, 5.0
+_GAIN, _DEVIATIONS = 0.18, 5.0
 # Share of the residual that a true gain error leaves at most.
 _LEFT = 0.75
 _POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
@@ -64,11 +66,16 @@ def unit_of(factor: float) -> str:
     return f"a gain of {factor:.3g}"
 
 
-def explain(data: Redundancy) -> tuple[list[Explanation], Redundancy]:
-    """Explanations, the strongest first, and the mended rows."""
+def explain(
+    data: Redundancy, believed: Callable[[Explanation, int], bool]
+) -> tuple[list[Explanation], Redundancy]:
+    """Explanations, the strongest first, and the mended rows.
+
+    believed : of an explanation and the number of classes, whether it gains enough.
+    """
     found: list[Explanation] = []
     for _ in range(data.chain.n):
-        best = _best(data)
+        best = _best(data, believed)
         if best is None:
             break
         found.append(best)
@@ -76,28 +83,34 @@ def explain(data: Redundancy) -> tuple[list[Explanation], Redundancy]:
     return found, data
 
 
-def _best(data: Redundancy) -> Explanation | None:
+def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Explanation | None:
     normal = data.normal()
     fit = data.fit(normal)
-    before = fit.score
-    gains = data.gains(fit, normal)
-    tried = []
-    for candidate in _candidates(data, fit, gains):
-        torque = candidate.channel.endswith("torque")
-        after = candidate.mended.fit(normal if torque else None, doubtful=False).score
-        tried.append(replace(candidate, drop=before - after))
-    tried = [_refined(candidate, before) for candidate in sorted(tried, key=lambda c: -c.drop)[:3]]
-    return max(tried, key=lambda c: c.drop, default=None)
+    before, tried = fit.score, []
+    for candidate in _torques(data, data.gains(fit, normal)):
+        after = candidate.mended.fit(normal, doubtful=False)
+        tried.append(replace(candidate, drop=before - after.score))
+        if believed(tried[-1], len(normal)) and max(after.rho.values()) < AGREES:
+            break
+    else:
+        for candidate in _motions(data):
+            drop = before - candidate.mended.fit(doubtful=False).score
+            tried.append(replace(candidate, drop=drop))
+    tried = [one for one in tried if believed(one, len(normal))]
+    tried = [_refined(one, before) for one in sorted(tried, key=lambda one: -one.drop)[:3]]
+    return max(tried, key=lambda one: one.drop, default=None)
 
 
-def _candidates(data: Redundancy, fit: Fit, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
-    yield from _torque_gains(data, gains)
+def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
+    yield from sorted(_torque_gains(data, gains), key=lambda one: -len(one.joints))
     for side in data.sides:
         for a, b in _pairs(data):
             if (side, a) not in data.silent and (side, b) not in data.silent:
-                yield Explanation(
-                    f"{side} torque", (a, b), "the two joints interchanged", _mapped(data, side, _exchange(data, a, b))
-                )
+                mended = _mapped(data, side, _exchange(data, a, b))
+                yield Explanation(f"{side} torque", (a, b), "the two joints interchanged", mended)
+
+
+def _motions(data: Redundancy) -> Iterator[Explanation]:
     yield from _positions(data)
     yield from (_paced(data, factor) for factor in _PACES)
     yield from _labels(data)
@@ -106,12 +119,14 @@ def _candidates(data: Redundancy, fit: Fit, gains: Mapping[Class, Gain]) -> Iter
 def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
     for side in data.sides:
         own = {joint: gain for (where, joint), gain in gains.items() if where == side}
-        wrong = {joint: gain for joint, gain in own.items() if _wrong(gain)}
+        wrong = {joint: gain for joint, gain in own.items() if is_wrong(gain)}
         for joint, gain in wrong.items():
             scale = np.eye(data.chain.n)
             scale[joint, joint] = 1.0 / gain.value
+            small = abs(gain.value) < 3.0 * gain.std
+            looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value)
             yield Explanation(
-                f"{side} torque", (joint,), unit_of(gain.value), _mapped(data, side, scale), 0.0, gain.value, gain
+                f"{side} torque", (joint,), looks, _mapped(data, side, scale), 0.0, gain.value, gain
             )
         middle = float(np.median([gain.value for gain in wrong.values()])) if wrong else 1.0
         alike = [joint for joint, gain in wrong.items() if abs(gain.value / middle - 1.0) < 0.3]
@@ -123,9 +138,10 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
             )  # fmt: skip
 
 
-def _wrong(gain: Gain) -> bool:
+def is_wrong(gain: Gain) -> bool:
+    """Whether a gain is off by more than a calibration and its deviation, and mending it helps."""
     off = abs(gain.value - 1.0)
-    return off > max(_GAIN, _DEVIATIONS * gain.std) and gain.left < _LEFT and abs(gain.value) > 1e-6
+    return off > max(_GAIN, _DEVIATIONS * gain.std) and gain.left < _LEFT and gain.value != 0.0
 
 
 def _pairs(data: Redundancy) -> list[tuple[int, int]]:
@@ -188,7 +204,9 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
     for record in records:
         for label in {*labels.values(), None, "another payload"} - {labels[record]}:
             rows = tuple(replace(p, payload=label) if p.record == record else p for p in data.rows)
-            looks = "no payload" if label is None else f"payload {label!r}" if label in labels.values() else label
+            looks = (
+                "no payload" if label is None else f"payload {label!r}" if label in labels.values() else label
+            )
             yield Explanation("payload", (), looks, replace(data, rows=rows), label=str(record))
 
 
@@ -203,7 +221,9 @@ def _refined(candidate: Explanation, before: float) -> Explanation:
         for relative in (np.exp(step), np.exp(-step)):
             data = best.mended
             trial = (
-                _position_gain(data, best.joints, relative) if best.channel == "position" else _paced(data, relative)
+                _position_gain(data, best.joints, relative)
+                if best.channel == "position"
+                else _paced(data, relative)
             )
             drop = before - trial.mended.fit(doubtful=False).score
             if drop > best.drop:
@@ -214,8 +234,3 @@ def _refined(candidate: Explanation, before: float) -> Explanation:
         else:
             step *= 0.5
     return best
-
-
-def worst(fit: Fit) -> float:
-    """The largest rho above the floor."""
-    return max((value for value in fit.rho.values()), default=FLOOR)

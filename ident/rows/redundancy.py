@@ -42,7 +42,7 @@ _ROUNDS = 8
 _DEPENDENT = 1e-9
 # Rows with a common error: two seconds at the usual rate.
 _BLOCK = 10
-_MOST_ROWS = 1200
+_MOST_ROWS = 800
 _COVERED = 0.9
 
 
@@ -90,7 +90,9 @@ def sampled(
             channels = [passage.joint if sensed else None, passage.motor]
             for channel in channels:
                 if channel is not None:
-                    found.append(_rows(channel, passage.rows, record, payload_name(session), signals, couplings))
+                    found.append(
+                        _rows(channel, passage.rows, record, payload_name(session), signals, couplings)
+                    )
     return [rows for rows in found if len(rows.q)]
 
 
@@ -265,7 +267,10 @@ class Redundancy:
         chosen = {side: self.map_of(side) for side in self.sides}
         mixed = {key: own.mixed @ chosen[key[0]][key[1]] for key, own in normal.items()}
         size = {
-            key: tuple(float(chosen[key[0]][key[1]] @ part @ chosen[key[0]][key[1]]) for part in (own.scatter, own.square))
+            key: tuple(
+                float(chosen[key[0]][key[1]] @ part @ chosen[key[0]][key[1]])
+                for part in (own.scatter, own.square)
+            )
             for key, own in normal.items()
         }
         total = {key: max(scatter, 1e-12 * max(square, 1e-12)) for key, (scatter, square) in size.items()}
@@ -273,7 +278,11 @@ class Redundancy:
         fits = []
         # A torque in a wrong unit is far too heavy or far too light in one of these starts.
         for start in (total, dict.fromkeys(total, common))[: 1 + doubtful]:
-            weight, error, values = {key: 1.0 / value for key, value in start.items()}, dict(total), np.zeros(0)
+            weight, error, values = (
+                {key: 1.0 / value for key, value in start.items()},
+                dict(total),
+                np.zeros(0),
+            )
             for _ in range(_ROUNDS):
                 matrix = sum(weight[key] * own.matrix for key, own in normal.items())
                 right = sum(weight[key] * mixed[key] for key in normal)
@@ -327,6 +336,21 @@ class Redundancy:
                 1.0 + delta, np.sqrt(spread) / max(den, 1e-300), float(np.sqrt(after / max(before, 1e-300)))
             )
         return result
+
+    def deviation(self, fit: Fit, normal: Mapping[Class, _Normal], directions: Floats) -> Floats:
+        """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows."""
+        total = np.asarray(sum(fit.weight[key] * own.matrix for key, own in normal.items()))
+        spreads = np.column_stack([_solve(total, direction) for direction in directions])
+        variance = np.zeros(len(directions))
+        for rows in self.rows:
+            measured = rows.torque @ self.map_of(rows.side).T
+            for j, own in enumerate(self.matrix(rows)):
+                if (rows.side, j) in normal:
+                    error = measured[:, j] - own @ fit.parameters
+                    product = fit.weight[rows.side, j] * (own @ spreads) * error[:, None]
+                    blocks = np.add.reduceat(product, np.arange(0, len(product), _BLOCK), axis=0)
+                    variance += np.sum(blocks**2, axis=0)
+        return np.sqrt(variance)
 
 
 def _solve(matrix: Floats, right: Floats) -> Floats:
