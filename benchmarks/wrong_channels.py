@@ -9,17 +9,30 @@ other motions, lengths, paces, and arms with a day's tolerances.
 
 from __future__ import annotations
 
+import argparse
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import logging
+import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fri.errors import DataError
+from ident.dynamics.kinematics import Chain
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
+from tests.hidden_physics.robots import Day, session_settings
+from tests.hidden_physics.robots import Setting as Hidden
+from tests.ident.estimation.emulated_sessions import record_pair
+from tests.ident.estimation_arm import true_base
 
 Sessions = list[Session]
 Change = Callable[[Sessions], Sessions]
@@ -332,7 +345,8 @@ def main() -> None:
     plain = outcome(sessions, chain)
     print(f"{'case':<38}{'says':<9}{'named':<7}{'worst':>10}  parameter        s")
     print(
-        f"{'as recorded':<38}{plain.verdict:<9}{'':<7}{plain.deviation:>10.1f}  {plain.parameter:<10}{plain.seconds:>7.1f}"
+        f"{'as recorded':<38}{plain.verdict:<9}{'':<7}{plain.deviation:>10.1f}  "
+        f"{plain.parameter:<10}{plain.seconds:>7.1f}"
     )
     missed = []
     for case in CASES:

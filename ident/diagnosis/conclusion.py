@@ -10,7 +10,6 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
-from ident.rows.data_quality import SampleLoss, sample_loss
 from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.held_out import HeldOut, fall, held_out, interval
 from ident.diagnosis.intervals import estimated
@@ -23,6 +22,7 @@ from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import Baseline, State, Task
 from ident.effects import LOST_SAMPLES
 from ident.model import DynamicModel
+from ident.rows.data_quality import SampleLoss, sample_loss
 
 # Largest unexplained part in the rows of a claim without a loss of confidence, over the claim's gain.
 _DOUBT = 0.2

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
-from ident.rows.data_quality import Stuck, clipped_at, held_times, passed_band, stuck_at
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Side
+from ident.rows.data_quality import Stuck, clipped_at, held_times, passed_band, stuck_at
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name
