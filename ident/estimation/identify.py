@@ -27,7 +27,7 @@ from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
-from ident.rows.screening import require_sound
+from ident.rows.screening import require_sound, without_dead
 from ident.rows.sessions import payload_name, require, stated_mass
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -274,14 +274,16 @@ def identify(
     for session, payload in zip(chosen, mounted, strict=True):
         # One session after the other, so that memory holds the full-rate signals of one only.
         whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
-        problems.append(
-            observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
+        seen = observe(
+            [whole], [payload], structure, columns=base.columns, names=base.names, units=base.units
         )
+        problems.append(without_dead(seen, session))
         motion = None if settings.signals.average_periods else commanded(session, whole)
         prepared.append(whole.without_samples())
         del whole
         if motion is not None:
-            instruments.append(observe([motion], [payload], structure, columns=base.columns))
+            seen = observe([motion], [payload], structure, columns=base.columns)
+            instruments.append(without_dead(seen, session))
             del motion
     warnings = doubts + [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)

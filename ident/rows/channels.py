@@ -25,6 +25,8 @@ _CORRELATED = 0.9
 _OVER, _OUTLIERS = 1.1, 0.001
 # Corners at a flat top: least number, length of the top, way before it over the one of a usual stop, time of that way.
 _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
+# Share of the motion at one torque, wherever it is.
+_OFTEN = 0.05
 # Share of the rows of two logs that agree to the last bit.
 _SAME_ROWS = 0.2
 
@@ -32,11 +34,15 @@ _SAME_ROWS = 0.2
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions)]
-    limits = joint_limits(chain)
     for session in sessions:
         found += [*_clocks(session), *_dead(session), *_clipped(session), *_velocity(session)]
-        found += [*_limits(session, limits), *_pace(session, limits)]
     return found
+
+
+def check_limits(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
+    """Doubts by the limits in the URDF: they say that a channel is wrong, seldom how."""
+    limits = joint_limits(chain)
+    return [doubt for s in sessions for doubt in (*_limits(s, limits), *_pace(s, limits))]
 
 
 def joint_limits(chain: Chain) -> dict[str, dict[str, float]]:
@@ -187,12 +193,14 @@ def _clocks(session: Session) -> Iterator[Doubt]:
 def _dead(session: Session) -> Iterator[Doubt]:
     for channel, columns in _torques(session):
         for joint in dead(columns):
-            value = float(columns.effort[0, joint])
+            value, motor = float(columns.effort[0, joint]), channel == "motor torque"
+            mend = "its rows are left out; repair the channel"
+            if motor:
+                mend = "repair the channel, or leave the motor torques aside (Model 1, `--model 1`)"
+            seen = f"reads {value:.4g} Nm in every sample"
             yield Doubt(
-                channel, (session.joint_names[joint],), f"reads {value:.4g} Nm in every sample", "a dead sensor",
-                "its parameters come from the other rows alone; repair the channel, or import the log without it",
-                False, session.path.name,
-            )  # fmt: skip
+                channel, (session.joint_names[joint],), seen, "a dead sensor", mend, motor, session.path.name
+            )
 
 
 def _clipped(session: Session) -> Iterator[Doubt]:
@@ -210,10 +218,11 @@ def _clipped(session: Session) -> Iterator[Doubt]:
         silent = set(dead(session.motor))
         levels: dict[int, list[str]] = {}
         for stuck in stuck_at(session.motor, session.joint):
-            if stuck.joint not in silent:
-                share = 100.0 * stuck.count / max(stuck.samples, 1)
+            own, share = session.motor.effort[:, stuck.joint], stuck.count / max(stuck.samples, 1)
+            # A coarse sensor may repeat a value somewhere in its range; a limit is the end of the range.
+            if stuck.joint not in silent and (share > _OFTEN or stuck.value in (own.min(), own.max())):
                 levels.setdefault(stuck.joint, []).append(
-                    f"{stuck.value:.4g} Nm ({share:.0f} % of the motion)"
+                    f"{stuck.value:.4g} Nm ({100 * share:.0f} % of the motion)"
                 )
         for joint, texts in levels.items():
             seen = f"stays at {' and '.join(texts)}"

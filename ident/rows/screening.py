@@ -23,7 +23,8 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
-from ident.rows.channels import check_channels, dead
+from ident.estimators.problem import Problem
+from ident.rows.channels import check_channels, check_limits, dead
 from ident.rows.doubts import Doubt, settle
 from ident.rows.explanations import AGREES, Explanation, explain, is_wrong, unit_of
 from ident.rows.filters import SignalSettings
@@ -62,19 +63,36 @@ def screen(
     Raises ConfigurationError for sessions of other joints than the chain's.
     """
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
-    doubts = check_channels(chosen, chain)
-    if any(doubt.certain for doubt in doubts):
+    doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
+    if any(doubt.certain for doubt in (*doubts, *beyond)):
         # What is certain bends all that is computed from it.
-        return tuple(doubts)
+        return (*doubts, *beyond)
     try:
         data = Redundancy.of(chosen, chain, signals or SignalSettings(), couplings, _silent(chosen))
     except LwrError as error:
         # The fit itself says what is too short or does not move.
         logger.info("no screening by redundancy: %s", error)
-        return tuple(doubts)
-    named = {(doubt.channel, joint) for doubt in doubts for joint in doubt.joints}
-    found = [d for d in _contradictions(data, chosen) if not {(d.channel, j) for j in d.joints} & named]
-    return (*doubts, *found)
+        return (*doubts, *beyond)
+    found = [doubt for doubt in _contradictions(data, chosen) if not _shared(doubt, doubts)]
+    return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
+
+
+def without_dead(problem: Problem, session: Session) -> Problem:
+    """The rows of one session without those of its dead torque sensors."""
+    names = session.joint_names
+    silent = {(side, names[joint]) for side, joint in _silent([session])}
+    kept = {k: group for k, group in enumerate(problem.groups) if (group.side, group.joint) not in silent}
+    places = {old: new for new, old in enumerate(kept)}
+    nuisances = tuple(
+        replace(one, columns={places[k]: column for k, column in one.columns.items() if k in places})
+        for one in problem.nuisances
+    )
+    return replace(problem, groups=tuple(kept.values()), nuisances=nuisances)
+
+
+def _shared(doubt: Doubt, others: Sequence[Doubt]) -> bool:
+    """Whether another doubt names the channel and one of the joints."""
+    return any(one.channel == doubt.channel and set(one.joints) & set(doubt.joints) for one in others)
 
 
 def require_sound(
