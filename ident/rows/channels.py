@@ -33,9 +33,9 @@ _SAME_ROWS = 0.2
 
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
-    found = [*_repeated(sessions), *_never_moving(sessions)]
+    found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
     for session in sessions:
-        found += [*_clocks(session), *_dead(session), *_clipped(session), *_velocity(session)]
+        found += [*_clocks(session), *_clipped(session), *_velocity(session)]
     return found
 
 
@@ -190,17 +190,22 @@ def _clocks(session: Session) -> Iterator[Doubt]:
             )
 
 
-def _dead(session: Session) -> Iterator[Doubt]:
-    for channel, columns in _torques(session):
-        for joint in dead(columns):
-            value, motor = float(columns.effort[0, joint]), channel == "motor torque"
-            mend = "its rows are left out; repair the channel"
-            if motor:
-                mend = "repair the channel, or leave the motor torques aside (Model 1, `--model 1`)"
-            seen = f"reads {value:.4g} Nm in every sample"
-            yield Doubt(
-                channel, (session.joint_names[joint],), seen, "a dead sensor", mend, motor, session.path.name
-            )
+def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
+    """Dead torque sensors; certain for a joint without any torque of the side, and for the motor side's delay."""
+    for session in sessions:
+        for channel, columns in _torques(session):
+            motor = channel == "motor torque"
+            for joint in dead(columns):
+                alike = [own for other in sessions for name, own in _torques(other) if name == channel]
+                never = all(joint in dead(own) for own in alike)
+                mend = "its rows are left out; repair the channel"
+                if motor:
+                    mend = "repair the channel, or leave the motor torques aside (Model 1, `--model 1`)"
+                elif never:
+                    mend = "repair the channel, add a session with it, or leave the joint torques aside"
+                seen = f"reads {float(columns.effort[0, joint]):.4g} Nm in every sample"
+                names = (session.joint_names[joint],)
+                yield Doubt(channel, names, seen, "a dead sensor", mend, motor or never, session.path.name)
 
 
 def _clipped(session: Session) -> Iterator[Doubt]:
