@@ -17,6 +17,7 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
+from ident.estimation.plausibility import require_plausible
 from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
@@ -310,6 +311,7 @@ def identify(
     essential = None
     if settings.essential is not None:
         essential = find_essential(problem, estimate, settings.essential, settings.covariance)
+    warnings += require_plausible(problem, estimate, chain.joint_names)
     warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
     warnings += _condition_warnings(normalised, estimate)
     return Identification(

@@ -76,7 +76,8 @@ def explain(
     found: list[Explanation] = []
     for _ in range(data.chain.n):
         best = _best(data, believed)
-        if best is None:
+        # What is left of a mended channel is the coarseness of its mending.
+        if best is None or any(one.channel == best.channel and one.joints == best.joints for one in found):
             break
         found.append(best)
         data = best.mended
@@ -103,6 +104,12 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
 
 def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
     yield from sorted(_torque_gains(data, gains), key=lambda one: -len(one.joints))
+    for side, joint in gains:
+        for factor in (-1.0, 1e3, 1e-3):
+            scale = np.eye(data.chain.n)
+            scale[joint, joint] = 1.0 / factor
+            mended = _mapped(data, side, scale)
+            yield Explanation(f"{side} torque", (joint,), unit_of(factor), mended, 0.0, factor)
     for side in data.sides:
         for a, b in _pairs(data):
             if (side, a) not in data.silent and (side, b) not in data.silent:

@@ -254,6 +254,11 @@ class Redundancy:
             for key, items in parts.items()
         }
 
+    def enough(self, share: float) -> bool:
+        """Whether there are `share` rows for each parameter."""
+        count = sum(len(rows.q) for rows in self.rows) * self.chain.n - len(self.silent)
+        return count >= share * self.matrix(self.rows[0].thinned(len(self.rows[0].q))).shape[2]
+
     def map_of(self, side: str) -> Floats:
         """(n, n), true torque = map @ measured torque."""
         return self.maps.get(side, np.eye(self.chain.n))
