@@ -9,7 +9,7 @@ verdict is by consequence, beside the statistic:
   of the joint's torque, the accuracy on data sheets of joint torque sensors, and the scatter of a row, the floor of
   this sensor;
 * what bends the estimates (variance, outliers, noise in the regressor) is mended, by weights or by instruments, and
-  counts if a parameter leaves its own 95 % interval and the computed torque moves by as much as matters;
+  counts if a parameter leaves its own 95 % interval and a computed torque moves by two hundredths of itself;
 * correlation is allowed for by the robust covariance, if there are blocks enough to compute it from. With the
   textbook covariance it counts by the ratio of the two.
 """
@@ -298,7 +298,8 @@ class _Moved(NamedTuple):
         for row_class in problem.classes:
             parts = np.concatenate([problem.groups[k].matrix @ shift for k in row_class.groups])
             torques.append(float(np.sqrt(np.mean(parts**2))))
-        limits = [_matters(s) for s in series]
+        # The scatter of a row is no floor for what all rows share.
+        limits = [_matters(s, 0.0) for s in series]
         k = int(
             np.argmax([torque / max(limit, 1e-300) for torque, limit in zip(torques, limits, strict=True)])
         )

@@ -36,7 +36,7 @@ def check_estimate(problem: Problem, estimate: Estimate, joints: Sequence[str]) 
                     (joint,),
                     text,
                     "a reversed sign of torque or position, or a late channel",
-                    "check the signs of both channels and the delay; beside a weak motion, judge it by its deviation",
+                    "check the signs of both channels and the delay",
                     len(wrong) > 0.5 * len(joints),
                 )
             )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.rows.redundancy import Class, Gain, Redundancy
+from ident.rows.redundancy import Class, Fit, Gain, Redundancy
 
 # Ratios of units that are mixed up, and what they look like.
 UNITS = {
@@ -97,9 +97,8 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         for candidate in _motions(data):
             drop = before - candidate.mended.fit(doubtful=False).score
             tried.append(replace(candidate, drop=drop))
-    tried = [one for one in tried if believed(one, len(normal))]
-    tried = [_refined(one, before) for one in sorted(tried, key=lambda one: -one.drop)[:3]]
-    return max(tried, key=lambda one: one.drop, default=None)
+    best = max((one for one in tried if believed(one, len(normal))), key=lambda one: one.drop, default=None)
+    return None if best is None else _refined(best, before)
 
 
 def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
@@ -218,26 +217,28 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
 
 
 def _refined(candidate: Explanation, before: float) -> Explanation:
-    """The gain of a position or the pace of time by golden section around the coarse value."""
-    if candidate.factor in (1.0, -1.0) or candidate.channel not in ("position", "time"):
+    """The gain of a position or the pace of time by steps around the coarse value, each half the last."""
+    if abs(candidate.factor) == 1.0 or candidate.channel not in ("position", "time"):
         return candidate
-    # Undone on the rows of the candidate itself, so the search is relative to it.
-    best = candidate
+    best, fit = candidate, candidate.mended.fit(doubtful=False)
     step = 0.2
-    for _ in range(6):
+    for _ in range(8):
         for relative in (np.exp(step), np.exp(-step)):
+            # Undone on the mended rows, so the search is relative to them.
             data = best.mended
-            trial = (
-                _position_gain(data, best.joints, relative)
-                if best.channel == "position"
-                else _paced(data, relative)
-            )
-            drop = before - trial.mended.fit(doubtful=False).score
-            if drop > best.drop:
+            position = best.channel == "position"
+            trial = _position_gain(data, best.joints, relative) if position else _paced(data, relative)
+            tried = trial.mended.fit(doubtful=False)
+            if _sharp(tried) < _sharp(fit):
                 factor = best.factor * relative
-                looks = unit_of(factor) if best.channel == "position" else _paced(data, factor).looks_like
-                best = replace(trial, drop=drop, factor=factor, looks_like=looks)
+                looks = unit_of(factor) if position else _paced(data, factor).looks_like
+                best, fit = replace(trial, drop=before - tried.score, factor=factor, looks_like=looks), tried
                 break
         else:
             step *= 0.5
     return best
+
+
+def _sharp(fit: Fit) -> float:
+    """The score without its floor."""
+    return float(sum(np.log(max(value, 1e-6)) for value in fit.rho.values()))

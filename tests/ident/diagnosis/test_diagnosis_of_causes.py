@@ -10,10 +10,10 @@ import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import ArmData, Diagnosis, Reference, commission, diagnose
-from ident.rows.data_quality import clipped_at, held_times, stuck_at
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.model.model_file import model_text, read_model
+from ident.rows.data_quality import clipped_at, held_times, stuck_at
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]
