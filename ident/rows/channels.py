@@ -121,11 +121,18 @@ def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
             continue
         value = float(still[0].joint.position[0, joint])
         where = "" if len(still) == len(sessions) else still[0].path.name
-        yield Doubt(
-            "position", (name,), f"reads {value:.6g} in every sample", "a dead sensor or a column of constants",
-            "repair the channel or leave the log out; a locked joint is fixed in the chain",
-            bool(driven) or len(still) == len(sessions), where,
-        )  # fmt: skip
+        seen, looks = (
+            f"joint {name} never moves, {value:.6g} in every sample",
+            "a locked joint or a dead sensor",
+        )
+        if driven:
+            seen, looks = (
+                f"reads {value:.6g} in every sample of a motion",
+                "a dead sensor or a column of constants",
+            )
+        mend = "repair the channel or leave the log out; identify a locked joint's arm with a chain in which it is fixed"
+        certain = bool(driven) or len(still) == len(sessions)
+        yield Doubt("position", (name,), seen, looks, mend, certain, where)
 
 
 def _asked_to_move(session: Session, joint: int) -> bool:

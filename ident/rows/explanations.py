@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.rows.redundancy import Class, Fit, Gain, Redundancy
+from ident.rows.redundancy import Class, Gain, Redundancy
 
 # Ratios of units that are mixed up, and what they look like.
 UNITS = {
@@ -35,6 +35,8 @@ _GAIN, _DEVIATIONS = 0.18, 5.0
 _LEFT = 0.75
 _POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 _PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
+# Fall of the score for which a plain factor is given up.
+_FINER = 0.1
 _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
 
 
@@ -198,7 +200,7 @@ def _position_gain(data: Redundancy, joints: tuple[int, ...], factor: float) -> 
 def _paced(data: Redundancy, factor: float) -> Explanation:
     """Recorded time over true time is `factor`."""
     rows = tuple(part.at_pace(factor) for part in data.rows)
-    looks = f"time that passes {factor:.3g} times {'too slowly' if factor < 1 else 'too fast'} in the stamps"
+    looks = f"time that passes about {factor:.2g} times {'as fast' if factor < 1 else 'too fast'} in the stamps"
     return Explanation("time", (), looks, replace(data, rows=rows), 0.0, factor)
 
 
@@ -220,25 +222,19 @@ def _refined(candidate: Explanation, before: float) -> Explanation:
     """The gain of a position or the pace of time by steps around the coarse value, each half the last."""
     if abs(candidate.factor) == 1.0 or candidate.channel not in ("position", "time"):
         return candidate
-    best, fit = candidate, candidate.mended.fit(doubtful=False)
-    step = 0.2
+    best, step = candidate, 0.2
     for _ in range(8):
         for relative in (np.exp(step), np.exp(-step)):
             # Undone on the mended rows, so the search is relative to them.
             data = best.mended
             position = best.channel == "position"
             trial = _position_gain(data, best.joints, relative) if position else _paced(data, relative)
-            tried = trial.mended.fit(doubtful=False)
-            if _sharp(tried) < _sharp(fit):
+            drop = before - trial.mended.fit(doubtful=False).score
+            if drop > best.drop + _FINER:
                 factor = best.factor * relative
                 looks = unit_of(factor) if position else _paced(data, factor).looks_like
-                best, fit = replace(trial, drop=before - tried.score, factor=factor, looks_like=looks), tried
+                best = replace(trial, drop=drop, factor=factor, looks_like=looks)
                 break
         else:
             step *= 0.5
     return best
-
-
-def _sharp(fit: Fit) -> float:
-    """The score without its floor."""
-    return float(sum(np.log(max(value, 1e-6)) for value in fit.rho.values()))

@@ -55,7 +55,7 @@ def test_a_late_motor_channel_is_not_a_wrong_one() -> None:
         (scaled("joint", "position", -1.0, "E1"), "position", ("E1",), "reversed sign"),
         (swapped("joint", "position", "A3", "A4"), "position", ("A3", "A4"), "interchanged"),
         (scaled("joint", "position", 180.0 / np.pi, "A4"), "position", ("A4",), "degrees"),
-        (paced(0.5), "time", (), "passes 0.5"),
+        (paced(0.5), "time", (), "as fast in the stamps"),
         (labelled("none", "none"), "payload", (), "payload"),
     ],
 )  # fmt: skip
