@@ -130,7 +130,7 @@ def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
                 f"reads {value:.6g} in every sample of a motion",
                 "a dead sensor or a column of constants",
             )
-        mend = "repair the channel or leave the log out; identify a locked joint's arm with a chain in which it is fixed"
+        mend = "repair the channel or leave the log out; for a locked joint take a chain in which it is fixed"
         certain = bool(driven) or len(still) == len(sessions)
         yield Doubt("position", (name,), seen, looks, mend, certain, where)
 
