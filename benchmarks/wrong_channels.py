@@ -55,7 +55,8 @@ def _channel(sessions: Sessions, channel: str, edit: Callable[[JointColumns], Jo
     done = []
     for session in sessions:
         columns = getattr(session, channel)
-        done.append(session if columns is None else replace(session, **{channel: edit(columns)}))
+        changed: dict[str, Any] = {} if columns is None else {channel: edit(columns)}
+        done.append(replace(session, **changed))
     return done
 
 

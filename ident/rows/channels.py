@@ -21,6 +21,8 @@ _CLOCKS, _SPEEDS, _UNIT = 0.02, 0.15, 1.5
 # Blocks of the comparison with the velocity: least samples, least time [s]; least movement of a joint [rad or m].
 _BLOCK, _BLOCK_S, _MOVED = 5, 0.05, 0.05
 _CORRELATED = 0.9
+# Velocities over rad/s in other units.
+_SPEED_UNITS = {180.0 / np.pi: "deg/s for rad/s", 30.0 / np.pi: "revolutions per minute for rad/s"}
 # Overshoot of a limit by calibration, over which a doubt is raised, and share of the samples left out as outliers.
 _OVER, _OUTLIERS = 1.1, 0.001
 # Corners at a flat top: least number, length of the top, way before it over the one of a usual stop, time of that way.
@@ -305,7 +307,7 @@ def _velocity(session: Session) -> Iterator[Doubt]:
         return
     moved = np.ptp(joint.position, axis=0) > _MOVED
     factors: dict[int, float] = {}
-    for k in np.flatnonzero(moved):
+    for k in map(int, np.flatnonzero(moved)):
         speed, own = slope[:, k], inner[:, k]
         if not own.any():
             seen, mend = (
@@ -317,7 +319,9 @@ def _velocity(session: Session) -> Iterator[Doubt]:
         related = _correlation(speed, own)
         if abs(related) < _CORRELATED:
             others = [
-                j for j in np.flatnonzero(moved) if j != k and abs(_correlation(slope[:, j], own)) > 0.95
+                j
+                for j in map(int, np.flatnonzero(moved))
+                if j != k and abs(_correlation(slope[:, j], own)) > 0.95
             ]
             looks = (
                 f"the velocity of {session.joint_names[others[0]]}"
@@ -329,22 +333,26 @@ def _velocity(session: Session) -> Iterator[Doubt]:
             if others or abs(related) < 0.5:
                 yield Doubt("velocity", (session.joint_names[k],), seen, looks, mend, bool(others), name)
             continue
-        factors[int(k)] = float(own @ speed / (speed @ speed))
+        factors[k] = float(own @ speed / (speed @ speed))
     wrong = {k: f for k, f in factors.items() if abs(f - 1.0) > _SPEEDS}
     common = float(np.median(list(factors.values()))) if factors else 1.0
     if len(wrong) == len(factors) > 1 and all(abs(f / common - 1.0) < _SPEEDS for f in wrong.values()):
         seen = f"the velocities of all joints are {common:.4g} times dq/dt"
+        known = [unit for value, unit in _SPEED_UNITS.items() if abs(common / value - 1.0) < _SPEEDS]
+        if known:
+            mend = "state the factor of the velocities when importing; the fit does not use them"
+            yield Doubt(
+                "velocity", tuple(session.joint_names[k] for k in wrong), seen, known[0], mend, False, name
+            )
+            return
         looks = f"stamps that pass {common:.4g} times too fast, or velocities in another unit"
         mend = "state the unit of time, or the factor of the velocities, when importing"
         yield Doubt("time", (), seen, looks, mend, _by_unit(common), name)
         return
     for k, factor in wrong.items():
         seen = f"is {factor:.4g} times dq/dt of the position"
-        looks = (
-            "a reversed sign of one of the two"
-            if abs(factor + 1.0) < _SPEEDS
-            else "a wrong unit of one of the two"
-        )
+        kind = "reversed sign" if abs(factor + 1.0) < _SPEEDS else "wrong unit"
+        looks = f"a {kind} of one of the two"
         mend = "check sign and unit of position and velocity of this joint"
         yield Doubt("velocity", (session.joint_names[k],), seen, looks, mend, False, name)
 

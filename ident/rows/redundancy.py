@@ -115,9 +115,10 @@ def _rows(
     kept = middle.coverage() > _COVERED
     both = np.column_stack([channel.qd[:, a] + channel.qd[:, b] for a, b in couplings] or [channel.qd[:, :0]])
     motion = [channel.q, channel.qd, channel.qdd, np.sign(channel.qd), np.sign(both)]
-    smooth = [middle.apply(block_means(values, factor))[kept] for values in motion]
+    q, qd, qdd, sign, coupled = (middle.apply(block_means(values, factor))[kept] for values in motion)
     slope = (low_pass(step).apply(torque) - low_pass(-step).apply(torque)) / (2.0 * step)
-    return SampledRows(channel.side, record, payload, *smooth, middle.apply(torque)[kept], slope[kept])
+    smooth = middle.apply(torque)[kept]
+    return SampledRows(channel.side, record, payload, q, qd, qdd, sign, coupled, smooth, slope[kept])
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,8 @@ def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> N
     assert found(paced(1e3)).channel == "time"
     velocity = found(with_speed(None, -1.0, "A3"))
     assert (velocity.channel, velocity.joints) == ("velocity", ("A3",))
+    units = found(with_speed(None, 180.0 / np.pi, *chain().joint_names))
+    assert (units.channel, units.certain) == ("velocity", False)
     assert check_channels(with_speed()(pair), chain()) == []
 
 
