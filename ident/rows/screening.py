@@ -247,7 +247,7 @@ def _physics(data: Redundancy, fit: Fit, normal: Mapping[Class, Any]) -> list[Do
         acting[joint] = max(acting[joint], abs(inertia[joint]) * speeding / max(torque_rms, 1e-300))
     sure = (np.abs(inertia) > _DEVIATIONS * std) & (acting > _SHARE)
     negative, positive = np.flatnonzero(sure & (inertia < 0.0)), np.flatnonzero(sure & (inertia > 0.0))
-    if len(negative) > len(positive) and _without_inertia(data).score - fit.score > _CERTAIN:
+    if len(negative) > len(positive) and _without_inertia(data).score - fit.score > _DOUBT:
         listed = ", ".join(f"{names[j]} {inertia[j]:.3g} ± {std[j]:.2g} kg m^2" for j in negative)
         channel = " and ".join(f"{side} torque" for side in data.sides)
         looks, mend = (

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.wrong_channels import clipped, constant, labelled, paced, scaled, swapped, with_speed, without
 from fri.errors import DataError
+from ident.dynamics.kinematics import Chain
 from ident.rows.channels import check_channels
 from ident.rows.doubts import Doubt, settle
 from ident.rows.explanations import unit_of
@@ -93,6 +94,35 @@ def test_one_side_alone_shows_a_gain_and_a_sign(pair: list[Session]) -> None:
         assert (gain.channel, gain.joints) == (f"{side} torque", ("A2",))
         (sign,) = doubts(without(other, scaled(side, "effort", -1.0, "A3"))(pair))
         assert (sign.joints, sign.certain) == (("A3",), True)
+
+
+def test_the_sign_of_a_single_joint_shows_by_its_inertia() -> None:
+    time, random = np.arange(0.0, 20.0, 0.004), np.random.default_rng(0)
+    q = np.sin(1.1 * time) + 0.4 * np.sin(2.3 * time + 1.0)
+    qd = np.gradient(q, time)
+    torque = 3.0 * np.gradient(qd, time) + 20.0 * np.cos(q) + 4.0 * qd + 5.0 * np.sign(qd)
+    torque += 0.05 * random.normal(size=len(time))
+    alone = Chain.from_table([{"name": "A1"}], gravity=(0.0, -9.81, 0.0))
+    whole = session(rate_hz=250.0)
+    stamps = np.rint(1e9 * time).astype(np.int64)
+
+    def recorded(sign: float) -> Session:
+        columns = replace(
+            whole.joint,
+            names=("A1",),
+            log_time=stamps,
+            publish_time=stamps,
+            sequence=np.arange(1, len(time) + 1),
+            position=q[:, None] + 1e-5 * random.normal(size=(len(time), 1)),
+            velocity=np.zeros((len(time), 0)),
+            effort=sign * torque[:, None],
+        )
+        return replace(whole, joint_names=("A1",), joint=columns, motor=None, phases=())
+
+    assert screen([recorded(1.0)], alone) == ()
+    (found,) = screen([recorded(-1.0)], alone)
+    assert found.certain
+    assert "negative" in found.seen
 
 
 def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> None:
