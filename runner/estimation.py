@@ -224,7 +224,7 @@ KEYS = (
         otherwise="from the data",
     ),
     Key("signals.standstill_rad_s", "rad/s", "speed below which the sign of friction is unknown", least=0.0),
-    Key("signals.known_share", "", "least share of a row on samples measured and away from reversals", least=0.0, most=1.0),
+    Key("signals.known_share", "", "least share of a row's filter on samples in use", least=0.0, most=1.0),
     Key("signals.outlier_scale", "standard deviations", "distance of outliers from the running median", above=0.0),
     Key("signals.motor_delay_s", "s", "delay of the motor torques"),
     Key("signals.delay_search_s", "s", "largest delay considered, both ways", above=0.0),

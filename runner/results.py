@@ -39,7 +39,9 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     settings = IdentificationSettings(
         model=wanted.model,
         signals=SignalSettings(
-            cutoff_hz=wanted.cutoff_hz, decimate_hz=wanted.decimate_hz, stiffness_nm_rad=tuple(arm.stiffness.tolist())
+            cutoff_hz=wanted.cutoff_hz,
+            decimate_hz=wanted.decimate_hz,
+            stiffness_nm_rad=tuple(arm.stiffness.tolist()),
         ),
         estimator=wanted.estimator,
         resonance_hz=arm.resonance_hz,

@@ -18,6 +18,7 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
+from ident.estimation.plausibility import require_plausible
 from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
@@ -29,6 +30,7 @@ from ident.model.signals import signals_entry
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.screening import require_sound, without_dead
 from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -293,6 +295,7 @@ def identify(
         settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
+    doubts = require_sound(chosen, chain, settings.signals, settings.couplings)
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     conditions = _conditions(structure, chosen, mounted)
     base = numeric_base(structure, conditions)
@@ -307,24 +310,19 @@ def identify(
     prepared, problems, instruments = [], [], []
     for session, payload in zip(chosen, mounted, strict=True):
         # One session after the other, so that memory holds the full-rate signals of one only.
-        whole = prepare(
-            session,
-            settings.signals,
-            resonance_hz=settings.resonance_hz,
-            motor=needs_motor,
+        whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
+        seen = observe(
+            [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units
         )
-        problems.append(
-            observe(
-                [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units
-            )
-        )
+        problems.append(without_dead(seen, session))
         motion = None if settings.signals.average_periods else commanded(session, whole)
         prepared.append(whole.without_samples())
         del whole
         if motion is not None:
-            instruments.append(observe([motion], [payload], rows_structure, columns=base.columns))
+            seen = observe([motion], [payload], rows_structure, columns=base.columns)
+            instruments.append(without_dead(seen, session))
             del motion
-    warnings = [warning for session in prepared for warning in session.warnings]
+    warnings = doubts + [warning for session in prepared for warning in session.warnings]
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
     # With instrumental variables, this is the WLS compared with them.
@@ -352,6 +350,7 @@ def identify(
     essential = None
     if settings.essential is not None and full_rank:
         essential = find_essential(problem, estimate, settings.essential, settings.covariance)
+    warnings += require_plausible(problem, estimate, chain.joint_names)
     warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
     warnings += _condition_warnings(normalised, estimate)
     return Identification(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ident.estimation.assumptions import check_assumptions, repeatability
 from ident.estimators import InstrumentalVariables, Problem, RowGroup, WeightedLeastSquares
+from ident.estimators.covariance import CovarianceSettings
 from tests.ident.regression_problems import ar1, design, problem
 
 CHI = np.linspace(-2.0, 2.5, 12)
@@ -38,27 +41,48 @@ def test_white_normal_residuals_pass_every_check():
             assert np.mean([bool(found[name]) for found in passed]) >= 0.9, name
 
 
-def test_correlated_residuals_are_found():
+def test_correlation_matters_to_the_textbook_covariance_alone():
     matrices = design(samples=300)
     random = np.random.default_rng(0)
-    found = verdicts(problem(matrices, CHI, [ar1(random, 300, 0.5) for _ in matrices]))
-    assert found["serially uncorrelated"] is False
+    case = problem(matrices, CHI, [ar1(random, 300, 0.7) for _ in matrices])
+    robust = check_assumptions(case, WeightedLeastSquares().fit(case))["serially uncorrelated"]
+    assert robust.p_value < 1e-6
+    assert robust.holds is True
+    textbook = WeightedLeastSquares(CovarianceSettings(kind="textbook")).fit(case)
+    found = check_assumptions(case, textbook)["serially uncorrelated"]
+    assert found.holds is False
+    assert "robust covariance" in found.consequence
 
 
-def test_a_variance_that_grows_with_the_torque_is_found():
+def test_too_few_blocks_do_not_allow_for_correlation():
+    matrices = design(samples=300)
+    random = np.random.default_rng(0)
+    case = problem(matrices, CHI, [ar1(random, 300, 0.7) for _ in matrices])
+    estimate = WeightedLeastSquares().fit(case)
+    few = replace(estimate, covariance=replace(estimate.covariance, degrees_of_freedom=2.0))
+    assert check_assumptions(case, few)["serially uncorrelated"].holds is False
+
+
+def test_a_variance_that_grows_with_the_torque_is_told_but_bends_nothing():
     matrices = design(samples=300)
     random = np.random.default_rng(0)
     noise = [0.3 * np.abs(m @ CHI) * random.normal(size=300) for m in matrices]
-    assert verdicts(problem(matrices, CHI, noise))["equal variance"] is False
+    found = check_assumptions(case := problem(matrices, CHI, noise), WeightedLeastSquares().fit(case))
+    assert found["equal variance"].p_value < 1e-6
+    assert found["equal variance"].holds is True
 
 
-def test_spikes_are_not_normal():
+@pytest.mark.parametrize(("every", "holds"), [(150, True), (7, False)])
+def test_spikes_count_by_what_they_bend(every, holds):
     matrices = design(samples=300)
     random = np.random.default_rng(0)
-    noise = [random.normal(size=300) for _ in matrices]
-    noise[1][[50, 120]] = 25.0
+    noise = [0.1 * random.normal(size=300) for _ in matrices]
+    for k in (1, 4):
+        # The torque is doubled in some samples: a false gain, and not only scatter.
+        noise[k][::every] += (matrices[k] @ CHI)[::every]
     found = check_assumptions(case := problem(matrices, CHI, noise), WeightedLeastSquares().fit(case))
-    assert found["normality"].holds is False
+    assert found["normality"].p_value < 1e-6
+    assert found["normality"].holds is holds
     assert "A2" in found["normality"].finding
 
 
@@ -98,6 +122,13 @@ def _periodic(repeating: float, seed: int = 0) -> Problem:
     )
 
 
+def test_a_model_error_below_the_sensors_accuracy_does_not_matter():
+    small = check_assumptions(case := _periodic(0.06), WeightedLeastSquares().fit(case), period_rows=50)
+    assert small["lack of fit"].p_value < 0.01
+    assert small["lack of fit"].holds is True
+    assert "matters" in small["lack of fit"].finding
+
+
 def test_model_error_is_told_from_noise_by_the_periods():
     clean, wrong = _periodic(0.0), _periodic(0.2)
     assert verdicts(clean, period_rows=50)["lack of fit"] is True
@@ -111,9 +142,10 @@ def test_the_verdict_table_names_every_check_and_what_follows():
     matrices = design(samples=300)
     random = np.random.default_rng(0)
     case = problem(matrices, CHI, [ar1(random, 300, 0.9) for _ in matrices])
-    found = check_assumptions(case, WeightedLeastSquares().fit(case))
+    textbook = WeightedLeastSquares(CovarianceSettings(kind="textbook")).fit(case)
+    found = check_assumptions(case, textbook)
     text = found.summary()
     assert all(name in text for name in NAMES)
     assert "VIOLATED" in text
-    assert "the stated robust ones hold" in text
+    assert "state a robust covariance" in text
     assert found.to_dict()["serially uncorrelated"]["verdict"] == "VIOLATED"

@@ -17,7 +17,9 @@ from tests.ident import estimation_arm as arm
 def chosen(session, settings: SignalSettings | None = None, coulomb: Coulomb | None = None) -> SignalChoice:
     structure = ModelStructure(arm.chain(), 2 if session.motor is not None else 1)
     base = numeric_base(structure)
-    return choose_signals([session], [None], structure, base.columns, settings or SignalSettings(), (coulomb, None))
+    return choose_signals(
+        [session], [None], structure, base.columns, settings or SignalSettings(), (coulomb, None)
+    )
 
 
 def sensors(**changes) -> arm.Sensors:

@@ -1,0 +1,45 @@
+"""A doubt about the data: channel, joints, what was seen, what it looks like, and how to mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fri.errors import DataError
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One sentence about one channel of one session or of all.
+
+    channel : "position", "velocity", "joint torque", "motor torque", "time", "payload", "log".
+    joints : names; empty for the channel as a whole. session : file name; empty for all sessions.
+    certain : whether the data are worthless with it.
+    """
+
+    channel: str
+    joints: tuple[str, ...]
+    seen: str
+    looks_like: str
+    mend: str
+    certain: bool = False
+    session: str = ""
+
+    @property
+    def subject(self) -> str:
+        """Session, joints and channel."""
+        where = f"{self.session}: " if self.session else ""
+        return f"{where}{', '.join(self.joints)} {self.channel}" if self.joints else f"{where}{self.channel}"
+
+    def __str__(self) -> str:
+        looks = f", looks like {self.looks_like}" if self.looks_like else ""
+        return f"{self.subject}: {self.seen}{looks}; {self.mend}"
+
+
+def settle(doubts: Sequence[Doubt]) -> list[str]:
+    """Sentences of the doubts for the report. Raises DataError with all of them if one is certain."""
+    sentences = list(dict.fromkeys(str(doubt) for doubt in doubts))
+    certain = list(dict.fromkeys(str(doubt) for doubt in doubts if doubt.certain))
+    if certain:
+        raise DataError("\n".join([*certain, *(text for text in sentences if text not in certain)]))
+    return sentences

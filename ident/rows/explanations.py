@@ -1,0 +1,242 @@
+"""Which single change of a channel makes the data of an arm agree with themselves.
+
+Each explanation is a change that people and programs make by mistake: the sign of a channel, its unit or gain, two
+interchanged joints, a zero offset, the pace of time, the label of a payload. It is undone in the rows of `Redundancy`
+and judged by the fall of the score, the sum over joints and sides of log(residual / torque). The best one is taken, and
+the search goes on in the mended data, because two channels may be wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.dynamics.parameters import Floats
+from ident.rows.redundancy import Class, Gain, Redundancy
+
+# Ratios of units that are mixed up, and what they look like.
+UNITS = {
+    1000.0: "a unit 1000 times too small, such as mNm for Nm",
+    0.001: "a unit 1000 times too large, such as kNm for Nm",
+    180.0 / np.pi: "degrees for radians",
+    np.pi / 180.0: "radians taken for degrees",
+    60.0: "per minute for per second",
+    1.0 / 60.0: "per second for per minute",
+}
+"""Factor of the recorded over the true value, and its usual cause."""
+_NEAR = 0.1
+# Residual over torque of an arm whose channels agree; beyond it explanations are sought.
+AGREES = 0.1
+# Least gain error that is looked at, and its standard deviations: sensors are calibrated to a few per cent.
+_GAIN, _DEVIATIONS = 0.18, 5.0
+# Share of the residual that a true gain error leaves at most.
+_LEFT = 0.75
+_POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
+_PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
+# Fall of the score for which a plain factor is given up.
+_FINER = 0.1
+_OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A change of a channel: what it looks like, the mended rows, and the fall of the score.
+
+    channel : as in `Doubt`. factor : recorded over true value, where the change is one. gain : of a torque.
+    """
+
+    channel: str
+    joints: tuple[int, ...]
+    looks_like: str
+    mended: Redundancy
+    drop: float = 0.0
+    factor: float = 1.0
+    gain: Gain | None = None
+    label: str = ""
+
+
+def unit_of(factor: float) -> str:
+    """What a factor between recorded and true value looks like."""
+    if factor < 0.0:
+        rest = unit_of(-factor)
+        return "a reversed sign" if abs(factor + 1.0) < 0.5 else f"a reversed sign and {rest}"
+    for known, name in UNITS.items():
+        if abs(np.log(factor / known)) < _NEAR:
+            return name
+    return f"a gain of {factor:.3g}"
+
+
+def explain(
+    data: Redundancy, believed: Callable[[Explanation, int], bool]
+) -> tuple[list[Explanation], Redundancy]:
+    """Explanations, the strongest first, and the mended rows.
+
+    believed : of an explanation and the number of classes, whether it gains enough.
+    """
+    found: list[Explanation] = []
+    for _ in range(data.chain.n):
+        best = _best(data, believed)
+        # What is left of a mended channel is the coarseness of its mending.
+        if best is None or any(one.channel == best.channel and one.joints == best.joints for one in found):
+            break
+        found.append(best)
+        data = best.mended
+    return found, data
+
+
+def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Explanation | None:
+    normal = data.normal()
+    fit = data.fit(normal)
+    before, tried = fit.score, []
+    for candidate in _torques(data, data.gains(fit, normal)):
+        after = candidate.mended.fit(normal, doubtful=False)
+        tried.append(replace(candidate, drop=before - after.score))
+        if believed(tried[-1], len(normal)) and max(after.rho.values()) < AGREES:
+            break
+    else:
+        for candidate in _motions(data):
+            drop = before - candidate.mended.fit(doubtful=False).score
+            tried.append(replace(candidate, drop=drop))
+    best = max((one for one in tried if believed(one, len(normal))), key=lambda one: one.drop, default=None)
+    return None if best is None else _refined(best, before)
+
+
+def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
+    yield from sorted(_torque_gains(data, gains), key=lambda one: -len(one.joints))
+    for side, joint in gains:
+        for factor in (-1.0, 1e3, 1e-3):
+            scale = np.eye(data.chain.n)
+            scale[joint, joint] = 1.0 / factor
+            mended = _mapped(data, side, scale)
+            yield Explanation(f"{side} torque", (joint,), unit_of(factor), mended, 0.0, factor)
+    for side in data.sides:
+        for a, b in _pairs(data):
+            if (side, a) not in data.silent and (side, b) not in data.silent:
+                mended = _mapped(data, side, _exchange(data, a, b))
+                yield Explanation(f"{side} torque", (a, b), "the two joints interchanged", mended)
+
+
+def _motions(data: Redundancy) -> Iterator[Explanation]:
+    yield from _positions(data)
+    yield from (_paced(data, factor) for factor in _PACES)
+    yield from _labels(data)
+
+
+def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
+    for side in data.sides:
+        own = {joint: gain for (where, joint), gain in gains.items() if where == side}
+        wrong = {joint: gain for joint, gain in own.items() if is_wrong(gain)}
+        for joint, gain in wrong.items():
+            scale = np.eye(data.chain.n)
+            scale[joint, joint] = 1.0 / gain.value
+            small = abs(gain.value) < 3.0 * gain.std
+            looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value)
+            yield Explanation(
+                f"{side} torque", (joint,), looks, _mapped(data, side, scale), 0.0, gain.value, gain
+            )
+        middle = float(np.median([gain.value for gain in wrong.values()])) if wrong else 1.0
+        alike = [joint for joint, gain in wrong.items() if abs(gain.value / middle - 1.0) < 0.3]
+        if len(alike) > max(1, len(own) // 2):
+            scale = np.diag([1.0 / middle if joint in alike else 1.0 for joint in range(data.chain.n)])
+            yield Explanation(
+                f"{side} torque", tuple(alike), unit_of(middle), _mapped(data, side, scale), 0.0, middle,
+                wrong[alike[0]],
+            )  # fmt: skip
+
+
+def is_wrong(gain: Gain) -> bool:
+    """Whether a gain is off by more than a calibration and its deviation, and mending it helps."""
+    off = abs(gain.value - 1.0)
+    return off > max(_GAIN, _DEVIATIONS * gain.std) and gain.left < _LEFT and gain.value != 0.0
+
+
+def _pairs(data: Redundancy) -> list[tuple[int, int]]:
+    n = data.chain.n
+    return [(a, b) for a in range(n) for b in range(a + 1, n)]
+
+
+def _exchange(data: Redundancy, a: int, b: int) -> Floats:
+    order = np.arange(data.chain.n)
+    order[[a, b]] = b, a
+    return np.eye(data.chain.n)[order]
+
+
+def _mapped(data: Redundancy, side: str, matrix: Floats) -> Redundancy:
+    return replace(data, maps={**data.maps, side: matrix @ data.map_of(side)})
+
+
+def moved(data: Redundancy, matrix: Floats, offset: Floats | float = 0.0) -> Redundancy:
+    """True positions = measured ones times `matrix` (n, n), plus `offset` (n,)."""
+    rows = tuple(part.moved(part.q @ matrix + offset, matrix) for part in data.rows)
+    return replace(data, rows=rows)
+
+
+def _positions(data: Redundancy) -> Iterator[Explanation]:
+    n = data.chain.n
+    for a, b in _pairs(data):
+        if data.chain.prismatic[a] == data.chain.prismatic[b]:
+            mended = moved(data, _exchange(data, a, b))
+            yield Explanation("position", (a, b), "the two joints interchanged", mended)
+    for joint in range(n):
+        factors = (-1.0, *_POSITION_GAINS, *((180.0 / np.pi, np.pi / 180.0, 0.5 / np.pi, 2.0 * np.pi)))
+        for factor in factors:
+            yield _position_gain(data, (joint,), factor)
+        for angle in () if data.chain.prismatic[joint] else _OFFSETS:
+            offset = np.zeros(n)
+            offset[joint] = -angle
+            looks = f"a zero offset of {np.degrees(angle):.0f} deg"
+            yield Explanation("position", (joint,), looks, moved(data, np.eye(n), offset))
+    for factor in (-1.0, 180.0 / np.pi, np.pi / 180.0):
+        yield _position_gain(data, tuple(range(n)), factor)
+
+
+def _position_gain(data: Redundancy, joints: tuple[int, ...], factor: float) -> Explanation:
+    scale = np.diag([1.0 / factor if joint in joints else 1.0 for joint in range(data.chain.n)])
+    return Explanation("position", joints, unit_of(factor), moved(data, scale), 0.0, factor)
+
+
+def _paced(data: Redundancy, factor: float) -> Explanation:
+    """Recorded time over true time is `factor`."""
+    rows = tuple(part.at_pace(factor) for part in data.rows)
+    looks = (
+        f"time that passes about {factor:.2g} times {'as fast' if factor < 1 else 'too fast'} in the stamps"
+    )
+    return Explanation("time", (), looks, replace(data, rows=rows), 0.0, factor)
+
+
+def _labels(data: Redundancy) -> Iterator[Explanation]:
+    records = sorted({part.record for part in data.rows})
+    labels = {part.record: part.payload for part in data.rows}
+    if len(records) < 2:
+        return
+    for record in records:
+        for label in {*labels.values(), None, "another payload"} - {labels[record]}:
+            rows = tuple(replace(p, payload=label) if p.record == record else p for p in data.rows)
+            looks = (
+                "no payload" if label is None else f"payload {label!r}" if label in labels.values() else label
+            )
+            yield Explanation("payload", (), looks, replace(data, rows=rows), label=str(record))
+
+
+def _refined(candidate: Explanation, before: float) -> Explanation:
+    """The gain of a position or the pace of time by steps around the coarse value, each half the last."""
+    if abs(candidate.factor) == 1.0 or candidate.channel not in ("position", "time"):
+        return candidate
+    best, step = candidate, 0.2
+    for _ in range(8):
+        for relative in (np.exp(step), np.exp(-step)):
+            # Undone on the mended rows, so the search is relative to them.
+            data = best.mended
+            position = best.channel == "position"
+            trial = _position_gain(data, best.joints, relative) if position else _paced(data, relative)
+            drop = before - trial.mended.fit(doubtful=False).score
+            if drop > best.drop + _FINER:
+                factor = best.factor * relative
+                looks = unit_of(factor) if position else _paced(data, factor).looks_like
+                best = replace(trial, drop=drop, factor=factor, looks_like=looks)
+                break
+        else:
+            step *= 0.5
+    return best

@@ -1,0 +1,370 @@
+"""What the torques of an arm say about each other: one rigid model for all joints, sides and sessions.
+
+The joints of an arm share their inertial parameters, motor and joint torque of a joint differ by its drive alone,
+and gravity and acceleration act on the same masses. So the data hold more equations than a model needs, and a wrong
+channel contradicts the others. `Redundancy` keeps the normal equations of each class of rows (side and joint) apart:
+
+    G_c = W_c^T W_c,   B_c = W_c^T Y,   T_c = covariance of Y,
+
+with the torques Y of all joints of the side. A changed torque channel (gain, sign, interchanged joints) is then a
+linear map of Y and needs no new rows. The fit reweights each class by its own residual, so that a wrong channel
+does not bend the others: it stands out by its residual. The statistic of a class is rho, its residual over its
+torque; the sum of log rho over the classes ranks explanations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpstrf
+
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import INERTIAL, Floats
+from ident.dynamics.regressor import rigid_regressor
+from ident.dynamics.structure import Coupling
+from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
+from ident.rows.prepare import TorqueChannel, prepare
+from ident.rows.sessions import payload_name
+from lwr_driver.session import Session
+
+Class = tuple[str, int]
+
+_BODY = len(INERTIAL)
+# Friction of the joint side; drive inertia, friction and offset of the motor side.
+_JOINT, _MOTOR = 3, 4
+# A residual below this share of the torque is as good as none: the accuracy of torque sensors.
+FLOOR = 0.01
+_ROUNDS = 8
+# Square of the sine between a column and those before it, below which it is dependent.
+_DEPENDENT = 1e-9
+# Rows with a common error: two seconds at the usual rate.
+_BLOCK = 10
+_MOST_ROWS = 800
+_COVERED = 0.9
+
+
+@dataclass(frozen=True)
+class SampledRows:
+    """Filtered motion and torque of one side of one session at the times of its rows.
+
+    q, qd, qdd, sign, torque, slope : (K, n); sign is the filtered sign(qd), slope the time derivative of the torque.
+    """
+
+    side: str
+    record: int
+    payload: str | None
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    sign: Floats
+    coupled: Floats
+    torque: Floats
+    slope: Floats
+
+    def moved(self, q: Floats, speed: Floats) -> SampledRows:
+        """The rows with positions Q = q A + offset already in `q`, and speeds times the matrix `speed` (n, n)."""
+        return replace(self, q=q, qd=self.qd @ speed, qdd=self.qdd @ speed, sign=self.sign @ np.sign(speed))
+
+    def at_pace(self, factor: float) -> SampledRows:
+        """The rows with the time divided by `factor`."""
+        return replace(self, qd=self.qd * factor, qdd=self.qdd * factor**2, slope=self.slope * factor)
+
+    def thinned(self, step: int) -> SampledRows:
+        """Every `step`-th row."""
+        names = ("q", "qd", "qdd", "sign", "coupled", "torque", "slope")
+        return replace(self, **{name: getattr(self, name)[::step] for name in names})
+
+
+def sampled(
+    sessions: Sequence[Session], signals: SignalSettings, couplings: Sequence[tuple[int, int]] = ()
+) -> list[SampledRows]:
+    """Rows of all sides of the sessions, without an estimated delay. Raises DataError like `prepare`."""
+    found = []
+    for record, session in enumerate(sessions):
+        sensed = bool(session.joint.effort.shape[1])
+        whole = prepare(session, replace(signals, motor_delay_s=0.0), motor=session.motor is not None)
+        for passage in whole.passages:
+            channels = [passage.joint if sensed else None, passage.motor]
+            for channel in channels:
+                if channel is not None:
+                    found.append(
+                        _rows(channel, passage.rows, record, payload_name(session), signals, couplings)
+                    )
+    return [rows for rows in found if len(rows.q)]
+
+
+def _rows(
+    channel: TorqueChannel,
+    at: Floats,
+    record: int,
+    payload: str | None,
+    signals: SignalSettings,
+    couplings: Sequence[tuple[int, int]],
+) -> SampledRows:
+    factor = thinning(channel.times, signals.decimate_hz)
+    times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
+    step = 0.04 / signals.decimate_hz
+
+    def low_pass(shift: float) -> ParallelFilter:
+        return ParallelFilter(times, at + shift, signals.decimate_hz, signals.attenuation_db)
+
+    middle = low_pass(0.0)
+    kept = middle.coverage() > _COVERED
+    both = np.column_stack([channel.qd[:, a] + channel.qd[:, b] for a, b in couplings] or [channel.qd[:, :0]])
+    motion = [channel.q, channel.qd, channel.qdd, np.sign(channel.qd), np.sign(both)]
+    q, qd, qdd, sign, coupled = (middle.apply(block_means(values, factor))[kept] for values in motion)
+    slope = (low_pass(step).apply(torque) - low_pass(-step).apply(torque)) / (2.0 * step)
+    smooth = middle.apply(torque)[kept]
+    return SampledRows(channel.side, record, payload, q, qd, qdd, sign, coupled, smooth, slope[kept])
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations of one class: G (p, p), B (p, n), T (n, n) without and S with the mean, number of rows."""
+
+    matrix: Floats
+    mixed: Floats
+    scatter: Floats
+    square: Floats
+    count: int
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters (p,), rho and weight of each class. `score`: sum of log rho, none below the floor."""
+
+    parameters: Floats
+    rho: Mapping[Class, float]
+    weight: Mapping[Class, float]
+
+    @property
+    def score(self) -> float:
+        """Sum over classes of log rho; the less, the better the explanation."""
+        return float(sum(np.log(max(value, FLOOR)) for value in self.rho.values()))
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Measured over computed torque of a class, from all other rows: value and standard deviation.
+
+    left : share of the class's residual (rms) with this gain.
+    """
+
+    value: float
+    std: float
+    left: float
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """The rows of an arm and the classes in use.
+
+    rows : all sides and sessions. silent : classes left out (dead sensors). couplings : pairs of joints.
+    maps : (n, n) by side, true torque = map @ measured torque.
+    """
+
+    chain: Chain
+    rows: tuple[SampledRows, ...]
+    silent: frozenset[Class] = frozenset()
+    couplings: tuple[tuple[int, int], ...] = ()
+    maps: Mapping[str, Floats] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        sessions: Sequence[Session],
+        chain: Chain,
+        signals: SignalSettings,
+        couplings: Sequence[Coupling] = (),
+        silent: frozenset[Class] = frozenset(),
+    ) -> Redundancy:
+        """Rows of the sessions, at most about `_MOST_ROWS` a side."""
+        places = [tuple(chain.joint_names.index(name) for name in pair.joints) for pair in couplings]
+        pairs = tuple((a, b) for a, b in places)
+        rows = sampled(sessions, signals, pairs)
+        count = max((sum(len(r.q) for r in rows if r.side == side) for side in ("joint", "motor")), default=0)
+        step = max(1, -(-count // _MOST_ROWS))
+        return cls(chain, tuple(r.thinned(step) for r in rows), silent, pairs)
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Measured sides."""
+        return tuple(sorted({rows.side for rows in self.rows}))
+
+    @property
+    def payloads(self) -> tuple[str, ...]:
+        """Names of the payloads."""
+        return tuple(sorted({rows.payload for rows in self.rows if rows.payload is not None}))
+
+    def place(self, symbol: str, joint: int) -> int:
+        """Column of a drive parameter of a joint (from 0)."""
+        first = _BODY * (self.chain.n + len(self.payloads))
+        if symbol in ("Fvl", "Fcl", "offl"):
+            return first + _JOINT * joint + ("Fvl", "Fcl", "offl").index(symbol)
+        first += _JOINT * self.chain.n if "joint" in self.sides else 0
+        return first + _MOTOR * joint + ("Ia", "Fvm", "Fcm", "offm").index(symbol)
+
+    def matrix(self, rows: SampledRows) -> Floats:
+        """Regressor (n, K, p) of one set of rows."""
+        n = self.chain.n
+        payloads, sides = self.payloads, self.sides
+        joint, motor = "joint" in sides, "motor" in sides
+        rigid = rigid_regressor(self.chain, rows.q, rows.qd, rows.qdd)
+        first = _BODY * (n + len(payloads))
+        width = first + n * (_JOINT * joint + _MOTOR * motor) + motor + 3 * len(self.couplings) * motor
+        out = np.zeros((n, len(rows.q), width))
+        out[:, :, : _BODY * n] = rigid
+        if rows.payload is not None:
+            start = _BODY * (n + payloads.index(rows.payload))
+            out[:, :, start : start + _BODY] = rigid[:, :, -_BODY:]
+        for j in range(n):
+            if joint:
+                at = first + _JOINT * j
+                out[j, :, at], out[j, :, at + 1], out[j, :, at + 2] = rows.qd[:, j], rows.sign[:, j], 1.0
+            if rows.side == "motor":
+                at = first + n * _JOINT * joint + _MOTOR * j
+                out[j, :, at], out[j, :, at + 1] = rows.qdd[:, j], rows.qd[:, j]
+                out[j, :, at + 2], out[j, :, at + 3] = rows.sign[:, j], 1.0
+        if rows.side == "motor":
+            last = first + n * (_JOINT * joint + _MOTOR)
+            # One delay for the channel: an error of its time moves the torque by its slope.
+            out[:, :, last] = rows.slope.T
+            for k, (a, b) in enumerate(self.couplings):
+                at = last + 1 + 3 * k
+                out[a, :, at], out[b, :, at] = rows.qdd[:, b], rows.qdd[:, a]
+                out[[a, b], :, at + 1] = rows.qd[:, a] + rows.qd[:, b]
+                out[[a, b], :, at + 2] = rows.coupled[:, k]
+        return out
+
+    def normal(self) -> dict[Class, _Normal]:
+        """Normal equations by class, the silent ones left out."""
+        parts: dict[Class, list[tuple[Floats, Floats, Floats, Floats, int]]] = {}
+        for rows in self.rows:
+            matrix = self.matrix(rows)
+            centred = rows.torque - rows.torque.mean(axis=0)
+            scatter, square = centred.T @ centred, rows.torque.T @ rows.torque
+            for j, own in enumerate(matrix):
+                if (rows.side, j) not in self.silent:
+                    item = (own.T @ own, own.T @ rows.torque, scatter, square, len(own))
+                    parts.setdefault((rows.side, j), []).append(item)
+        return {
+            key: _Normal(*(sum(part[k] for part in items) for k in range(5)))  # type: ignore[arg-type]
+            for key, items in parts.items()
+        }
+
+    def enough(self, share: float) -> bool:
+        """Whether there are `share` rows for each parameter."""
+        count = sum(len(rows.q) for rows in self.rows) * self.chain.n - len(self.silent)
+        return count >= share * self.matrix(self.rows[0].thinned(len(self.rows[0].q))).shape[2]
+
+    def map_of(self, side: str) -> Floats:
+        """(n, n), true torque = map @ measured torque."""
+        return self.maps.get(side, np.eye(self.chain.n))
+
+    def fit(self, normal: Mapping[Class, _Normal] | None = None, *, doubtful: bool = True) -> Fit:
+        """Weighted least squares, each class weighted by its own residual.
+
+        normal : of rows that differ by their `maps` alone. doubtful : whether a torque may be in a wrong unit.
+        """
+        normal = self.normal() if normal is None else normal
+        chosen = {side: self.map_of(side) for side in self.sides}
+        mixed = {key: own.mixed @ chosen[key[0]][key[1]] for key, own in normal.items()}
+        size = {
+            key: tuple(
+                float(chosen[key[0]][key[1]] @ part @ chosen[key[0]][key[1]])
+                for part in (own.scatter, own.square)
+            )
+            for key, own in normal.items()
+        }
+        total = {key: max(scatter, 1e-12 * max(square, 1e-12)) for key, (scatter, square) in size.items()}
+        common = max(total.values(), default=1.0)
+        fits = []
+        # A torque in a wrong unit is far too heavy or far too light in one of these starts.
+        for start in (total, dict.fromkeys(total, common))[: 1 + doubtful]:
+            weight, error, values = (
+                {key: 1.0 / value for key, value in start.items()},
+                dict(total),
+                np.zeros(0),
+            )
+            for _ in range(_ROUNDS):
+                matrix = sum(weight[key] * own.matrix for key, own in normal.items())
+                right = sum(weight[key] * mixed[key] for key in normal)
+                values = _solve(np.asarray(matrix), np.asarray(right))
+                for key, own in normal.items():
+                    rest = size[key][1] - 2.0 * values @ mixed[key] + values @ own.matrix @ values
+                    error[key] = max(float(rest), 0.0)
+                weight = {key: 1.0 / max(error[key], FLOOR**2 * total[key]) for key in normal}
+            fits.append(Fit(values, {key: float(np.sqrt(error[key] / total[key])) for key in normal}, weight))
+        return min(fits, key=lambda fit: fit.score)
+
+    def gains(self, fit: Fit, normal: Mapping[Class, _Normal]) -> dict[Class, Gain]:
+        """Gain of each class against the torque that the shared parameters compute for it.
+
+        The computed torque z of the class is an added column; its projection on the others is taken off, so the
+        gain comes from what other joints, the other side and other poses say. Standard deviation by blocks of rows.
+        """
+        shared = np.zeros_like(fit.parameters)
+        shared[: _BODY * (self.chain.n + len(self.payloads))] = 1.0
+        total = sum(fit.weight[key] * own.matrix for key, own in normal.items())
+        matrices = [self.matrix(rows) for rows in self.rows]
+        result = {}
+        for key, own in normal.items():
+            part = shared * fit.parameters
+            others = _solve(np.asarray(total), fit.weight[key] * (own.matrix @ part))
+            den = num = spread = before = after = 0.0
+            scores: list[tuple[Floats, Floats, float]] = []
+            for rows, matrix in zip(self.rows, matrices, strict=True):
+                measured = rows.torque @ self.map_of(rows.side).T
+                for j, own_rows in enumerate(matrix):
+                    place = (rows.side, j)
+                    if place not in normal:
+                        continue
+                    column = (own_rows @ part if place == key else 0.0) - own_rows @ others
+                    error = measured[:, j] - own_rows @ fit.parameters
+                    scores.append((np.asarray(column), error, fit.weight[place]))
+                    den += fit.weight[place] * float(column @ column)
+                    num += fit.weight[place] * float(column @ error)
+            delta = num / max(den, 1e-300)
+            for column, error, weight in scores:
+                product = weight * column * (error - delta * column)
+                spread += float(np.sum(np.add.reduceat(product, np.arange(0, len(product), _BLOCK)) ** 2))
+            for rows, matrix in zip(self.rows, matrices, strict=True):
+                if rows.side == key[0]:
+                    own_rows = matrix[key[1]]
+                    error = (rows.torque @ self.map_of(rows.side).T)[:, key[1]] - own_rows @ fit.parameters
+                    column = own_rows @ (part - others)
+                    before += float(error @ error)
+                    after += float((error - delta * column) @ (error - delta * column))
+            result[key] = Gain(
+                1.0 + delta, np.sqrt(spread) / max(den, 1e-300), float(np.sqrt(after / max(before, 1e-300)))
+            )
+        return result
+
+    def deviation(self, fit: Fit, normal: Mapping[Class, _Normal], directions: Floats) -> Floats:
+        """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows."""
+        total = np.asarray(sum(fit.weight[key] * own.matrix for key, own in normal.items()))
+        spreads = np.column_stack([_solve(total, direction) for direction in directions])
+        variance = np.zeros(len(directions))
+        for rows in self.rows:
+            measured = rows.torque @ self.map_of(rows.side).T
+            for j, own in enumerate(self.matrix(rows)):
+                if (rows.side, j) in normal:
+                    error = measured[:, j] - own @ fit.parameters
+                    product = fit.weight[rows.side, j] * (own @ spreads) * error[:, None]
+                    blocks = np.add.reduceat(product, np.arange(0, len(product), _BLOCK), axis=0)
+                    variance += np.sum(blocks**2, axis=0)
+        return np.sqrt(variance)
+
+
+def _solve(matrix: Floats, right: Floats) -> Floats:
+    """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale > 1e-150, scale, np.inf)
+    factor, order, rank, _ = dpstrf(matrix / scale[:, None] / scale[None, :], tol=_DEPENDENT)
+    kept = order[:rank] - 1
+    found = np.zeros(len(right))
+    found[kept] = cho_solve((factor[:rank, :rank], False), (right / scale)[kept]) / scale[kept]
+    return found

@@ -1,0 +1,301 @@
+"""Doubts about sessions before anything is estimated from them: `screen`.
+
+First the channels by themselves (`channels`), then the arm's own redundancy (`redundancy`, `explanations`): the joints
+share their inertial parameters, motor and joint torque differ by a drive, gravity and acceleration act on the same
+masses. What the laws of motion allow comes last: positive inertia, friction that dissipates. The inertia of the URDF
+decides only what the data cannot, and only in orders of magnitude.
+
+The thresholds lie between what true faults and what wrong explanations of healthy data reach; both are printed by
+`python -m benchmarks.wrong_channels`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fri.errors import LwrError
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import INERTIAL, Floats
+from ident.dynamics.regressor import rigid_regressor, torque
+from ident.dynamics.structure import Coupling
+from ident.estimators.problem import Problem
+from ident.rows.channels import check_channels, check_limits, dead
+from ident.rows.doubts import Doubt, settle
+from ident.rows.explanations import AGREES, Explanation, explain, is_wrong, unit_of
+from ident.rows.filters import SignalSettings
+from ident.rows.redundancy import Class, Fit, Redundancy
+from ident.rows.sessions import payload_name
+from lwr_driver.session import Session, Sessions, as_sessions
+
+logger = logging.getLogger(__name__)
+
+# Fall of the score for a doubt: the product of all residuals falls to a tenth; for certainty, to a hundredth. Wrong
+# explanations of healthy recordings reach 1.6 (two joints of a real LWR4+ with torques of 0.3 Nm), true faults 5.
+_DOUBT, _CERTAIN = float(np.log(10.0)), float(np.log(100.0))
+# Gains beyond a factor of two, and reversed signs, are no calibration; undone, they leave this share of the residual.
+_FACTOR, _LEFT = 2.0, 0.6
+# A payload acts on all joints: the geometric mean of the residuals falls to a half.
+_LABEL = float(np.log(2.0))
+# Rows for each parameter, below which a fit explains anything.
+_ROWS = 3.0
+# Row rates tried, over that of the settings.
+_RATES = (1.0, 2.5)
+_POSES = 64
+# Factor between an arm's gravity and its URDF's: 0.9 to 1.4 in six real arms. Correlation of gravity of the two, and
+# number of joints, to speak of a factor.
+_NOMINAL, _ALIKE, _SEVERAL = 4.0, 0.9, 3
+# Standard deviations of a negative inertia, and least share of its torque in that of the joint.
+_DEVIATIONS, _SHARE = 5.0, 0.1
+
+
+def screen(
+    sessions: Sessions,
+    chain: Chain,
+    signals: SignalSettings | None = None,
+    couplings: Sequence[Coupling] = (),
+) -> tuple[Doubt, ...]:
+    """Doubts about the channels of the sessions of one arm.
+
+    signals : as for `prepare`. couplings : coupled joints of the motor side.
+
+    Raises ConfigurationError for sessions of other joints than the chain's.
+    """
+    chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
+    doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
+    if any(doubt.certain for doubt in (*doubts, *beyond)):
+        # What is certain bends all that is computed from it.
+        return (*doubts, *beyond)
+    data = _rows(chosen, chain, signals or SignalSettings(), couplings)
+    contradictions = [] if data is None else _contradictions(data, chosen)
+    found = [doubt for doubt in contradictions if not _shared(doubt, doubts)]
+    return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
+
+
+def _rows(
+    sessions: Sequence[Session], chain: Chain, signals: SignalSettings, couplings: Sequence[Coupling]
+) -> Redundancy | None:
+    """Rows of the sessions, at a higher rate for short ones; None for too few rows for a contradiction."""
+    for factor in _RATES:
+        faster = replace(signals, decimate_hz=min(factor * signals.decimate_hz, 0.5 * signals.cutoff_hz))
+        try:
+            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions))
+        except LwrError as error:
+            # The fit itself says what is too short or does not move.
+            logger.info("no screening by redundancy at %g Hz: %s", faster.decimate_hz, error)
+            continue
+        if data.rows and data.enough(_ROWS):
+            return data
+    return None
+
+
+def without_dead(problem: Problem, session: Session) -> Problem:
+    """The rows of one session without those of its dead torque sensors."""
+    names = session.joint_names
+    silent = {(side, names[joint]) for side, joint in _silent([session])}
+    kept = {k: group for k, group in enumerate(problem.groups) if (group.side, group.joint) not in silent}
+    places = {old: new for new, old in enumerate(kept)}
+    nuisances = tuple(
+        replace(one, columns={places[k]: column for k, column in one.columns.items() if k in places})
+        for one in problem.nuisances
+    )
+    return replace(problem, groups=tuple(kept.values()), nuisances=nuisances)
+
+
+def _shared(doubt: Doubt, others: Sequence[Doubt]) -> bool:
+    """Whether another doubt names the channel and one of the joints."""
+    return any(one.channel == doubt.channel and set(one.joints) & set(doubt.joints) for one in others)
+
+
+def require_sound(
+    sessions: Sessions,
+    chain: Chain,
+    signals: SignalSettings | None = None,
+    couplings: Sequence[Coupling] = (),
+) -> list[str]:
+    """Sentences of `screen` for the report. Raises DataError when a doubt is certain."""
+    return settle(screen(sessions, chain, signals, couplings))
+
+
+def _silent(sessions: Sequence[Session]) -> frozenset[Class]:
+    return frozenset(
+        (side, joint)
+        for session in sessions
+        for side, columns in (("joint", session.joint), ("motor", session.motor))
+        for joint in dead(columns)
+    )
+
+
+def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> list[Doubt]:
+    normal = data.normal()
+    fit = data.fit(normal)
+    found: list[Doubt] = []
+    if max(fit.rho.values()) > AGREES or any(map(is_wrong, data.gains(fit, normal).values())):
+        explanations, data = explain(data, _supported)
+        explanations = [_of_the_wrong_side(one) for one in explanations]
+        data = explanations[-1].mended if explanations else data
+        found = [_doubt(one, sessions) for one in explanations]
+        normal = data.normal()
+        fit = data.fit(normal)
+    return found + _physics(data, fit, normal)
+
+
+def _of_the_wrong_side(one: Explanation) -> Explanation:
+    """A factor between motor and joint torque of all joints: inertia tells its sign, the URDF's bodies its unit."""
+    data = one.mended
+    if one.gain is None or len(one.joints) < 2 or len(data.sides) < 2:
+        return one
+    scale = np.diag([one.factor if joint in one.joints else 1.0 for joint in range(data.chain.n)])
+    turned = replace(data, maps={side: scale @ data.map_of(side) for side in data.sides})
+    inertias = [_inertia(d.chain, _poses(d), _bodies(d, d.fit())) for d in (data, turned)]
+    if one.factor < 0.0:
+        other = bool(np.sum(inertias[1] > 0.0) > np.sum(inertias[0] > 0.0))
+    else:
+        slopes = [list(_gravity_slopes(d, d.fit()).values()) for d in (data, turned)]
+        if not slopes[0] or not slopes[1]:
+            return replace(one, channel="motor torque against joint torque")
+        ratios = [abs(float(np.median(values))) for values in slopes]
+        other = abs(np.log(ratios[1])) < abs(np.log(ratios[0]))
+    if not other:
+        return one
+    channel = "joint torque" if one.channel == "motor torque" else "motor torque"
+    factor = 1.0 / one.factor
+    return replace(one, channel=channel, factor=factor, looks_like=unit_of(factor), mended=turned)
+
+
+def _supported(one: Explanation, classes: int) -> bool:
+    """Whether an explanation gains enough to be believed."""
+    if one.gain is not None:
+        return one.drop > 0.0
+    return one.drop > (_LABEL * classes if one.channel == "payload" else _DOUBT)
+
+
+def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
+    names = sessions[0].joint_names
+    joints = tuple(names[joint] for joint in one.joints)
+    channel, session = one.channel, ""
+    certain = one.drop > _CERTAIN
+    better = (
+        f"the residuals of all torques together fall by a factor of {np.exp(one.drop):.3g} with it undone"
+    )
+    if one.gain is not None:
+        seen = f"is {one.factor:.4g} times the torque computed from all other channels"
+        if len(joints) == 1:
+            seen = f"is {one.gain.value:.4g} ± {one.gain.std:.2g} times the torque computed from all other channels"
+        strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
+        certain = strange and one.gain.left < _LEFT
+        mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
+    elif channel == "payload":
+        session = sessions[int(one.label)].path.name
+        stated = payload_name(sessions[int(one.label)]) or "none"
+        seen = f"the torques contradict the label {stated!r}; {better}"
+        mend = f"name the mounted payload (`--payload {session}=NAME`, `none`: the bare arm)"
+    elif channel == "time":
+        seen = f"accelerations and gravity contradict each other; {better}"
+        mend = "check the sampling rate and the unit of time of the log"
+    elif one.factor == 1.0:
+        seen = f"contradicts the other channels; {better}"
+        mend = "check the order of the columns of this channel, and its zero positions"
+    else:
+        seen = f"contradicts the other channels; {better}"
+        mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
+    return Doubt(channel, joints, seen, one.looks_like, mend, certain, session)
+
+
+def _poses(data: Redundancy) -> Floats:
+    return np.concatenate([part.q[:: max(1, len(part.q) // _POSES)] for part in data.rows])
+
+
+def _bodies(data: Redundancy, fit: Fit) -> Floats:
+    return fit.parameters[: len(INERTIAL) * data.chain.n]
+
+
+def _inertia_rows(chain: Chain, q: Floats) -> Floats:
+    """Rows (n, 10 n) of the diagonal of the mass matrix, mean over the poses (N, n)."""
+    still = np.zeros_like(q)
+    rest = rigid_regressor(chain, q, still, still)
+    rows = []
+    for joint in range(chain.n):
+        unit = still.copy()
+        unit[:, joint] = 1.0
+        rows.append(np.mean(rigid_regressor(chain, q, still, unit)[joint] - rest[joint], axis=0))
+    return np.array(rows)
+
+
+def _inertia(chain: Chain, q: Floats, bodies: Floats) -> Floats:
+    return _inertia_rows(chain, q) @ bodies
+
+
+def _physics(data: Redundancy, fit: Fit, normal: Mapping[Class, Any]) -> list[Doubt]:
+    """Inertia that is negative beyond doubt, and gravity of another order than the URDF's."""
+    n, names = data.chain.n, data.chain.joint_names
+    bodies = len(INERTIAL) * n
+    rows = np.zeros((n, len(fit.parameters)))
+    rows[:, :bodies] = _inertia_rows(data.chain, _poses(data))
+    if data.sides == ("motor",):
+        rows[np.arange(n), [data.place("Ia", joint) for joint in range(n)]] = 1.0
+    inertia, std = rows @ fit.parameters, data.deviation(fit, normal, rows)
+    acting = np.zeros(n)
+    for side, joint in fit.rho:
+        parts = [part for part in data.rows if part.side == side]
+        torque_rms = np.sqrt(np.mean([np.var(part.torque[:, joint]) for part in parts]))
+        speeding = np.sqrt(np.mean([np.mean(part.qdd[:, joint] ** 2) for part in parts]))
+        acting[joint] = max(acting[joint], abs(inertia[joint]) * speeding / max(torque_rms, 1e-300))
+    sure = (np.abs(inertia) > _DEVIATIONS * std) & (acting > _SHARE)
+    negative, positive = np.flatnonzero(sure & (inertia < 0.0)), np.flatnonzero(sure & (inertia > 0.0))
+    if len(negative) > len(positive) and _without_inertia(data).score - fit.score > _DOUBT:
+        listed = ", ".join(f"{names[j]} {inertia[j]:.3g} ± {std[j]:.2g} kg m^2" for j in negative)
+        channel = " and ".join(f"{side} torque" for side in data.sides)
+        looks, mend = (
+            "a reversed sign of all torques, or of all positions",
+            "`scale: -1` in the mapping of the import mends it",
+        )
+        return [Doubt(channel, names, f"the arm's inertia is negative ({listed})", looks, mend, True)]
+    return _nominal(data, fit)
+
+
+def _nominal(data: Redundancy, fit: Fit) -> list[Doubt]:
+    """Gravity against that of the URDF's bodies, in the joints where both agree but for a factor.
+
+    Bodies of a URDF are often rough or missing; then they do not correlate, and nothing is said.
+    """
+    slopes = _gravity_slopes(data, fit)
+    if not slopes:
+        return []
+    middle = float(np.median(list(slopes.values())))
+    if middle > 0.0 and abs(np.log(middle)) < np.log(_NOMINAL):
+        return []
+    channel = " and ".join(f"{side} torque" for side in data.sides)
+    names = tuple(data.chain.joint_names[joint] for joint in slopes)
+    looks = unit_of(middle) if middle > 0.0 else "a reversed sign of all torques, or of all positions"
+    seen = f"gravity is {middle:.3g} times that of the URDF's bodies"
+    mend = "state unit and sign of the torques when importing, or correct the URDF's masses"
+    certain = len(slopes) >= _SEVERAL and (middle < 0.0 or abs(np.log(middle)) > 2.0 * np.log(_NOMINAL))
+    return [Doubt(channel, names, seen, looks, mend, certain)]
+
+
+def _gravity_slopes(data: Redundancy, fit: Fit) -> dict[int, float]:
+    """Identified over nominal gravity torque, by joint, where they correlate."""
+    try:
+        nominal = data.chain.urdf_inertials()
+    except LwrError:
+        return {}
+    q = _poses(data)
+    still = np.zeros_like(q)
+    expected = torque(data.chain, q, still, still, nominal)
+    computed = (rigid_regressor(data.chain, q, still, still) @ _bodies(data, fit)).T
+    expected, computed = expected - expected.mean(axis=0), computed - computed.mean(axis=0)
+    power, both = np.sum(expected**2, axis=0), np.sum(expected * computed, axis=0)
+    size = np.sqrt(power * np.sum(computed**2, axis=0))
+    # Only joints that bear a visible part of the arm.
+    bearing = np.flatnonzero((power > 1e-4 * power.max()) & (power > 1e-12))
+    return {int(j): float(both[j] / power[j]) for j in bearing if abs(both[j]) > _ALIKE * size[j]}
+
+
+def _without_inertia(data: Redundancy) -> Fit:
+    """The fit without accelerations: a slow motion says nothing about inertia."""
+    return replace(data, rows=tuple(replace(part, qdd=np.zeros_like(part.qdd)) for part in data.rows)).fit()

@@ -1,0 +1,184 @@
+"""Wrong channels are named, healthy ones are not: synthetic sessions of an arm that obeys the equations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.wrong_channels import clipped, constant, labelled, paced, scaled, swapped, with_speed, without
+from fri.errors import DataError
+from ident.dynamics.kinematics import Chain
+from ident.rows.channels import check_channels
+from ident.rows.doubts import Doubt, settle
+from ident.rows.explanations import unit_of
+from ident.rows.screening import require_sound, screen, without_dead
+from lwr_driver.session import Session
+from tests.ident.estimation_arm import Sensors, chain, session
+
+SENSORS = Sensors(position=2e-5, joint=0.03, motor=0.1, motor_step_s=0.012)
+
+
+@pytest.fixture(scope="module")
+def pair() -> list[Session]:
+    bare = session(sensors=SENSORS, seed=1, command=True, metadata={"uid": "one"})
+    loaded = session(
+        sensors=SENSORS, seed=2, loaded=True, motion_seed=6, command=True, metadata={"uid": "two"}
+    )
+    return [bare, loaded]
+
+
+def doubts(sessions: list[Session]) -> tuple[Doubt, ...]:
+    return screen(sessions, chain())
+
+
+def test_healthy_sessions_are_not_doubted(pair: list[Session]) -> None:
+    assert doubts(pair) == ()
+    assert doubts(pair[:1]) == ()
+    for channel in ("motor", "joint"):
+        assert doubts(without(channel, lambda sessions: sessions)(pair)) == ()
+
+
+def test_a_late_motor_channel_is_not_a_wrong_one() -> None:
+    late = session(sensors=replace(SENSORS, motor_delay_s=0.02))
+    assert doubts([late]) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "channel", "joints", "words"),
+    [
+        (scaled("motor", "effort", -1.0, "A5"), "motor torque", ("A5",), "reversed sign"),
+        (scaled("joint", "effort", 1e3, "A6"), "joint torque", ("A6",), "mNm"),
+        (swapped("motor", "effort", "E1", "A3"), "motor torque", ("E1", "A3"), "interchanged"),
+        (swapped("joint", "effort", "A5", "A6"), "joint torque", ("A5", "A6"), "interchanged"),
+        (scaled("joint", "position", -1.0, "E1"), "position", ("E1",), "reversed sign"),
+        (swapped("joint", "position", "A3", "A4"), "position", ("A3", "A4"), "interchanged"),
+        (scaled("joint", "position", 180.0 / np.pi, "A4"), "position", ("A4",), "degrees"),
+        (paced(0.5), "time", (), "as fast in the stamps"),
+        (labelled("none", "none"), "payload", (), "payload"),
+    ],
+)  # fmt: skip
+def test_a_wrong_channel_is_an_error_with_its_name(pair, change, channel, joints, words) -> None:  # type: ignore[no-untyped-def]
+    found = [doubt for doubt in doubts(change(pair)) if doubt.certain]
+    assert (found[0].channel, found[0].joints) == (channel, joints)
+    assert words in str(found[0])
+
+
+@pytest.mark.parametrize("side", ["motor", "joint"])
+def test_the_reversed_side_is_told_from_the_right_one(pair: list[Session], side: str) -> None:
+    """All torques of one side reversed: inertia and friction of the other side are positive."""
+    (found,) = doubts(scaled(side, "effort", -1.0)(pair))
+    assert (found.channel, found.certain, len(found.joints)) == (f"{side} torque", True, 7)
+
+
+def test_both_sides_reversed_make_a_negative_inertia(pair: list[Session]) -> None:
+    both = scaled("motor", "effort", -1.0)(scaled("joint", "effort", -1.0)(pair))
+    assert any(doubt.certain and "negative" in doubt.seen for doubt in doubts(both))
+
+
+@pytest.mark.parametrize(
+    ("side", "joint", "gain"), [("joint", "A2", 1.3), ("joint", "A3", 0.7), ("motor", "A2", 1.3)]
+)
+def test_a_gain_is_a_warning_with_its_value(pair: list[Session], side: str, joint: str, gain: float) -> None:
+    (found,) = doubts(scaled(side, "effort", gain, joint)(pair))
+    assert (found.channel, found.joints, found.certain) == (f"{side} torque", (joint,), False)
+    value = float(found.seen.split()[1])
+    assert value == pytest.approx(gain, rel=0.05)
+
+
+def test_one_side_alone_shows_a_gain_and_a_sign(pair: list[Session]) -> None:
+    for side, other in (("joint", "motor"), ("motor", "joint")):
+        (gain,) = doubts(without(other, scaled(side, "effort", 1.3, "A2"))(pair))
+        assert (gain.channel, gain.joints) == (f"{side} torque", ("A2",))
+        (sign,) = doubts(without(other, scaled(side, "effort", -1.0, "A3"))(pair))
+        assert (sign.joints, sign.certain) == (("A3",), True)
+
+
+def test_the_sign_of_a_single_joint_shows_by_its_inertia() -> None:
+    time, random = np.arange(0.0, 20.0, 0.004), np.random.default_rng(0)
+    q = np.sin(1.1 * time) + 0.4 * np.sin(2.3 * time + 1.0)
+    qd = np.gradient(q, time)
+    torque = 3.0 * np.gradient(qd, time) + 20.0 * np.cos(q) + 4.0 * qd + 5.0 * np.sign(qd)
+    torque += 0.05 * random.normal(size=len(time))
+    alone = Chain.from_table([{"name": "A1"}], gravity=(0.0, -9.81, 0.0))
+    whole = session(rate_hz=250.0)
+    stamps = np.rint(1e9 * time).astype(np.int64)
+
+    def recorded(sign: float) -> Session:
+        columns = replace(
+            whole.joint,
+            names=("A1",),
+            log_time=stamps,
+            publish_time=stamps,
+            sequence=np.arange(1, len(time) + 1),
+            position=q[:, None] + 1e-5 * random.normal(size=(len(time), 1)),
+            velocity=np.zeros((len(time), 0)),
+            effort=sign * torque[:, None],
+        )
+        return replace(whole, joint_names=("A1",), joint=columns, motor=None, phases=())
+
+    assert screen([recorded(1.0)], alone) == ()
+    (found,) = screen([recorded(-1.0)], alone)
+    assert found.certain
+    assert "negative" in found.seen
+
+
+def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> None:
+    def found(change) -> Doubt:  # type: ignore[no-untyped-def]
+        return check_channels(change(pair), chain())[0]
+
+    assert found(constant("joint", "position", 0.4, "A5")).certain
+    assert found(constant("joint", "effort", 0.0, "A4")).joints == ("A4",)
+    assert "saturation" in found(clipped("joint", "effort", 0.7, "A2")).looks_like
+    assert "saturation" in found(clipped("motor", "effort", 0.5, "A3")).looks_like
+    assert found(clipped("joint", "position", 0.7, "A4")).channel == "position"
+    assert found(paced(2.0, clocks=("publish_time",))).channel == "time"
+    assert found(paced(1e3)).channel == "time"
+    velocity = found(with_speed(None, -1.0, "A3"))
+    assert (velocity.channel, velocity.joints) == ("velocity", ("A3",))
+    units = found(with_speed(None, 180.0 / np.pi, *chain().joint_names))
+    assert (units.channel, units.certain) == ("velocity", False)
+    assert check_channels(with_speed()(pair), chain()) == []
+
+
+def test_a_log_given_twice_is_known_by_uid_and_by_content(pair: list[Session]) -> None:
+    copy = replace(pair[0], path=Path("copy.mcap"), metadata={**pair[0].metadata, "uid": "three"})
+    for sessions in ([pair[0], pair[0]], [pair[0], copy]):
+        with pytest.raises(DataError, match="given twice"):
+            require_sound(sessions, chain())
+
+
+def test_rows_of_a_sensor_dead_in_one_session_are_left_out(pair: list[Session]) -> None:
+    from ident.dynamics.structure import ModelStructure
+    from ident.rows.observation import observe
+    from ident.rows.prepare import prepare
+
+    bad = constant("joint", "effort", 0.0, "A4", only=0)(pair)
+    (found,) = screen(bad, chain())
+    assert not found.certain
+    rows = observe([prepare(bad[0])], [None], ModelStructure(chain()))
+    kept = without_dead(rows, bad[0])
+    assert {group.label for group in rows.groups} - {group.label for group in kept.groups} == {"A4 joint"}
+    assert without_dead(rows, pair[0]).groups == rows.groups
+
+
+def test_a_message_says_channel_joint_sight_guess_and_remedy() -> None:
+    doubt = Doubt(
+        "motor torque", ("A5",), "is -1 times the other", "a reversed sign", "check it", session="a.mcap"
+    )
+    assert (
+        str(doubt) == "a.mcap: A5 motor torque: is -1 times the other, looks like a reversed sign; check it"
+    )
+    assert settle([doubt]) == [str(doubt)]
+    with pytest.raises(DataError, match="reversed sign"):
+        settle([doubt, replace(doubt, certain=True)])
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(1000.0, "mNm"), (0.001, "kNm"), (57.3, "degrees"), (-1.0, "a reversed sign"), (1.3, "a gain of 1.3")],
+)
+def test_factors_have_their_usual_causes(factor: float, words: str) -> None:
+    assert words in unit_of(factor)
