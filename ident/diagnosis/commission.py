@@ -17,7 +17,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.nominal import Nominal, NominalArm
-from ident.diagnosis.recording import SessionRecord, record
+from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
@@ -25,6 +25,7 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
+from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -197,6 +198,7 @@ def commission(
         raise DataError("no session given; name at least one healthy session")
     start = replace(nominal_arm(chain, arm, None), encoder_known=True)
     sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
+    settings = settled(settings, parts[0], chain)
     recorded: list[list[SessionRecord]] = []
     for part in parts:
         recorded.append([record(s, k, chain, settings) for k, s in enumerate(part)])
@@ -233,7 +235,9 @@ def commission(
         for key, gain in gains(bench.dictionary, bench.evidence, settings).items():
             null[key] = null.get(key, 0.0) + gain / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))
-    return _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
+    found = _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
+    provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals)}
+    return replace(found, model=replace(found.model, provenance=provenance))
 
 
 def _tuned(

@@ -22,6 +22,7 @@ from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import Baseline, State, Task
 from ident.effects import LOST_SAMPLES
 from ident.model import DynamicModel
+from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.data_quality import SampleLoss, sample_loss
 
 # Largest unexplained part in the rows of a claim without a loss of confidence, over the claim's gain.
@@ -347,11 +348,12 @@ def _models(
     provenance: dict[str, Any] = {
         "sessions": [r.name for r in nominal.recordings if not r.test],
         "estimator": "diagnosis",
+        SIGNALS: signals_entry(task.settings.signals) | {"motor_delay_s": nominal.arm.motor_delay_s},
     }
     effects = tuple(_entry(f) for f in findings if f.cause != LOST_SAMPLES.cause)
     base = DynamicModel(
         robot,
-        nominal.structure,
+        replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb),
         nominal.base.names,
         baseline.values,
         baseline.covariance,

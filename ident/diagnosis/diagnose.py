@@ -19,7 +19,7 @@ from ident.diagnosis.bench import (
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import conclude, timing_finding
 from ident.diagnosis.evidence import Score
-from ident.diagnosis.recording import record
+from ident.diagnosis.recording import record, settled
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis
 from ident.diagnosis.selection import Claim, Selection, best_candidate
@@ -28,6 +28,7 @@ from ident.diagnosis.task import Baseline, Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
 from ident.model import Model, as_model
+from ident.model.signals import signal_settings
 from ident.rows.sessions import require
 from lwr_driver.session import Sessions, as_sessions
 
@@ -74,6 +75,8 @@ def diagnose(
         raise DataError("no session given; name at least one session file")
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     held = {id(s) for s in test}
+    known = None if reference is None else signal_settings(reference.model)
+    settings = settled(settings if known is None else replace(settings, signals=known), sessions, chain)
     recordings = tuple(record(s, k, chain, settings, test=id(s) in held) for k, s in enumerate(everything))
     some_joint_moves(recordings)
     nominal = nominal_arm(chain, arm, reference)

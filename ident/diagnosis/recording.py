@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import Side
-from ident.rows.data_quality import Stuck, clipped_at, held_times, passed_band, stuck_at
-from ident.rows.filters import SignalSettings
+from ident.dynamics.structure import ModelStructure, Side
+from ident.rows.data_quality import Stuck, clipped_at, passed_band, stuck_at
 from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name
+from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session
 
 Floats = NDArray[np.float64]
 
-# Distance from held samples within which the filtered positions are wrong too [s].
-_HELD_S = 0.1
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +85,39 @@ class SessionRecord:
         return (*motor, "joint") if self.has_effort else motor
 
 
+def settled(settings: DiagnosisSettings, sessions: Sequence[Session], chain: Chain) -> DiagnosisSettings:
+    """The settings with signals and friction law from the fitted sessions, as `identify` chooses them."""
+    chosen = [session.select(chain.joint_names) for session in sessions]
+    payloads = [payload_name(session) for session in chosen]
+    sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
+    motor = any(session.motor is not None for session in chosen)
+    structure = ModelStructure(
+        chain,
+        2 if motor else 1,
+        tuple(dict.fromkeys(p for p in payloads if p is not None)),
+        sides=() if sensed else ("motor",),
+    )
+    try:
+        base = numeric_base(structure)
+        laws = (settings.law, None)
+        found = choose_signals(chosen, payloads, structure, base.columns, settings.signals, laws)
+    except DataError as error:
+        # The records say what is wrong with a session.
+        logger.info("signal settings of the paper, because: %s", error)
+        return settings
+    return replace(settings, signals=found.settings, law=found.coulomb)
+
+
 def record(
     session: Session, number: int, chain: Chain, settings: DiagnosisSettings, *, test: bool = False
 ) -> SessionRecord:
     """Filter one session. Raises DataError for sessions without a stretch long enough."""
     chosen = session.select(chain.joint_names)
     rate = 1.0 / chosen.joint.period_s
-    cutoff = min(settings.cutoff_hz, 0.2 * rate)
-    decimate = min(10.0, 0.5 * cutoff)
-    prepared = prepare(
-        chosen,
-        SignalSettings(cutoff_hz=cutoff, decimate_hz=decimate, motor_delay_s=0.0, standstill_share=1.0),
-    )
+    prepared = prepare(chosen, replace(settings.signals, motor_delay_s=0.0))
     motor = chosen.motor
     stuck = () if motor is None else stuck_at(motor, chosen.joint)
-    stretches = tuple(_stretches(prepared, rate, held_times(chosen.joint), stuck))
+    stretches = tuple(_stretches(prepared, rate, stuck))
     if not stretches:
         raise DataError(f"{prepared.name}: no stretch of the session is long enough for a diagnosis")
     spans = chosen.spans("period")
@@ -123,9 +142,7 @@ def record(
     )
 
 
-def _stretches(
-    prepared: PreparedSession, rate: float, held: Floats, stuck: Sequence[Stuck]
-) -> list[RecordStretch]:
+def _stretches(prepared: PreparedSession, rate: float, stuck: Sequence[Stuck]) -> list[RecordStretch]:
     found = []
     for passage in prepared.passages:
         joint = passage.joint
@@ -142,21 +159,12 @@ def _stretches(
             # A margin keeps the samples inside the grid when the channel is shifted.
             keep = (m.times >= joint.times[pick[0]] + 0.06) & (m.times <= joint.times[pick[-1]] - 0.06)
             motor_time, motor = m.times[keep], m.torque[keep]
-            usable = ~m.flagged[keep] & _apart(motor_time, held)[:, None]
+            usable = ~m.flagged[keep]
             for one in stuck:
                 usable[:, one.joint] &= motor[:, one.joint] != one.value
         time, q, qd, qdd, effort = (
             x[pick] for x in (joint.times, joint.q, joint.qd, joint.qdd, joint.torque)
         )
-        known = ~joint.flagged[pick] & _apart(time, held)[:, None]
+        known = ~joint.flagged[pick]
         found.append(RecordStretch(time, q, qd, qdd, effort, known, motor_time, motor, usable))
     return found
-
-
-def _apart(times: Floats, held: Floats) -> NDArray[np.bool_]:
-    """Whether times (N,) are far enough from held samples."""
-    if not len(held):
-        return np.ones(len(times), dtype=bool)
-    after = np.searchsorted(held, times)
-    before, after = np.maximum(after - 1, 0), np.minimum(after, len(held) - 1)
-    return np.minimum(np.abs(times - held[before]), np.abs(times - held[after])) > _HELD_S

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fri.errors import ConfigurationError
+from ident.dynamics.structure import Coulomb
+from ident.rows.filters import SignalSettings
 
 
 @dataclass(frozen=True)
@@ -15,7 +17,8 @@ class DiagnosisSettings:
         Slower channels give one row per sample.
     ringing_s : the same for positions of the motors: about one period of the links on their springs, invisible in
         motors held by friction.
-    cutoff_hz : zero-phase low-pass on the positions; at most a fifth of the sampling rate.
+    signals : from channels to filtered motion, as for `identify`; what is open is chosen from the data. law : of
+        Coulomb friction in the resulting models, None for the one that predicts best.
     deflection_hz : low-pass on the torque for the joints' twist.
     standstill_rad_s : rows of a joint below this speed are left out, for their friction is unknown.
     reversal_s : rows this close to a reversal are left out: the motor may reverse later.
@@ -35,7 +38,8 @@ class DiagnosisSettings:
 
     bin_s: float = 0.02
     ringing_s: float = 0.1
-    cutoff_hz: float = 25.0
+    signals: SignalSettings = field(default_factory=SignalSettings)
+    law: Coulomb | None = None
     deflection_hz: float = 30.0
     standstill_rad_s: float = 0.01
     reversal_s: float = 0.015
@@ -54,7 +58,7 @@ class DiagnosisSettings:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("bin_s", "cutoff_hz", "deflection_hz", "block_s", "alpha", "least_gain", "most_s"):
+        for name in ("bin_s", "deflection_hz", "block_s", "alpha", "least_gain", "most_s"):
             if not getattr(self, name) > 0.0:
                 raise ConfigurationError(f"`{name}` is {getattr(self, name)}; it must be positive")
         if self.folds < 2:

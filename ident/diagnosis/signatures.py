@@ -18,7 +18,7 @@ from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.evidence import Floats, Key, Rows
-from ident.diagnosis.recording import record
+from ident.diagnosis.recording import record, settled
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import select
 from ident.diagnosis.settings import DiagnosisSettings
@@ -72,6 +72,7 @@ def signature_bench(
     if not sessions:
         raise DataError("no session given; name at least one session file")
     ordered = sorted(sessions, key=lambda s: s.start)
+    settings = settled(settings, ordered, chain)
     recordings = [record(s, k, chain, settings) for k, s in enumerate(ordered)]
     known = nominal_arm(chain, arm, reference)
     bench = prepare_bench(known, recordings, settings, reference, (), fit_compliance=reference is None)

@@ -20,7 +20,7 @@ from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
 
-KEY = "signals"
+SIGNALS = "signals"
 
 
 def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] = ()) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def signal_settings(model: DynamicModel) -> SignalSettings | None:
 
     Keys of other versions of this software are left aside. Raises ConfigurationError for values out of range.
     """
-    entry = model.provenance.get(KEY)
+    entry = model.provenance.get(SIGNALS)
     if not isinstance(entry, Mapping):
         return None
     known = {field.name for field in dataclasses.fields(SignalSettings)}

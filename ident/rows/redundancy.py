@@ -104,12 +104,12 @@ def _rows(
     signals: SignalSettings,
     couplings: Sequence[tuple[int, int]],
 ) -> SampledRows:
-    factor = thinning(channel.times, signals.decimate_hz)
+    factor = thinning(channel.times, signals.decimate)
     times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
-    step = 0.04 / signals.decimate_hz
+    step = 0.04 / signals.decimate
 
     def low_pass(shift: float) -> ParallelFilter:
-        return ParallelFilter(times, at + shift, signals.decimate_hz, signals.attenuation_db)
+        return ParallelFilter(times, at + shift, signals.decimate, signals.attenuation_db)
 
     middle = low_pass(0.0)
     kept = middle.coverage() > _COVERED

@@ -81,7 +81,7 @@ def _rows(
 ) -> Redundancy | None:
     """Rows of the sessions, at a higher rate for short ones; None for too few rows for a contradiction."""
     for factor in _RATES:
-        faster = replace(signals, decimate_hz=min(factor * signals.decimate_hz, 0.5 * signals.cutoff_hz))
+        faster = replace(signals, decimate_hz=min(factor * signals.decimate, 0.5 * signals.cutoff))
         try:
             data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions))
         except LwrError as error:

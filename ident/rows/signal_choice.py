@@ -6,8 +6,8 @@ model on rows at full band, in two-second blocks: the even ones are fitted, the 
 
 * The band of the rows covers the excitation, and gives a short recording rows enough. Half of the band left by an
   earlier filter is its upper limit.
-* The positions' cut-off is the lowest within half a per cent of the least held-back error: a lower one smears the
-  acceleration, a higher one lets noise into it.
+* The positions' cut-off is the highest within half a per cent of the least held-back error: a lower one smears the
+  jumps of the acceleration at reversals, a higher one lets noise into it.
 * The time left out beside reversals is the one with the least held-back error far from them: a shorter one lets the
   turning of friction bend the parameters, a longer one wastes samples.
 * The friction law of the model is the one with the least held-back error over all samples, reversals and standstill
@@ -41,7 +41,7 @@ _BIN_S, _BLOCK_S = 0.02, 2.0
 _MOST_S = 120.0
 # Rows of a joint in a short recording, at least.
 _LEAST_ROWS = 40
-_CUTOFFS = (2.5, 5.0, 10.0)
+_CUTOFFS = (2.5, 5.0, 12.5)
 _TOLERANCE = 0.005
 # Bins left out beside a reversal; the last ones are far from it.
 _WINDOWS = (0, 1, 2, 3, 4, 5, 7, 10)
@@ -217,7 +217,7 @@ class _Bench:
         return found
 
     def with_cutoff(self, settings: SignalSettings, rate: float, reasons: list[str]) -> SignalSettings:
-        """With the lowest cut-off of a held-back error near the least."""
+        """With the highest cut-off of a held-back error near the least."""
         ladder = sorted({min(factor * settings.decimate, NYQUIST_SHARE * rate) for factor in _CUTOFFS})
         still = settings.standstill_rad_s
         errors = []
@@ -316,7 +316,8 @@ def _fit(rows: _ByClass, masks: _Masks) -> Floats:
         scaled = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
         values = np.linalg.solve(scaled, right / scale) / scale
         powers = [
-            max(square - 2.0 * values @ target + values @ gram @ values, 1e-12 * square + 1e-300) / count
+            max(float(square - 2.0 * values @ target + values @ gram @ values), 1e-12 * square + 1e-300)
+            / count
             for gram, target, square, count in zip(grams, targets, squares, counts, strict=True)
         ]
         weights = 1.0 / np.array(powers)
