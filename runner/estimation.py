@@ -39,6 +39,9 @@ class CoulombSettings:
     kind: Literal["data", "sign", "deadband", "tanh"] = "data"
     width: float = 0.0
 
+    def __post_init__(self) -> None:
+        _ = self.law
+
     @property
     def law(self) -> Coulomb | None:
         """The law, None for a choice from the data."""

@@ -351,13 +351,14 @@ def _models(
         SIGNALS: signals_entry(task.settings.signals) | {"motor_delay_s": nominal.arm.motor_delay_s},
     }
     effects = tuple(_entry(f) for f in findings if f.cause != LOST_SAMPLES.cause)
+    structure = replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb)
     base = DynamicModel(
         robot,
-        replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb),
+        structure,
         nominal.base.names,
         baseline.values,
         baseline.covariance,
-        nominal.base,
+        replace(nominal.base, structure=structure),
         provenance,
     )
     values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]

@@ -39,7 +39,7 @@ from ident.rows.sessions import payload_name
 from lwr_driver.session import Session, Sessions, as_sessions
 
 _SAME_ROW = 1e-8
-_SAMPLES = ("times", "q", "qd", "qdd", "torque", "flagged")
+_SAMPLES = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
 
 
 @dataclass(frozen=True)

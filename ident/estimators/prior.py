@@ -300,9 +300,12 @@ def _shares(problem: Problem, values: Floats) -> Floats:
 
 
 def _root_of(precision: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(precision)
+    # Parameters of different units differ by many orders of magnitude.
+    scale = np.sqrt(np.maximum(np.diag(precision), 0.0))
+    size = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(precision / np.outer(size, size))
     keep = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
-    return np.sqrt(values[keep])[:, None] * vectors[:, keep].T
+    return np.sqrt(values[keep])[:, None] * vectors[:, keep].T * size
 
 
 def _posterior(problem: Problem, prior: Prior, weights: Floats, scale: float) -> tuple[Floats, Floats]:

@@ -29,6 +29,7 @@ from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, 
 
 logger = logging.getLogger(__name__)
 
+_SYMBOLS = ("Ia", "Fvm", "Fcm", "offm")
 _STEPS = 12
 _GRID = 41
 _ATTENUATION_DB = 40.0
@@ -249,9 +250,17 @@ def _newton(
     here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, _STEP_S, -_STEP_S))
     count = len(joints) if separate else 1
     groups = []
+    # A joint moving one way only cannot tell Coulomb friction from an offset.
+    used, first = {}, 0
+    for j in joints:
+        signs = np.concatenate(
+            [columns[part.known_rows[:, j], j, 2] for part, (columns, _) in zip(parts, here, strict=True)]
+        )
+        used[j] = [0, 1, 2, 3] if float(np.ptp(signs)) > 1.0 else [0, 1, 3]
+    width = sum(map(len, used.values()))
     for place, j in enumerate(joints):
         keep = [part.known_rows[:, j] for part in parts]
-        own = np.vstack([columns[k, j] for (columns, _), k in zip(here, keep, strict=True)])
+        own = np.vstack([columns[k, j][:, used[j]] for (columns, _), k in zip(here, keep, strict=True)])
         values = np.concatenate([target[k, j] for (_, target), k in zip(here, keep, strict=True)])
         model = np.linalg.lstsq(own, values, rcond=None)[0]
         for record, k in enumerate(keep):
@@ -259,14 +268,15 @@ def _newton(
             if not len(rows):
                 continue
             (ahead, target_ahead), (behind, target_behind) = later[record], earlier[record]
-            slope = (target_ahead[rows, j] - ahead[rows, j] @ model) - (
-                target_behind[rows, j] - behind[rows, j] @ model
+            slope = (target_ahead[rows, j] - ahead[rows, j][:, used[j]] @ model) - (
+                target_behind[rows, j] - behind[rows, j][:, used[j]] @ model
             )
-            matrix = np.zeros((len(rows), 4 * len(joints) + count))
-            matrix[:, 4 * place : 4 * place + 4] = here[record][0][rows, j]
-            matrix[:, 4 * len(joints) + (place if separate else 0)] = -slope / (2.0 * _STEP_S)
+            matrix = np.zeros((len(rows), width + count))
+            matrix[:, first : first + len(used[j])] = here[record][0][rows, j][:, used[j]]
+            matrix[:, width + (place if separate else 0)] = -slope / (2.0 * _STEP_S)
             groups.append(RowGroup(str(j), "difference", record, matrix, here[record][1][rows, j], rows))
-    titles = [f"{symbol} {j}" for j in joints for symbol in ("Ia", "Fvm", "Fcm", "offm")]
+        first += len(used[j])
+    titles = [f"{_SYMBOLS[k]} {j}" for j in joints for k in used[j]]
     titles += [f"delay {k}" for k in range(count)]
     step = float(parts[0].parallel.outputs[1] - parts[0].parallel.outputs[0])
     fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(Problem(tuple(titles), tuple(groups), step))

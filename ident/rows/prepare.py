@@ -131,8 +131,9 @@ def prepare(
     *,
     resonance_hz: float | None = None,
     motor: bool = True,
+    log: bool = True,
 ) -> PreparedSession:
-    """Filter and align one session. `motor` False leaves the motor channel aside.
+    """Filter and align one session. `motor` False leaves the motor channel aside, `log` False keeps warnings to itself.
 
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
@@ -227,7 +228,7 @@ def prepare(
             int((~passage.motor_valid).sum()) for passage in passages if passage.motor_valid is not None
         ),
     }
-    for warning in warnings:
+    for warning in warnings if log else ():
         logger.warning("%s", warning)
     return PreparedSession(
         name=name,

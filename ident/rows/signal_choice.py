@@ -2,7 +2,7 @@
 
 The positions' cut-off, the band of the rows, the time left out beside reversals and the law of Coulomb friction are
 properties of a recording: its sampling, motion, noise, earlier filters and drives. Each is chosen with the base
-model on rows at full band, in two-second blocks: the even ones are fitted, the odd ones predicted.
+model on rows at full band, in blocks of two seconds at most: the even ones are fitted, the odd ones predicted.
 
 * The band of the rows covers the excitation, and gives a short recording rows enough. Half of the band left by an
   earlier filter is its upper limit.
@@ -29,14 +29,14 @@ from ident.dynamics.parameters import Floats, split_name
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.binned import BinnedRows, observe_bins
 from ident.rows.data_quality import passed_band
-from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings
+from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
 from ident.rows.reversals import away_from_reversals
 from lwr_driver.session import JointColumns, Session
 
 logger = logging.getLogger(__name__)
 
-_BIN_S, _BLOCK_S = 0.02, 2.0
+_BIN_S, _BLOCK_S, _LEAST_BLOCKS = 0.02, 2.0, 8
 # Longest part of all sessions together used for the choice [s].
 _MOST_S = 120.0
 # Rows of a joint in a short recording, at least.
@@ -85,9 +85,10 @@ def choose_signals(
     rate = min(1.0 / session.joint.period_s for session in parts)
     reasons: list[str] = []
     found, band = _with_decimation(settings, parts, rate, motor, reasons)
-    rough = [prepare(session, found, motor=motor) for session in parts]
+    rough = [prepare(session, found, motor=motor, log=False) for session in parts]
     delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
-    bench = _Bench(parts, payloads, structure, columns, motor, delays)
+    block_s = min(_BLOCK_S, min(session.duration_s for session in parts) / _LEAST_BLOCKS)
+    bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s)
     if found.cutoff_hz is None:
         found = bench.with_cutoff(found, rate, reasons)
     rows = bench.rows(found)
@@ -128,7 +129,7 @@ def _with_decimation(
     band = min((edge for edge in edges if edge is not None), default=None)
     if settings.decimate_hz is not None:
         return settings, band
-    rough = [prepare(session, replace(settings, motor_delay_s=0.0)) for session in sessions]
+    rough = [prepare(session, replace(settings, motor_delay_s=0.0), log=False) for session in sessions]
     excitation = max(session.excitation_hz for session in rough)
     shortest = min(session.duration_s for session in sessions)
     wanted = {
@@ -187,6 +188,8 @@ class _Bench:
     columns: NDArray[np.int64]
     motor: bool
     delays: Sequence[float]
+    band: float | None
+    block_s: float
 
     def rows(self, settings: SignalSettings) -> _ByClass:
         """Rows by side and joint."""
@@ -199,15 +202,17 @@ class _Bench:
                 parts.setdefault(rows.side, []).append(rows)
         found = {}
         for side, some in parts.items():
-            even = np.concatenate([np.floor(rows.time / _BLOCK_S) % 2 == 0 for rows in some])
+            even = np.concatenate([np.floor(rows.time / self.block_s) % 2 == 0 for rows in some])
             ends = np.cumsum([0, *(len(rows.time) for rows in some)]).tolist()
             stretches = tuple(slice(first, last) for first, last in pairwise(ends))
             for j in range(self.structure.chain.n):
                 measured = np.concatenate([rows.measured[:, j] for rows in some])
                 if measured.any():
                     found[side, j] = _Rows(
-                        np.concatenate([rows.matrix[j] for rows in some]),
-                        np.concatenate([rows.torque[:, j] for rows in some]),
+                        np.concatenate([self._smooth(rows.matrix[j], rows) for rows in some]),
+                        np.concatenate(
+                            [self._smooth(rows.torque[:, j : j + 1], rows)[:, 0] for rows in some]
+                        ),
                         np.concatenate([rows.speed[:, j] for rows in some]),
                         measured,
                         even,
@@ -215,6 +220,13 @@ class _Bench:
                         stretches,
                     )
         return found
+
+    def _smooth(self, values: Floats, rows: BinnedRows) -> Floats:
+        """Rows (m, k) with a low-pass common to torque and columns where an earlier one smoothed the torques."""
+        dt = float(np.median(np.diff(rows.time))) if len(rows.time) > 1 else 0.0
+        if self.band is None or 0.5 * self.band * dt >= 0.4:
+            return values
+        return low_pass(values, dt, 0.5 * self.band)
 
     def with_cutoff(self, settings: SignalSettings, rate: float, reasons: list[str]) -> SignalSettings:
         """With the highest cut-off of a held-back error near the least."""
@@ -226,9 +238,8 @@ class _Bench:
             away = {key: own.known(_WINDOWS[-1] // 2, still) for key, own in rows.items()}
             errors.append(_error(rows, _fit(rows, away), away))
         best = int(np.argmin(errors))
-        chosen = next(
-            one for one, error in zip(ladder, errors, strict=True) if error < errors[best] + _TOLERANCE
-        )
+        limit = errors[best] + _TOLERANCE
+        chosen = max(one for one, error in zip(ladder, errors, strict=True) if error < limit)
         listed = ", ".join(
             f"{100.0 * np.expm1(error - errors[best]):+.1f} % at {one:g} Hz"
             for one, error in zip(ladder, errors, strict=True)
@@ -270,7 +281,9 @@ class _Bench:
         found = {}
         for (side, j), own in rows.items():
             matrix = own.matrix.copy()
-            turned = np.concatenate([part.turned(law)[:, j] for part in own.parts])
+            turned = np.concatenate(
+                [self._smooth(part.turned(law)[:, j : j + 1], part)[:, 0] for part in own.parts]
+            )
             for place, (symbol, link, *_) in enumerate(names):
                 if symbol in ("Fcl", "Fcm") and link == j + 1 and np.any(matrix[:, place]):
                     matrix[:, place] = turned

@@ -309,7 +309,7 @@ def test_settings_reach_the_identification(workplace: Callable[[], Path]) -> Non
     write_settings(
         place,
         essential=None,
-        signals={"standstill_share": 1, "cutoff_hz": 8},
+        signals={"known_share": 0.3, "cutoff_hz": 8},
         coulomb={"kind": "tanh", "width": 0.01},
         without=["offl"],
         couplings=[["A5", "A6"]],
@@ -331,8 +331,9 @@ def test_every_key_of_the_settings_reaches_the_identification(tmp_path: Path) ->
         "covariance": {"kind": "bootstrap", "bandwidth_s": 0.5, "block_s": 2.0, "draws": 50, "seed": 3},
         "signals": {
             "cutoff_hz": 9.0, "order": 3, "decimate_hz": 3.0, "rate_hz": 6.0, "attenuation_db": 50.0,
-            "choose_cutoff": True, "average_periods": True, "edge_s": 0.4, "longest_bridge_s": 0.03,
-            "bridged_share": 0.2, "standstill_rad_s": 0.003, "standstill_share": 0.1, "outlier_scale": 6.0,
+            "average_periods": True, "edge_s": 0.4, "longest_bridge_s": 0.03,
+            "reversal_s": 0.03, "standstill_rad_s": 0.003, "known_share": 0.5,
+            "stiffness_nm_rad": [10000, 9000, 8000, 8000, 7000, 6000, 5000], "outlier_scale": 6.0,
             "motor_delay_s": 0.004, "delay_search_s": 0.05,
         },
         "essential": {"significance": 0.05, "largest_loss_percent": 2.0, "keep": ["Fcm"], "drop": ["offl7"]},
@@ -392,7 +393,7 @@ def test_options_of_an_estimator_change_its_estimate(workplace: Callable[[], Pat
         ({"essential": {"keep": ["M8"], "drop": ["M8"]}}, "in both"),
         ({"estimator": {"prior_strength": "much"}}, "'much' is not one of evidence, cross_validation"),
         ({"signals": {"cutof_hz": 8.0}}, "unknown key `cutof_hz`; did you mean `cutoff_hz`?"),
-        ({"signals": {"bridged_share": 1.5}}, "`signals.bridged_share` is 1.5, outside its range (0 to 1)"),
+        ({"signals": {"known_share": 1.5}}, "`signals.known_share` is 1.5, outside its range (0 to 1)"),
         ({"covariance": {"block_s": 0.0}}, "`covariance.block_s` is 0, outside its range (above 0)"),
     ],
 )

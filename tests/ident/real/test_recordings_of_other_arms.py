@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import gravity_torque
-from ident.dynamics.structure import Coupling
+from ident.dynamics.structure import Coulomb, Coupling
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.validate import validate
 from ident.import_log import LogMapping, import_log
@@ -51,9 +51,12 @@ def tx40(tmp_path_factory: pytest.TempPathFactory) -> Identification:
         cutoff_hz=100.0,
         decimate_hz=50.0,
         standstill_rad_s=0.05,
-        standstill_share=0.5,
+        known_share=0.5,
+        reversal_s=0.0,
     )
-    settings = IdentificationSettings(model=2, couplings=(Coupling(("joint_5", "joint_6")),), signals=signals)
+    settings = IdentificationSettings(
+        model=2, couplings=(Coupling(("joint_5", "joint_6")),), signals=signals, coulomb=Coulomb()
+    )
     return identify([read_session(path)], Chain.from_urdf(source / "tx40_mdh_modified.urdf"), settings)
 
 
