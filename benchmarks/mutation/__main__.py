@@ -57,7 +57,9 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
         tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
     stages: list[list[tuple[str, list[str], float]]] = [[]]
     for entry in tests:
-        if stages[-1] and sum(item[2] for item in stages[-1]) + entry[2] > _FIRST_S * 4.0 ** (len(stages) - 1):
+        if stages[-1] and sum(item[2] for item in stages[-1]) + entry[2] > _FIRST_S * 4.0 ** (
+            len(stages) - 1
+        ):
             stages.append([])
         stages[-1].append(entry)
     seconds = 0.0
@@ -146,7 +148,10 @@ def replay(trials: Trials) -> int:
             answer = trials.run(files, set(bug.tests), 300.0, fresh="njit" in source)
         caught = answer["outcome"] != "survived"
         passed += not caught
-        print(f"{'caught' if caught else 'PASSED'} {answer['seconds']:6.1f} s  {bug.name}  {answer['test']}", flush=True)
+        print(
+            f"{'caught' if caught else 'PASSED'} {answer['seconds']:6.1f} s  {bug.name}  {answer['test']}",
+            flush=True,
+        )
     print(f"{len(BUGS) - passed} of {len(BUGS)} bugs are caught")
     return passed
 
@@ -156,10 +161,17 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=400, help="number of mutants of all modules")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=[], help="keep mutants of files that begin so")
-    parser.add_argument("--again", action="store_true", help="try the survivors of the last run again, keep the others")
+    parser.add_argument(
+        "--again", action="store_true", help="try the survivors of the last run again, keep the others"
+    )
     parser.add_argument("--bugs", action="store_true", help="replay the bugs written by hand instead")
+    parser.add_argument(
+        "--control", action="store_true", help="run the tests as for a mutant, without a change"
+    )
     parser.add_argument("--table", action="store_true", help="print the table of the last run")
-    parser.add_argument("--out", type=Path, default=Path("mutation"), help="folder of results, lines and copy")
+    parser.add_argument(
+        "--out", type=Path, default=Path("mutation"), help="folder of results, lines and copy"
+    )
     arguments = parser.parse_args()
     folder: Path = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
@@ -172,6 +184,11 @@ def main() -> int:
         if arguments.bugs:
             return min(replay(trials), 1)
         known = known_lines(trials, folder)
+        if arguments.control:
+            names = {f"{file}::{function}" for file, entry in known.items() for function in entry.seconds}
+            answer = trials.run(sorted(known), names, 3600.0)
+            print(f"without a change: {answer['test'] or 'no test'} fails, {answer['seconds']:.0f} s")
+            return min(answer["outcome"] != "survived", 1)
         drawn = sample(ROOT, arguments.sample, arguments.seed, arguments.only)
         done = {(r["file"], r["old"], r["new"]): r for r in before if arguments.again}
         results = []

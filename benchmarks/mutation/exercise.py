@@ -123,7 +123,9 @@ def save(path: Path, known: dict[str, FileOfTests]) -> None:
 
 def stale(known: dict[str, FileOfTests], root: Path) -> list[str]:
     """Files of tests that are new or changed, or whose sources are."""
-    files = sorted(str(path.relative_to(root)) for place in TESTS for path in (root / place).rglob("test_*.py"))
+    files = sorted(
+        str(path.relative_to(root)) for place in TESTS for path in (root / place).rglob("test_*.py")
+    )
     return [
         file
         for file in files

@@ -235,7 +235,9 @@ def files(root: Path, places: Sequence[str]) -> list[str]:
 def sample(root: Path, number: int, seed: int, only: Sequence[str] = ()) -> list[Mutant]:
     """`number` mutants of all strata, each with its share of all mutants; `only` keeps files beginning so."""
     by_stratum = {
-        stratum: [m for file in files(root, places) for m in mutants_of(file, (root / file).read_text("utf-8"))]
+        stratum: [
+            m for file in files(root, places) for m in mutants_of(file, (root / file).read_text("utf-8"))
+        ]
         for stratum, places in STRATA.items()
     }
     total = sum(map(len, by_stratum.values()))

@@ -100,6 +100,16 @@ def test_the_wrist_of_the_tx40_is_coupled():
         ModelStructure(lwr(), 2, couplings=(Coupling(("A1", "A9")),))
 
 
+@pytest.mark.parametrize("model", [1, 2, 3])
+def test_a_coupling_of_the_drives_is_not_seen_at_the_joints(model):
+    structure = ModelStructure(tx40(), model, couplings=(Coupling(("q5", "q6")),))
+    q, qd, qdd = states(structure.chain, 12)
+    rows = structure.regressor(q, qd, qdd)[:, -3:].reshape(len(structure.sides), 6, 12, 3)
+    for side, block in zip(structure.sides, rows, strict=True):
+        assert block[4:].any() == (side != "joint")
+        assert not block[:4].any()
+
+
 @pytest.mark.parametrize(
     ("coulomb", "expected"),
     [

@@ -106,7 +106,9 @@ class Stand:
     def execute(self, motion: Motion, progress: Callable[[Any], None]) -> Outcome:
         self.calls.append(("execute", motion))
         half = len(motion) // 2
-        progress(SimpleNamespace(row=half, rows=len(motion), time_s=1.5, phase="period 1", state=self.state()))
+        progress(
+            SimpleNamespace(row=half, rows=len(motion), time_s=1.5, phase="period 1", state=self.state())
+        )
         self.during()
         self.q = motion.q[-1].astype(np.float32).astype(np.float64)
         status, reason, error = self.outcome
@@ -132,8 +134,6 @@ class Stand:
 
     def begin(self, session: str, payload: Payload | None, motion: Motion) -> None:
         self.calls.append(("begin", session, payload, motion))
-
-
 
 
 def excite(plan: SessionPlan, period_s: float) -> Motion:
@@ -168,5 +168,3 @@ def run_of(stand: Stand, folder: Path, *sessions: SessionPlan, source: str = "no
         stand,
     )
     return Run(experiment(*sessions, source=source, **changes), folder, bench, excite)
-
-

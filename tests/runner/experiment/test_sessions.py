@@ -226,7 +226,9 @@ def test_the_log_tells_what_was_done_with_what(stand: Stand, tmp_path: Path) -> 
     assert attachments["robot.urdf"].decode() == stand.arm.urdf
     checks = json.loads(attachments["preflight.json"])
     subjects = [item["subject"] for item in checks]
-    assert {"link", "torque at rest", "clearance", "joint torque estimate", "free disk space"} <= set(subjects)
+    assert {"link", "torque at rest", "clearance", "joint torque estimate", "free disk space"} <= set(
+        subjects
+    )
     ((motion,),) = stand.of("execute")
     with np.load(io.BytesIO(attachments["plan.npz"])) as plan:
         assert np.array_equal(plan["q"], motion.q)
