@@ -55,6 +55,7 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
     tests = exercise.tests_of(known, mutant.file, lines, anywhere=False)
     if jitted or not tests:
         tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
+    tests = tests or exercise.tests_naming(known, mutant.file, trials.tree)
     stages: list[list[tuple[str, list[str], float]]] = [[]]
     for entry in tests:
         if stages[-1] and sum(item[2] for item in stages[-1]) + entry[2] > _FIRST_S * 4.0 ** (
@@ -121,14 +122,15 @@ def store(folder: Path, results: list[dict[str, Any]], arguments: argparse.Names
     """Write results.json and table.txt; returns the table."""
     reasons: list[dict[str, str]] = yaml.safe_load(REASONS.read_text("utf-8")) or []
     text = table(results, reasons)
+    known = [{k: v for k, v in reason_of(r, reasons).items() if k in ("kind", "reason")} for r in results]
     content = {
         "commit": git_commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "sample": arguments.sample,
         "seed": arguments.seed,
         "only": arguments.only,
-        "mutants": [{**r, **{k: v for k, v in reason_of(r, reasons).items() if k in ("kind", "reason")}} for r in results],
-    }  # fmt: skip
+        "mutants": [{**r, **why} for r, why in zip(results, known, strict=True)],
+    }
     (folder / "results.json").write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
     (folder / "table.txt").write_text(text + "\n", encoding="utf-8")
     return text

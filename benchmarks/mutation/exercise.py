@@ -155,6 +155,19 @@ def tests_of(
     return sorted(found, key=lambda item: (item[2], item[0]))
 
 
+def tests_naming(
+    known: dict[str, FileOfTests], source: str, root: Path
+) -> list[tuple[str, list[str], float]]:
+    """Tests of the files that import a source without a line run by a test, such as one of constants alone."""
+    module = source.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    found = [
+        (file, list(entry.seconds), sum(entry.seconds.values()))
+        for file, entry in known.items()
+        if f"{module} import" in (root / file).read_text("utf-8")
+    ]
+    return sorted(found, key=lambda item: (item[2], item[0]))
+
+
 if __name__ == "__main__":
     place = Path(sys.argv[1])
     entries = load(place)

@@ -39,11 +39,13 @@ STRATA: Mapping[str, tuple[str, ...]] = {
 }
 
 # cosmic-ray knows every pair of operators. Most of them, such as a shift of floats, fail at once and show nothing.
-_PAIRS = (
-    "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul LShift_RShift RShift_LShift BitOr_BitAnd "
-    "BitAnd_BitOr Eq_NotEq NotEq_Eq Lt_LtE Lt_GtE LtE_Lt LtE_Gt Gt_GtE Gt_LtE GtE_Gt GtE_Lt Is_IsNot IsNot_Is "
-    "Delete_USub Delete_Not Delete_Invert"
-).split()
+_PAIRS: tuple[str, ...] = (
+    *("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "FloorDiv_Mul", "Mod_FloorDiv", "Pow_Mul"),
+    *("LShift_RShift", "RShift_LShift", "BitOr_BitAnd", "BitAnd_BitOr"),
+    *("Eq_NotEq", "NotEq_Eq", "Is_IsNot", "IsNot_Is"),
+    *("Lt_LtE", "Lt_GtE", "LtE_Lt", "LtE_Gt", "Gt_GtE", "Gt_LtE", "GtE_Gt", "GtE_Lt"),
+    *("Delete_USub", "Delete_Not", "Delete_Invert"),
+)
 # Text for a reader: no test pins its words.
 _TEXT = {"__repr__", "__str__", "summary", "describe"}
 # The order of their first two arguments does not matter.
@@ -194,9 +196,8 @@ def _only_text(node: Any, kind: type[Operator]) -> bool:
             return True
         if above.type in ("param", "tfpdef") and ":" in above.get_code() and _in_annotation(above, below):
             return True
-        if above.type == "funcdef":
-            if above.name.value in _TEXT or below is above.annotation:
-                return True
+        if above.type == "funcdef" and (above.name.value in _TEXT or below is above.annotation):
+            return True
         if above.type == "if_stmt" and "TYPE_CHECKING" in above.children[1].get_code():
             return True
         if above.type == "simple_stmt" and _QUIET.search(above.get_code()):

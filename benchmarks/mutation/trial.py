@@ -5,6 +5,7 @@ It works in a copy of the tree, with one JSON object a line on its input and out
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -75,10 +76,8 @@ def serve() -> None:
             sys.dont_write_bytecode = request["quiet"]
             _run(request["files"], set(request["functions"]), report)
         code = _wait(child, start + request["limit_s"])
-        try:
+        with contextlib.suppress(ProcessLookupError):
             os.killpg(child, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
         test = json.loads(report.read_text())["test"] if report.exists() else ""
         # 5: no test collected.
         outcome = "time" if code is None else "survived" if code in (0, 5) else "caught"

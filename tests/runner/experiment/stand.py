@@ -16,7 +16,7 @@ from lwr_driver.configuration import find
 from lwr_driver.driver import Outcome
 from lwr_driver.motion import Motion, move_to
 from runner.experiment import Bench, Run
-from runner.experiment_file import Experiment, Moves, MotorTorque, Payload, SessionPlan
+from runner.experiment_file import Experiment, MotorTorque, Moves, Payload, SessionPlan
 from runner.preflight import gravity_torque
 from runner.terminal import StatusLine
 

@@ -305,8 +305,8 @@ def test_a_resumption_weighs_the_payload_against_the_last_session(stand: Stand, 
     with pytest.raises(RefusedError, match="payload 'paper_load' announced"):
         run_of(stand, tmp_path, LOADED, AGAIN).sessions()
     other = Payload("other", 1.0, (0.0, 0.0, 0.1))
+    stand.careless = True
     with pytest.raises(RefusedError, match="payload 'other' announced"):
-        stand.careless = True
         run_of(stand, tmp_path, LOADED, SessionPlan("next", other)).sessions()
 
 
