@@ -24,7 +24,7 @@ REASONS = Path(__file__).with_name("survivors.yaml")
 # The first tests of a mutant take so long at most; most mutants need no more of them.
 _FIRST_S = 4.0
 # A mutant may be slower than the code so many times, and longer by so much.
-_SLOWER, _LONGER_S = 4.0, 30.0
+_SLOWER, _LONGER_S = 3.0, 10.0
 
 
 def known_lines(trials: Trials, folder: Path) -> dict[str, exercise.FileOfTests]:
@@ -65,14 +65,13 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
         stages[-1].append(entry)
     seconds = 0.0
     with trials.replace(mutant.file, code):
-        # Functions compiled before may hold a changed constant: a survivor is tried without them too.
-        for fresh in (True,) if jitted else (False, True):
-            if fresh and not jitted and not mutant.file.startswith("ident/dynamics"):
-                continue
+        # Functions compiled before may hold a changed constant: such a survivor is tried without them too.
+        constant = not source.splitlines()[mutant.line - 1].startswith((" ", ")", "]", "}"))
+        for fresh in (True,) if jitted else (False, True) if constant else (False,):
             for stage in stages if tests else ():
                 files = [file for file, _, _ in stage]
                 functions = {f"{file}::{function}" for file, names, _ in stage for function in names}
-                limit = _LONGER_S * (3.0 if fresh else 1.0) + _SLOWER * sum(item[2] for item in stage)
+                limit = _LONGER_S * (6.0 if fresh else 1.0) + _SLOWER * sum(item[2] for item in stage)
                 answer = trials.run(files, functions, limit, fresh=fresh)
                 seconds += answer["seconds"]
                 if answer["outcome"] != "survived":

@@ -133,5 +133,7 @@ def test_load_data_in_force_are_read() -> None:
 
 
 def test_an_unknown_program_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match="known are lwr_identification, rcprg, ros_control, stanford"):
+    with pytest.raises(
+        ConfigurationError, match="known are lwr_identification, rcprg, ros_control, stanford"
+    ):
         find_handshake("fri")
