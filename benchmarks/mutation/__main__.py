@@ -23,6 +23,8 @@ ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("survivors.yaml")
 # The first tests of a mutant take so long at most; most mutants need no more of them.
 _FIRST_S = 4.0
+# Tests of a mutant take so long together at most, the quickest files first.
+_MOST_S = 25.0
 # A mutant may be slower than the code so many times, and longer by so much.
 _SLOWER, _LONGER_S = 3.0, 10.0
 
@@ -56,6 +58,8 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
     if jitted or not tests:
         tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
     tests = tests or exercise.tests_naming(known, mutant.file, trials.tree)
+    while len(tests) > 1 and sum(seconds for *_, seconds in tests) > _MOST_S:
+        tests.pop()
     stages: list[list[tuple[str, list[str], float]]] = [[]]
     for entry in tests:
         if stages[-1] and sum(item[2] for item in stages[-1]) + entry[2] > _FIRST_S * 4.0 ** (

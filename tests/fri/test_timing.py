@@ -153,7 +153,7 @@ def test_limits_are_copies_that_cannot_be_changed():
     assert limits.q_max[0] == 1.0
     with pytest.raises(ValueError, match="read-only"):
         limits.v_max[0] = 2.0
-    with pytest.raises(ConfigurationError, match="A1 v_max 1.0 rad/s and a_max 0.0"):
+    with pytest.raises(ConfigurationError, match=r"A1 v_max 1\.0 rad/s and a_max 0\.0"):
         KrcLimits(-limits.q_max, limits.q_max, limits.v_max, np.zeros(7))
     with pytest.raises(ConfigurationError, match="A1 q_min"):
         KrcLimits(limits.q_max, limits.q_max, limits.v_max, limits.v_max)
