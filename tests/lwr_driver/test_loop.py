@@ -633,3 +633,21 @@ def test_silence_ends_a_measurement_too(rig, monkeypatch):
     assert not r.loop.cycle(0.0)
     assert r.result is Result.NETWORK
     assert r.reason.startswith("no packet for 0.110 s")
+
+
+def test_a_start_is_asked_for_only_after_the_program_has_taken_the_stop(rig, monkeypatch):
+    r = rig()
+    r.cycles(60)
+    taken = False
+    monkeypatch.setattr(r.loop._handshake, "stopped", lambda msr: taken)
+    monkeypatch.setattr(r.loop._handshake, "fallen", lambda msr: False)
+    r.post(Job.START, limit=2000)
+    r.cycles(5)
+    # The words of Stanford's program: 20 stops, 10 starts.
+    assert int(r.loop.remote.command["krl_int"][15]) == 20
+    assert r.session.state is State.MON
+    taken = True
+    r.cycle()
+    assert int(r.loop.remote.command["krl_int"][15]) == 10
+    taken = False
+    assert r.until_done(200) is Result.DONE

@@ -161,3 +161,22 @@ def test_motion_at_full_speed_can_be_stopped_anywhere_without_passing_the_veloci
         motion = move_to(arm(), START, START + 0.8, period, speed_scale=1.0)
         _, _, speed = stop_extent(limits, period, motion.q)
         assert np.all(speed <= limits.v_max + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("v", "a", "jerk"),
+    [(0.5, 3.0, -1.0), (-0.5, -3.0, 1.0), (0.5, -3.0, -1.0), (0.05, -5.0, 1.0), (-0.05, 5.0, -1.0)],
+)
+def test_the_jerk_of_a_stop_begins_with_its_first_row(v, a, jerk):
+    # Against the motion as it would be once the acceleration is gone, v + a |a| / 2 j: the fourth case has turned by
+    # then.
+    limits, period = arm().limits, 0.001
+    history_of = np.zeros((3, 7))
+    history_of[0] = START
+    history_of[1] = START - np.eye(7)[0] * v * period
+    history_of[2] = history_of[1] - np.eye(7)[0] * (v - a * period) * period
+    stop = Stop(limits, period)
+    stop.begin(*history_of)
+    first = stop.advance(1)
+    second = (first - 2.0 * history_of[0] + history_of[1])[0] / period**2
+    assert second == pytest.approx(a + jerk * limits.j_max[0] * period, abs=1e-6)
