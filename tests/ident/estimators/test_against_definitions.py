@@ -11,6 +11,7 @@ from ident.dynamics.parameters import from_com, pseudo_inertia
 from ident.estimators import (
     BodyPrior,
     CovarianceSettings,
+    InstrumentalVariables,
     MaximumAPosteriori,
     OrdinaryLeastSquares,
     PhysicallyConsistent,
@@ -21,10 +22,12 @@ from ident.estimators import (
     RegressorExtensionMixing,
     RobustLeastSquares,
     RowGroup,
+    TotalLeastSquares,
     TriangularFactor,
     WeightedLeastSquares,
     nearest_consistent,
 )
+from ident.estimators.covariance import Scores, correlation_time
 from tests.ident.regression_problems import design, problem
 
 CHI = np.linspace(-2.0, 2.5, 12)
@@ -549,3 +552,165 @@ def test_weights_of_a_perfect_fit_stay_finite() -> None:
     estimate = WeightedLeastSquares().fit(problem(matrices, CHI, [np.zeros(len(m)) for m in matrices]))
     assert np.all(np.isfinite(estimate.weights))
     assert np.all(estimate.std >= 0.0)
+
+
+# -- errors in variables -------------------------------------------------------------------------------------
+
+
+def test_instruments_solve_their_equations() -> None:
+    case = noisy(samples=60)
+    random = np.random.default_rng(9)
+    instruments = [g.matrix + 0.3 * random.normal(size=g.matrix.shape) for g in case.groups]
+    estimate = InstrumentalVariables(lambda values: instruments).fit(case)
+    matrix, target, classes = stack(case)
+    z = np.vstack(instruments)
+    weight = estimate.weights[classes]
+    bread = np.linalg.inv((z.T * weight) @ matrix)
+    np.testing.assert_allclose(estimate.values, bread @ (z.T * weight) @ target, atol=1e-9)
+    expected = bread @ (z.T * weight) @ z @ bread.T
+    np.testing.assert_allclose(estimate.covariances["textbook"].matrix, expected, rtol=1e-7)
+    assert estimate.converged
+
+
+def test_instruments_are_simulated_with_the_newest_estimate_until_it_rests() -> None:
+    case = noisy(samples=60)
+    seen: list[np.ndarray] = []
+
+    def simulated(values: np.ndarray) -> list[np.ndarray]:
+        seen.append(values.copy())
+        return [group.matrix for group in case.groups]
+
+    estimate = InstrumentalVariables(simulated).fit(case)
+    plain = WeightedLeastSquares().fit(case)
+    # Instruments equal to the regressor: weighted least squares itself.
+    np.testing.assert_allclose(estimate.values, plain.values, atol=1e-6)
+    np.testing.assert_allclose(seen[0], plain.values, atol=1e-6)
+    assert (len(seen), estimate.iterations) == (1, 1)
+    never = InstrumentalVariables(simulated, tolerance=0.0, iterations=3).fit(case)
+    assert (never.iterations, never.converged) == (3, False)
+
+
+@pytest.mark.parametrize(
+    ("instruments", "message"),
+    [
+        (lambda case: [g.matrix for g in case.groups][:-1], "5 instrument matrices for 6 row groups"),
+        (lambda case: [g.matrix * np.nan for g in case.groups], "not finite"),
+        (lambda case: [np.ones_like(g.matrix) for g in case.groups], "do not span the parameters"),
+    ],
+)
+def test_instruments_that_cannot_serve_are_refused(instruments, message) -> None:
+    case = noisy(samples=20)
+    with pytest.raises(DataError, match=message):
+        InstrumentalVariables(lambda values: instruments(case)).fit(case)
+
+
+def one_class(seed: int, rows: int, share: float) -> tuple[Problem, np.ndarray, np.ndarray]:
+    """Rows of one class; the last three of five columns are measured with errors, share times their rms."""
+    random = np.random.default_rng(seed)
+    true = random.normal(size=(rows, 5)) * np.array([1.0, 2.0, 1.0, 3.0, 0.5])
+    chi = np.array([1.0, -1.0, 2.0, 0.5, -3.0])
+    target = true @ chi + 0.2 * random.normal(size=rows)
+    rms = np.sqrt(np.mean(true**2, axis=0))
+    seen = true + share * rms * np.array([0, 0, 1, 1, 1]) * random.normal(size=true.shape)
+    group = RowGroup("A1", "joint", 0, seen, target, np.arange(rows))
+    names = ("offl1", "offm1", "XX1", "YY1", "ZZ1")
+    return Problem(names, (group,), 0.2), chi, np.sqrt(np.mean(seen**2, axis=0))
+
+
+def test_total_least_squares_minimises_its_criterion() -> None:
+    case, chi, rms = one_class(1, 400, 0.1)
+    estimate = TotalLeastSquares(0.1).fit(case)
+    assert estimate.notes == ("3 columns with errors, 2 exact",)
+    group = case.groups[0]
+    column = 0.1 * rms * np.array([0.0, 0.0, 1.0, 1.0, 1.0])
+    square = float(np.sum((group.target - group.matrix @ estimate.values) ** 2))
+    # The torque's variance: what remains of the residual's without the columns' share.
+    torque = square / (400 - 5) - float(np.sum((column * estimate.values) ** 2))
+
+    def cost(x: np.ndarray) -> float:
+        return float(np.sum((group.target - group.matrix @ x) ** 2) / (torque + np.sum((column * x) ** 2)))
+
+    best = cost(estimate.values)
+    for k in range(5):
+        for sign in (-1.0, 1.0):
+            step = np.zeros(5)
+            step[k] = sign * 0.2 * estimate.std[k]
+            assert cost(estimate.values + step) > best
+    assert np.abs((estimate.values - chi) / estimate.std).max() < 4.0
+
+
+def test_the_deviations_of_total_least_squares_are_those_of_repeated_data() -> None:
+    found = [TotalLeastSquares(0.1).fit(one_class(seed, 300, 0.1)[0]) for seed in range(120)]
+    scatter = np.std([estimate.values for estimate in found], axis=0)
+    stated = np.mean([estimate.std for estimate in found], axis=0)
+    np.testing.assert_allclose(stated / scatter, 1.0, atol=0.25)
+
+
+def test_column_noise_is_given_by_name_too() -> None:
+    case, *_ = one_class(2, 400, 0.1)
+    same = TotalLeastSquares({"XX1": 0.1, "YY1": 0.1, "ZZ1": 0.1}).fit(case)
+    np.testing.assert_allclose(same.values, TotalLeastSquares(0.1).fit(case).values, atol=1e-10)
+    with pytest.raises(DataError, match="given for 'XX9', not a parameter"):
+        TotalLeastSquares({"XX9": 0.1}).fit(case)
+    none = TotalLeastSquares(0.0).fit(case)
+    np.testing.assert_allclose(none.values, WeightedLeastSquares().fit(case).values, atol=1e-10)
+    assert none.notes == ("0 columns with errors, 5 exact",)
+
+
+# -- covariances ---------------------------------------------------------------------------------------------
+
+
+def test_scores_are_summed_over_all_rows_of_an_instant_with_gaps_as_zeros() -> None:
+    random = np.random.default_rng(0)
+    times = [np.array([2, 3, 5, 9]), np.array([3, 4, 9]), np.array([0, 1])]
+    groups = tuple(
+        RowGroup(f"A{k + 1}", "joint", int(k == 2), random.normal(size=(len(t), 2)), np.ones(len(t)), t)
+        for k, t in enumerate(times)
+    )
+    case = Problem(("a", "b"), groups, 0.1)
+    coefficients = [random.normal(size=len(t)) for t in times]
+    scores = Scores.of(case, coefficients)
+    first = np.zeros((8, 2))
+    for group, weight in zip(groups[:2], coefficients[:2], strict=True):
+        for row, t in enumerate(group.time_index):
+            first[t - 2] += weight[row] * group.matrix[row]
+    np.testing.assert_allclose(scores.records[0], first, atol=1e-14)
+    np.testing.assert_allclose(scores.records[1], coefficients[2][:, None] * groups[2].matrix, atol=1e-14)
+    assert scores.samples == 10
+    other = [np.ones_like(group.matrix) for group in groups]
+    replaced = Scores.of(case, coefficients, other)
+    np.testing.assert_allclose(replaced.records[1], np.outer(coefficients[2], [1.0, 1.0]), atol=1e-14)
+
+
+@pytest.mark.parametrize("length", [1, 3, 7])
+def test_bartletts_weights_fall_linearly_with_the_lag_within_a_record(length: int) -> None:
+    random = np.random.default_rng(1)
+    records = tuple(random.normal(size=(n, 2)) for n in (12, 5))
+    expected = np.zeros((2, 2))
+    for record in records:
+        for i in range(len(record)):
+            for j in range(len(record)):
+                expected += max(0.0, 1.0 - abs(i - j) / length) * np.outer(record[i], record[j])
+    np.testing.assert_allclose(Scores(records).bartlett(length), expected, atol=1e-12)
+
+
+def test_thinned_scores_are_sums_of_neighbours() -> None:
+    record = np.arange(14.0).reshape(7, 2)
+    thin = Scores((record,)).thinned(3).records[0]
+    np.testing.assert_array_equal(thin, [record[:3].sum(axis=0), record[3:6].sum(axis=0), record[6]])
+
+
+@pytest.mark.parametrize(
+    ("autocovariance", "time"),
+    [
+        ([2.0, 0.0, 0.0, 0.0], 1.0),
+        ([1.0, 0.5, 0.25, 0.125], 2.0 * (1.5 + 0.375) - 1.0),
+        # Summed while a pair of lags is positive.
+        ([1.0, 0.5, -0.3, -0.4, 0.9, 0.9], 2.0),
+        ([4.0, -3.0, 1.0, 0.0], 1.0),
+        ([0.0, 1.0], 1.0),
+        ([1.0, 0.5, 0.25], 2.0),
+    ],
+)
+def test_the_correlation_time_is_that_of_geyers_sequence(autocovariance: list[float], time: float) -> None:
+    assert correlation_time(np.array(autocovariance)) == pytest.approx(time)
