@@ -277,7 +277,7 @@ def test_an_empty_stack_is_refused(route):
 
 def test_columns_are_preferred_as_in_the_literature():
     """Of a revolute joint's link YY, MZ and M come last, of a prismatic one's the inertia tensor and MZ."""
-    structure = ModelStructure(scara(), 2, payloads=("p",), couplings=(Coupling(("j1", "j2")),))
+    structure = ModelStructure(scara(), 2, payloads=("p",), couplings=(Coupling(("q1", "q2")),))
     order = columns_by_preference(structure)
     assert sorted(order) == list(range(structure.n_columns))
     names = [structure.names[k] for k in order]
