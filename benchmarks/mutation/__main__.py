@@ -165,7 +165,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mutation", description=__doc__)
     parser.add_argument("--sample", type=int, default=400, help="number of mutants of all modules")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="+", default=[], help="keep mutants of files that begin so")
+    parser.add_argument("--only", nargs="+", default=[], help="draw from files that begin so")
     parser.add_argument(
         "--again", action="store_true", help="try the survivors of the last run again, keep the others"
     )
@@ -175,7 +175,10 @@ def main() -> int:
     )
     parser.add_argument("--table", action="store_true", help="print the table of the last run")
     parser.add_argument(
-        "--out", type=Path, default=Path("mutation"), help="folder of results, lines and copy"
+        "--out",
+        type=Path,
+        default=ROOT / "build/mutation",
+        help="folder of results, of the lines of the tests and of the copy",
     )
     arguments = parser.parse_args()
     folder: Path = arguments.out
@@ -196,17 +199,20 @@ def main() -> int:
             return min(answer["outcome"] != "survived", 1)
         drawn = sample(ROOT, arguments.sample, arguments.seed, arguments.only)
         done = {(r["file"], r["old"], r["new"]): r for r in before if arguments.again}
-        results = []
-        for number, mutant in enumerate(drawn, start=1):
+        results, open_ = [], []
+        for mutant in drawn:
             source = (ROOT / mutant.file).read_text("utf-8")
             earlier = done.get((mutant.file, *change(source, mutant.code(source))))
             if earlier and earlier["outcome"] in ("caught", "time"):
                 results.append({**earlier, "line": mutant.line})
-                continue
+            else:
+                open_.append((earlier is not None, mutant))
+        # What was never tried comes first.
+        for number, (_, mutant) in enumerate(sorted(open_, key=lambda item: item[0]), start=1):
             results.append(attempt(trials, mutant, known))
             last = results[-1]
             print(
-                f"{number}/{len(drawn)} {last['outcome']:<8} {last['seconds']:5.1f} s {last['file']}:{last['line']}  "
+                f"{number}/{len(open_)} {last['outcome']:<8} {last['seconds']:5.1f} s {last['file']}:{last['line']}  "
                 f"{last['old'][:90]} -> {last['new'][:90]}",
                 flush=True,
             )

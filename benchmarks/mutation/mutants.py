@@ -234,20 +234,28 @@ def files(root: Path, places: Sequence[str]) -> list[str]:
 
 
 def sample(root: Path, number: int, seed: int, only: Sequence[str] = ()) -> list[Mutant]:
-    """`number` mutants of all strata, each with its share of all mutants; `only` keeps files beginning so."""
+    """`number` mutants of all strata, each with its share of all mutants.
+
+    only : beginnings of paths; the sample is drawn from these files
+    """
     by_stratum = {
         stratum: [
-            m for file in files(root, places) for m in mutants_of(file, (root / file).read_text("utf-8"))
+            mutant
+            for file in files(root, places)
+            if not only or file.startswith(tuple(only))
+            for mutant in mutants_of(file, (root / file).read_text("utf-8"))
         ]
         for stratum, places in STRATA.items()
     }
     total = sum(map(len, by_stratum.values()))
+    if total <= number:
+        return [mutant for all_ in by_stratum.values() for mutant in all_]
     exact = {stratum: number * len(all_) / total for stratum, all_ in by_stratum.items()}
     counts = {stratum: int(share) for stratum, share in exact.items()}
     for stratum in sorted(exact, key=lambda s: counts[s] - exact[s])[: number - sum(counts.values())]:
         counts[stratum] += 1
-    drawn: list[Mutant] = []
-    for stratum, all_ in by_stratum.items():
-        take = min(counts[stratum], len(all_))
-        drawn += random.Random(f"{seed} {stratum}").sample(all_, take)
-    return [m for m in drawn if not only or m.file.startswith(tuple(only))]
+    return [
+        mutant
+        for stratum, all_ in by_stratum.items()
+        for mutant in random.Random(f"{seed} {stratum}").sample(all_, counts[stratum])
+    ]
