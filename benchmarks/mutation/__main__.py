@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("survivors.yaml")
 # The first tests of a mutant take so long at most; most mutants need no more of them.
 _FIRST_S = 4.0
-# Tests of a mutant take so long together at most, the quickest files first.
+# Tests from other folders than the one that mirrors the module's are left out beyond so long, the longest first.
 _MOST_S = 25.0
 # A mutant may be slower than the code so many times, and longer by so much.
 _SLOWER, _LONGER_S = 3.0, 10.0
@@ -58,7 +58,9 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
     if jitted or not tests:
         tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
     tests = tests or exercise.tests_naming(known, mutant.file, trials.tree)
-    while len(tests) > 1 and sum(seconds for *_, seconds in tests) > _MOST_S:
+    near = f"tests/{Path(mutant.file).parent}/"
+    tests.sort(key=lambda item: (not item[0].startswith(near), item[2]))
+    while sum(item[2] for item in tests) > _MOST_S and len(tests) > 1 and not tests[-1][0].startswith(near):
         tests.pop()
     stages: list[list[tuple[str, list[str], float]]] = [[]]
     for entry in tests:

@@ -137,3 +137,11 @@ def test_an_unknown_program_is_refused_with_the_known_ones() -> None:
         ConfigurationError, match="known are lwr_identification, rcprg, ros_control, stanford"
     ):
         find_handshake("fri")
+
+
+def test_a_request_that_was_never_taken_keeps_its_number_from_the_next() -> None:
+    handshake, cmd, msr = IdentificationHandshake(), new_cmd(), new_msr()
+    for number in (1, 2, 3):
+        handshake.request_load(cmd, msr, np.full(7, float(number)))
+        assert cmd["krl_int"][12:14].tolist() == [-number, number]
+        assert not handshake.load_taken(cmd, msr)

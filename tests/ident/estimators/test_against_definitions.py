@@ -27,8 +27,9 @@ from ident.estimators import (
     WeightedLeastSquares,
     nearest_consistent,
 )
-from ident.estimators.covariance import Scores, correlation_time
-from tests.ident.regression_problems import design, problem
+from ident.estimators.covariance import Scores, correlation_time, effective_rows
+from ident.estimators.least_squares import class_variances
+from tests.ident.regression_problems import ar1, design, problem
 
 CHI = np.linspace(-2.0, 2.5, 12)
 
@@ -199,6 +200,37 @@ def test_a_robust_estimate_solves_its_equations(loss: str, tuning: float) -> Non
     assert estimate.converged
 
 
+@pytest.mark.parametrize(("loss", "tuning"), [("huber", 1.345), ("tukey", 4.685)])
+def test_the_covariance_of_a_robust_estimate_has_the_slope_of_its_loss(loss: str, tuning: float) -> None:
+    case = noisy(scale=(0.3, 0.3, 0.3))
+    estimate = RobustLeastSquares(loss, covariance=CovarianceSettings("textbook")).fit(case)  # type: ignore[arg-type]
+    matrix, target, classes = stack(case)
+    weight = estimate.weights[classes]
+    u = (target - matrix @ estimate.values) * np.sqrt(weight)
+
+    def psi(at: np.ndarray) -> np.ndarray:
+        if loss == "huber":
+            return np.clip(at, -tuning, tuning)
+        return np.where(np.abs(at) < tuning, at * (1.0 - (at / tuning) ** 2) ** 2, 0.0)
+
+    slope = np.maximum((psi(u + 1e-6) - psi(u - 1e-6)) / 2e-6, 0.0)
+    expected = np.mean(psi(u) ** 2) * np.linalg.inv((matrix.T * (weight * slope)) @ matrix)
+    np.testing.assert_allclose(estimate.covariance.matrix, expected, rtol=1e-4, atol=1e-12)
+
+
+def test_iterations_end_where_they_are_told_to() -> None:
+    case = noisy()
+    prior = correlated_prior()
+    for estimator in (
+        RobustLeastSquares("huber", iterations=1),
+        MaximumAPosteriori(prior, 1.0, iterations=1),
+        WeightedLeastSquares(iterations=1),
+    ):
+        estimate = estimator.fit(case)
+        assert (estimate.iterations, estimate.converged) == (1, False)
+    assert WeightedLeastSquares().fit(case).converged
+
+
 # -- priors --------------------------------------------------------------------------------------------------
 
 
@@ -273,6 +305,20 @@ def test_cross_validation_predicts_the_blocks_left_out() -> None:
     assert best is not None
     assert error(best) < error(1.3 * best)
     assert error(best) < error(best / 1.3)
+
+
+def test_a_prior_serves_where_the_motion_excites_nothing() -> None:
+    matrices = [m.copy() for m in design()]
+    for matrix in matrices:
+        matrix[:, 7] = 0.0
+        matrix[:, 9] = 2.0 * matrix[:, 8]
+    case = problem(matrices, CHI, [0.1 * np.cos(np.arange(len(m))) for m in matrices])
+    estimate = MaximumAPosteriori(Prior.independent(CHI + 0.1, np.full(12, 0.5)), 1.0).fit(case)
+    assert estimate.values[7] == pytest.approx(CHI[7] + 0.1, abs=1e-9)
+    assert estimate.std[7] == pytest.approx(0.5, rel=1e-6)
+    # What the data tell of the pair is told, the rest comes from the prior.
+    assert estimate.values[8] + 2.0 * estimate.values[9] == pytest.approx(CHI[8] + 2.0 * CHI[9], abs=0.05)
+    assert 0.2 < estimate.std[9] < 0.5
 
 
 def test_an_independent_prior_has_infinite_deviations_for_free_parameters() -> None:
@@ -714,3 +760,49 @@ def test_thinned_scores_are_sums_of_neighbours() -> None:
 )
 def test_the_correlation_time_is_that_of_geyers_sequence(autocovariance: list[float], time: float) -> None:
     assert correlation_time(np.array(autocovariance)) == pytest.approx(time)
+
+
+def test_effective_rows_follow_from_the_autocovariances_of_each_class() -> None:
+    random = np.random.default_rng(6)
+    times = [np.arange(5, 305), np.delete(np.arange(200), [20, 21, 90]), np.arange(150)]
+    labels = ["A1", "A1", "A2"]
+    series = [np.convolve(random.normal(size=len(t) + 9), np.ones(10) / 10.0, "valid") for t in times]
+    groups = tuple(
+        RowGroup(label, "joint", k, np.ones((len(t), 1)), np.ones(len(t)), t)
+        for k, (label, t) in enumerate(zip(labels, times, strict=True))
+    )
+    found = effective_rows(Problem(("a",), groups, 0.1), series)
+
+    def autocovariance(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+        full = np.zeros(t[-1] - t[0] + 1)
+        full[t - t[0]] = values
+        lags = min(len(full), max(64, len(full) // 3))
+        return np.array([full[: len(full) - lag] @ full[lag:] for lag in range(lags)])
+
+    one, two, three = (autocovariance(t, values) for t, values in zip(times, series, strict=True))
+    both = one.copy()
+    both[: len(two)] += two
+    assert found[0] == pytest.approx(497 / correlation_time(both), rel=1e-9)
+    assert found[1] == pytest.approx(150 / correlation_time(three), rel=1e-9)
+    assert found[0] < 100
+
+
+@pytest.mark.parametrize("rho", [0.3, 0.8])
+def test_the_bandwidth_is_andrews_for_a_process_of_first_order(rho: float) -> None:
+    scores = Scores((ar1(np.random.default_rng(0), 200_000, rho)[:, None],))
+    alpha = 4.0 * rho**2 / ((1.0 - rho) ** 2 * (1.0 + rho) ** 2)
+    expected = 1.1447 * (alpha * 200_000) ** (1.0 / 3.0)
+    assert scores.bandwidth(np.eye(1)) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(("left", "refused"), [(0.9, True), (-1.0, True), (1.1, False)])
+def test_a_class_needs_a_residual_for_its_variance(left: float, refused: bool) -> None:
+    case = noisy(samples=20, records=1)
+    consumed = np.array([2.0, 20.0 - left, 2.0])
+    if refused:
+        with pytest.raises(DataError, match=r"A2 joint: 20 rows for .* leave no residual"):
+            class_variances(case, CHI, consumed)
+    else:
+        variance = class_variances(case, CHI, consumed)
+        residual = case.residuals(CHI)[1]
+        assert variance[1] == pytest.approx(float(residual @ residual) / 1.1)

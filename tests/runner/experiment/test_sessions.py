@@ -162,6 +162,17 @@ def test_a_failed_motion_keeps_its_error(stand: Stand, tmp_path: Path) -> None:
     assert stand.of("end_record") == [("fail", "drives are off")]
 
 
+@pytest.mark.parametrize(("status", "warned"), [("success", True), ("abort", False)])
+def test_warnings_about_the_data_of_a_finished_session_are_said_and_kept(
+    stand: Stand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: str, warned: bool
+) -> None:
+    monkeypatch.setattr(Run, "_torque_warnings", lambda run, path: (f"{path.name}: A2 looks like A3",))
+    stand.outcome = (status, "", None)
+    (record,) = run_of(stand, tmp_path).sessions()
+    assert record.warnings == (("bare.mcap: A2 looks like A3",) if warned else ())
+    assert ("A2 looks like A3" in stand.text.getvalue()) == warned
+
+
 def test_a_log_that_could_not_be_written_fails_the_session(stand: Stand, tmp_path: Path) -> None:
     stand.write_error = "no space left on device"
     (record,) = run_of(stand, tmp_path).sessions()
