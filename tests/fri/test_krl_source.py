@@ -379,3 +379,13 @@ def test_bits_of_the_words_are_read_and_written_one_by_one() -> None:
     assert rig.session.to_bool == 0x8001
     program.step(rig.session)
     assert rig.session.to_bool == 0x8000
+
+
+def test_the_strategy_is_position_control_until_another_is_committed() -> None:
+    assert ints("$FRI_TO_INT[1]=$STIFFNESS.STRATEGY")[0] == 10
+    body = "$STIFFNESS.STRATEGY=30\n$FRI_TO_INT[1]=$STIFFNESS.STRATEGY"
+    _, rig = run(body)
+    assert rig.session.to_int[0] == 30
+    assert rig.session.control is Control.POSITION
+    _, rig = run(body + "\n$STIFFNESS.COMMIT=TRUE")
+    assert rig.session.control is Control.JNT_IMP
