@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fri.krc import EventKind, KrcPolicy, KrcSession, Sample
-from fri.packets import MSR
+from fri.packets import MSR, new_msr
 from fri.states import ALL_DRIVES, Control, Quality, State
 from tests.fri.fri_rig import LIMITS, Q_MAX, Q_START, QUICK, V_MAX, Rig
 
@@ -681,3 +681,74 @@ def test_clients_that_know_only_the_bytes(first, style, sample_time_ms):
     assert moved > 50
     assert setpoint.state is State.CMD
     assert np.allclose(setpoint.position, Q_START + 1e-4 * sample_time_ms * moved, atol=1e-6)
+
+
+def test_every_field_of_the_first_packet():
+    rig = Rig(sample_time_ms=5)
+    session = KrcSession(LIMITS, Q_START, KrcPolicy(**QUICK), uptime_s=12.5, first_sequence=40, power=0x3F)
+    session.fri_open(5)
+    expected = new_msr()
+    values = {
+        "send_seq": 40,
+        "timestamp": np.float32(12.505),
+        "state": 1,
+        "msr_sample_time": np.float32(0.005),
+        "cmd_sample_time": np.float32(0.005),
+        "safety_limits": 1.0,
+        "power": 0x3F,
+        "control": 1,
+        "cmd_jnt_pos": np.float32(Q_START),
+        "cmd_cart_pos_fri_offset": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0],
+    }
+    for name, value in values.items():
+        expected[name] = value
+    for name in Sample.__dataclass_fields__:
+        expected[name] = getattr(rig.sample, name)
+    found = np.frombuffer(session.packet(rig.sample), MSR)[0]
+    for name in MSR.names:
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+    assert session.timestamp_s == pytest.approx(12.505)
+    assert {name for name, count in session.counters().items() if count} == {"packets"}
+    assert session.counters()["packets"] == 1
+
+
+def test_the_last_answer_can_be_read():
+    rig = Rig().open()
+    assert not rig.session.command.tobytes().strip(bytes(1))
+    rig.begin()
+    answer = rig.answer(np.linspace(-0.3, 0.3, 7))
+    rig.session.receive(answer)
+    assert rig.session.command.tobytes() == answer
+
+
+@pytest.mark.parametrize("sample_time_ms", [1, 2, 10])
+def test_a_late_answer_is_as_late_as_its_packets_are_old(sample_time_ms):
+    rig = Rig(sample_time_ms).open()
+    rig.begin()
+    held_back = rig.answer()
+    rig.session.close_cycle()
+    for _ in range(2):
+        rig.cycle(reply=False)
+    rig.begin()
+    assert rig.session.receive(held_back, delay_s=0.0002) is False
+    rig.session.close_cycle()
+    assert rig.begin()["latency"] == pytest.approx(3 * sample_time_ms * 1e-3 + 0.0002)
+
+
+def test_an_answer_between_two_cycles_is_nobodys():
+    rig = Rig().open()
+    rig.begin()
+    answer = rig.answer()
+    rig.session.close_cycle()
+    before = rig.session.counters()
+    assert rig.session.receive(answer) is False
+    assert rig.session.counters() == before
+
+
+def test_the_clock_goes_on_while_the_session_is_closed():
+    rig = Rig(sample_time_ms=4).open()
+    rig.cycles(3)
+    rig.session.fri_close()
+    for _ in range(5):
+        rig.session.close_cycle()
+    assert rig.session.timestamp_s == pytest.approx(0.004 * 8)

@@ -9,6 +9,23 @@ from fri.errors import ConfigurationError
 from fri.handshake import IdentificationHandshake
 from fri.krc import EventKind
 from fri.krl import AXES, Interpreter, KrlProgram, NoMachinery
+from fri.krl_source import (
+    Assign,
+    Binary,
+    Branch,
+    Call,
+    Constant,
+    Declaration,
+    For,
+    Leave,
+    Loop,
+    Move,
+    Name,
+    Unary,
+    WaitFor,
+    WaitSeconds,
+    parse_source,
+)
 from fri.packets import JOINT_NAMES, new_cmd, new_msr
 from fri.states import Control, State
 from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
@@ -265,3 +282,110 @@ def test_after_a_fallback_a_damaged_request_does_not_start_anything() -> None:
     bench.cycles(200)
     assert bench.rig.session.state is State.MON
     assert bench.rig.msr["krl_int"][15] == 6
+
+
+def only_statement(line: str) -> object:
+    """The tree of a line, with some declarations around it."""
+    data = "DECL INT N=3\nDECL REAL R=-1.5\nDECL BOOL B=TRUE\nDECL CHAR HOST[8]"
+    source = parse_source(f"DEF p( )\n{line}\nEND\n", data)
+    (statement,) = source.subprograms["P"]
+    return statement
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ('friSetup("10.0.0.1", 7)', Call("FRISETUP", (Constant("10.0.0.1"), Constant(7)), 2)),
+        ("N=1.5", Assign(Name("N"), Constant(1.5), 2)),
+        ("N=2", Assign(Name("N"), Constant(2), 2)),
+        ("B=FALSE", Assign(Name("B"), Constant(False), 2)),
+        ("B=true", Assign(Name("B"), Constant(True), 2)),
+        ("N=#MON", Assign(Name("N"), Constant("#MON"), 2)),
+        ("N=-N*2", Assign(Name("N"), Binary("*", Unary("-", Name("N")), Constant(2)), 2)),
+        (
+            "$FRI_TO_INT[N+1]=R",
+            Assign(Name("$FRI_TO_INT", Binary("+", Name("N"), Constant(1))), Name("R"), 2),
+        ),
+        ("WAIT SEC 0.012", WaitSeconds(Constant(0.012), 2)),
+        ("WAIT FOR B", WaitFor(Name("B"), 2)),
+        ("PTP XHOME", Move(Name("XHOME"), 2)),
+        ("EXIT", Leave("EXIT", 2)),
+        ("RETURN", Leave("RETURN", 2)),
+    ],
+)
+def test_a_line_becomes_its_tree(line: str, expected: object) -> None:
+    assert only_statement(line) == expected
+
+
+def test_blocks_keep_their_statements_and_lines() -> None:
+    body = "IF B THEN\nN=1\nELSE\nN=2\nN=3\nENDIF"
+    one, two, three = (Assign(Name("N"), Constant(k), line) for k, line in ((1, 3), (2, 5), (3, 6)))
+    assert only_statement(body) == Branch(Name("B"), (one,), (two, three), 2)
+    assert only_statement("IF B THEN\nN=1\nENDIF") == Branch(Name("B"), (one,), (), 2)
+    assert only_statement("LOOP\nN=1\nENDLOOP") == Loop((one,), None, 2)
+    assert only_statement("WHILE B\nN=1\nENDWHILE") == Loop((one,), Name("B"), 2)
+    assert only_statement("FOR N=1 TO 4\nN=1\nENDFOR") == For(Name("N"), Constant(1), Constant(4), (one,), 2)
+
+
+def test_declarations_have_kind_size_value_and_line() -> None:
+    data = 'DEFDAT p\n; nothing\nDECL INT A, B=-2\nREAL C[7]\nDECL CHAR HOST[8]\nHOST[]="abc"\nENDDAT'
+    found = parse_source("DEF p( )\nBOOL D=TRUE\nEND\n", data).declarations
+    assert found == {
+        "A": Declaration("A", "INT", 0, None, 3),
+        "B": Declaration("B", "INT", 0, Constant(-2.0), 3),
+        "C": Declaration("C", "REAL", 7, None, 4),
+        "HOST": Declaration("HOST", "CHAR", 8, Constant("abc"), 5),
+        "D": Declaration("D", "BOOL", 0, Constant(True), 2),
+    }
+
+
+def test_a_text_fills_its_variable_at_most() -> None:
+    data = 'DECL CHAR HOST[4]\nHOST[]="{}"'
+    assert parse_source("DEF p( )\nEND", data.format("abcd")).declarations["HOST"].value == Constant("abcd")
+    with pytest.raises(ConfigurationError, match="line 2: the text does not fit into HOST"):
+        parse_source("DEF p( )\nEND", data.format("abcde"))
+    with pytest.raises(ConfigurationError, match="does not fit"):
+        parse_source("DEF p( )\nEND", 'DECL INT HOST[4]\nHOST[]="a"')
+
+
+def test_the_first_subprogram_is_the_main_one() -> None:
+    source = parse_source("DEF one( )\nEND\n\nDEF two( )\nN=1\nEND\n", "DECL INT N")
+    assert source.main == "ONE"
+    assert list(source.subprograms) == ["ONE", "TWO"]
+    with pytest.raises(ConfigurationError, match="holds no DEF"):
+        parse_source("; nothing\n")
+
+
+def test_load_data_begin_with_zeros_and_are_set_field_by_field() -> None:
+    machinery = NoMachinery()
+    body = "$LOAD=L\nL.CM.Y=2.5\nL.M=3\n$FRI_TO_REA[1]=L.CM.Y\n$LOAD.J.Z=0.5\n$FRI_TO_REA[2]=$LOAD.J.Z"
+    rig = Rig()
+    machinery.set_load((9.0,) * 7)
+    program = KrlProgram(f"DEF p( )\nLOAD L\n{body}\nEND\n", machinery=machinery)
+    program.step(rig.session)
+    assert machinery.load == (0.0,) * 6 + (0.5,)
+    assert rig.session.to_real[:3].tolist() == [2.5, 0.5, 0.0]
+
+
+def test_bits_of_the_words_are_read_and_written_one_by_one() -> None:
+    rig = Rig().open()
+    rig.begin()
+    rig.session.receive(rig.answer(krl_bool=0b0100))
+    body = "$FRI_TO_BOOL[16]=$FRI_FRM_BOOL[3]\n$FRI_TO_BOOL[1]=TRUE\n$FRI_TO_BOOL[2]=$FRI_FRM_BOOL[2]"
+    body += "\nWAIT SEC 0.012\n$FRI_TO_BOOL[1]=FALSE"
+    program = KrlProgram(f"DEF p( )\n{body}\nEND\n")
+    rig.session.to_bool = 0b0010
+    program.step(rig.session)
+    assert rig.session.to_bool == 0x8001
+    program.step(rig.session)
+    assert rig.session.to_bool == 0x8000
+
+
+def test_the_strategy_is_position_control_until_another_is_committed() -> None:
+    assert ints("$FRI_TO_INT[1]=$STIFFNESS.STRATEGY")[0] == 10
+    body = "$STIFFNESS.STRATEGY=30\n$FRI_TO_INT[1]=$STIFFNESS.STRATEGY"
+    _, rig = run(body)
+    assert rig.session.to_int[0] == 30
+    assert rig.session.control is Control.POSITION
+    _, rig = run(body + "\n$STIFFNESS.COMMIT=TRUE")
+    assert rig.session.control is Control.JNT_IMP

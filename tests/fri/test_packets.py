@@ -143,7 +143,17 @@ def test_wrong_length_is_named(length):
         ("cmd_sample_time", 0.0, Fault.FIELD),
         ("cmd_sample_time", 0.2, Fault.FIELD),
         ("cmd_sample_time", np.nan, Fault.FIELD),
+        ("msr_sample_time", 0.0, Fault.FIELD),
+        ("msr_sample_time", 0.0008, Fault.FIELD),
+        ("msr_sample_time", 0.11, Fault.FIELD),
+        ("msr_sample_time", -0.001, Fault.FIELD),
+        ("msr_sample_time", np.nan, Fault.FIELD),
+        ("cmd_sample_time", 0.0008, Fault.FIELD),
+        ("cmd_sample_time", 0.11, Fault.FIELD),
         ("timestamp", np.inf, Fault.FIELD),
+        ("timestamp", 1.1e9, Fault.FIELD),
+        ("timestamp", -1.1e9, Fault.FIELD),
+        ("timestamp", np.nan, Fault.FIELD),
     ],
 )
 def test_damaged_field_is_named(field, value, fault):
@@ -159,6 +169,38 @@ def test_joint_values_that_cannot_be_are_refused(field, value, joint):
     record = valid_msr()
     record[field][joint] = value
     assert judge(record.tobytes()) is Fault.VALUE
+
+
+@pytest.mark.parametrize("field", ["msr_jnt_pos", "cmd_jnt_pos", "cmd_jnt_pos_fri_offset"])
+def test_positions_of_more_than_a_turn_are_refused_and_a_turn_of_all_joints_is_not(field):
+    record = valid_msr()
+    for name in ("msr_jnt_pos", "cmd_jnt_pos", "cmd_jnt_pos_fri_offset"):
+        record[name] = 2.0 * np.pi * 0.999
+    assert judge(record.tobytes()) is None
+    record = valid_msr()
+    record[field][3] = 29.0
+    assert judge(record.tobytes()) is Fault.VALUE
+    record[field][3] = -28.0
+    assert judge(record.tobytes()) is None
+
+
+def test_torques_beyond_the_sensors_are_refused_and_full_scale_of_all_joints_is_not():
+    record = valid_msr()
+    record["msr_jnt_trq"] = 999.0
+    assert judge(record.tobytes()) is None
+    record["msr_jnt_trq"] = -1001.0
+    assert judge(record.tobytes()) is Fault.VALUE
+    record["msr_jnt_trq"] = 0.0
+    record["msr_jnt_trq"][6] = 2700.0
+    assert judge(record.tobytes()) is Fault.VALUE
+
+
+@pytest.mark.parametrize("field", ["state", "quality", "control"])
+def test_every_value_of_the_protocol_is_accepted(field):
+    for value in range(3 if field == "state" else 4):
+        record = valid_msr()
+        record[field] = value
+        assert judge(record.tobytes()) is None
 
 
 @pytest.mark.parametrize("sample_time", [0.001, 0.002, 0.012, 0.05, 0.1])

@@ -435,3 +435,60 @@ def test_measurement_is_what_was_sent(end, controller):
     controller.send()
     assert end.receive(PATIENCE_S).tobytes() == controller.msr.tobytes()
     assert len(end.msr.tobytes()) == MSR_SIZE
+
+
+def test_a_refusing_network_is_counted_and_the_packet_counts_as_unanswered(end, controller):
+    exchange(end, controller)
+    controller.send(state=State.CMD)
+    assert end.receive(PATIENCE_S) is not None
+    end.controller = ("255.255.255.255", 9)
+    assert end.answer(np.zeros(7)) is False
+    assert (end.send_errors, end.answered) == (1, 1)
+    end.remind()
+    assert (end.send_errors, end.answered) == (2, 1)
+
+
+@pytest.mark.parametrize("index", [-1, 16])
+def test_krl_bits_outside_the_word_are_refused(end, index):
+    with pytest.raises(ValueError, match=r"outside 0\.\.15"):
+        end.set_krl_bool(index, True)
+    end.set_krl_bool(0, True)
+    end.set_krl_bool(15, True)
+    assert int(end.command["krl_bool"]) == 0x8001
+    end.set_krl_bool(0, False)
+    assert int(end.command["krl_bool"]) == 0x8000
+
+
+def test_a_new_end_has_seen_nothing(end):
+    assert set(end.counters().values()) == {0}
+    assert (end.sequence, end.state, end.quality, end.power, end.control, end.error) == (-1, 0, 0, 0, 0, 0)
+    assert (end.timestamp_s, end.sample_time_s, end.received_ns, end.commanding) == (0.0, 0.0, 0, False)
+    assert end.controller is None
+    assert set(end.malformed_by.values()) == {0}
+    assert end.msr.tobytes() == bytes(916)
+
+
+def test_the_default_answer_is_stiff_and_damped(end, controller):
+    answer = exchange(end, controller)
+    expected = {
+        "jnt_stiffness": [1000.0] * 7,
+        "jnt_damping": [0.7] * 7,
+        "cart_stiffness": [1000.0] * 3 + [100.0] * 3,
+        "cart_damping": [0.7] * 6,
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(answer[name], values, rtol=1e-6)
+    assert not answer["krl_real"].any()
+    assert not answer["krl_int"].any()
+    assert int(answer["krl_bool"]) == 0
+
+
+def test_a_reminder_is_the_last_answer_again(end, controller):
+    end.remind()
+    first = exchange(end, controller)
+    end.remind()
+    assert controller.answer().tobytes() == first.tobytes()
+    end.krl_int[3] = 5
+    end.remind()
+    assert int(controller.answer()["krl_int"][3]) == 5
+    assert end.counters()["answered"] == 1

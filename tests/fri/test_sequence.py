@@ -188,3 +188,79 @@ def test_packet_that_is_expected_is_new_whatever_its_clock_says(history, timesta
         before = tracker.sequence
         assert tracker.feed(tracker.expected, timestamp, T) is Arrival.NEW
         assert tracker.sequence == before + 1
+
+
+@pytest.mark.parametrize("sample_time", [0.001, 0.005])
+def test_a_clock_that_has_run_for_weeks_is_coarse_and_no_contradiction(sample_time):
+    # At 2e6 s float32 has steps of 0.125 s.
+    tracker = SequenceTracker()
+    number = 100
+    for step in (1, 2, 30, 1, 5, 90, 3) * 20:
+        number += step
+        arrival = tracker.feed(number & 0xFFFF, stamp(number, 2e6, sample_time), sample_time)
+        assert arrival is Arrival.NEW
+    assert tracker.sequence == number
+    assert tracker.suspect == tracker.restarts == tracker.reordered == 0
+
+
+def test_a_second_packet_in_doubt_confirms_the_first_only_with_a_clock_that_agrees():
+    tracker = SequenceTracker()
+    for number in range(30_000, 30_100):
+        tracker.feed(number, stamp(number), T)
+    assert tracker.feed(0, stamp(0, 900.0), T) is Arrival.SUSPECT
+    assert tracker.feed(1, stamp(1, 905.0), T) is Arrival.SUSPECT
+    assert tracker.feed(2, stamp(2, 905.0), T) is not Arrival.SUSPECT
+    assert tracker.suspect == 2
+
+
+def test_a_second_packet_in_doubt_confirms_the_first_only_with_a_counter_near_it():
+    tracker = SequenceTracker()
+    for number in range(30_000, 30_100):
+        tracker.feed(number, stamp(number), T)
+    assert tracker.feed(0, stamp(0, 900.0), T) is Arrival.SUSPECT
+    assert tracker.feed(17, stamp(17, 900.0), T) is Arrival.SUSPECT
+    assert tracker.feed(33, stamp(33, 900.0), T) is Arrival.RESTARTED
+
+
+def test_forty_old_packets_in_order_are_a_restart():
+    tracker = SequenceTracker()
+    for number in range(100):
+        tracker.feed(number, stamp(number), T)
+    arrivals = [tracker.feed(number, stamp(number), T) for number in range(40)]
+    assert arrivals == [Arrival.REORDERED] * 39 + [Arrival.RESTARTED]
+    assert (tracker.sequence, tracker.reordered, tracker.lost) == (100, 40, 0)
+
+
+def test_old_packets_out_of_order_are_no_restart():
+    tracker = SequenceTracker()
+    for number in range(200):
+        tracker.feed(number, stamp(number), T)
+    for number in range(0, 160, 2):
+        assert tracker.feed(number, stamp(number), T) is Arrival.REORDERED
+    assert tracker.reordered == 80
+
+
+def test_a_new_packet_begins_the_run_of_old_ones_anew():
+    tracker = SequenceTracker()
+    for number in range(100):
+        tracker.feed(number, stamp(number), T)
+    for number in range(39):
+        assert tracker.feed(number, stamp(number), T) is Arrival.REORDERED
+    assert tracker.feed(100, stamp(100), T) is Arrival.NEW
+    assert tracker.feed(39, stamp(39), T) is Arrival.REORDERED
+
+
+@pytest.mark.parametrize(("jump", "arrival"), [(64, Arrival.SUSPECT), (65, Arrival.RESTARTED)])
+def test_a_short_jump_with_an_old_clock_is_damage_and_a_long_one_a_restart(jump, arrival):
+    tracker = SequenceTracker()
+    for number in range(5000):
+        tracker.feed(number, stamp(number), T)
+    assert tracker.feed(4999 + jump, stamp(10), T) is arrival
+
+
+@pytest.mark.parametrize(("off", "arrival"), [(17, Arrival.NEW), (20, Arrival.SUSPECT)])
+def test_over_a_gap_counter_and_clock_agree_within_sixteen_packets_and_two_percent(off, arrival):
+    tracker = SequenceTracker()
+    tracker.feed(0, stamp(0), T)
+    # 100 packets by the counter; by the clock 100 + off: 16 + 0.02 (100 + off).
+    assert tracker.feed(100, stamp(100 + off), T) is arrival

@@ -86,3 +86,74 @@ def test_impossible_limits_are_refused_by_joint():
         KrcLimits(-ones, ones, np.array([1.0, 1, 1, 1, 1, 1, 0]), ones)
     with pytest.raises(ConfigurationError, match="finite"):
         KrcLimits(-ones, ones, ones, np.full(7, np.nan))
+
+
+def test_an_answer_older_than_the_window_or_the_session_is_not_counted():
+    statistics = AnswerStatistics(4)
+    for _ in range(3):
+        statistics.close(None)
+    statistics.late(4, 1_000_000)
+    statistics.late(0, 1_000_000)
+    assert statistics.latency == 0.0
+    statistics.late(3, 3_000_000)
+    assert statistics.latency == pytest.approx(0.003)
+    statistics.late(1, 1_000_000)
+    assert (statistics.latency, statistics.jitter) == pytest.approx((0.002, 0.001))
+    assert (statistics.answer_rate, statistics.miss_counter) == (0.0, 3)
+    # It leaves the window with its packet.
+    for _ in range(2):
+        statistics.close(None)
+    assert (statistics.latency, statistics.jitter) == pytest.approx((0.001, 0.0))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"window": 2, "minimum_packets": 1},
+        {"window": 100, "minimum_packets": 100},
+        {"bad_rate": 0.0, "ok_rate": 0.0, "perfect_rate": 0.0},
+        {"bad_rate": 1.0, "ok_rate": 1.0, "perfect_rate": 1.0},
+        {"start_dwell": 0},
+        {"bridged_cycles": 0},
+        {"limit_tolerance": 0.0},
+        {"acceleration_factor": 0.1},
+    ],
+)
+def test_extreme_policies_are_possible(settings):
+    policy = KrcPolicy(**settings)
+    assert all(getattr(policy, name) == value for name, value in settings.items())
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("minimum_packets", 0),
+        ("bad_rate", -0.1),
+        ("perfect_rate", 1.1),
+        ("bad_rate", 0.96),
+        ("perfect_latency", 0.0),
+        ("perfect_latency", float("nan")),
+        ("t1_velocity_factor", 0.0),
+        ("stop_acceleration_factor", -1.0),
+        ("stop_jerk_time_s", 0.0),
+        ("acceleration_factor", 0.0),
+        ("limit_tolerance", 1e-3),
+        ("limit_tolerance", -1e-9),
+    ],
+)
+def test_policies_just_beyond_the_possible_are_refused(setting, value):
+    with pytest.raises(ConfigurationError, match=setting):
+        KrcPolicy(**{setting: value})
+
+
+def test_limits_are_copies_that_cannot_be_changed():
+    high = np.ones(7)
+    limits = KrcLimits(-high, high, high, high)
+    high[0] = 5.0
+    assert limits.q_max[0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        limits.v_max[0] = 2.0
+    with pytest.raises(ConfigurationError, match=r"A1 v_max 1\.0 rad/s and a_max 0\.0"):
+        KrcLimits(-limits.q_max, limits.q_max, limits.v_max, np.zeros(7))
+    with pytest.raises(ConfigurationError, match="A1 q_min"):
+        KrcLimits(limits.q_max, limits.q_max, limits.v_max, limits.v_max)

@@ -157,3 +157,128 @@ def test_a_check_that_is_not_remembered_finds_the_same_and_leaves_no_trace():
     assert guard.check(far, 1, remember=False) is not None
     assert guard.check(q, 1, remember=False) is None
     assert guard.check(q, 1) is None
+
+
+# Of one value, in the distances of the docstring: cycles before the row, widened limits of velocity (times T),
+# acceleration (times T²) and jerk (times T³), in roundings of float32.
+WIDENED = [((), 2.0, 2.0, 2.0), ((1,), 2.0, 4.0, 6.0), ((1, 1), 2.0, 4.0, 8.0), ((1, 1, 1), 2.0, 4.0, 8.0)]
+
+
+def zeroed(period_s: float, before: tuple[int, ...]) -> Guard:
+    """After rows of zeros, where float32 has no rounding to speak of."""
+    watch = guard(period_s, np.zeros(7))
+    for cycles in before:
+        assert watch.check(np.zeros(7, dtype=np.float32), cycles) is None
+    return watch
+
+
+def first(distance: float) -> np.ndarray:
+    q = np.zeros(7, dtype=np.float32)
+    q[0] = distance
+    return q
+
+
+@pytest.mark.parametrize(("before", "velocity", "acceleration", "jerk"), WIDENED)
+def test_each_limit_is_widened_by_the_rounding_and_nothing_else(before, velocity, acceleration, jerk):
+    limits = arm().limits
+    # The jerk limits short steps, the acceleration steps of 20 ms, the velocity those of 1 s.
+    for period, order, bound, roundings in (
+        (1.0, 1, limits.v_max[0], velocity),
+        (0.02 * 8.0, 2, limits.a_max[0], acceleration),
+        (T, 3, limits.j_max[0], jerk),
+    ):
+        edge = bound * period**order + roundings * 2.0**-23
+        assert zeroed(period, before).check(first(0.999 * edge), 1) is None
+        violation = zeroed(period, before).check(first(1.001 * edge), 1)
+        assert violation is not None
+        assert violation.quantity == ("velocity", "acceleration", "jerk")[order - 1]
+        assert violation.value == pytest.approx(1.001 * edge / period**order, rel=1e-5)
+        assert violation.limit == pytest.approx(bound)
+
+
+@pytest.mark.parametrize("h", [(1, 1, 1), (2, 1, 3), (4, 5, 1), (1, 1, 4)])
+def test_derivatives_over_lost_packets_are_divided_differences(h):
+    period = 0.01
+    h1, h2, h3 = (cycles * period for cycles in h)
+    x1, x2 = 2e-6, 5e-6
+
+    def jerk(x3: float) -> float:
+        v1, v2, v3 = x1 / h1, (x2 - x1) / h2, (x3 - x2) / h3
+        a2, a3 = 2.0 * (v2 - v1) / (h2 + h1), 2.0 * (v3 - v2) / (h3 + h2)
+        return 3.0 * (a3 - a2) / (h3 + h2 + h1)
+
+    # Linear in x3, so the two points give the distance at the limit.
+    slope = (jerk(1e-3) - jerk(0.0)) / 1e-3
+    r = 2.0**-23
+    error = (
+        (4 * r / (h3 + h2) * (1 / h3 + 1 / h2) + 4 * r / (h2 + h1) * (1 / h2 + 1 / h1)) * 3 / (h1 + h2 + h3)
+    )
+    edge = (arm().limits.j_max[0] + error - jerk(0.0)) / slope
+    for factor, allowed in ((0.999, True), (1.001, False)):
+        watch = guard(period, np.zeros(7))
+        # A long rest, and the rows x0 = 0, x1, x2 at distances of h1 and h2.
+        for distance, cycles in ((0.0, 1), (0.0, 1), (x1, h[0]), (x2, h[1])):
+            assert watch.check(first(distance), cycles) is None
+        found = watch.check(first(factor * edge), h[2])
+        assert (found is None) == allowed
+        if found is not None:
+            assert found.quantity == "jerk"
+            assert found.value == pytest.approx(jerk(factor * edge), rel=1e-4)
+
+
+def test_the_guard_can_begin_at_a_velocity():
+    v = np.zeros(7)
+    v[0] = 0.5
+    watch = guard(T, np.zeros(7))
+    watch.reset(np.zeros(7, dtype=np.float32), v)
+    for k in range(1, 5):
+        assert watch.check(first(0.5 * T * k), 1) is None
+    watch.reset(np.zeros(7, dtype=np.float32), v)
+    violation = watch.check(np.zeros(7, dtype=np.float32), 1)
+    assert violation is not None
+    assert violation.quantity == "acceleration"
+    assert violation.value == pytest.approx(0.5 / T, rel=1e-6)
+
+
+def test_rounding_of_the_row_before_counts_where_the_guard_begins_at_a_velocity():
+    # v' from rounded rows, so its error is 2 r / T, and that of the acceleration before 2 (2 r / T) / T.
+    r, v = 2.0**-23, np.zeros(7)
+    edge = arm().limits.j_max[0] * T**3 + (4.0 + 4.0) * r
+    for factor, allowed in ((0.999, True), (1.001, False)):
+        watch = guard(T, np.zeros(7))
+        watch.reset(np.zeros(7, dtype=np.float32), v)
+        assert (watch.check(first(factor * edge), 1) is None) == allowed
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_positions_are_limited_on_both_sides(side):
+    limits = arm().limits
+    edge = limits.q_high[1] if side > 0 else limits.q_low[1]
+    q = START.copy()
+    for step, allowed in ((0.0, True), (side * 1e-6, False)):
+        q[1] = edge + step
+        watch = guard(1.0, START + np.eye(7)[1] * (edge - START[1] - side * 0.01))
+        violation = watch.check(q.astype(np.float32), 1)
+        assert (violation is None) == allowed
+        if violation is not None:
+            assert (violation.quantity, violation.joint) == ("position", 1)
+            assert violation.limit == pytest.approx(edge)
+            assert violation.value == pytest.approx(q[1], rel=1e-6)
+
+
+def test_a_copy_goes_its_own_way():
+    watch = guard()
+    watch.scale_velocity(0.5)
+    twin = watch.copy()
+    twin.scale_velocity(1.0)
+    twin.reset(np.zeros(7, dtype=np.float32))
+    slow = guard(1.0)
+    slow.scale_velocity(0.5)
+    other = slow.copy()
+    far = moved(A1=0.7 * arm().v_max[0])
+    slow.scale_velocity(1.0)
+    assert slow.check(far, 1) is None
+    violation = other.check(far, 1)
+    assert violation is not None
+    assert violation.quantity == "velocity"
+    assert watch.check(START.astype(np.float32), 1) is None

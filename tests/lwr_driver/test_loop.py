@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fri.states import ALL_DRIVES, Control, EventKind, Quality, State
-from lwr_driver.control import Job, Mode, Result, Text, Word
+from lwr_driver.control import BIN_NS, Job, Mode, Result, Text, Word
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE, ROW, Ring
 from tests.lwr_driver.driver_rig import START, Rig, arm
@@ -473,3 +473,181 @@ def test_random_faults_in_every_phase_never_lead_outside_the_limits(rig, seed):
         r.post(Job.START, limit=3000)
         r.until_done()
         check_sent(r)
+
+
+def moving_setpoint(rig, steps: list[np.ndarray]) -> object:
+    """What the loop makes of the step of a set point that has moved by these, in units of its limit."""
+    r = rig()
+    r.cycles(50)
+    q = START.astype(np.float64)
+    r.loop._past_setpoints = []
+    for step in steps:
+        q = q + step
+        r.loop._past_setpoints.insert(0, (q.astype(np.float32), 1))
+    return r.loop._step()
+
+
+def test_a_set_point_that_changes_its_step_beyond_the_acceleration_limit_is_unknown(rig):
+    a, t = arm().limits.a_max, 1e-3
+    room = a * t**2 + 1e-5
+    steady = 0.2 * arm().limits.v_max * t
+    none = np.zeros(7)
+    assert moving_setpoint(rig, [none, steady, steady]) == pytest.approx(steady, abs=1e-6)
+    # Float32 adds a few 1e-7 rad.
+    assert moving_setpoint(rig, [none, steady, steady + 0.9 * room]) is not None
+    assert moving_setpoint(rig, [none, steady, steady + 1.1 * room]) is None
+    assert moving_setpoint(rig, [none, steady, steady - 1.1 * room]) is None
+    assert moving_setpoint(rig, [none, steady, np.full(7, np.nan)]) is None
+
+
+def test_a_set_point_faster_than_the_arm_is_unknown(rig):
+    fast = arm().limits.v_max * 1e-3
+    none = np.zeros(7)
+    assert moving_setpoint(rig, [none, 0.99 * fast, 0.99 * fast]) is not None
+    assert moving_setpoint(rig, [none, 1.01 * fast, 1.01 * fast]) is None
+
+
+def test_a_set_point_that_hardly_moves_is_at_rest(rig):
+    none = np.zeros(7)
+    assert np.array_equal(moving_setpoint(rig, [none, none, np.full(7, 0.8e-5)]), none)
+    assert moving_setpoint(rig, [none, none, np.full(7, 1.2e-5)]).any()
+
+
+def test_over_lost_packets_a_step_is_counted_by_cycle(rig):
+    r = rig()
+    r.cycles(50)
+    steady = 0.2 * arm().limits.v_max * 1e-3
+    q = START
+    r.loop._past_setpoints = [
+        ((q + 6 * steady).astype(np.float32), 4),
+        ((q + 2 * steady).astype(np.float32), 2),
+        (q.astype(np.float32), 1),
+    ]
+    np.testing.assert_allclose(r.loop._step(), steady, atol=1e-6)
+
+
+def test_a_reason_counts_the_irregular_packets_of_command_mode(rig):
+    r = rig()
+    in_motion(r, 100)
+    for _ in range(3):
+        r.cycle(lose_packet=True)
+        r.cycles(5)
+    for _ in range(2):
+        r.end.send(b"nonsense")
+        r.cycle()
+    r.cycles(3)
+    assert r.loop._meanwhile() == (" (packets in command mode: 3 lost, 2 malformed, most for its length)")
+    r.session.drop(EventKind.EXTERNAL, "test")
+    r.until_done(50)
+    assert "3 lost, 2 malformed, most for its length" in r.reason
+
+
+def test_counters_of_the_link_are_published(rig):
+    r = rig()
+    r.enter()
+    words = r.control.words
+    before = {
+        name: int(words[Word[name]]) for name in ("RECEIVED", "ANSWERED", "LOST", "CYCLES", "MALFORMED")
+    }
+    r.cycle(lose_packet=True)
+    r.cycles(4)
+    r.end.send(b"x")
+    r.cycle()
+    after = {name: int(words[Word[name]]) for name in before}
+    assert after["RECEIVED"] - before["RECEIVED"] == 5
+    assert after["ANSWERED"] - before["ANSWERED"] == 5
+    assert after["LOST"] - before["LOST"] == 1
+    assert after["MALFORMED"] - before["MALFORMED"] == 1
+    assert after["CYCLES"] - before["CYCLES"] == 5
+    assert words[Word.MODE] == Mode.HOLD
+    assert words[Word.INDEX] == -1
+
+
+def test_latencies_are_counted_in_bins_of_the_time_from_packet_to_answer(rig):
+    r = rig(lock_step=False)
+    r.cycles(50)
+    latency = r.control.latency
+    latency[:] = 0
+    received = r.loop.remote.received_ns
+    for bins in (0.5, 3.2, 3.9, 1e9):
+        r.loop._write_row(True, received + int(bins * BIN_NS))
+    r.loop._write_row(False, received)
+    assert latency[0] == 1
+    assert latency[3] == 2
+    assert latency[-1] == 1
+    assert latency.sum() == 4
+    assert r.control.words[Word.HEARD_NS] == received
+
+
+def test_rows_without_an_answer_have_no_time_of_sending(rig):
+    with Ring.create(128) as ring:
+        r = rig(ring=ring, lock_step=False)
+        r.cycles(50)
+        received = r.loop.remote.received_ns
+        r.loop._write_row(True, received + 7)
+        r.loop._write_row(False, received + 7)
+        rows = ring.take()[-2:]
+        r.loop.remote.close()
+    assert rows["t_recv"].tolist() == [received, received]
+    assert rows["t_send"].tolist() == [received + 7, 0]
+    assert rows["answered"].tolist() == [1, 0]
+    np.testing.assert_array_equal(rows["msr"]["cmd_jnt_pos"], [START.astype(np.float32)] * 2)
+
+
+def test_a_quality_is_waited_for_a_whole_run_of_packets_at_least_so_good(rig):
+    r = rig()
+    r.cycles(60)
+    for quality, count in ((Quality.OK, 7), (Quality.PERFECT, 7)):
+        r.session.quality_ceiling = Quality.OK
+        r.cycles(3)
+        r.post(Job.QUALITY, count, int(quality))
+        r.cycles(count - 1)
+        assert not r.done
+        r.cycle()
+        assert r.done == (quality is Quality.OK)
+    r.session.quality_ceiling = Quality.PERFECT
+    assert r.until_done(20) is Result.DONE
+
+
+def test_a_job_without_an_end_times_out_after_its_limit_of_cycles(rig):
+    r = rig()
+    r.session.quality_ceiling = Quality.BAD
+    r.cycles(50)
+    r.post(Job.QUALITY, 5, int(Quality.OK), limit=20)
+    r.cycles(20)
+    assert not r.done
+    r.cycle()
+    assert (r.done, r.result, r.reason) == (True, Result.TIMEOUT, "")
+
+
+def test_silence_ends_a_measurement_too(rig, monkeypatch):
+    r = rig(lock_step=False)
+    r.cycles(50)
+    r.post(Job.CYCLES, 100)
+    r.cycles(3)
+    heard = r.loop.remote.received_ns * 1e-9
+    monkeypatch.setattr("lwr_driver.loop.time.monotonic", lambda: heard + 0.09)
+    assert not r.loop.cycle(0.0)
+    assert not r.done
+    monkeypatch.setattr("lwr_driver.loop.time.monotonic", lambda: heard + 0.11)
+    assert not r.loop.cycle(0.0)
+    assert r.result is Result.NETWORK
+    assert r.reason.startswith("no packet for 0.110 s")
+
+
+def test_a_start_is_asked_for_only_after_the_program_has_taken_the_stop(rig, monkeypatch):
+    r = rig()
+    r.cycles(60)
+    taken = False
+    monkeypatch.setattr(r.loop._handshake, "stopped", lambda msr: taken)
+    monkeypatch.setattr(r.loop._handshake, "fallen", lambda msr: False)
+    r.post(Job.START, limit=2000)
+    r.cycles(5)
+    # The words of Stanford's program: 20 stops, 10 starts.
+    assert int(r.loop.remote.command["krl_int"][15]) == 20
+    assert r.session.state is State.MON
+    taken = True
+    r.cycle()
+    assert int(r.loop.remote.command["krl_int"][15]) == 10
+    taken = False
+    assert r.until_done(200) is Result.DONE

@@ -175,3 +175,25 @@ def test_motions_that_do_not_meet_cannot_be_joined():
         motion.join(motion)
     with pytest.raises(ConfigurationError, match="periods"):
         motion.join(move_to(arm(), GOAL, START, 0.002))
+
+
+def stepped(size: float, period_s: float) -> Motion:
+    """Rest at zero, and at `size` from one row to the next; exact in float32."""
+    q = np.zeros((12, 7))
+    q[6:, 0] = np.float32(size)
+    return Motion(q, period_s)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "order", "quantity", "factor"),
+    [(0.1, 1, "velocity", 1.0), (0.1, 2, "acceleration", 1.0), (0.001, 3, "jerk", 2.0)],
+)
+def test_limits_are_widened_by_the_rounding_of_a_difference_and_nothing_else(
+    period_s, order, quantity, factor
+):
+    # A step of x makes differences of x, x and 2 x at most; one of order k has 2^k roundings.
+    limits = arm().limits
+    bound = (limits.v_max, limits.a_max, limits.j_max)[order - 1][0]
+    edge = (bound * period_s**order + 2.0**order * 2.0**-23) / factor
+    assert quantity not in broken(stepped(0.999 * edge, period_s))
+    assert quantity in broken(stepped(1.001 * edge, period_s))

@@ -58,6 +58,35 @@ def test_extent_bounds_every_row_of_the_stop(v, a, period):
     assert np.all(np.abs(np.diff(rows, axis=0)) / period <= speed + 1e-9)
 
 
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(v=unit, a=unit)
+def test_extent_is_too_wide_by_two_periods_at_the_highest_speed_at_most(v, a):
+    limits, period = arm().limits, 1e-3
+    past = history(START, v, a, np.zeros(7), period)
+    rows = rows_of(Stop(limits, period), past)[3:]
+    lowest, highest, speed = (bound[-1] for bound in stop_extent(limits, period, np.array(past[2::-1])))
+    found = np.abs(np.diff(rows_of(Stop(limits, period), past)[2:], axis=0)).max(axis=0) / period
+    # A peak between two rows is missed by half a period of full jerk at most.
+    assert np.all(speed <= found + limits.j_max * period**2 + 1e-9)
+    room = 2.0 * period * (speed + limits.a_max * period)
+    assert np.all(rows.min(axis=0) - lowest <= room)
+    assert np.all(highest - rows.max(axis=0) <= room)
+
+
+def test_extent_of_every_row_looks_at_the_two_rows_before():
+    limits, period = arm().limits, 1e-3
+    motion = move_to(arm(), START, START + 0.4, period, speed_scale=0.7)
+    whole = stop_extent(limits, period, motion.q)
+    for row in (0, 1, 2, 57, 200, len(motion) - 1):
+        past = motion.q[np.maximum([row - 2, row - 1, row], 0)]
+        part = stop_extent(limits, period, past)
+        for one, other in zip(whole, part, strict=True):
+            np.testing.assert_allclose(one[row], other[-1], atol=1e-12)
+    # At rest there is nothing to stop.
+    for bound, expected in zip(whole, (START, START, np.zeros(7)), strict=True):
+        np.testing.assert_allclose(bound[0], expected, atol=1e-12)
+
+
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(v=unit, a=unit, period=st.sampled_from([0.001, 0.01]), gaps=st.lists(st.integers(1, 7), min_size=3))
 def test_stop_with_lost_packets_is_the_same_stop(v, a, period, gaps):
@@ -132,3 +161,22 @@ def test_motion_at_full_speed_can_be_stopped_anywhere_without_passing_the_veloci
         motion = move_to(arm(), START, START + 0.8, period, speed_scale=1.0)
         _, _, speed = stop_extent(limits, period, motion.q)
         assert np.all(speed <= limits.v_max + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("v", "a", "jerk"),
+    [(0.5, 3.0, -1.0), (-0.5, -3.0, 1.0), (0.5, -3.0, -1.0), (0.05, -5.0, 1.0), (-0.05, 5.0, -1.0)],
+)
+def test_the_jerk_of_a_stop_begins_with_its_first_row(v, a, jerk):
+    # Against the motion as it would be once the acceleration is gone, v + a |a| / 2 j: the fourth case has turned by
+    # then.
+    limits, period = arm().limits, 0.001
+    history_of = np.zeros((3, 7))
+    history_of[0] = START
+    history_of[1] = START - np.eye(7)[0] * v * period
+    history_of[2] = history_of[1] - np.eye(7)[0] * (v - a * period) * period
+    stop = Stop(limits, period)
+    stop.begin(*history_of)
+    first = stop.advance(1)
+    second = (first - 2.0 * history_of[0] + history_of[1])[0] / period**2
+    assert second == pytest.approx(a + jerk * limits.j_max[0] * period, abs=1e-6)

@@ -153,6 +153,24 @@ def test_push_moves_the_links_and_ends():
     assert abs(arm.position[1] - POSE[1]) < 1e-4
 
 
+@pytest.mark.parametrize("joint", range(7))
+def test_a_brake_holds_up_to_its_torque_and_lets_go_when_it_opens(joint):
+    arm = arms.lwr()
+    arm.reset(POSE)
+    hold = arm.joint_torque + arm.drive.offm
+    arm.brake(True)
+    push = np.zeros(7)
+    push[joint] = 0.9 * (arm.drive.brake_torque + arm.drive.Fcm)[joint]
+    start = arm.motor_position.copy()
+    for _ in range(50):
+        arm.step(hold + push)
+    assert np.abs(arm.motor_position - start).max() < 1e-6
+    arm.brake(False)
+    for _ in range(50):
+        arm.step(hold + push)
+    assert arm.motor_position[joint] - start[joint] > 1e-3
+
+
 def test_truth_lists_all_standard_parameters_with_the_payload_as_link_8():
     values = truth("emulator/default.yaml", payload="paper_load")
     assert len(values) == 136

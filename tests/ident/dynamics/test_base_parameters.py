@@ -6,11 +6,12 @@ import yaml
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_closed_form import closed_form_base
-from ident.dynamics.base_set import numeric_base, rank_at_gap
+from ident.dynamics.base_set import columns_by_preference, numeric_base, rank_at_gap
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, ModelStructure
 from lwr_driver.configuration import find
 from tests.ident.dynamics.core_arms import (
+    RIGHT,
     lwr,
     panda,
     puma560,
@@ -272,3 +273,39 @@ def test_the_closed_form_needs_gravity():
 def test_an_empty_stack_is_refused(route):
     with pytest.raises((DataError, ConfigurationError), match="no condition"):
         route(ModelStructure(lwr(), 1), [])
+
+
+def test_columns_are_preferred_as_in_the_literature():
+    """Of a revolute joint's link YY, MZ and M come last, of a prismatic one's the inertia tensor and MZ."""
+    structure = ModelStructure(scara(), 2, payloads=("p",), couplings=(Coupling(("q1", "q2")),))
+    order = columns_by_preference(structure)
+    assert sorted(order) == list(range(structure.n_columns))
+    names = [structure.names[k] for k in order]
+    tensor = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MZ")
+    late = [f"{symbol}{link}" for link in (1, 2, 3) for symbol in ("YY", "MZ", "M")]
+    # The payload is on the last link, of the prismatic joint.
+    late += [f"{symbol}{link}" for link in (4, 5) for symbol in tensor]
+    assert names[-len(late) :] == late
+    assert names[:4] == ["XX1", "XY1", "XZ1", "YZ1"]
+    assert names[-len(late) - 3 : -len(late)] == list(structure.names[-3:])
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_both_routes_agree_on_gantries(seed):
+    """Slides between the first turning joint and the next that is not parallel to it."""
+    rng = np.random.default_rng([seed, 7])
+    n = int(rng.integers(4, 6))
+    slides = [False, True, True, bool(rng.random() < 0.5), False][:n]
+    joints = [
+        {
+            "kind": "prismatic" if slide else "revolute",
+            "alpha": float(rng.choice([0.0, RIGHT, -RIGHT, 0.7])),
+            "d": float(rng.choice([0.0, 0.3])),
+            "r": float(rng.choice([0.0, 0.25])),
+            **({"theta": float(rng.choice([0.0, RIGHT, 0.5]))} if slide else {}),
+        }
+        for slide in slides
+    ]
+    joints[0]["alpha"] = 0.0
+    chain = Chain.from_table(joints)
+    assert_same(ModelStructure(chain, int(rng.integers(1, 3)), without=() if seed % 2 else ("offl", "offm")))

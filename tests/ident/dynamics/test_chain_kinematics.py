@@ -218,3 +218,45 @@ def test_published_urdfs_have_pinocchios_torques(file):
     found = regressor.torque(chain, q, qd, qdd, chain.urdf_inertials())
     # The files write right angles with eleven digits; ours are exact.
     assert found == pytest.approx(np.array(expected), abs=1e-9)
+
+
+def test_a_urdf_without_an_axis_turns_about_x():
+    text = urdf([{"axis": "1 0 0"}, {"xyz": "0 0.1 0.2", "axis": "1 0 0"}])
+    bare = text.replace('<axis xyz="1 0 0"/>', "")
+    assert "axis" not in bare
+    one, other = Chain.from_urdf(text), Chain.from_urdf(bare)
+    assert other.to_dict() == one.to_dict()
+
+
+def test_frames_have_no_rounding_about_zero():
+    for joints in (UPRIGHT, PARALLEL):
+        chain = Chain.from_urdf(urdf(joints))
+        for values in (
+            chain.link_placements,
+            chain.base_placement,
+            chain.d,
+            chain.r,
+            chain.alpha,
+            chain.theta,
+        ):
+            size = np.abs(values)
+            assert not np.any((size > 0.0) & (size < 1e-12))
+
+
+def test_a_dictionary_without_names_of_links_numbers_them():
+    content = lwr().to_dict()
+    for row in content["joints"]:
+        del row["link"]
+    assert Chain.from_dict(content).link_names == tuple(f"link_{k}" for k in range(1, 8))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"mass": 1}, "unknown key `mass`"), ({"gravity": None}, "`joints` and `gravity` are needed")],
+)
+def test_a_dictionary_that_is_no_chain_is_refused(change, message):
+    content = {**lwr().to_dict(), **change}
+    if change.get("gravity", 1) is None:
+        del content["gravity"]
+    with pytest.raises(ConfigurationError, match=message):
+        Chain.from_dict(content)

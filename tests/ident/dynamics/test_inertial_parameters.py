@@ -108,3 +108,36 @@ def test_impossible_bodies_are_named_with_the_reason(body, reason):
 def test_wrong_shape_names_the_ten():
     with pytest.raises(ConfigurationError, match="XX XY XZ"):
         parameters.transform(np.zeros(9), np.eye(4))
+
+
+def test_a_verdict_has_mass_principal_moments_and_the_smallest_eigenvalue():
+    rotation = _pose(np.random.default_rng(5))[:3, :3]
+    moments = np.array([0.01, 0.02, 0.025])
+    body = parameters.from_com(2.0, [0.1, -0.2, 0.3], rotation @ np.diag(moments) @ rotation.T)
+    (verdict,) = parameters.consistency(body)
+    assert verdict.consistent
+    assert (verdict.link, verdict.mass, verdict.reason) == ("link 1", 2.0, "")
+    assert verdict.principal == pytest.approx(moments, abs=1e-12)
+    smallest = np.linalg.eigvalsh(parameters.pseudo_inertia(body))[0]
+    assert verdict.smallest_eigenvalue == pytest.approx(smallest, abs=1e-12)
+    (nothing,) = parameters.consistency(np.zeros(10))
+    assert np.isnan(nothing.principal).all()
+    assert "mass 0 kg is not positive" in nothing.reason
+
+
+def test_a_flat_body_at_the_edge_of_the_possible_is_consistent():
+    # A disc: the two moments in its plane add up to the third.
+    edge = parameters.from_com(1.0, [0.0, 0.0, 0.0], np.diag([0.01, 0.01, 0.02]))
+    assert parameters.consistency(edge)[0].consistent
+    beyond = edge.copy()
+    beyond[5] *= 1.0 + 1e-6
+    assert not parameters.consistency(beyond)[0].consistent
+    assert parameters.consistency(beyond, tolerance=1e-3)[0].consistent
+
+
+def test_units_of_all_symbols():
+    revolute = [parameters.unit(f"{symbol}1") for symbol in parameters.PER_LINK]
+    prismatic = [parameters.unit(f"{symbol}1", prismatic=True) for symbol in parameters.PER_LINK]
+    bodies_ = ["kg m^2"] * 6 + ["kg m"] * 3 + ["kg"]
+    assert revolute == [*bodies_, "kg m^2", "Nm s/rad", "Nm", "Nm", "Nm s/rad", "Nm", "Nm"]
+    assert prismatic == [*bodies_, "kg", "N s/m", "N", "N", "N s/m", "N", "N"]

@@ -100,6 +100,16 @@ def test_the_wrist_of_the_tx40_is_coupled():
         ModelStructure(lwr(), 2, couplings=(Coupling(("A1", "A9")),))
 
 
+@pytest.mark.parametrize("model", [1, 2, 3])
+def test_a_coupling_of_the_drives_is_not_seen_at_the_joints(model):
+    structure = ModelStructure(tx40(), model, couplings=(Coupling(("q5", "q6")),))
+    q, qd, qdd = states(structure.chain, 12)
+    rows = structure.regressor(q, qd, qdd)[:, -3:].reshape(len(structure.sides), 6, 12, 3)
+    for side, block in zip(structure.sides, rows, strict=True):
+        assert block[4:].any() == (side != "joint")
+        assert not block[:4].any()
+
+
 @pytest.mark.parametrize(
     ("coulomb", "expected"),
     [
@@ -137,3 +147,50 @@ def test_units_of_all_columns():
     assert units["Iam6"] == "kg m^2"
     assert units["fvm6"] == "Nm s/rad"
     assert units["M7"] == "kg"
+
+
+def test_signals_are_written_over_whatever_was_there():
+    structure = ModelStructure(tx40(), 2, couplings=(Coupling(("q2", "q5")),))
+    _, qd, qdd = states(structure.chain, 4)
+    out = np.full((structure.n_signals, 6, 4), np.nan)
+    structure.signals(qd, qdd, out)
+    expected = np.zeros((7, 6, 4))
+    expected[:4] = qdd.T, qd.T, np.sign(qd).T, np.ones((6, 4))
+    expected[4, 1], expected[4, 4] = qdd[:, 4], qdd[:, 1]
+    expected[5, [1, 4]] = qd[:, 1] + qd[:, 4]
+    expected[6, [1, 4]] = np.sign(qd[:, 1] + qd[:, 4])
+    np.testing.assert_array_equal(out, expected)
+
+
+@pytest.mark.parametrize("columns", [[-1], [119], [[1]]])
+def test_columns_outside_the_matrix_are_refused(columns):
+    structure = ModelStructure(lwr(), 2)
+    q = np.zeros((2, 7))
+    with pytest.raises(ConfigurationError, match="indices below 119"):
+        structure.regressor(q, q, q, columns=columns)
+
+
+def test_a_column_can_be_asked_for_twice():
+    structure = ModelStructure(lwr(), 2)
+    q, qd, qdd = states(structure.chain, 3)
+    whole = structure.regressor(q, qd, qdd)
+    columns = [30, 9, 30, 11, 118]
+    assert np.array_equal(structure.regressor(q, qd, qdd, columns=columns), whole[:, columns])
+
+
+def test_conditions_and_payloads_are_counted_after_the_links():
+    structure = ModelStructure(lwr(), 2, payloads=("a", "b"))
+    assert [structure.payload_link(name) for name in (None, "a", "b")] == [None, 7, 8]
+    assert [condition.payload for condition in structure.conditions()] == [None, "a", "b"]
+    assert structure.n_links == 9
+    assert structure.rigid_of(17 * 7 + 3, "a") == (6, 3)
+    assert structure.rigid_of(17 * 7 + 3, "b") is None
+    assert structure.rigid_of(17 * 8 + 9, "b") == (6, 9)
+    assert structure.rigid_of(17 * 7 + 10, "a") is None
+    assert structure.rigid_of(17 * 2 + 4, None) == (2, 4)
+
+
+def test_sides_are_put_in_order_and_given_once():
+    assert ModelStructure(lwr(), 2, sides=("joint", "motor")).sides == ("motor", "joint")
+    with pytest.raises(ConfigurationError, match="not a choice of"):
+        ModelStructure(lwr(), 2, sides=("joint", "joint"))

@@ -68,3 +68,24 @@ def test_reference_bodies_repairs_what_cannot_exist_and_leaves_the_rest() -> Non
 def test_a_reference_that_cannot_exist_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="cannot exist"):
         project(np.eye(10), np.zeros(10), np.zeros((1, 10)))
+
+
+def test_the_reason_names_the_body_that_cannot_exist() -> None:
+    good = bodies(2)
+    bad = parameters.from_com(1.0, [0.0, 0.0, 0.0], np.diag([0.01, 0.01, 0.05]))
+    with pytest.raises(ConfigurationError, match=r"link 2: principal moments .* triangle inequality"):
+        project(np.eye(30), np.zeros(30), np.array([good[0], bad, good[1]]))
+
+
+def test_repaired_bodies_have_the_smallest_mass_and_radius_asked_for() -> None:
+    (found,) = reference_bodies([np.zeros(10)], smallest_mass_kg=0.2, gyration_m=0.03)
+    assert found[9] == pytest.approx(0.2)
+    second = parameters.pseudo_inertia(found)[:3, :3]
+    np.testing.assert_allclose(second, 0.2 * 0.03**2 * np.eye(3), atol=1e-15)
+    # A mass away from the origin keeps its first moments.
+    (rod,) = reference_bodies([[0, 0, 0, 0, 0, 0, 0.1, 0, 0.3, 1.0]], smallest_mass_kg=0.2, gyration_m=0.03)
+    mass, com, inertia = parameters.to_com(rod)
+    assert mass == 1.0
+    np.testing.assert_allclose(com, [0.1, 0.0, 0.3], atol=1e-12)
+    # The origin's second moment was given as zero: the repair is about the centre of mass.
+    np.testing.assert_allclose(inertia, 2.0 * 0.03**2 * np.eye(3), atol=1e-12)

@@ -135,6 +135,33 @@ def test_variances_have_the_right_degrees_of_freedom():
     np.testing.assert_allclose(np.mean(squares, axis=0), 1.0, atol=0.06)
 
 
+def test_weights_are_inverse_variances_with_the_degrees_of_freedom_of_equation_13():
+    matrices = design(samples=20, records=1)
+    estimate = WeightedLeastSquares().fit(problem(matrices, CHI, white(11, matrices)))
+    consumed = []
+    normal = sum(w * m.T @ m for w, m in zip(estimate.weights, matrices, strict=True))
+    for number, matrix in enumerate(matrices):
+        square = float(estimate.residuals[number] @ estimate.residuals[number])
+        share = float(np.trace(np.linalg.solve(normal, estimate.weights[number] * matrix.T @ matrix)))
+        consumed.append(share)
+        assert estimate.weights[number] == pytest.approx((20.0 - share) / square, rel=1e-4)
+        assert estimate.classes[number].sigma == pytest.approx(np.sqrt(square / (20.0 - share)), rel=1e-6)
+        assert estimate.classes[number].rms == pytest.approx(np.sqrt(square / 20.0), rel=1e-9)
+    assert [fit.parameters for fit in estimate.classes] == pytest.approx(consumed, rel=1e-4)
+    assert min(consumed) > 2.0
+
+
+def test_the_intervals_of_a_hac_covariance_are_widened_for_its_bandwidth():
+    # Critical value at 97.5 % of Kiefer and Vogelsang (2005), Bartlett kernel, table I.
+    matrices = design(records=1, samples=100)
+    for share in (0.05, 0.25):
+        settings = CovarianceSettings("hac", bandwidth_s=share * 100 * 0.2)
+        estimate = WeightedLeastSquares(settings).fit(problem(matrices, CHI, white(2, matrices)))
+        critical = 1.96 + 2.9694 * share + 0.4160 * share**2 - 0.5324 * share**3
+        low, high = estimate.interval(0.95).T
+        np.testing.assert_allclose((high - low) / 2.0 / estimate.std, critical, rtol=1e-4)
+
+
 def test_ordinary_least_squares_has_one_variance():
     matrices = design()
     case = problem(matrices, CHI, white(3, matrices, np.full(3, 0.4)))

@@ -1,0 +1,227 @@
+"""The command: sample, try, and tell what survived."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections import Counter, defaultdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchmarks.mutation import exercise
+from benchmarks.mutation.bugs import BUGS
+from benchmarks.mutation.mutants import STRATA, Mutant, change, sample
+from benchmarks.mutation.trial import Trials
+from runner.computer import git_commit
+
+ROOT = Path(__file__).resolve().parents[2]
+REASONS = Path(__file__).with_name("survivors.yaml")
+# The first tests of a mutant take so long at most; most mutants need no more of them.
+_FIRST_S = 4.0
+# Tests from other folders than the one that mirrors the module's are left out beyond so long, the longest first.
+_MOST_S = 25.0
+# A mutant may be slower than the code so many times, and longer by so much.
+_SLOWER, _LONGER_S = 3.0, 10.0
+
+
+def known_lines(trials: Trials, folder: Path) -> dict[str, exercise.FileOfTests]:
+    """Lines and durations of all tests; measures what is new."""
+    path = folder / "lines.json"
+    known = exercise.load(path)
+    while missing := exercise.stale(known, trials.tree)[:40]:
+        print(f"measuring the lines of {len(missing)} files of tests", flush=True)
+        command = [sys.executable, "-m", "benchmarks.mutation.exercise", str(path.resolve()), *missing]
+        subprocess.run(command, cwd=trials.tree, env=trials.environment, check=True)
+        known = exercise.load(path)
+    present = {str(p.relative_to(trials.tree)) for p in (trials.tree / "tests").rglob("*.py")}
+    return {file: entry for file, entry in known.items() if file in present}
+
+
+def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTests]) -> dict[str, Any]:
+    """The fate of a mutant: its change, whether it was caught, by which test and in what time."""
+    source = (trials.tree / mutant.file).read_text("utf-8")
+    code = mutant.code(source)
+    old, new = change(source, code)
+    result = {"file": mutant.file, "line": mutant.line, "operator": mutant.operator, "old": old, "new": new}
+    try:
+        compile(code, mutant.file, "exec")
+    except SyntaxError:
+        return {**result, "outcome": "caught", "test": "the compiler", "seconds": 0.0}
+    jitted = "njit" in source
+    lines = range(mutant.line, mutant.last + 1)
+    tests = exercise.tests_of(known, mutant.file, lines, anywhere=False)
+    if jitted or not tests:
+        tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
+    tests = tests or exercise.tests_naming(known, mutant.file, trials.tree)
+    near = f"tests/{Path(mutant.file).parent}/"
+    tests.sort(key=lambda item: (not item[0].startswith(near), item[2]))
+    while sum(item[2] for item in tests) > _MOST_S and len(tests) > 1 and not tests[-1][0].startswith(near):
+        tests.pop()
+    stages: list[list[tuple[str, list[str], float]]] = [[]]
+    for entry in tests:
+        if stages[-1] and sum(item[2] for item in stages[-1]) + entry[2] > _FIRST_S * 4.0 ** (
+            len(stages) - 1
+        ):
+            stages.append([])
+        stages[-1].append(entry)
+    seconds = 0.0
+    with trials.replace(mutant.file, code):
+        # Functions compiled before may hold a changed constant: such a survivor is tried without them too.
+        constant = not source.splitlines()[mutant.line - 1].startswith((" ", ")", "]", "}"))
+        for fresh in (True,) if jitted else (False, True) if constant else (False,):
+            for stage in stages if tests else ():
+                files = [file for file, _, _ in stage]
+                functions = {f"{file}::{function}" for file, names, _ in stage for function in names}
+                limit = _LONGER_S * (6.0 if fresh else 1.0) + _SLOWER * sum(item[2] for item in stage)
+                answer = trials.run(files, functions, limit, fresh=fresh)
+                seconds += answer["seconds"]
+                if answer["outcome"] != "survived":
+                    return {**result, **answer, "seconds": seconds}
+    return {**result, "outcome": "survived" if tests else "not run", "test": "", "seconds": seconds}
+
+
+def reason_of(result: dict[str, Any], reasons: list[dict[str, str]]) -> dict[str, str]:
+    """The stored reason of a survivor, found by its file and its change."""
+    for entry in reasons:
+        if all(result[key] == entry[key] for key in ("file", "old", "new")):
+            return entry
+    return {}
+
+
+def table(results: list[dict[str, Any]], reasons: list[dict[str, str]]) -> str:
+    """Caught and survived by module, and the survivors."""
+    lines = [f"{'module':<40} {'mutants':>8} {'caught':>8} {'survived':>8} {'caught':>8}"]
+
+    def row(name: str, some: list[dict[str, Any]]) -> str:
+        caught = sum(r["outcome"] in ("caught", "time") for r in some)
+        share = 100.0 * caught / max(len(some), 1)
+        return f"{name:<40} {len(some):>8} {caught:>8} {len(some) - caught:>8} {share:>6.1f} %"
+
+    for stratum, places in STRATA.items():
+        mine = [r for r in results if r["file"].startswith(places)]
+        if not mine:
+            continue
+        by_file = defaultdict(list)
+        for r in mine:
+            by_file[r["file"]].append(r)
+        lines += [row(stratum, mine), *(row(f"  {file}", some) for file, some in sorted(by_file.items()))]
+    lines.append(row("all", results))
+    alive = [r for r in results if r["outcome"] in ("survived", "not run")]
+    kinds = Counter(reason_of(r, reasons).get("kind", "no reason yet") for r in alive)
+    if alive:
+        lines.append("survivors: " + ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())))
+    for r in alive:
+        found = reason_of(r, reasons)
+        why = f"{found['kind']}: {found['reason']}" if found else "no reason yet"
+        note = " (no test runs it)" if r["outcome"] == "not run" else ""
+        lines += [f"{r['file']}:{r['line']}{note}", f"  - {r['old']}", f"  + {r['new']}", f"    {why}"]
+    return "\n".join(lines)
+
+
+def store(folder: Path, results: list[dict[str, Any]], arguments: argparse.Namespace) -> str:
+    """Write results.json and table.txt; returns the table."""
+    reasons: list[dict[str, str]] = yaml.safe_load(REASONS.read_text("utf-8")) or []
+    text = table(results, reasons)
+    known = [{k: v for k, v in reason_of(r, reasons).items() if k in ("kind", "reason")} for r in results]
+    content = {
+        "commit": git_commit(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "sample": arguments.sample,
+        "seed": arguments.seed,
+        "only": arguments.only,
+        "mutants": [{**r, **why} for r, why in zip(results, known, strict=True)],
+    }
+    (folder / "results.json").write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+    (folder / "table.txt").write_text(text + "\n", encoding="utf-8")
+    return text
+
+
+def replay(trials: Trials) -> int:
+    """Try the bugs written by hand; returns the number that pass."""
+    passed = 0
+    for bug in BUGS:
+        source = (trials.tree / bug.file).read_text("utf-8")
+        if source.count(bug.old) != 1:
+            print(f"{bug.file}: `{bug.old}` is there {source.count(bug.old)} times; mend the table")
+            passed += 1
+            continue
+        files = list(dict.fromkeys(test.split("::")[0] for test in bug.tests))
+        with trials.replace(bug.file, source.replace(bug.old, bug.new)):
+            answer = trials.run(files, set(bug.tests), 300.0, fresh="njit" in source)
+        caught = answer["outcome"] != "survived"
+        passed += not caught
+        print(
+            f"{'caught' if caught else 'PASSED'} {answer['seconds']:6.1f} s  {bug.name}  {answer['test']}",
+            flush=True,
+        )
+    print(f"{len(BUGS) - passed} of {len(BUGS)} bugs are caught")
+    return passed
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mutation", description=__doc__)
+    parser.add_argument("--sample", type=int, default=400, help="number of mutants of all modules")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", default=[], help="draw from files that begin so")
+    parser.add_argument(
+        "--again", action="store_true", help="try the survivors of the last run again, keep the others"
+    )
+    parser.add_argument("--bugs", action="store_true", help="replay the bugs written by hand instead")
+    parser.add_argument(
+        "--control", action="store_true", help="run the tests as for a mutant, without a change"
+    )
+    parser.add_argument("--table", action="store_true", help="print the table of the last run")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=ROOT / "build/mutation",
+        help="folder of results, of the lines of the tests and of the copy",
+    )
+    arguments = parser.parse_args()
+    folder: Path = arguments.out
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "results.json"
+    before = json.loads(path.read_text("utf-8"))["mutants"] if path.exists() else []
+    if arguments.table:
+        print(store(folder, before, arguments))
+        return 0
+    with Trials(ROOT, folder.resolve()) as trials:
+        if arguments.bugs:
+            return min(replay(trials), 1)
+        known = known_lines(trials, folder)
+        if arguments.control:
+            names = {f"{file}::{function}" for file, entry in known.items() for function in entry.seconds}
+            answer = trials.run(sorted(known), names, 3600.0)
+            print(f"without a change: {answer['test'] or 'no test'} fails, {answer['seconds']:.0f} s")
+            return min(answer["outcome"] != "survived", 1)
+        drawn = sample(ROOT, arguments.sample, arguments.seed, arguments.only)
+        done = {(r["file"], r["old"], r["new"]): r for r in before if arguments.again}
+        results, open_ = [], []
+        for mutant in drawn:
+            source = (ROOT / mutant.file).read_text("utf-8")
+            earlier = done.get((mutant.file, *change(source, mutant.code(source))))
+            if earlier and earlier["outcome"] in ("caught", "time"):
+                results.append({**earlier, "line": mutant.line})
+            else:
+                open_.append((earlier is not None, mutant))
+        # What was never tried comes first.
+        for number, (_, mutant) in enumerate(sorted(open_, key=lambda item: item[0]), start=1):
+            results.append(attempt(trials, mutant, known))
+            last = results[-1]
+            print(
+                f"{number}/{len(open_)} {last['outcome']:<8} {last['seconds']:5.1f} s {last['file']}:{last['line']}  "
+                f"{last['old'][:90]} -> {last['new'][:90]}",
+                flush=True,
+            )
+            store(folder, results, arguments)
+        print(store(folder, results, arguments))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,165 @@
+"""Bugs written by hand: a changed term, and the tests that must notice it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_SESSIONS = "tests/runner/experiment/test_sessions.py"
+_CAUSES = "tests/ident/effects/test_every_cause.py"
+_ESTIMATORS = "tests/ident/estimators/test_estimators.py"
+_PACKETS = "tests/fri/test_packets.py"
+_GUARD = "tests/lwr_driver/test_guard.py"
+
+
+@dataclass(frozen=True)
+class Bug:
+    """`old` becomes `new` in `file`; one of `tests` (file::function) must fail."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+def _causes(name: str, file: str, old: str, new: str) -> Bug:
+    test = f"{_CAUSES}::test_the_torque_of_the_rows_is_that_of_the_simulation"
+    return Bug(name, f"ident/effects/{file}", old, new, (test,))
+
+
+BUGS: tuple[Bug, ...] = (
+    Bug(
+        "the preflight is not enforced",
+        "runner/experiment.py",
+        "        preflight.enforce()\n",
+        "",
+        (f"{_SESSIONS}::test_nothing_moves_after_a_failed_check",),
+    ),
+    Bug(
+        "the torques at rest are not compared with gravity",
+        "runner/experiment.py",
+        "            check_gravity(bench.arm, here),\n",
+        "",
+        (f"{_SESSIONS}::test_nothing_moves_after_a_failed_check",),
+    ),
+    Bug(
+        "a resumption forgets the payload",
+        "runner/experiment.py",
+        "self._mounted, self._rest = plan.payload, self._progress.rest(plan.name, plan.payload)",
+        "self._rest = self._progress.rest(plan.name, plan.payload)",
+        (f"{_SESSIONS}::test_a_resumption_knows_the_mounted_payload",),
+    ),
+    Bug(
+        "a resumption forgets the state at rest",
+        "runner/experiment.py",
+        "self._mounted, self._rest = plan.payload, self._progress.rest(plan.name, plan.payload)",
+        "self._mounted = plan.payload",
+        (f"{_SESSIONS}::test_a_resumption_weighs_the_payload_against_the_last_session",),
+    ),
+    Bug(
+        "a payload lost in motion is not noticed",
+        "runner/experiment.py",
+        "outcome = self._still_loaded(plan, here, self._drive(plan, motion))",
+        "outcome = self._drive(plan, motion)",
+        (f"{_SESSIONS}::test_a_payload_lost_on_the_way_fails_the_session",),
+    ),
+    Bug(
+        "the variances of weighted least squares lose their degrees of freedom",
+        "ident/estimators/least_squares.py",
+        "        freedom = row_class.factor.rows - share\n",
+        "        freedom = float(row_class.factor.rows)\n",
+        (f"{_ESTIMATORS}::test_weights_are_inverse_variances_with_the_degrees_of_freedom_of_equation_13",),
+    ),
+    Bug(
+        "the inflation of a HAC interval has the wrong sign",
+        "ident/estimators/covariance.py",
+        "1.96 + 2.9694 * share",
+        "1.96 - 2.9694 * share",
+        (f"{_ESTIMATORS}::test_the_intervals_of_a_hac_covariance_are_widened_for_its_bandwidth",),
+    ),
+    Bug(
+        "the share of the blocks in the jackknife is turned over",
+        "ident/estimators/covariance.py",
+        "(count - 1) / count * (stacked.T @ stacked)",
+        "count / (count - 1) * (stacked.T @ stacked)",
+        (f"{_ESTIMATORS}::test_jackknife_is_the_scatter_of_estimates_without_a_block",),
+    ),
+    Bug(
+        "couplings of the drives leak into the joint rows",
+        "ident/dynamics/structure.py",
+        'if side != "joint" and joint in involved else None',
+        "if joint in involved else None",
+        (
+            "tests/ident/dynamics/test_model_structure.py::test_a_coupling_of_the_drives_is_not_seen_at_the_joints",
+        ),
+    ),
+    _causes(
+        "the simulated Stribeck effect lowers the friction",
+        "drive.py",
+        'loads.Fcm[run.joint] += values["amplitude"] * fall',
+        'loads.Fcm[run.joint] -= values["amplitude"] * fall',
+    ),
+    _causes(
+        "the cosine of the simulated gear ripple has the wrong sign",
+        "drive.py",
+        "-= cosine * np.cos(angle) + sine * np.sin(angle)",
+        "-= -cosine * np.cos(angle) + sine * np.sin(angle)",
+    ),
+    _causes(
+        "the cosine of the simulated sensor ripple has the wrong sign",
+        "channel.py",
+        "+= cosine * np.cos(angle) + sine * np.sin(angle)",
+        "+= -cosine * np.cos(angle) + sine * np.sin(angle)",
+    ),
+    _causes(
+        "the simulated crosstalk is that of the next joint",
+        "channel.py",
+        'other = plant.joint_torque[round(run.values["source"]) - 1]',
+        'other = plant.joint_torque[round(run.values["source"]) % 7]',
+    ),
+    Bug(
+        "the brakes of the emulated arm have no effect",
+        "sim_backend/plant.py",
+        "self.drive.Fcm + (self.drive.brake_torque if engaged else 0.0)",
+        "self.drive.Fcm + 0.0",
+        ("tests/sim_backend/test_arm.py::test_a_brake_holds_up_to_its_torque_and_lets_go_when_it_opens",),
+    ),
+    Bug(
+        "the guard allows ten times the rounding of the jerk",
+        "lwr_driver/guard.py",
+        "3.0 * (a_error + self._a_error) / three",
+        "30.0 * (a_error + self._a_error) / three",
+        (f"{_GUARD}::test_each_limit_is_widened_by_the_rounding_and_nothing_else",),
+    ),
+    Bug(
+        "the check of a motion allows ten times the rounding",
+        "lwr_driver/motion.py",
+        "slack = 2.0**order * ROUNDING / period**order",
+        "slack = 10.0 * 2.0**order * ROUNDING / period**order",
+        (
+            "tests/lwr_driver/test_motion.py::"
+            "test_limits_are_widened_by_the_rounding_of_a_difference_and_nothing_else",
+        ),
+    ),
+    Bug(
+        "the period of the measurements is not checked",
+        "fri/packets.py",
+        "            or not 0.0009 < measuring < 0.1001\n",
+        "",
+        (f"{_PACKETS}::test_damaged_field_is_named",),
+    ),
+    Bug(
+        "the bound of the torques is a hundred times too wide",
+        "fri/packets.py",
+        "math.sqrt(JOINTS) * 1000.0",
+        "math.sqrt(JOINTS) * 100_000.0",
+        (f"{_PACKETS}::test_torques_beyond_the_sensors_are_refused_and_full_scale_of_all_joints_is_not",),
+    ),
+    Bug(
+        "the bound of the positions is a hundred times too wide",
+        "fri/packets.py",
+        "math.sqrt(3 * JOINTS) * 2 * math.pi",
+        "math.sqrt(3 * JOINTS) * 200 * math.pi",
+        (f"{_PACKETS}::test_positions_of_more_than_a_turn_are_refused_and_a_turn_of_all_joints_is_not",),
+    ),
+)
