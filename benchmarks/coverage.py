@@ -115,13 +115,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         inertias += errors.tolist()
         held += delays(found, LATE_S if late else 0.0)
         shown = ", ".join(
-            f"{1e3 * s.delay.seconds:.2f} ± {1e3 * s.delay.std:.2f}" for s in found.prepared if s.delay is not None
+            f"{1e3 * s.delay.seconds:.2f} ± {1e3 * s.delay.std:.2f}"
+            for s in found.prepared
+            if s.delay is not None
         )
-        print(
-            f"{seed:>4}  {'turning ' if turns else 'sign    '}  {'late  ' if late else 'timely'} "
-            f"{100.0 * np.mean(inside):>9.1f} {np.sqrt(np.mean(z**2)):>6.2f} {100.0 * np.mean(errors):>12.2f}   {shown}",
-            flush=True,
+        row = (
+            f"{100.0 * np.mean(inside):>9.1f} {np.sqrt(np.mean(z**2)):>6.2f} {100.0 * np.mean(errors):>12.2f}"
         )
+        scene = f"{'turning ' if turns else 'sign    '}  {'late  ' if late else 'timely'}"
+        print(f"{seed:>4}  {scene} {row}   {shown}", flush=True)
     scores["all"] = [row for rows in scores.values() for row in rows]
     print("\n" + table(scores))
     print(f"\nmean |error| of Ia {100.0 * np.mean(inertias):.2f} %")

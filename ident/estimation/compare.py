@@ -30,7 +30,7 @@ from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.scores import SessionScore, finite, score_session
 from ident.estimation.validate import mounted, predictor, prepared_session
-from ident.estimators.estimate import normal_tail
+from ident.estimators.estimate import student_tail
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
@@ -39,6 +39,8 @@ from ident.rows.sessions import payload_name
 from lwr_driver.session import Session, Sessions, as_sessions
 
 _SAME_ROW = 1e-8
+# Degrees of freedom of a standard deviation counted as known.
+_EXACT = 1e6
 _SAMPLES = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
 
 
@@ -200,7 +202,11 @@ def compare(
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(known & (total > 0), (b - a) / total, np.nan)
         percent = np.where(a != 0, 100.0 * (b - a) / np.abs(a), np.inf)
-    p = 2.0 * normal_tail(np.abs(z))
+    # Standard deviations from a few dozen blocks are uncertain themselves (Welch 1947).
+    freedom = _freedom(first), _freedom(second)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        both = total**4 / (std_a**4 / freedom[0] + std_b**4 / freedom[1])
+    p = 2.0 * student_tail(np.abs(z), np.where(np.isfinite(both), both, np.inf))
     differences = tuple(
         Difference(
             name, unit, float(a[k]), float(b[k]), float(std_a[k]), float(std_b[k]), float(z[k]), float(p[k]),
@@ -220,6 +226,12 @@ def compare(
         only_first=tuple(only_first),
         only_second=tuple(only_second),
     )
+
+
+def _freedom(model: DynamicModel) -> float:
+    """Degrees of freedom of a model's standard deviations; models without count as exact."""
+    stated = model.provenance.get("degrees_of_freedom")
+    return float(stated) if isinstance(stated, (int, float)) and stated > 0 else _EXACT
 
 
 def _require_same_arm(first: DynamicModel, second: DynamicModel) -> None:

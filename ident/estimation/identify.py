@@ -127,7 +127,7 @@ class Identification(Tabular):
         return self._model(self.essential.names, self.essential.estimate)
 
     def _model(self, names: tuple[str, ...], found: Estimate) -> DynamicModel:
-        provenance = {
+        provenance: dict[str, Any] = {
             "estimator": self.estimate.method,
             "covariance": self.estimate.covariance.kind,
             "sessions": [
@@ -136,6 +136,9 @@ class Identification(Tabular):
             ],
             "signals": signals_entry(self.settings.signals, self.prepared),
         }
+        freedom = found.covariance.degrees_of_freedom
+        if np.isfinite(freedom):
+            provenance["degrees_of_freedom"] = float(freedom)
         if self.choice is not None:
             provenance["choice"] = self.choice.to_dict()
         matrix = found.covariance.matrix

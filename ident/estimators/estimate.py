@@ -214,9 +214,9 @@ def normal_quantile(p: float) -> float:
     return float(special.ndtri(p))
 
 
-def student_tail(t: float, freedom: float) -> float:
-    """Probability of Student's t with `freedom` degrees of freedom above t."""
-    return float(special.stdtr(freedom, -t))
+def student_tail(t: Any, freedom: Any) -> Any:
+    """Probability of Student's t with `freedom` degrees of freedom above t, elementwise."""
+    return special.stdtr(freedom, -t)
 
 
 def student_quantile(p: float, freedom: float) -> float:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,13 +202,21 @@ class _Rows:
         outputs = np.arange(first + 0.5 * width, last - 0.5 * width, 1.0 / (2.5 * cutoff_hz))
         parallel = ParallelFilter(times, outputs, cutoff_hz, _ATTENUATION_DB)
         dt = float(data.times[1] - data.times[0])
-        at = np.clip(np.rint((times - data.times[0]) / dt).astype(np.int64), 0, len(data.times) - 1)
-        known = data.known[at].astype(np.float64)
-        share = parallel.apply(known)
         # Interpolation smooths noise, and more so between two samples: without a low-pass the noise chooses the delay.
         torque = low_pass(data.joint_torque, dt, min(3.0 * cutoff_hz, 0.4 / dt))
         state = np.hstack([data.qdd, data.qd, torque])
-        return cls(data, state, parallel, inside, known, share, share > _KNOWN)
+        empty = np.zeros((len(times), data.qd.shape[1]))
+        rows = np.zeros((len(outputs), data.qd.shape[1]))
+        return cls(data, state, parallel, inside, empty, rows, rows > 0.0).masked(0.0)
+
+    def masked(self, delay: float) -> _Rows:
+        """With the samples that are known for a delay."""
+        data = self.data
+        step = float(data.times[1] - data.times[0])
+        place = np.rint((data.motor_times[self.inside] - delay - data.times[0]) / step).astype(np.int64)
+        known = data.known[np.clip(place, 0, len(data.times) - 1)].astype(np.float64)
+        share = self.parallel.apply(known)
+        return replace(self, known=known, share=share, known_rows=share > _KNOWN)
 
     def thinned(self, cutoff_hz: float) -> _Rows:
         """With no more samples than the coarse search needs, 40 a period of the cut-off."""
@@ -232,6 +240,7 @@ class _Rows:
 
 def _misfit(parts: Sequence[_Rows], joints: Sequence[int], delay: float) -> float:
     """Sum over joints of the log residual power: the likelihood with one unknown variance a joint."""
+    parts = [part.masked(delay) for part in parts]
     rows = [part.at(delay) for part in parts]
     total = 0.0
     for j in joints:
@@ -239,7 +248,7 @@ def _misfit(parts: Sequence[_Rows], joints: Sequence[int], delay: float) -> floa
         matrix = np.vstack([columns[k, j] for (columns, _), k in zip(rows, keep, strict=True)])
         target = np.concatenate([values[k, j] for (_, values), k in zip(rows, keep, strict=True)])
         residual = target - matrix @ np.linalg.lstsq(matrix, target, rcond=None)[0]
-        total += len(target) * float(np.log(residual @ residual + 1e-30))
+        total += len(target) * float(np.log(residual @ residual / max(len(target), 1) + 1e-30))
     return total
 
 
@@ -247,6 +256,7 @@ def _newton(
     parts: Sequence[_Rows], joints: Sequence[int], delay: float, *, separate: bool
 ) -> tuple[Floats, Floats]:
     """Gauss-Newton step of the delay (1,), or of each joint's own (J,), and standard deviations [s]."""
+    parts = [part.masked(delay) for part in parts]
     here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, _STEP_S, -_STEP_S))
     count = len(joints) if separate else 1
     groups = []
@@ -268,6 +278,8 @@ def _newton(
             if not len(rows):
                 continue
             (ahead, target_ahead), (behind, target_behind) = later[record], earlier[record]
+            # The direction of a known sample does not depend on the delay.
+            ahead[rows, j, 2] = behind[rows, j, 2]
             slope = (target_ahead[rows, j] - ahead[rows, j][:, used[j]] @ model) - (
                 target_behind[rows, j] - behind[rows, j][:, used[j]] @ model
             )
