@@ -81,8 +81,8 @@ def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
 def stale(columns: JointColumns) -> Flags:
     """Samples (N,) older than their stamp.
 
-    Either all joints repeat their last torques, or most moving joints jolt at once, like positions a part of a sample
-    old. A few such samples are no finding, but derivatives of the positions are wrong there.
+    Either all joints repeat their last torques and positions, or most moving joints jolt at once, like positions a
+    part of a sample old. A few such samples are no finding, but derivatives of the positions are wrong there.
     """
     stamps = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
     steps = np.diff(stamps, prepend=stamps[:1])
@@ -99,7 +99,7 @@ def stale(columns: JointColumns) -> Flags:
     )
     old = _jolts(columns.position) & ~beside
     if _repeated(columns.effort):
-        old |= _same(columns.effort)
+        old |= _same(columns.effort) & _same(columns.position)
     return old
 
 

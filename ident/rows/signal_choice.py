@@ -32,7 +32,7 @@ from ident.rows.data_quality import passed_band
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
 from ident.rows.reversals import away_from_reversals
-from lwr_driver.session import JointColumns, Session
+from lwr_driver.session import Session
 
 logger = logging.getLogger(__name__)
 
@@ -105,15 +105,13 @@ def _excerpt(session: Session, longest_s: float) -> Session:
     if session.duration_s <= longest_s:
         return session
     spans = session.spans("period") or session.spans("excitation")
-    start = spans[0][0] if spans else session.start
+    times = session.joint.log_time
+    latest = int(times[-1]) - round(longest_s * 1e9)
+    start = int(np.clip(spans[0][0] if spans else times[0], times[0], latest))
     stop = start + round(longest_s * 1e9)
 
-    def cut(channel: JointColumns) -> JointColumns:
-        first, last = np.searchsorted(channel.log_time, [start, stop])
-        return channel.rows(int(first), int(last))
-
-    motor = None if session.motor is None else cut(session.motor)
-    return replace(session, joint=cut(session.joint), motor=motor)
+    motor = None if session.motor is None else session.motor.rows(start, stop)
+    return replace(session, joint=session.joint.rows(start, stop), motor=motor)
 
 
 def _with_decimation(

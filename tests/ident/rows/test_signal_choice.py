@@ -84,3 +84,9 @@ def test_a_drive_that_turns_slowly_has_its_reversals_left_out():
     turned = dataclasses.replace(session, motor=dataclasses.replace(session.motor, effort=effort))
     assert chosen(turned).settings.reversal_s >= late
     assert chosen(session).settings.reversal_s < late
+
+
+def test_a_long_recording_is_judged_by_a_part_of_it():
+    session = arm.session(motor=False, sensors=sensors(), period_s=10.0, periods=14)
+    assert session.duration_s > 130.0
+    assert chosen(session).settings.decimate_hz == 2.0
