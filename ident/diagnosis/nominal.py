@@ -26,16 +26,15 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import split_name
-from ident.dynamics.structure import Condition, Coupling, ModelStructure, Side
+from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
 from ident.effects.motion import ArmMotion, dahl
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
+from ident.rows.binned import Motion, binned_regressor, bins
 from ident.rows.filters import differentiate, low_pass
 
 Floats = NDArray[np.float64]
 
-_CHUNK = 2000
 # Least share of a low-passed row from samples of a moving joint.
 _KNOWN = 0.8
 # Length of the windows used of a long session [s].
@@ -317,7 +316,7 @@ class Nominal:
     def _stamps(self, side: str, stretch: RecordStretch) -> Floats:
         """Times (m,) [s] of all rows of a stretch."""
         stamp, _, width = self._sampling(side, stretch)
-        return self._slow(side, _binned(stamp[:, None], width)[:, 0], width * _step(stamp), smooth=False)
+        return self._slow(side, bins(stamp[:, None], width)[:, 0], width * _step(stamp), smooth=False)
 
     def _windows(self, recording: SessionRecord, stamps: Floats) -> NDArray[np.bool_]:
         """Rows (m,) to use. Of a long session: the beginning, two periods at least, and windows spread evenly, so
@@ -351,18 +350,18 @@ class Nominal:
             dt = width * _step(stamp)
             wide = self._matrix(side, motion, recording, stretch.time, at, width)
             matrix = np.stack([self._slow(side, table, dt) for table in wide])
-            torque = self._slow(side, _binned(target, width), dt)
+            torque = self._slow(side, bins(target, width), dt)
             if self.band_hz[side] is not None:
                 # The columns pass through the same low-pass, so rounded reversals cancel; only longer rests are
                 # unknown.
-                valid = self._slow(side, _binned((usable & moves).astype(float), width), dt) > _KNOWN
+                valid = self._slow(side, bins((usable & moves).astype(float), width), dt) > _KNOWN
             else:
-                moves = _binned(moves.astype(float), width) > 1.0 - 1e-9
+                moves = bins(moves.astype(float), width) > 1.0 - 1e-9
                 if side == "joint":
                     # The positions' low-pass rounds the corner made by the link's Coulomb friction.
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
-                valid = (_binned(usable.astype(float), width) > 1.0 - 1e-9) & moves
+                valid = (bins(usable.astype(float), width) > 1.0 - 1e-9) & moves
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
             session, test = (np.full(int(chosen.sum()), v) for v in (recording.number, recording.test))
@@ -381,42 +380,26 @@ class Nominal:
     def _matrix(
         self, side: str, motion: ArmMotion, recording: SessionRecord, grid: Floats, at: Floats, width: int
     ) -> Floats:
-        """(n, m, p) regressor of one stretch and side in rows."""
-        n, columns = motion.n, self.base.columns
-        chosen: Side = "motor" if side == "motor" else "joint"
-        parts = []
-        size = max(width, _CHUNK // width * width)
-        count = len(at) // width * width
+        """(n, m, p) regressor of one stretch and side in rows, the drives at the motors' own motion."""
         exact = _on_grid(grid, at)
-        drive = self._drive_columns() if side == "motor" else {}
-        speeds = motion.motor_speed, motion.motor_acceleration, motion.direction
-        for first in range(0, count, size):
-            some = at[first : min(first + size, count)]
-            pick = None if exact is None else exact[first : first + len(some)]
-            q, qd, qdd, speed, acceleration, slip = (
-                x[pick] if pick is not None else _at(grid, x, some)
-                for x in (motion.q, motion.qd, motion.qdd, *speeds)
-            )
-            wide = self.structure.regressor(
-                q, qd, qdd, payload=recording.payload, sides=(chosen,), columns=columns
-            )
-            table = wide.T.reshape(len(columns), n, len(some))
-            if drive:
-                table = table.copy()
-                signals = {"Ia": acceleration, "Fvm": speed, "Fcm": slip}
-                for place, (symbol, joint) in drive.items():
-                    table[place, joint] = signals[symbol][:, joint]
-            parts.append(table.reshape(len(columns), n, -1, width).mean(axis=3).transpose(1, 2, 0))
-        return np.concatenate(parts, axis=1)
-
-    def _drive_columns(self) -> dict[int, tuple[str, int]]:
-        """Places of the motor's base columns, with symbol and joint."""
-        found = {}
-        for place, column in enumerate(self.base.columns):
-            symbol, link = split_name(self.structure.names[column])[:2]
-            if symbol in ("Ia", "Fvm", "Fcm") and link <= self.arm.chain.n:
-                found[place] = (symbol, link - 1)
-        return found
+        signals = (
+            motion.q,
+            motion.qd,
+            motion.qdd,
+            motion.motor_speed,
+            motion.motor_acceleration,
+            motion.direction,
+        )
+        q, qd, qdd, *drive = (x[exact] if exact is not None else _at(grid, x, at) for x in signals)
+        chosen: Side = "motor" if side == "motor" else "joint"
+        return binned_regressor(
+            self.structure,
+            np.asarray(self.base.columns),
+            Motion(q, qd, qdd, DriveMotion(*drive) if side == "motor" else None),
+            recording.payload,
+            chosen,
+            width,
+        )
 
 
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
@@ -454,14 +437,6 @@ def _at(grid: Floats, values: Floats, at: Floats) -> Floats:
     low = place.astype(np.int64)
     share = (place - low)[:, None]
     return (1.0 - share) * values[low] + share * values[low + 1]
-
-
-def _binned(values: Floats, width: int) -> Floats:
-    """Means (m, k) over `width` samples of (N, k)."""
-    if width == 1:
-        return values
-    count = len(values) // width
-    return values[: count * width].reshape(count, width, -1).mean(axis=1)
 
 
 def _definite(mass: Floats) -> Floats:

@@ -204,19 +204,19 @@ def jackknife(
     count = len(shifts)
     stacked = np.array(shifts)
     matrix = (count - 1) / count * (stacked.T @ stacked)
-    freedom, note = max(1.0, count - 1.0), cut.note
+    freedom, how = max(1.0, count - 1.0), ""
     if consumed is not None and 2 < count < _MANY_BLOCKS:
         plain = np.einsum("ij,jk,ik->i", bread, _stationary(problem, coefficients, consumed, matrices), bread)
         variance, freedom = moderated(np.diag(matrix), np.maximum(plain, 1e-300), freedom)
         ratio = np.sqrt(variance / np.maximum(np.diag(matrix), 1e-300))
         matrix = matrix * np.outer(ratio, ratio)
-        note += ", moderated"
+        how = ", moderated"
     if correlation is not None:
         own, other = np.sqrt(np.diag(matrix)), np.sqrt(np.diag(correlation))
         ratio = own / np.where(other > 0, other, 1.0)
         matrix = correlation * np.outer(ratio, ratio)
     kind = (
-        f"block jackknife ({count} blocks of {cut.length * problem.sample_time_s:.2f} s{note} left out): "
+        f"block jackknife ({count} blocks of {cut.length * problem.sample_time_s:.2f} s{cut.note} left out{how}): "
         "robust to serial correlation"
     )
     return Covariance(matrix, kind, degrees_of_freedom=freedom)

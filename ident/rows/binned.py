@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
-from ident.dynamics.structure import Coulomb, ModelStructure, Side
+from ident.dynamics.structure import Coulomb, DriveMotion, ModelStructure, Side
 from ident.rows.prepare import PreparedSession, TorqueChannel
 
 _CHUNK = 2000
@@ -51,28 +52,37 @@ def bins(values: Floats, width: int) -> Floats:
     return values[: count * width].reshape(count, width, -1).mean(axis=1)
 
 
+class Motion(NamedTuple):
+    """Motion (N, n) at the samples of a torque; drive : of the motors where it differs."""
+
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    drive: DriveMotion | None = None
+
+
 def binned_regressor(
     structure: ModelStructure,
     columns: NDArray[np.int64],
-    channel: TorqueChannel,
+    motion: Motion | TorqueChannel,
     payload: str | None,
     side: Side,
     width: int,
 ) -> Floats:
-    """Regressor (n, m, C) of one channel in bins of `width` samples."""
-    n, count = structure.chain.n, len(channel.times) // width * width
+    """Regressor (n, m, C) of a motion in bins of `width` samples."""
+    n, count = structure.chain.n, len(motion.q) // width * width
     size = max(width, _CHUNK // width * width)
     parts = []
     for first in range(0, count, size):
         some = slice(first, min(first + size, count))
         wide = structure.regressor(
-            channel.q[some],
-            channel.qd[some],
-            channel.qdd[some],
+            motion.q[some],
+            motion.qd[some],
+            motion.qdd[some],
             payload=payload,
             sides=(side,),
             columns=columns,
-            drive=None if channel.drive is None else channel.drive.at(some),
+            drive=None if motion.drive is None else motion.drive.at(some),
         )
         table = wide.T.reshape(len(columns), n, -1, width)
         parts.append(table.mean(axis=3).transpose(1, 2, 0))
