@@ -27,7 +27,7 @@ import numpy as np
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.estimation.identify import Identification, IdentificationSettings, identify
-from ident.rows.screening import screen
+from ident.screening.screen import screen
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
 from tests.hidden_physics.robots import Day, session_settings

@@ -30,9 +30,9 @@ from ident.model.signals import signals_entry
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
-from ident.rows.screening import require_sound, without_dead
 from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.signal_choice import choose_signals
+from ident.screening.screen import require_sound, without_dead
 from lwr_driver.session import Session, Sessions, as_sessions
 
 if TYPE_CHECKING:

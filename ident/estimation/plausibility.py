@@ -14,7 +14,7 @@ import numpy as np
 from ident.dynamics.parameters import split_name
 from ident.estimators.estimate import Estimate
 from ident.estimators.problem import Problem
-from ident.rows.doubts import Doubt, settle
+from ident.screening.doubts import Doubt, settle
 
 _DEVIATIONS = 5.0
 # Least share of the torque of the joint.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ident.rows.delay import Delay, DelayData, estimate_delay
-from ident.rows.doubts import Doubt
 from ident.rows.filters import (
     ParallelFilter,
     SignalSettings,
@@ -15,22 +14,23 @@ from ident.rows.filters import (
 )
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
-from ident.rows.screening import require_sound, screen
 from ident.rows.sessions import payload_name, require, stated_mass
+from ident.rows.signal_choice import SignalChoice, choose_signals
 from lwr_driver.session import Sessions, as_sessions
 
 __all__ = [
     "Delay",
     "DelayData",
-    "Doubt",
     "ParallelFilter",
     "Passage",
     "PreparedSession",
     "Sessions",
+    "SignalChoice",
     "SignalSettings",
     "TorqueChannel",
     "advice",
     "as_sessions",
+    "choose_signals",
     "commanded",
     "differentiate",
     "estimate_delay",
@@ -41,8 +41,6 @@ __all__ = [
     "payload_name",
     "prepare",
     "require",
-    "require_sound",
-    "screen",
     "stack",
     "stated_mass",
 ]

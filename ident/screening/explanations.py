@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.rows.redundancy import Class, Gain, Redundancy
+from ident.screening.redundancy import Class, Gain, Redundancy
 
 # Ratios of units that are mixed up, and what they look like.
 UNITS = {

@@ -11,7 +11,7 @@ import numpy as np
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.rows.data_quality import clipped_at, stuck_at
-from ident.rows.doubts import Doubt
+from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
 
 # Sampling rates of robot logs [Hz], and the least duration that tells one clock from another [s].

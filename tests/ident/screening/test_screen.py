@@ -11,10 +11,10 @@ import pytest
 from benchmarks.wrong_channels import clipped, constant, labelled, paced, scaled, swapped, with_speed, without
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
-from ident.rows.channels import check_channels
-from ident.rows.doubts import Doubt, settle
-from ident.rows.explanations import unit_of
-from ident.rows.screening import require_sound, screen, without_dead
+from ident.screening.channels import check_channels
+from ident.screening.doubts import Doubt, settle
+from ident.screening.explanations import unit_of
+from ident.screening.screen import require_sound, screen, without_dead
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session
 

@@ -24,12 +24,12 @@ from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
 from ident.estimators.problem import Problem
-from ident.rows.channels import check_channels, check_limits, dead
-from ident.rows.doubts import Doubt, settle
-from ident.rows.explanations import AGREES, Explanation, explain, is_wrong, unit_of
 from ident.rows.filters import SignalSettings
-from ident.rows.redundancy import Class, Fit, Redundancy
 from ident.rows.sessions import payload_name
+from ident.screening.channels import check_channels, check_limits, dead
+from ident.screening.doubts import Doubt, settle
+from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
+from ident.screening.redundancy import Class, Fit, Redundancy
 from lwr_driver.session import Session, Sessions, as_sessions
 
 logger = logging.getLogger(__name__)

@@ -1,0 +1,8 @@
+"""Channels that are wrong: their signs, units, gains, clocks and labels, before anything is identified from them."""
+
+from __future__ import annotations
+
+from ident.screening.doubts import Doubt
+from ident.screening.screen import require_sound, screen, without_dead
+
+__all__ = ["Doubt", "require_sound", "screen", "without_dead"]
