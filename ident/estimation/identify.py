@@ -313,7 +313,13 @@ def identify(
     prepared, problems, instruments = [], [], []
     for session, payload in zip(chosen, mounted, strict=True):
         # One session after the other, so that memory holds the full-rate signals of one only.
-        whole = prepare(session, settings.signals, resonance_hz=settings.resonance_hz, motor=needs_motor)
+        whole = prepare(
+            session,
+            settings.signals,
+            resonance_hz=settings.resonance_hz,
+            motor=needs_motor,
+            advise=not signals.reasons,
+        )
         seen = observe(
             [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units
         )

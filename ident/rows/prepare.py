@@ -132,8 +132,12 @@ def prepare(
     resonance_hz: float | None = None,
     motor: bool = True,
     log: bool = True,
+    advise: bool = True,
 ) -> PreparedSession:
-    """Filter and align one session. `motor` False leaves the motor channel aside, `log` False keeps warnings to itself.
+    """Filter and align one session.
+
+    motor : False leaves the motor channel aside. log : False keeps warnings to itself. advise : False gives no advice
+    on cut-offs, for those that the data chose.
 
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
@@ -207,13 +211,14 @@ def prepare(
             f"{name}: no stretch is longer than the ends of the position filter, {2.0 * settings.edge:.2f} s; record a "
             "longer motion or raise `cutoff_hz`"
         )
-    warnings += advice(
+    advised = advice(
         settings,
         excitation_hz=excitation,
         joint_rate_hz=1.0 / dt,
         motor_rate_hz=None if motor_data is None else 1.0 / float(np.median(np.diff(motor_data[0]))),
         resonance_hz=resonance_hz,
     )
+    warnings += advised if advise else ()
     counts = {
         "lost": lost,
         "stale": int(old.sum()),

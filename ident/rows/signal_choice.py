@@ -193,9 +193,8 @@ class _Bench:
         """Rows by side and joint."""
         parts: dict[str, list[BinnedRows]] = {}
         for session, payload, delay in zip(self.sessions, self.payloads, self.delays, strict=True):
-            prepared = prepare(
-                session, replace(settings, motor_delay_s=delay, reversal_s=0.0), motor=self.motor
-            )
+            wanted = replace(settings, motor_delay_s=delay, reversal_s=0.0)
+            prepared = prepare(session, wanted, motor=self.motor, log=False)
             for rows in observe_bins(prepared, payload, self.structure, self.columns, _BIN_S):
                 parts.setdefault(rows.side, []).append(rows)
         found = {}

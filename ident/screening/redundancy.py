@@ -85,7 +85,8 @@ def sampled(
     found = []
     for record, session in enumerate(sessions):
         sensed = bool(session.joint.effort.shape[1])
-        whole = prepare(session, replace(signals, motor_delay_s=0.0), motor=session.motor is not None)
+        wanted = replace(signals, motor_delay_s=0.0)
+        whole = prepare(session, wanted, motor=session.motor is not None, log=False)
         for passage in whole.passages:
             channels = [passage.joint if sensed else None, passage.motor]
             for channel in channels:
