@@ -496,9 +496,19 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
         sentences.append(f"Mean over joints and sides: {error_change(whole)} error.")
     if worse:
         sentences.append(f"Worse than the base model by more than chance: {', '.join(worse)}.")
+    for entry in details.get("torque_errors", []):
+        parts = [_percents(side, errors, is_named) for side, errors in entry["by_side"].items()]
+        sentences.append(
+            f"Torque error of {entry['session']} (all samples, as of `validate`): {', '.join(parts)}."
+        )
     middle = ("extended [Nm]", "change %", "gain [Nm], 95 %") if is_named else ()
     head = ("torque", "noise [Nm]", "base model [Nm]", *middle, "avoidable %")
     return Part("gain", "Gain" if is_named else "Error on held-out data", sentences, head, rows)
+
+
+def _percents(side: str, errors: Plain, is_named: bool) -> str:
+    base, extended = (100.0 * errors[name] for name in ("base", "extended"))
+    return f"{side} {base:.2f} %" + (f", extended {extended:.2f} %" if is_named else "")
 
 
 def _simulated(content: Plain) -> tuple[Plain, Plain]:

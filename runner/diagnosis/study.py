@@ -20,6 +20,8 @@ from ident.diagnosis.statements import SURE, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect
+from ident.estimation.scores import finite
+from ident.estimation.validate import validate
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from lwr_driver.arm import JOINTS, Arm
@@ -63,7 +65,8 @@ class Study:
 
     sessions : names in their order. referenced : whether a healthy reference was at hand. pairs : look-alikes, side
     by side. replayed : errors of the simulation over time. offers : discriminating experiments. material : the
-    inputs. sure : confidence below which a finding with alternatives is open.
+    inputs. sure : confidence below which a finding with alternatives is open. torque_errors : of the base and the
+    extended model in each held-out session, the figure of `validate`.
     """
 
     diagnosis: Diagnosis
@@ -78,6 +81,7 @@ class Study:
     offers: tuple[Discriminating, ...] = field(default=())
     material: Material | None = field(default=None, repr=False)
     sure: float = SURE
+    torque_errors: tuple[Mapping[str, Any], ...] = ()
 
     def __str__(self) -> str:
         content, details = self.diagnosis.to_dict(), self.details()
@@ -102,6 +106,7 @@ class Study:
             "rows": list(self.gains),
             "base_parameters": list(self.moved),
             "notes": list(self.notes),
+            "torque_errors": list(self.torque_errors),
             "look_alikes": [pair.to_dict() for pair in self.pairs],
             "deciding_motions": [offer.to_dict() for offer in self.offers],
         }
@@ -197,6 +202,27 @@ def study(
         _first_replay(replay),
         material=Material(tuple(sessions), chain, data, healthy),
         sure=sure,
+        torque_errors=_torque_errors(found, held_out),
+    )
+
+
+def _torque_errors(found: Diagnosis, sessions: Sequence[Session]) -> tuple[Mapping[str, Any], ...]:
+    if not sessions:
+        return ()
+    base, extended = (
+        validate(model, sessions, allow_seen=True, keep_going=True).scores
+        for model in (found.base_model, found.extended_model)
+    )
+    return tuple(
+        {
+            "session": one.session,
+            "by_side": {
+                side: {"base": finite(error), "extended": finite(other.relative.get(side))}
+                for side, error in one.relative.items()
+            },
+        }
+        for one, other in zip(base, extended, strict=True)
+        if all(map(np.isfinite, (*one.relative.values(), *other.relative.values())))
     )
 
 
