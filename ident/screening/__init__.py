@@ -1,4 +1,4 @@
-"""Channels that are wrong: their signs, units, gains, clocks and labels, before anything is identified from them."""
+"""Wrong channels: signs, units, gains, clocks and labels, checked before identification."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from ident.rows.data_quality import clipped_at, stuck_at
 from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
 
-# Sampling rates of robot logs [Hz], and the least duration that tells one clock from another [s].
+# Sampling rates of robot logs [Hz], and the least duration for a comparison of two clocks [s].
 _RATES, _LONG_S = (10.0, 20_000.0), 2.0
 # Difference of two clocks or of dq/dt and velocity beyond filters and jitter; beyond the second one is a wrong unit.
 _CLOCKS, _SPEEDS, _UNIT = 0.02, 0.15, 1.5
@@ -29,7 +29,7 @@ _OVER, _OUTLIERS = 1.1, 0.001
 _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
 # Share of the motion at one torque, wherever it is.
 _OFTEN = 0.05
-# Share of the rows of two logs that agree to the last bit.
+# Share of the rows of two logs equal to the last bit.
 _SAME_ROWS = 0.2
 
 
@@ -42,7 +42,7 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
 
 
 def check_limits(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
-    """Doubts by the limits in the URDF: they say that a channel is wrong, seldom how."""
+    """Doubts by the limits in the URDF: a channel is wrong, seldom clear how."""
     limits = joint_limits(chain)
     return [doubt for s in sessions for doubt in (*_limits(s, limits), *_pace(s, limits))]
 
@@ -97,7 +97,7 @@ def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 
 def _shared_rows(a: Session, b: Session) -> float:
-    """Share of the rows of the shorter log that the other holds to the last bit, in motion."""
+    """Share of the rows of the shorter log found in the other to the last bit, in motion."""
     rows = []
     for session in (a, b):
         values = np.hstack([session.joint.position, session.joint.effort])
@@ -258,9 +258,9 @@ def _clipped(session: Session) -> Iterator[Doubt]:
 
 
 def _flat_tops(columns: JointColumns) -> Iterator[tuple[int, float]]:
-    """Joint and level of repeated flat tops that a moving joint enters or leaves at speed.
+    """Joint and level of repeated flat tops, entered or left at speed.
 
-    A joint that stops with the acceleration a covers a T^2 / 2 in the time T before; a clipped one covers its speed
+    A joint stopping with the acceleration a covers a T^2 / 2 in the time T before; a clipped one covers its speed
     times T. Second differences at the lag T are a T^2.
     """
     position, period = columns.position, columns.period_s

@@ -1,4 +1,4 @@
-"""A doubt about the data: channel, joints, what was seen, what it looks like, and how to mend it."""
+"""A doubt about the data: channel, joints, observation, likely cause, remedy."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Which single change of a channel makes the data of an arm agree with themselves.
 
-Each explanation is a change that people and programs make by mistake: the sign of a channel, its unit or gain, two
+Each explanation is a common mistake of people and programs: the sign of a channel, its unit or gain, two
 interchanged joints, a zero offset, the pace of time, the label of a payload. It is undone in the rows of `Redundancy`
 and judged by the fall of the score, the sum over joints and sides of log(residual / torque). The best one is taken, and
 the search goes on in the mended data, because two channels may be wrong.
@@ -16,7 +16,7 @@ import numpy as np
 from ident.dynamics.parameters import Floats
 from ident.screening.redundancy import Class, Gain, Redundancy
 
-# Ratios of units that are mixed up, and what they look like.
+# Ratios of units often mixed up, with their names.
 UNITS = {
     1000.0: "a unit 1000 times too small, such as mNm for Nm",
     0.001: "a unit 1000 times too large, such as kNm for Nm",
@@ -29,9 +29,9 @@ UNITS = {
 _NEAR = 0.1
 # Residual over torque of an arm whose channels agree; beyond it explanations are sought.
 AGREES = 0.1
-# Least gain error that is looked at, and its standard deviations: sensors are calibrated to a few per cent.
+# Least gain error of interest, and its standard deviations: sensors are calibrated to a few per cent.
 _GAIN, _DEVIATIONS = 0.18, 5.0
-# Share of the residual that a true gain error leaves at most.
+# Largest share of the residual left by a true gain error.
 _LEFT = 0.75
 _POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 _PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
@@ -42,9 +42,9 @@ _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
 
 @dataclass(frozen=True)
 class Explanation:
-    """A change of a channel: what it looks like, the mended rows, and the fall of the score.
+    """A change of a channel: its name, the mended rows, and the fall of the score.
 
-    channel : as in `Doubt`. factor : recorded over true value, where the change is one. gain : of a torque.
+    channel : as in `Doubt`. factor : recorded over true value, for a change of scale. gain : of a torque.
     """
 
     channel: str

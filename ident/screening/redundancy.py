@@ -268,7 +268,7 @@ class Redundancy:
     def fit(self, normal: Mapping[Class, _Normal] | None = None, *, doubtful: bool = True) -> Fit:
         """Weighted least squares, each class weighted by its own residual.
 
-        normal : of rows that differ by their `maps` alone. doubtful : whether a torque may be in a wrong unit.
+        normal : of rows with different `maps` only. doubtful : whether a torque may be in a wrong unit.
         """
         normal = self.normal() if normal is None else normal
         chosen = {side: self.map_of(side) for side in self.sides}
@@ -302,10 +302,10 @@ class Redundancy:
         return min(fits, key=lambda fit: fit.score)
 
     def gains(self, fit: Fit, normal: Mapping[Class, _Normal]) -> dict[Class, Gain]:
-        """Gain of each class against the torque that the shared parameters compute for it.
+        """Gain of each class against its torque computed from the shared parameters.
 
         The computed torque z of the class is an added column; its projection on the others is taken off, so the
-        gain comes from what other joints, the other side and other poses say. Standard deviation by blocks of rows.
+        gain comes from the other joints, the other side and other poses. Standard deviation by blocks of rows.
         """
         shared = np.zeros_like(fit.parameters)
         shared[: _BODY * (self.chain.n + len(self.payloads))] = 1.0

@@ -2,11 +2,11 @@
 
 First the channels by themselves (`channels`), then the arm's own redundancy (`redundancy`, `explanations`): the joints
 share their inertial parameters, motor and joint torque differ by a drive, gravity and acceleration act on the same
-masses. What the laws of motion allow comes last: positive inertia, friction that dissipates. The inertia of the URDF
-decides only what the data cannot, and only in orders of magnitude.
+masses. The laws of motion come last: positive inertia, dissipative friction. The inertia of the URDF decides only in
+orders of magnitude, and only questions left open by the data.
 
-The thresholds lie between what true faults and what wrong explanations of healthy data reach; both are printed by
-`python -m benchmarks.wrong_channels`.
+The thresholds lie between the scores of true faults and of wrong explanations of healthy data;
+`python -m benchmarks.wrong_channels` holds them against both.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def screen(
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
     doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
     if any(doubt.certain for doubt in (*doubts, *beyond)):
-        # What is certain bends all that is computed from it.
+        # A certain fault bends everything computed from it.
         return (*doubts, *beyond)
     data = _rows(chosen, chain, signals or SignalSettings(), couplings)
     contradictions = [] if data is None else _contradictions(data, chosen)
@@ -231,7 +231,7 @@ def _inertia(chain: Chain, q: Floats, bodies: Floats) -> Floats:
 
 
 def _physics(data: Redundancy, fit: Fit, normal: Mapping[Class, Any]) -> list[Doubt]:
-    """Inertia that is negative beyond doubt, and gravity of another order than the URDF's."""
+    """Inertia clearly negative, and gravity of another order than the URDF's."""
     n, names = data.chain.n, data.chain.joint_names
     bodies = len(INERTIAL) * n
     rows = np.zeros((n, len(fit.parameters)))
@@ -259,7 +259,7 @@ def _physics(data: Redundancy, fit: Fit, normal: Mapping[Class, Any]) -> list[Do
 
 
 def _nominal(data: Redundancy, fit: Fit) -> list[Doubt]:
-    """Gravity against that of the URDF's bodies, in the joints where both agree but for a factor.
+    """Gravity against the URDF's, in joints with agreement but for a factor.
 
     Bodies of a URDF are often rough or missing; then they do not correlate, and nothing is said.
     """
@@ -279,7 +279,7 @@ def _nominal(data: Redundancy, fit: Fit) -> list[Doubt]:
 
 
 def _gravity_slopes(data: Redundancy, fit: Fit) -> dict[int, float]:
-    """Identified over nominal gravity torque, by joint, where they correlate."""
+    """Identified over nominal gravity torque of joints with correlated torques."""
     try:
         nominal = data.chain.urdf_inertials()
     except LwrError:
@@ -291,7 +291,7 @@ def _gravity_slopes(data: Redundancy, fit: Fit) -> dict[int, float]:
     expected, computed = expected - expected.mean(axis=0), computed - computed.mean(axis=0)
     power, both = np.sum(expected**2, axis=0), np.sum(expected * computed, axis=0)
     size = np.sqrt(power * np.sum(computed**2, axis=0))
-    # Only joints that bear a visible part of the arm.
+    # Only joints bearing a visible part of the arm.
     bearing = np.flatnonzero((power > 1e-4 * power.max()) & (power > 1e-12))
     return {int(j): float(both[j] / power[j]) for j in bearing if abs(both[j]) > _ALIKE * size[j]}
 
