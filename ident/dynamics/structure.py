@@ -97,7 +97,7 @@ class DriveMotion:
     acceleration: Floats
     slip: Floats | None = None
 
-    def at(self, samples: slice | NDArray[np.int64]) -> DriveMotion:
+    def at(self, samples: slice | NDArray[np.bool_] | NDArray[np.int64]) -> DriveMotion:
         """The same at some of the samples."""
         slip = None if self.slip is None else self.slip[samples]
         return DriveMotion(self.speed[samples], self.acceleration[samples], slip)

@@ -41,7 +41,6 @@ from lwr_driver.session import Session, Sessions, as_sessions
 _SAME_ROW = 1e-8
 # Degrees of freedom of a standard deviation counted as known.
 _EXACT = 1e6
-_SAMPLES = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
 
 
 @dataclass(frozen=True)
@@ -407,8 +406,7 @@ def score_controller_model(prepared: PreparedSession, session: Session) -> Sessi
     for passage in prepared.passages:
         picked, _ = _matched(passage.joint.times, times)
         if len(picked) > 1:
-            rows = {key: getattr(passage.joint, key)[picked] for key in _SAMPLES}
-            passages.append(replace(passage, joint=replace(passage.joint, **rows)))
+            passages.append(replace(passage, joint=passage.joint.at(picked)))
     if not passages:
         return None
 

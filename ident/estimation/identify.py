@@ -300,13 +300,12 @@ def identify(
     )
     doubts = require_sound(chosen, chain, settings.signals, settings.couplings)
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
-    conditions = _conditions(structure, chosen, mounted)
-    base = numeric_base(structure, conditions)
+    base = numeric_base(structure, _conditions(structure, chosen, mounted))
     laws = (settings.coulomb, settings.row_coulomb)
     signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, laws)
     rows_structure = replace(structure, coulomb=signals.row_coulomb)
     structure = replace(structure, coulomb=signals.coulomb)
-    base = numeric_base(structure, conditions)
+    base = replace(base, structure=structure)
     settings = replace(
         settings, signals=signals.settings, coulomb=signals.coulomb, row_coulomb=signals.row_coulomb
     )

@@ -7,7 +7,7 @@ or a lost sample spoils few rows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -109,7 +109,7 @@ def observe_bins(
             ):
                 continue
             inside = (channel.times >= passage.rows[0]) & (channel.times <= passage.rows[-1])
-            some = _part(channel, np.flatnonzero(inside))
+            some = channel.at(inside)
             if len(some.times) < 2:
                 continue
             width = max(1, round(bin_s / float(np.median(np.diff(some.times)))))
@@ -132,13 +132,3 @@ def observe_bins(
                 )
             )
     return found
-
-
-def _part(channel: TorqueChannel, samples: NDArray[np.int64]) -> TorqueChannel:
-    """The channel at some of its samples."""
-    whole = len(samples) == len(channel.times)
-    if whole:
-        return channel
-    names = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
-    drive = None if channel.drive is None else channel.drive.at(samples)
-    return replace(channel, **{name: getattr(channel, name)[samples] for name in names}, drive=drive)

@@ -154,10 +154,7 @@ def _side(
 def _difference(joint: TorqueChannel, motor: TorqueChannel) -> TorqueChannel:
     """The motor channel less the joint torque at its own times."""
     start, dt = float(joint.times[0]), float(joint.times[1] - joint.times[0])
-    inside = (motor.times >= start) & (motor.times <= joint.times[-1])
-    drive = None if motor.drive is None else motor.drive.at(np.flatnonzero(inside))
-    names = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
-    kept = replace(motor, **{name: getattr(motor, name)[inside] for name in names}, drive=drive)
+    kept = motor.at((motor.times >= start) & (motor.times <= joint.times[-1]))
     return replace(kept, torque=kept.torque - interpolate_uniform(joint.torque, start, dt, kept.times))
 
 

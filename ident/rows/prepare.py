@@ -47,6 +47,7 @@ logger = logging.getLogger(__name__)
 # Scatter of seven joints over their standard deviations, exceeded once in a thousand healthy sessions, for deviations
 # that are a third too small.
 _DISAGREEMENT = 3.0
+_SAMPLED = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,11 @@ class TorqueChannel:
     flagged: BoolArray
     known: BoolArray
     drive: DriveMotion | None = None
+
+    def at(self, samples: NDArray[np.bool_] | NDArray[np.int64]) -> TorqueChannel:
+        """The channel at some of its samples."""
+        drive = None if self.drive is None else self.drive.at(samples)
+        return replace(self, **{name: getattr(self, name)[samples] for name in _SAMPLED}, drive=drive)
 
 
 @dataclass(frozen=True)
