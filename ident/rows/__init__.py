@@ -10,7 +10,6 @@ from ident.rows.filters import (
     differentiate,
     excitation_frequency,
     low_pass,
-    optimal_cutoff,
 )
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
@@ -37,7 +36,6 @@ __all__ = [
     "excitation_frequency",
     "low_pass",
     "observe",
-    "optimal_cutoff",
     "payload_name",
     "prepare",
     "require",

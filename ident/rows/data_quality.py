@@ -103,12 +103,6 @@ def stale(columns: JointColumns) -> Flags:
     return old
 
 
-def held_times(columns: JointColumns) -> Floats:
-    """Times (k,) [s] from the first sample of the `stale` ones."""
-    old = stale(columns)
-    return (columns.log_time[old] - columns.log_time[0]) * 1e-9
-
-
 def clipped_at(columns: JointColumns) -> Floats:
     """Torque (n,) [Nm] at the limit of each joint's sensor, NaN where the samples show no limit.
 

@@ -1,7 +1,7 @@
 """Signal settings, zero-phase filters and cut-off frequencies, from raw channels to rows of the regression.
 
 The filters are Butterworth forward and back, central differences, and the parallel low-pass to the row rate.
-The spectra of the motion decide the cut-off frequencies.
+The spectrum of the motion gives the excitation, and with it the band of the rows.
 """
 
 from __future__ import annotations
@@ -331,28 +331,6 @@ def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> f
         if cumulative[-1] > 0:
             highest = max(highest, float(frequency[np.searchsorted(cumulative, share * cumulative[-1])]))
     return highest
-
-
-def optimal_cutoff(position: Floats, dt: float, order: int = 4) -> float:
-    """Cut-off [Hz] of the smallest expected square error of the accelerations, from the data.
-
-    position : (n, J). The noise floor of each joint is the median of its spectrum's upper half; the excess
-        over it is the signal S. With the gain |H|^2 = 1 / (1 + (f / fc)^(2 order)) of the forward and backward
-        pass, the error is the sum over f of (2 pi f)^4 [(1 - |H|^2)^2 S + |H|^4 N]; joints are weighted by
-        their signal's power. The answer is bounded to 0.02 to 0.4 of the sampling rate.
-    """
-    rate = 1.0 / dt
-    grid = np.geomspace(0.002 * rate, 0.4 * rate, 240)
-    cost = np.zeros(len(grid))
-    for joint in np.flatnonzero(np.ptp(position, axis=0) > 1e-2):
-        frequency, power = _spectrum(position[:, joint], dt)
-        floor = float(np.median(power[len(power) // 2 :]))
-        signal = np.where(power > 4.0 * floor, power - floor, 0.0)
-        weight = (2.0 * np.pi * frequency) ** 4
-        gain = 1.0 / (1.0 + (frequency[None, :] / grid[:, None]) ** (2 * order))
-        error = (weight * ((1.0 - gain) ** 2 * signal + gain**2 * floor)).sum(axis=1)
-        cost += error / max(float((weight * signal).sum()), 1e-30)
-    return float(grid[int(np.argmin(cost))])
 
 
 def advice(

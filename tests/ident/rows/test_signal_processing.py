@@ -18,7 +18,6 @@ from ident.rows import (
     differentiate,
     excitation_frequency,
     low_pass,
-    optimal_cutoff,
     prepare,
 )
 from ident.rows.filters import interpolate_uniform
@@ -284,15 +283,6 @@ def test_excitation_frequency_is_the_highest_harmonic():
     time = np.arange(0, 60, 0.004)
     _, qd, _ = arm.fourier(time, 10.0, 3)
     assert 0.4 < excitation_frequency(qd, 0.004) < 0.62
-
-
-def test_chosen_cutoff_follows_the_noise():
-    time = np.arange(0, 60, 0.004)
-    q, _, _ = arm.fourier(time, 10.0, 3)
-    random = np.random.default_rng(0)
-    quiet = optimal_cutoff(q + 1e-6 * random.normal(size=q.shape), 0.004)
-    noisy = optimal_cutoff(q + 1e-3 * random.normal(size=q.shape), 0.004)
-    assert 0.6 < noisy < quiet < 30.0
 
 
 @pytest.mark.parametrize(
