@@ -26,6 +26,7 @@ from ident.import_log import LogMapping, import_log
 from ident.import_log.mapping import Signal, TimeBase
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import differentiate, low_pass
+from ident.rows.sample_clock import sample_clock
 from lwr_driver.configuration import find
 from lwr_driver.session import Session, read_session
 
@@ -120,6 +121,9 @@ def low_passed_error(model: DynamicModel, session: Session, band_hz: float) -> f
     joint = session.joint
     times = 1e-9 * (joint.log_time - joint.log_time[0]).astype(np.float64)
     fresh = np.append(True, np.diff(times) > 0.0)
+    clock = sample_clock(times, joint.position)
+    if clock is not None:
+        times, fresh = clock.times, ~clock.repeated
     dt = float(np.median(np.diff(times[fresh])))
     even = np.arange(times[-1], step=dt)
     chosen = session.select(model.structure.chain.joint_names).joint

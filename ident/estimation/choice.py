@@ -1,12 +1,15 @@
 """Choice of the estimator by what it predicts: the torque of parts of the training motion held back.
 
 Candidates are weighted least squares, and physically consistent bodies with the inertials of the URDF as prior: as
-stated, and with looser standard deviations. Each is scored with the base upright and leaning.
+stated, and with looser standard deviations. Each is scored with the base upright and leaning, and the best of them
+with a gain for the joint torque sensors.
 
 **Choice.** The squared error over the squared torque counts, over all joints and parts (`ident.estimation.parts`);
-motor and joint side count alike. Among the candidates within one standard error of the best (Breiman et al. 1984), or
-within one percent of it, the one with the most prior knowledge wins: prior as stated before looser ones before least
-squares, upright before leaning. Deviations of the prior are loosened as long as the error falls.
+motor and joint side count alike. Deviations of the prior are loosened as long as the error falls by a percent. Every
+further freedom has to pay by more than one standard error of the difference (Breiman et al. 1984): a leaning base,
+least squares in place of the prior. A tilt beyond chance (p < 0.001 for an upright base) has to pay at all. Gains of
+sensors pay by two standard errors; only those beyond two standard deviations are free.
+An arm with gains is identified from the torques divided by them, and its model states them as effects.
 
 Normal equations of each part are made once, so a linear candidate costs a solution a part, a physical one a conic
 program.
@@ -15,17 +18,19 @@ program.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
+from ident.effects.channel import SensorGain
 from ident.estimation.identify import Identification, IdentificationSettings, estimator_factory, identify
 from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
 from ident.estimation.parts import beside, held_back_parts
@@ -36,17 +41,21 @@ from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
 from ident.rows.filters import half_width
-from lwr_driver.session import Sessions, as_sessions
+from lwr_driver.session import Session, Sessions, as_sessions
 
 _SCALES = (1.0, 10.0, 100.0)
 _TILT_STD_RAD = float(np.deg2rad(2.0))
 _GAIN_STD = 0.05
+# Standard errors and deviations that a sensor's gain has to exceed: a claim about the robot, beyond a better fit.
+_GAIN_SURE = 2.0
+# Largest probability of an upright base behind so large a tilt, for a tilt beyond chance.
+_UPRIGHT = 1e-3
 # Errors this close to one another count as equal, and so much of a joint's torque as nothing.
 _ALIKE = 0.01
 _PLAIN = CovarianceSettings(kind="textbook")
 
-Kind = tuple[str, float | None, bool]
-"""Estimator, factor on the variance of the prior, leaning base."""
+Kind = tuple[str, float | None, bool, tuple[int, ...]]
+"""Estimator, factor on the variance of the prior, leaning base, sensors with a gain."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +63,8 @@ class Candidate:
     """An estimator with its error on held-back parts.
 
     estimator : "wls" or "physical". prior_scale : factor on the variance of the prior, None without one.
-    tilt : whether the base leans. held_back_percent : rms of the error over rms of the torque [%], over all joints of
-    a side; for two sides the root mean square of both.
+    tilt : whether the base leans. gains : joints with a gain of the torque sensor. held_back_percent : rms of the
+    error over rms of the torque [%], over all joints of a side; for two sides the root mean square of both.
     by_joint_percent : the same by joint and side. excess, excess_std : difference of the squared error to the best
     candidate's, over the squared torque, and its standard error over the parts.
     """
@@ -63,6 +72,7 @@ class Candidate:
     estimator: str
     prior_scale: float | None
     tilt: bool
+    gains: tuple[str, ...]
     held_back_percent: float
     by_joint_percent: dict[str, float]
     excess: float = 0.0
@@ -73,7 +83,8 @@ class Candidate:
         """The candidate in words."""
         loose = 1.0 if self.prior_scale is None else float(np.sqrt(self.prior_scale))
         text = self.estimator + ("" if loose == 1.0 else f", prior's deviations x {loose:.3g}")
-        return text + (", base leaning" if self.tilt else "")
+        text += ", base leaning" if self.tilt else ""
+        return text + (f", sensor gain of {', '.join(self.gains)}" if self.gains else "")
 
 
 @dataclass(frozen=True)
@@ -83,6 +94,7 @@ class Choice(Tabular):
     candidates : in the order of preference. chosen : number of the winner. parts, block_s : of the held-back rows.
     excluded : candidates that the data do not permit, with the reason. disagreement : between the URDF's inertials
     and the data. advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
+    gains : error of the joint torque sensor's scale by joint, value and standard deviation, if the winner has some.
     used : the estimator taken instead of the winner; empty for the winner itself.
     """
 
@@ -94,6 +106,7 @@ class Choice(Tabular):
     disagreement: Disagreement | None = None
     advice: tuple[str, ...] = ()
     mounting: Mounting | None = None
+    gains: dict[str, tuple[float, float]] = field(default_factory=dict)
     used: str = ""
 
     @property
@@ -122,6 +135,7 @@ class Choice(Tabular):
             "prior_disagreement": None if self.disagreement is None else self.disagreement.to_dict(),
             "advice": list(self.advice),
             "mounting": None if self.mounting is None else self.mounting.to_dict(),
+            "sensor_gains": {joint: {"error": e, "std": s} for joint, (e, s) in self.gains.items()},
         }
 
     def __repr__(self) -> str:
@@ -146,6 +160,12 @@ class Choice(Tabular):
             lines.append(f"  {self.disagreement}")
         if self.mounting is not None:
             lines.append(f"  {self.mounting}")
+        if self.gains:
+            listed = ", ".join(f"{j} {100 * e:+.1f} ± {100 * s:.1f} %" for j, (e, s) in self.gains.items())
+            lines.append(
+                f"  joint torque sensors read too much by: {listed}; the model states it as an effect, and "
+                "`lwr-run diagnose` tells a gain from its look-alikes"
+            )
         return "\n".join(lines)
 
 
@@ -171,12 +191,35 @@ def choose(
     options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
     settled = replace(first.settings, estimator=settings.estimator, essential=settings.essential)
     final = replace(settled, estimator=estimator_factory(winner.estimator, **options))
+    sessions = [_calibrated(session, choice.gains) for session in sessions]
     if winner.tilt:
         mounting = find_mounting(sessions, chain, final)
         found, choice = mounting.identification, replace(choice, mounting=mounting)
     else:
         found = identify(sessions, chain, final)
-    return replace(found, settings=settled, choice=choice, signal_reasons=first.signal_reasons)
+    effects = tuple(_entry(chain, joint, *gain) for joint, gain in choice.gains.items())
+    return replace(
+        found, settings=settled, choice=choice, signal_reasons=first.signal_reasons, effects=effects
+    )
+
+
+def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> Session:
+    """The session with the joint torques that sensors without these errors of scale would have read."""
+    scale = [1.0 + gains[name][0] if name in gains else 1.0 for name in session.joint.names]
+    if not gains or not session.joint.effort.shape[1]:
+        return session
+    return replace(session, joint=replace(session.joint, effort=session.joint.effort / np.array(scale)))
+
+
+def _entry(chain: Chain, joint: str, error: float, std: float) -> dict[str, Any]:
+    """The gain as an entry of a model's effects."""
+    effect = SensorGain()
+    return {
+        "cause": effect.cause,
+        "side": effect.side,
+        "joints": [chain.joint_names.index(joint) + 1],
+        "parameters": {"error": {"value": error, "std": std, "unit": "1"}},
+    }
 
 
 def compared(
@@ -198,14 +241,15 @@ def compared(
 class _Comparison:
     """Normal equations of the held-back parts: the parameters, two of the tilt, one gain a joint, the torque.
 
-    total : (classes, q, q) of all rows. held : (parts, classes, q, q) of the rows of a part. near : the same with the
-    rows beside them, missing in the training.
+    gains : columns of the gains of `joints`. total : (classes, q, q) of all rows. held : (parts, classes, q, q) of the
+    rows of a part. near : the same with the rows beside them, missing in the training.
     """
 
     problem: Problem
     leaning: Problem | None
     bodies: BodyPrior | None
     gains: NDArray[np.int64]
+    joints: tuple[str, ...]
     total: Floats
     held: Floats
     near: Floats
@@ -251,6 +295,7 @@ class _Comparison:
             None if lean is None else with_tilt(problem, lean),
             bodies,
             np.arange(len(values) + 2, len(values) + extra),
+            tuple(joints),
             total,
             held,
             near,
@@ -269,7 +314,7 @@ class _Comparison:
         advice = list(self._placeholder())
         if len(self.held) < 2:
             unknown = Candidate(
-                "physical" if bodies else "wls", 1.0 if bodies else None, tilted[0], math.nan, {}
+                "physical" if bodies else "wls", 1.0 if bodies else None, tilted[0], (), math.nan, {}
             )
             text = f"not compared: the motion is too short for parts of {self.block_s:.1f} s to be held back"
             return Choice((unknown,), 0, 0, self.block_s, excluded, self._disagreement(), (text, *advice))
@@ -277,32 +322,34 @@ class _Comparison:
         for tilt in tilted if bodies else ():
             for scale in _SCALES:
                 try:
-                    found["physical", scale, tilt] = self._errors("physical", scale, tilt)
+                    found["physical", scale, tilt, ()] = self._errors(("physical", scale, tilt, ()))
                 except DataError as error:
                     excluded = (*excluded, f"physical: {error}")
                     break
-                before = found.get(("physical", 0.1 * scale, tilt))
-                if (
-                    before is not None
-                    and self._share(before).sum() < self._share(found["physical", scale, tilt]).sum()
-                ):
+                before = found.get(("physical", 0.1 * scale, tilt, ()))
+                if before is not None and not self._pays(before, found["physical", scale, tilt, ()], 0.0):
                     break
         if self.full_rank:
-            found |= {("wls", None, tilt): self._errors("wls", None, tilt) for tilt in tilted}
-        kinds = sorted(found, key=lambda kind: (math.inf if kind[1] is None else kind[1], kind[2]))
+            found |= {kind: self._errors(kind) for tilt in tilted for kind in [("wls", None, tilt, ())]}
+        chosen = self._preferred(found)
+        gains = self._gains_of(chosen)
+        if gains:
+            wide: Kind = (*chosen[:3], gains)
+            found[wide] = self._errors(wide)
+            if self._pays(found[chosen], found[wide], _GAIN_SURE):
+                chosen = wide
+        kinds = sorted(found, key=lambda kind: (math.inf if kind[1] is None else kind[1], kind[2:]))
         squares = np.array([found[kind] for kind in kinds])
         share = np.array([self._share(square) for square in squares])
-        best = int(np.argmin(share.sum(axis=1)))
-        excess, std = _paired(share - share[best])
-        alike = ((1.0 + _ALIKE) ** 2 - 1.0) * share[best].sum()
-        chosen = next(k for k in range(len(kinds)) if excess[k] <= max(std[k], alike))
+        excess, std = _paired(share - share[np.argmin(share.sum(axis=1))])
         labels = [c.label for c in self.problem.classes]
         torque = self.held[:, :, -1, -1].sum(axis=0)
         joint = 100.0 * np.sqrt(squares.sum(axis=1) / np.maximum(torque, 1e-300))
         whole = 100.0 * np.sqrt(share.sum(axis=1))
         candidates = tuple(
             Candidate(
-                *kind,
+                *kind[:3],
+                tuple(self.joints[g] for g in kind[3]),
                 float(whole[k]),
                 dict(zip(labels, joint[k].tolist(), strict=True)),
                 float(excess[k]),
@@ -310,11 +357,36 @@ class _Comparison:
             )
             for k, kind in enumerate(kinds)
         )
-        advice += self._worse_joints(candidates, squares, chosen)
-        advice += self._gain_advice(kinds[chosen])
+        place = kinds.index(chosen)
+        advice += self._worse_joints(candidates, squares, place)
+        stated = zip(chosen[3], *self._gains(chosen), strict=True) if chosen[3] else ()
         return Choice(
-            candidates, chosen, len(self.held), self.block_s, excluded, self._disagreement(), tuple(advice)
-        )
+            candidates, place, len(self.held), self.block_s, excluded, self._disagreement(), tuple(advice),
+            gains={self.joints[g]: (float(value), float(std)) for g, value, std in stated},
+        )  # fmt: skip
+
+    def _preferred(self, found: Mapping[Kind, Floats]) -> Kind:
+        """The candidate whose freedoms all pay: prior before least squares, upright before leaning base."""
+        chosen: Kind | None = None
+        for family in dict.fromkeys((kind[0], kind[2]) for kind in found):
+            best: Kind | None = None
+            for kind in found:
+                if (kind[0], kind[2]) == family and (
+                    best is None or self._pays(found[best], found[kind], 0.0)
+                ):
+                    best = kind
+            assert best is not None
+            real = chosen is not None and best[2] > chosen[2] and self._leans(best)
+            if chosen is None or self._pays(found[chosen], found[best], 0.0 if real else 1.0):
+                chosen = best
+        assert chosen is not None
+        return chosen
+
+    def _pays(self, before: Floats, after: Floats, sure: float) -> bool:
+        """Whether squared errors (parts, classes) fall by a percent and by `sure` standard errors."""
+        gain, std = _paired((self._share(before) - self._share(after))[None])
+        alike = (1.0 - (1.0 - _ALIKE) ** 2) * self._share(before).sum()
+        return bool(gain[0] > max(sure * std[0], alike))
 
     def _share(self, squares: Floats) -> Floats:
         """Squared error of each part (parts,) over the squared torque of a side, mean of the sides."""
@@ -324,19 +396,56 @@ class _Comparison:
         part: Floats = (squares / np.maximum(total, 1e-300)).sum(axis=1) / len(set(sides))
         return part
 
-    def _errors(self, estimator: str, scale: float | None, tilt: bool) -> Floats:
+    def _errors(self, kind: Kind) -> Floats:
         """Squared error (parts, classes) [Nm^2] of a candidate on each part, estimated without it."""
+        used, weights, prior = self._estimation(kind)
+        return self._scores(used, weights, prior, kind[1] if kind[0] == "physical" else None)
+
+    def _estimation(self, kind: Kind) -> tuple[NDArray[np.int64], Floats, Prior]:
+        """A candidate's columns, weights (classes,) and prior."""
+        estimator, scale, tilt, gains = kind
         p = len(self.problem.names)
-        used = np.arange(p + 2 * tilt)
+        inner = p + 2 * tilt
+        used = np.append(np.arange(inner), self.gains[list(gains)])
+        mean, precision = np.zeros(len(used)), np.zeros((len(used),) * 2)
         problem = self.leaning if tilt and self.leaning is not None else self.problem
-        if estimator == "wls":
-            free = Prior(np.zeros(len(used)), np.zeros((len(used),) * 2))
+        if estimator == "wls" or scale is None:
             weights = WeightedLeastSquares(_PLAIN).fit(problem).weights
-            return self._scores(used, weights, free)
-        prior = self._prior(2 * tilt, _TILT_STD_RAD, problem)
-        scale = 1.0 if scale is None else scale
-        fit = MaximumAPosteriori(prior, scale, _PLAIN).fit(problem)
-        return self._scores(used, _tempered(problem, fit), _scaled(prior, scale), scale)
+        else:
+            arm = self._prior(2 * tilt, _TILT_STD_RAD, problem)
+            weights = _tempered(problem, MaximumAPosteriori(arm, scale, _PLAIN).fit(problem))
+            mean[:inner], precision[:inner, :inner] = arm.mean, arm.precision / scale
+        precision[range(inner, len(used)), range(inner, len(used))] = _GAIN_STD**-2
+        return used, weights, Prior(mean, precision)
+
+    def _solved(self, kind: Kind) -> tuple[Floats, Floats]:
+        """Values (k,) and covariance (k, k) of a candidate from all rows."""
+        used, weights, prior = self._estimation(kind)
+        inner = np.ix_(*[np.append(used, self.total.shape[-1] - 1)] * 2)
+        normal = np.einsum("c,cij->ij", weights, self.total)[inner]
+        covariance = np.linalg.pinv(normal[:-1, :-1] + prior.precision, hermitian=True)
+        return _solution(normal, prior), covariance
+
+    def _leans(self, kind: Kind) -> bool:
+        """Whether the tilt of a candidate is beyond chance."""
+        values, covariance = self._solved(kind)
+        place = slice(len(self.problem.names), len(self.problem.names) + 2)
+        tilt = values[place]
+        square = float(tilt @ np.linalg.solve(covariance[place, place], tilt))
+        return bool(chi2.sf(square, 2) < _UPRIGHT)
+
+    def _gains(self, kind: Kind) -> tuple[Floats, Floats]:
+        """Errors of the sensors' scale of a candidate from all rows, and their standard deviations."""
+        values, covariance = self._solved(kind)
+        count = len(kind[3])
+        return values[-count:], np.sqrt(np.diag(covariance))[-count:]
+
+    def _gains_of(self, kind: Kind) -> tuple[int, ...]:
+        """Sensors with an error of scale beyond chance, beside all others; none with a single sensor."""
+        if len(self.joints) < 2:
+            return ()
+        value, std = self._gains((*kind[:3], tuple(range(len(self.joints)))))
+        return tuple(np.flatnonzero(np.abs(value) > _GAIN_SURE * std).tolist())
 
     def _scores(
         self, used: NDArray[np.int64], weights: Floats, prior: Prior, physical: float | None = None
@@ -403,7 +512,7 @@ class _Comparison:
         """Joints that the winner predicts worse than least squares, beyond two standard errors."""
         mine = candidates[chosen]
         for k, other in enumerate(candidates):
-            if other.estimator != "wls" or other.tilt != mine.tilt or k == chosen:
+            if other.estimator != "wls" or (other.tilt, other.gains) != (mine.tilt, ()) or k == chosen:
                 continue
             excess, std = _paired((squares[chosen] - squares[k]).T)
             worse = [
@@ -418,42 +527,6 @@ class _Comparison:
                     for label in worse
                 )
                 yield f"least squares predicts single joints better than the chosen estimator: {listed}"
-
-    def _gain_advice(self, kind: Kind) -> Iterator[str]:
-        """Whether a gain of each joint torque sensor would help the prediction, by more than two standard errors."""
-        estimator, scale, tilt = kind
-        if self.bodies is None or estimator != "physical" or not len(self.gains):
-            return
-        scale = 1.0 if scale is None else scale
-        p = len(self.problem.names)
-        used = np.arange(p + 2 * tilt)
-        problem = self.leaning if tilt and self.leaning is not None else self.problem
-        plain = self._prior(2 * tilt, _TILT_STD_RAD, problem)
-        weights = _tempered(problem, MaximumAPosteriori(plain, scale, _PLAIN).fit(problem))
-        size = len(used) + len(self.gains)
-        precision = np.diag(np.full(size, _GAIN_STD**-2))
-        precision[: len(used), : len(used)] = plain.precision / scale
-        wide = Prior(np.append(plain.mean, np.zeros(len(self.gains))), precision)
-        columns = np.append(used, self.gains)
-        before = self._share(self._scores(used, weights, _scaled(plain, scale)))
-        after = self._share(self._scores(columns, weights, wide))
-        excess, std = _paired((before - after)[None])
-        if excess[0] <= 2.0 * std[0]:
-            return
-        inner = np.ix_(
-            np.append(columns, self.total.shape[-1] - 1), np.append(columns, self.total.shape[-1] - 1)
-        )
-        normal = np.einsum("c,cij->ij", weights, self.total)[inner]
-        gains = _solution(normal, wide)[-len(self.gains) :]
-        spread = np.sqrt(np.diag(np.linalg.inv(normal[:-1, :-1] + wide.precision))[-len(self.gains) :])
-        joints = list(dict.fromkeys(group.joint for group in self.problem.groups if group.side == "joint"))
-        worst = int(np.argmax(np.abs(gains) / spread))
-        yield (
-            f"with a gain for each joint torque sensor the held-back error would fall from "
-            f"{100 * np.sqrt(before.sum()):.2f} to {100 * np.sqrt(after.sum()):.2f} % "
-            f"({joints[worst]} reads {100 * gains[worst]:+.1f} ± {100 * spread[worst]:.1f} %); `lwr-run diagnose` "
-            "decides between a gain and its look-alikes, and writes a model with it"
-        )
 
 
 def _paired(difference: Floats) -> tuple[Floats, Floats]:
@@ -471,10 +544,6 @@ def _solution(normal: Floats, prior: Prior) -> Floats:
     scale = np.where(scale > 0.0, scale, 1.0)
     solution: Floats = np.linalg.lstsq(left / np.outer(scale, scale), right / scale, rcond=1e-12)[0] / scale
     return solution
-
-
-def _scaled(prior: Prior, scale: float) -> Prior:
-    return replace(prior, precision=prior.precision / scale)
 
 
 def _tempered(problem: Problem, fit: Estimate) -> Floats:

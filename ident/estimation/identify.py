@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -92,7 +92,7 @@ class Identification(Tabular):
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
     warnings : sentences for the report. choice : of the estimator, with "auto". signal_reasons : why the signal
-    settings are as they are, where the data chose them.
+    settings are as they are, where the data chose them. effects : of the model beside its parameters (sensor gains).
     """
 
     settings: IdentificationSettings
@@ -110,6 +110,7 @@ class Identification(Tabular):
     warnings: tuple[str, ...]
     signal_reasons: tuple[str, ...] = ()
     choice: Choice | None = None
+    effects: tuple[Mapping[str, Any], ...] = ()
 
     @cached_property
     def model(self) -> DynamicModel:
@@ -142,7 +143,10 @@ class Identification(Tabular):
         if self.choice is not None:
             provenance["choice"] = self.choice.to_dict()
         matrix = found.covariance.matrix
-        return DynamicModel(self.robot, self.structure, names, found.values, matrix, self.base, provenance)
+        base = self.base
+        return DynamicModel(
+            self.robot, self.structure, names, found.values, matrix, base, provenance, self.effects
+        )
 
     @property
     def counts(self) -> dict[str, int]:
@@ -181,6 +185,7 @@ class Identification(Tabular):
                     "lost_samples": session.counts["lost"],
                     "motor_delay_s": session.delay.seconds if session.delay is not None else None,
                     "motor_delay_std_s": session.delay.std if session.delay is not None else None,
+                    "stamp_jitter_s": session.jitter_s,
                     "excitation_hz": session.excitation_hz,
                     "cutoff_hz": session.cutoff_hz,
                 }
@@ -234,6 +239,11 @@ class Identification(Tabular):
                 f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
                 f"{session.counts['lost']} samples lost{delay}"
             )
+            if session.jitter_s is not None:
+                lines.append(
+                    f"{session.name}: stamps jitter by {1e3 * session.jitter_s:.2g} ms rms about an even sample time; "
+                    f"times counted by the motion, {session.counts['stale']} repeated samples left out"
+                )
         lines += self.signal_reasons
         lines.append(
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"

@@ -32,6 +32,7 @@ from ident.rows.filters import (
     thinning,
 )
 from ident.rows.reversals import away_from_reversals
+from ident.rows.sample_clock import sample_clock
 from ident.rows.timebase import (
     Stretch,
     flag_outliers,
@@ -99,6 +100,7 @@ class PreparedSession:
     delay : of the motor channel, None without one. counts : lost samples, outliers, dropped rows.
     moving : moving joints. warnings : sentences for the report. uid : of the session, from its metadata.
     mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
+    jitter_s : rms of the stamps about the counted times [s] (`sample_clock`), None where the stamps stand.
     """
 
     name: str
@@ -116,6 +118,7 @@ class PreparedSession:
     warnings: tuple[str, ...]
     uid: str = ""
     mean_torque: tuple[float, ...] = ()
+    jitter_s: float | None = None
 
     def __repr__(self) -> str:
         return (
@@ -152,8 +155,10 @@ def prepare(
     name = session.path.name
     _check_finite(session.joint, name)
     origin = int(clock_ns(session.joint)[0])
-    times = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
+    stamps = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
     position, effort = session.joint.position, session.joint.effort
+    clock = sample_clock(stamps, position)
+    times = stamps if clock is None else clock.times
     sensed = bool(effort.shape[1])
     if not sensed:
         if not motor or session.motor is None:
@@ -176,7 +181,7 @@ def prepare(
             f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone does "
             "not show inertia and friction"
         )
-    old = stale(session.joint)
+    old = stale(session.joint) if clock is None else clock.repeated
     bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
     parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
     if not parts:
@@ -191,6 +196,8 @@ def prepare(
     motor_data = (
         _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
     )
+    if motor_data is not None and clock is not None:
+        motor_data = (clock.at(motor_data[0], stamps), *motor_data[1:])
     delay = None
     if motor_data is not None:
         delay = _delay(motor_data, motions, session.joint_names, settings, sensed)
@@ -259,6 +266,7 @@ def prepare(
         warnings=tuple(warnings),
         uid=session.metadata.get("uid", ""),
         mean_torque=_mean_torque(passages) if sensed else (),
+        jitter_s=None if clock is None else clock.jitter_s,
     )
 
 
