@@ -17,8 +17,9 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.nominal import Nominal, NominalArm
+from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
-from ident.diagnosis.reference import DELAY_STD_S, Reference
+from ident.diagnosis.reference import DELAY_STD_S, Reference, habit
 from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
@@ -43,7 +44,6 @@ _CLEAR = 3.0
 _SETTLING = 2
 _TUNING_SETS = 3
 _ROUNDS = 3
-_ENOUGH = 3
 _LATEST_S = 0.02
 _CHANNELS = ("motor", "joint")
 _USUAL_DAYS = 4
@@ -158,12 +158,13 @@ def with_far_presliding(arm: NominalArm, days: Sequence[SlowTurns], coulomb: Seq
 class _Day:
     """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of the
     drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels beyond the arm's, with standard
-    deviation, by side [s].
+    deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm].
     """
 
     values: Floats
     covariance: Floats
     sigma: Mapping[str, Floats]
+    torque_rms: Mapping[str, Floats]
     coulomb: Floats
     slow_turns: SlowTurns
     late: Mapping[str, tuple[float, float]]
@@ -230,9 +231,10 @@ def commission(
     null: dict[tuple[str, int], float] = {}
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
-        rest = _reference(others, base, known, robot, parts[0], {}) if len(others) >= _ENOUGH - 1 else None
+        rest = _reference(others, base, known, robot, parts[0], {}) if others else None
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
-        for key, gain in gains(bench.dictionary, bench.evidence, settings).items():
+        own = gains(bench.dictionary, bench.evidence, settings)
+        for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
             null[key] = null.get(key, 0.0) + gain / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))
     found = _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
@@ -297,6 +299,7 @@ def _day(
         evidence.full.values[:p].copy(),
         evidence.covariance()[:p, :p],
         evidence.sigma,
+        {side: np.sqrt(np.mean(rows.target**2, axis=0)) for side, rows in bench.nominal.rows.items()},
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
         {side: mean_delay(nuisance, side) for side in _CHANNELS},
@@ -316,11 +319,10 @@ def _reference(
     pulls = [p @ day.values for p, day in zip(precisions, days, strict=True)]
     values: Floats = within @ np.sum(pulls, axis=0)
     covariance: Floats = np.asarray(within, dtype=np.float64)
-    if len(days) >= _ENOUGH:
-        scatter = np.var([day.values for day in days], axis=0, ddof=1)
-        expected = np.mean([np.diag(day.covariance) for day in days], axis=0)
-        # Scatter beyond each day's own uncertainty is the arm's own change.
-        covariance = covariance + np.diag(np.maximum(scatter - 0.7 * expected, 0.0))
+    rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in days[0].torque_rms}
+    changes = habit(base.names, [day.values for day in days], [day.covariance for day in days], rms)
+    # A further day differs from the mean of these.
+    covariance = covariance + np.diag(changes * (1.0 + 1.0 / len(days)))
     model = DynamicModel(
         robot or "arm",
         base.structure,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,16 +11,17 @@ import numpy as np
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
 from ident.diagnosis.evidence import Floats, Key, Rows
-from ident.diagnosis.held_out import HeldOut, fall, held_out, interval
+from ident.diagnosis.held_out import HeldOut, fall, held_out, interval, spread_out, worse_rows
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions, model_form_error
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import DELAY_STD_S, Reference
-from ident.diagnosis.result import Diagnosis, Evident, Finding, RowStates, Unexplained, Value
+from ident.diagnosis.result import Diagnosis, Evident, Finding, Nameless, RowStates, Unexplained, Value
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import Baseline, State, Task
-from ident.effects import LOST_SAMPLES
+from ident.diagnosis.wear import wear
+from ident.effects import EFFECTS, LOST_SAMPLES, NAMELESS
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.data_quality import SampleLoss, sample_loss
@@ -35,6 +36,8 @@ _OPEN, _TO_SPARE = 0.7, 2.0
 _ALL_BUT = 0.05
 # Largest share of a claim's gain replaceable by unnamed functions of other variables.
 _ENCOMPASSED = 0.8
+# Least fall of the error on held-out rows by a sure claim, as a share: less is felt by nobody.
+_FELT = 0.05
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
 _EXCITED = 0.1
 
@@ -46,36 +49,59 @@ def conclude(task: Task, state: State) -> Diagnosis:
     baseline = state.baseline if state.timing else None
     baseline = baseline or Baseline.of(bench, nuisance)
     kept = _confirmed_findings(task, state)
-    claims = [claim for claim, _ in kept]
-    fixed = [*(c.trial.rows for c in claims), *nuisance]
-    after = held_out(evidence, fixed)
-    remainders = find_remainders(bench.dictionary, evidence, settings)
+    evidence.replace([*(c.trial.rows for c, _ in kept), *nuisance])
+    remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     findings = _doubted(task, state, kept, remainders)
-    evidence.replace(fixed)
-    findings += state.timing
+    worn = []
+    if task.reference is not None:
+        shown = held_out(evidence, [*(c.trial.rows for c, _ in kept), *nuisance])
+        worn = wear(bench, task.reference, shown)
+    members = [
+        _Member((claim.trial.rows,), claim.gain, finding=finding)
+        for (claim, _), finding in zip(kept, findings, strict=True)
+        # A change between sessions has no value in a further one.
+        if finding.mode != "between"
+    ]
+    members += [
+        _Member(tuple(dict.fromkeys([(r.side, r.joint - 1)], t.column) for t in r.terms), r.gain, remainder=r)
+        for r in remainders
+        if r.terms
+    ]
+    members, after = _extension(bench, baseline, members, nuisance, settings.seed)
+    findings += [*state.timing, *worn]
     loss = sample_loss(list(task.sessions))
     if loss:
         findings.append(_loss_finding(loss[0]))
     findings.sort(key=lambda f: -f.gain)
+    shipped = [m.finding for m in members if m.finding is not None]
+    nameless = _nameless(bench, members, nuisance, after, settings.seed)
     before, after = baseline.held.where(after), after.where(baseline.held)
     extended_rms = after.rms()
-    base_model, extended, changes = _models(task, bench, baseline, findings)
-    nameless = [*_stuck(nominal), *((r.side, r.joint, r.depends_on) for r in remainders)]
+    entries = [_entry(f) for f in findings if f in shipped or f in state.timing]
+    base_model, extended, changes = _models(
+        task, bench, baseline, (*entries, *(e for term in nameless for e in term.entries))
+    )
+    fitted = {(term.side, term.joint) for term in nameless}
+    left = [(r.side, r.joint, r.depends_on) for r in remainders if (r.side, r.joint) not in fitted]
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
     if task.simulate is not None:
         simulation = task.simulate(task.model or base_model, replayed)
-        extended_simulation = task.simulate(extended, replayed) if findings else simulation
+        extended_simulation = task.simulate(extended, replayed) if extended.effects else simulation
+    is_character = {id(f): task.reference is None and EFFECTS[f.cause].character for f in findings}
     return Diagnosis(
         train=tuple(r.name for r in nominal.recordings if not r.test),
         test=tuple(r.name for r in nominal.recordings if r.test),
         model_number=nominal.structure.model,
-        findings=tuple(findings),
+        findings=tuple(f for f in findings if not is_character[id(f)]),
+        character=tuple(f for f in findings if is_character[id(f)]),
+        nameless=nameless,
+        extension=tuple(_title(entry) for entry in extended.effects),
         unexplained=tuple(
             Unexplained(
                 side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])
             )
-            for side, j, variables in nameless
+            for side, j, variables in (*_stuck(nominal), *left)
         ),
         noise_floor=evidence.floor,
         rms_base=before.rms(),
@@ -93,6 +119,86 @@ def conclude(task: Task, state: State) -> Diagnosis:
     )
 
 
+# ---- the extension ----
+
+
+@dataclass(frozen=True, eq=False)
+class _Member:
+    """A claim or a remainder of the extended model: its columns and gain."""
+
+    rows: tuple[Rows, ...]
+    gain: float
+    finding: Finding | None = None
+    remainder: Remainder | None = None
+
+
+def _extension(
+    bench: DiagnosisBench, baseline: Baseline, members: list[_Member], nuisance: Sequence[Rows], seed: int
+) -> tuple[list[_Member], HeldOut]:
+    """The members that leave no row worse than the base model beyond chance, and the held-out rows with them.
+
+    Of those acting on a worse row the one of least gain goes first, remainders before claims; then the rest is
+    measured again. The columns of the evidence are those of the result.
+    """
+    while True:
+        after = held_out(bench.evidence, [*(rows for m in members for rows in m.rows), *nuisance])
+        worse = set(worse_rows(baseline.held.where(after), after.where(baseline.held), seed))
+        if not worse or not members:
+            return members, after
+        acting = [m for m in members if any(worse & set(rows) for rows in m.rows)] or members
+        out = min(acting, key=lambda m: (m.finding is not None, m.gain))
+        members = [m for m in members if m is not out]
+
+
+def _nameless(
+    bench: DiagnosisBench, members: Sequence[_Member], nuisance: Sequence[Rows], after: HeldOut, seed: int
+) -> tuple[Nameless, ...]:
+    """The nameless terms of an extension, their functions scaled as in the common fit."""
+    evidence, found = bench.evidence, []
+    values = evidence.full.values[evidence.base_count :].copy()
+    place = 0
+    scales = {}
+    for member in members:
+        widths = [next(iter(rows.values())).shape[1] for rows in member.rows]
+        scales[id(member)] = values[place : place + sum(widths)]
+        place += sum(widths)
+    for member in members:
+        remainder = member.remainder
+        if remainder is None:
+            continue
+        others = [rows for m in members if m is not member for rows in m.rows]
+        key = (remainder.side, remainder.joint - 1)
+        without = held_out(evidence, [*others, *nuisance])
+        before, rms, low, high = interval(without, after, [key], seed)
+        cause, side = NAMELESS[remainder.side].cause, remainder.side
+        entries = tuple(
+            {
+                "cause": cause,
+                "side": side,
+                "joints": [remainder.joint],
+                "form": term.form,
+                "parameters": {
+                    **{
+                        f"value_{k + 1}": {"value": float(c * v), "std": float(abs(c) * s), "unit": "Nm"}
+                        for k, (v, s) in enumerate(zip(term.values, term.std, strict=True))
+                    },
+                    "low": {"value": term.low, "std": 0.0, "unit": "SI"},
+                    "high": {"value": term.high, "std": 0.0, "unit": "SI"},
+                },
+            }
+            for c, term in zip(scales[id(member)], remainder.terms, strict=True)
+        )
+        found.append(Nameless(side, remainder.joint, remainder.depends_on, entries, before, rms, (low, high)))
+    evidence.replace([*(rows for m in members for rows in m.rows), *nuisance])
+    return tuple(found)
+
+
+def _title(entry: Mapping[str, Any]) -> str:
+    """An entry of the extended model in short: the cause and its joints."""
+    joints = ", ".join(map(str, entry["joints"]))
+    return f"{entry['cause']}({joints})" if joints else str(entry["cause"])
+
+
 # ---- confirmation by held-out rows ----
 
 
@@ -108,9 +214,25 @@ def _confirmed_findings(task: Task, state: State) -> list[tuple[Claim, Finding]]
         finding = _finding(claim, bench, without, after, seed)
         weights = {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
         most = _confirmed(claim, finding, bench, fall(without, after, weights, seed))
+        if most > 0.0 and not _felt(claim, finding, without, after, seed):
+            most = min(most, _OPEN)
         if most > 0.0:
             kept.append((claim, _at_most(most, finding)))
     return kept
+
+
+def _felt(claim: Claim, finding: Finding, without: HeldOut, after: HeldOut, seed: int) -> bool:
+    """Whether held-out rows show a claim plainly: a fall of the error by `_FELT` in the rows of its joints, in two
+    blocks at least, with no other row worse beyond chance. Of changes between sessions, brief events and causes seen
+    in the samples they need not."""
+    effect = claim.trial.candidate.effect
+    if finding.mode == "between" or effect.repeats or effect.seen_in_samples(claim.trial.shape):
+        return True
+    shown = finding.evidence
+    if shown.test_rms_after > (1.0 - _FELT) * shown.test_rms_before:
+        return False
+    keys = list(claim.trial.rows)
+    return spread_out(without, after, keys) and not worse_rows(without, after, seed)
 
 
 def _confirmed(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float]) -> float:
@@ -311,7 +433,7 @@ def _beyond(
     if not remainders or not wide:
         return remainders
     bench.evidence.replace([*(c.trial.rows for c in claims), *nuisance, *wide])
-    return find_remainders(bench.dictionary, bench.evidence, task.settings)
+    return find_remainders(bench.dictionary, bench.evidence, task.settings, task.null)
 
 
 def _encompassed(
@@ -337,7 +459,7 @@ def _at_most(confidence: float, finding: Finding) -> Finding:
 
 
 def _models(
-    task: Task, bench: DiagnosisBench, baseline: Baseline, findings: Sequence[Finding]
+    task: Task, bench: DiagnosisBench, baseline: Baseline, effects: tuple[Mapping[str, Any], ...]
 ) -> tuple[DynamicModel, DynamicModel, dict[str, float]]:
     """Base model, extended model with the columns of the evidence, and the change of the base parameters in their
     standard deviations.
@@ -350,7 +472,6 @@ def _models(
         "estimator": "diagnosis",
         SIGNALS: signals_entry(task.settings.signals) | {"motor_delay_s": nominal.arm.motor_delay_s},
     }
-    effects = tuple(_entry(f) for f in findings if f.cause != LOST_SAMPLES.cause)
     structure = replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb)
     base = DynamicModel(
         robot,
@@ -412,8 +533,8 @@ def _notes(bench: DiagnosisBench, reference: Reference | None) -> list[str]:
     if reference is None:
         notes.append(
             "no reference of the healthy arm: a constant change absorbed by base parameters (payload, torque "
-            "constant, wear, offsets) is invisible, and normal properties of the arm, such as presliding friction, "
-            "are reported as if they were faults; run `lwr-run commission` with the healthy arm"
+            "constant, wear, offsets) is invisible, and what such drives have when healthy is told as character of the "
+            "arm, not as a finding; run `lwr-run commission` with the healthy arm"
         )
     elif evidence.prior is None:
         notes.append(

@@ -449,14 +449,22 @@ class Evidence:
                     predicted[:, j] += columns[mine] @ values[here]
         return predicted
 
-    def covariance(self) -> Floats:
-        """Covariance (P, P) of all present columns, from blocks, at least that of independent rows."""
-        scores = self.target - self.gram @ self.full.values
+    def covariance(self, fit: Fit | None = None) -> Floats:
+        """Covariance (P, P) of all present columns in a fit, default the full one, from blocks, at least that of
+        independent rows."""
+        fit = fit or self.full
+        scores = self.target - self.gram @ fit.values
         middle = self.blocks / max(self.blocks - 1, 1) * scores.T @ scores
-        sandwich = self.full.inverse @ middle @ self.full.inverse
+        sandwich = fit.inverse @ middle @ fit.inverse
         # The variance of columns without excitation is zero, on either side of it by rounding.
         np.fill_diagonal(sandwich, np.maximum(np.diag(sandwich), 0.0))
-        return _widened(sandwich, self.full.inverse)
+        return _widened(sandwich, fit.inverse)
+
+    def free(self) -> tuple[Floats, Floats]:
+        """Base parameters (p,) by these sessions alone, without the prior, and their covariance (p, p)."""
+        fit = self._fit(self._part_gram.sum(axis=0), self._part_target.sum(axis=0), with_prior=False)
+        p = self.base_count
+        return fit.values[:p], self.covariance(fit)[:p, :p]
 
     @property
     def chi_square(self) -> float:

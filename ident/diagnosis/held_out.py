@@ -79,6 +79,26 @@ def fall(before: HeldOut, after: HeldOut, weights: Mapping[Key, float], seed: in
     return float(low), float(high)
 
 
+def spread_out(before: HeldOut, after: HeldOut, keys: Sequence[Key]) -> bool:
+    """Whether the error over the rows of `keys` falls without the block of its largest fall, too."""
+    table = _by_block(before, after, dict.fromkeys(keys, 1.0))
+    fall = table[:, 0] - table[:, 1] if len(table) else np.zeros(1)
+    return bool(fall.sum() > max(float(fall.max()), 0.0))
+
+
+def worse_rows(before: HeldOut, after: HeldOut, seed: int) -> list[Key]:
+    """Sides and joints with a larger error after than before, beyond the 95 % interval."""
+    found = []
+    for side, values in before.residual.items():
+        for joint in range(values.shape[1]):
+            if (
+                np.isfinite(values[:, joint]).any()
+                and interval(before, after, [(side, joint)], seed)[3] < 0.0
+            ):
+                found.append((side, joint))
+    return found
+
+
 def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:
     """Weighted sums of squares before and after, and number of rows, (blocks, 3)."""
     blocks: dict[float, Floats] = {}

@@ -23,7 +23,7 @@ from ident.diagnosis.selection import margin
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import Signature, overlap, signature_bench, signatures
 from ident.dynamics.kinematics import Chain
-from ident.effects import find_effect
+from ident.effects import WEAR, find_effect
 from lwr_driver.session import Session
 
 Place = tuple[str, tuple[int, ...]]
@@ -179,7 +179,7 @@ def look_alikes(
     """
     settings = settings or DiagnosisSettings()
     wanted: list[tuple[int, Place, Place]] = []
-    for number, finding in enumerate(diagnosis.findings, start=1):
+    for number, finding in enumerate(diagnosis.claims, start=1):
         first = (finding.cause, finding.joints)
         wanted += [(number, first, (c, tuple(j))) for c, j, _ in finding.alternatives[:_RIVALS]]
     asked_for = [pair for pair in pairs if pair not in [(a, b) for _, a, b in wanted]]
@@ -188,12 +188,12 @@ def look_alikes(
         return (), ()
     bench = signature_bench(sessions, chain, arm=arm, reference=reference, settings=settings)
     nuisance = list(bench.evidence.extra)
-    columns = {(f.cause, f.joints): _columns(bench, f) for f in diagnosis.findings}
+    columns = {(f.cause, f.joints): _columns(bench, f) for f in diagnosis.claims}
     found, notes = [], []
     for number, first, second in wanted:
         others = [rows for place, rows in columns.items() if place not in (first, second) and rows]
         bench.evidence.replace([*others, *nuisance])
-        mine = diagnosis.findings[number - 1] if number else None
+        mine = diagnosis.claims[number - 1] if number else None
         try:
             found.append(_side_by_side(bench, number, first, second, mine))
         except DataError as error:
@@ -210,6 +210,8 @@ def _rest(strength: float, alike: float) -> float:
 
 def _columns(bench: DiagnosisBench, finding: Finding) -> Rows:
     """Columns of a finding on the bench; none for a cause without torque."""
+    if finding.cause == WEAR:
+        return {}
     effect = find_effect(finding.cause)
     candidate = Candidate(effect, finding.joints[0] - 1 if finding.joints else -1)
     if effect.counted:

@@ -12,8 +12,9 @@ import numpy as np
 
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Floats, Key, Rows
-from ident.diagnosis.probes import groups, hats, hats_of
+from ident.diagnosis.probes import groups, hats_of
 from ident.effects import ZERO_OFFSET, Shape
+from ident.effects.nameless import hats
 
 
 def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
@@ -91,7 +92,7 @@ def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
             turn.wide(joint, m.n)[side == "joint"] for turn, m in zip(turns, nominal.motions, strict=True)
         ]
         for k in range(nominal.arm.chain.n):
-            signals = [p[:, k : k + 1] * h for p, h in zip(parts, loads, strict=True) if p is not None]
+            signals = [p[:, k : k + 1] * h for p, h in zip(parts, loads.hats, strict=True) if p is not None]
             columns = nominal.reduce(side, signals)
             if np.any(columns):
                 found[side, k] = columns

@@ -2,14 +2,14 @@
 
 For each joint and side, groups of hat functions of one variable (angle, speed, acceleration or load of the joint,
 angle or speed of another joint, time) are scored like any candidate: plain, times the sign of the joint's speed, and
-those of an angle times the joint's load. So is a line in the spectrum. The remainder is reported by its variables; a
-large one casts doubt on the named causes.
+those of an angle times the joint's load. So is a line in the spectrum. A remainder becomes a nameless term of the
+extended model, or is reported by its variables; a large one casts doubt on the named causes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.effects import NAMELESS
+from ident.effects.nameless import KNOTS, hats
 
 # Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
@@ -28,7 +30,6 @@ _STANDS_OUT = 16.0
 _IN_EACH = 4.0
 # Zero padding of the spectrum, against lines between two of its frequencies.
 _PADDING = 4
-_HATS = 7
 _RIDGE = 1e-3
 # Least explained share of the noise; generic functions find a little everywhere.
 _LEAST_INFLATION = 0.012
@@ -109,11 +110,40 @@ def _not_repeating(
     return even, step
 
 
-@dataclass(frozen=True)
+Null = Mapping[tuple[str, int], float]
+"""Limit of a gain on a healthy arm, by cause and joint from 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A variable over its range: hat functions (N, 7) of each motion, with knots evenly from `low` to `high`."""
+
+    low: float
+    high: float
+    hats: list[Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A function of the variables in `form` (`ident.effects.nameless`) with values at its knots (7,) [Nm].
+
+    column : (m, 1) torque in the rows of its joint and side.
+    """
+
+    form: str
+    low: float
+    high: float
+    values: Floats
+    std: Floats
+    column: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class Remainder:
     """A remainder in the rows of a joint (from 1) and side, dependent on the named variables.
 
-    rows : columns of its generic functions. line_hz : frequency of its line, 0 without one.
+    rows : columns of its generic functions. line_hz : frequency of its line, 0 without one. terms : its functions,
+    empty for a remainder that depends on time.
     """
 
     side: str
@@ -123,12 +153,16 @@ class Remainder:
     inflation: float
     rows: tuple[Rows, ...] = ()
     line_hz: float = 0.0
+    terms: tuple[Term, ...] = field(default=(), repr=False)
 
 
 def find_remainders(
-    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
+    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
 ) -> tuple[Remainder, ...]:
-    """Remainders beside the columns of the evidence, largest first; at most two variables each."""
+    """Remainders beside the columns of the evidence, largest first; at most two variables each.
+
+    null : limits of their gain on the healthy arm, by name of the nameless term.
+    """
     fixed = list(evidence.extra)
     found = []
     variables, residuals = hats_of(dictionary), evidence.residuals()
@@ -141,7 +175,8 @@ def find_remainders(
             for name, rows in groups(dictionary, variables, side, joint).items():
                 padded = evidence.padded(rows)
                 prepared[name] = rows, padded, evidence.alone(padded)
-            remainder = _one(evidence, settings.least_gain, prepared, line, side, joint)
+            least = max(settings.least_gain, (null or {}).get((NAMELESS[side].cause, joint), 0.0))
+            remainder = _one(evidence, least, prepared, line, side, joint, variables)
             evidence.replace(fixed)
             if remainder is not None:
                 found.append(remainder)
@@ -155,6 +190,7 @@ def _one(
     line: tuple[float, Rows, int] | None,
     side: str,
     joint: int,
+    variables: Mapping[str, Curve],
 ) -> Remainder | None:
     """The remainder of a joint from its line and its `prepared` groups of columns."""
     taken: list[tuple[str, Score, Rows]] = []
@@ -171,7 +207,7 @@ def _one(
         best: tuple[str, Score, Rows] | None = None
         for name, (rows, padded, known) in prepared.items():
             score = evidence.score(padded, ridge=_RIDGE, known=known)
-            least = max(least_gain + 2.0 * _HATS, 0.0 if best is None else best[1].gain)
+            least = max(least_gain + 2.0 * KNOTS, 0.0 if best is None else best[1].gain)
             if score.gain > least and score.inflation > _LEAST_INFLATION:
                 best = name, score, rows
         if best is None:
@@ -184,11 +220,37 @@ def _one(
     names = dict.fromkeys(part for name, _, _ in taken for part in name.split(" "))
     gain, inflation = np.sum([(score.gain, score.inflation) for _, score, _ in taken], axis=0).tolist()
     columns = tuple(rows for _, _, rows in taken)
-    return Remainder(side, joint + 1, tuple(names), gain, inflation, columns, line_hz)
+    terms = () if "time" in names else tuple(_term(*one, variables) for one in taken)
+    return Remainder(side, joint + 1, tuple(names), gain, inflation, columns, line_hz, terms)
 
 
-def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
-    """Hat functions of every variable by its name, for each motion."""
+def _term(name: str, score: Score, rows: Rows, variables: Mapping[str, Curve]) -> Term:
+    curve, columns = variables[name.split(" ")[0]], next(iter(rows.values()))
+    column = (columns @ score.coefficients)[:, None]
+    return Term(name, curve.low, curve.high, score.coefficients, np.sqrt(np.diag(score.covariance)), column)
+
+
+def remainder_gains(dictionary: Dictionary, evidence: Evidence) -> dict[tuple[str, int], float]:
+    """Largest gain of a function of the motion or of a line beside the columns of the evidence, by the name of the
+    nameless term and the joint from 0."""
+    found = {}
+    variables, residuals = hats_of(dictionary), evidence.residuals()
+    for side in evidence.nominal.rows:
+        for joint in range(evidence.nominal.arm.chain.n):
+            if evidence.mask[side, joint].sum() < 100:
+                continue
+            scores = [
+                evidence.score(evidence.padded(rows), ridge=_RIDGE)
+                for rows in groups(dictionary, variables, side, joint).values()
+            ]
+            line = find_line(evidence, side, joint, residuals[side][:, joint])
+            scores += [] if line is None else [evidence.score(evidence.padded(line[1]))]
+            found[NAMELESS[side].cause, joint] = max(0.0, *(score.gain for score in scores))
+    return found
+
+
+def hats_of(dictionary: Dictionary) -> dict[str, Curve]:
+    """Hat functions of every variable by its name."""
     motions = dictionary.nominal.motions
     variables: dict[str, list[Floats]] = {"time": [m.time for m in motions]}
     for k in range(dictionary.nominal.arm.chain.n):
@@ -201,19 +263,19 @@ def hats_of(dictionary: Dictionary) -> dict[str, list[Floats]]:
         low = min(float(v.min()) for v in values)
         high = max(float(v.max()) for v in values)
         if high - low >= (TRAVEL_RAD if name[1:].isdigit() else 1e-6):
-            found[name] = [hats(v, low, high) for v in values]
+            found[name] = Curve(low, high, [hats(v, low, high) for v in values])
     return found
 
 
 def groups(
-    dictionary: Dictionary, variables: Mapping[str, Sequence[Floats]], side: str, joint: int
+    dictionary: Dictionary, variables: Mapping[str, Curve], side: str, joint: int
 ) -> dict[str, dict[Key, Floats]]:
     """Groups of columns by the names of their variables."""
     nominal, found = dictionary.nominal, {}
     signs = [m.direction[:, joint : joint + 1] for m in nominal.motions]
     loads = [m.joint_torque[:, joint : joint + 1] for m in nominal.motions]
-    for name, parts in variables.items():
-        of = name.rstrip("0123456789")
+    for name, curve in variables.items():
+        parts, of = curve.hats, name.rstrip("0123456789")
         if of in ("load", "qdd") and name != f"{of}{joint + 1}":
             continue
         found[name] = {(side, joint): nominal.reduce(side, parts)}
@@ -224,9 +286,3 @@ def groups(
             scaled = [part * value for part, value in zip(parts, values, strict=True)]
             found[f"{name} {factor}"] = {(side, joint): nominal.reduce(side, scaled)}
     return found
-
-
-def hats(values: Floats, low: float, high: float) -> Floats:
-    """Piecewise linear functions (N, 7) with knots evenly over the range."""
-    place = (values - low) / (high - low) * (_HATS - 1)
-    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(_HATS)))

@@ -9,7 +9,7 @@ of a claim.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +19,8 @@ import numpy as np
 from fri.errors import ConfigurationError
 from ident.diagnosis.evidence import Floats
 from ident.dynamics.base_set import BaseSet
+from ident.effects import NAMELESS
+from ident.effects.nameless import KNOTS
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
 
@@ -27,8 +29,14 @@ DELAY_STD_S = 2e-4
 
 _KEY = "commissioning"
 _WIDER = 1.5
-_DAY_TO_DAY = {"Fvl": 0.02, "Fcl": 0.02, "Fvm": 0.02, "Fcm": 0.02, "Ia": 0.005}
-_ELSE = 0.002
+# Usual relative standard deviation of a healthy arm's parameters from day to day: Coulomb friction within 10 % and
+# viscous friction within 15 %, evenly; gains of the sensors by a per cent.
+_USUAL = {"Fvl": 0.087, "Fcl": 0.058, "Fvm": 0.087, "Fcm": 0.058}
+_ELSE = 0.01
+# Offsets have no size of their own: share of the rms torque in their rows.
+_OFFSETS = ("offl", "offm")
+# Weight of the usual change beside that of this arm, in changes of a parameter.
+_USUAL_CHANGES = 2.0
 _ONE_IN = 0.01
 _AS_SETS = 4
 
@@ -141,11 +149,14 @@ class Reference:
         # The gain from noise alone has no such tail; the least gain of a claim accounts for it.
         noise = float(np.median(list(self.null.values()))) if self.null else 0.0
         sets = self.sets + _AS_SETS
-        quantile = fisher_limit(_ONE_IN, 1, sets)
+        single = fisher_limit(_ONE_IN, 1, sets)
+        # The gain of a nameless function is the sum of as many squares as it has knots.
+        function = fisher_limit(_ONE_IN, KNOTS, KNOTS * sets)
+        terms = {effect.cause for effect in NAMELESS.values()}
         found = {}
         for key, gain in self.null.items():
             mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
-            found[key] = noise + quantile * max(mean - noise, 0.0)
+            found[key] = noise + (function if key[0] in terms else single) * max(mean - noise, 0.0)
         return found
 
     def loosened(self, symbol: str, share: float) -> Reference:
@@ -173,10 +184,9 @@ class Reference:
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
         covariance = own.covariance[np.ix_(there, there)] * _WIDER**2
         values = own.values[there]
-        # Several sets show the changes from day to day themselves; one set cannot.
-        share = 1.0 if self.sets < 3 else 0.25
-        change = [_DAY_TO_DAY.get(_symbol(base.names[b]), _ELSE) for b in here]
-        tolerance = share * np.array(change) * np.abs(values)
+        # A commissioned arm's covariance holds its changes from day to day.
+        usual = np.array([_USUAL.get(_symbol(base.names[b]), _ELSE) for b in here])
+        tolerance = np.zeros(len(here)) if self.sets else usual * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
         precision = np.zeros((len(base), len(base)))
@@ -184,6 +194,50 @@ class Reference:
         mean = np.zeros(len(base))
         mean[here] = values
         return precision, mean
+
+
+def habit(
+    names: Sequence[str],
+    days: Sequence[Floats],
+    covariances: Sequence[Floats],
+    torque_rms: Mapping[str, Floats],
+) -> Floats:
+    """Variance (p,) of healthy parameters from day to day around their mean.
+
+    days, covariances : parameters (p,) and covariance (p, p) of each day. torque_rms : of the rows by side, (n,) [Nm].
+    Joints of an arm have the same habits, so all parameters of a symbol share one relative variance: the scatter of the
+    days beyond their own uncertainty, and the usual change as some further changes. Two days of a 7-joint arm are
+    seven changes of its Coulomb friction.
+    """
+    values = np.array(days)
+    mean, own = values.mean(axis=0), np.mean([np.diag(c) for c in covariances], axis=0)
+    symbols = [_symbol(name) for name in names]
+    scale = np.array(
+        [
+            float(torque_rms["motor" if symbol == "offm" else "joint"][_joint(name)])
+            if symbol in _OFFSETS
+            else abs(value)
+            for name, symbol, value in zip(names, symbols, mean, strict=True)
+        ]
+    )
+    usual = np.array([_USUAL.get(symbol, _ELSE) for symbol in symbols])
+    groups = [symbol if symbol in (*_USUAL, *_OFFSETS, "Ia") else "" for symbol in symbols]
+    variance = np.zeros(len(names))
+    for group in dict.fromkeys(groups):
+        mine = np.array([g == group for g in groups])
+        # A parameter less certain than its usual change tells nothing of habits.
+        telling = mine & (own < (usual * scale) ** 2) & (scale > 0.0)
+        changes = (len(values) - 1) * int(telling.sum())
+        scatter = np.sum((values[:, telling] - mean[telling]) ** 2, axis=0) - (len(values) - 1) * own[telling]
+        total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
+        share = (_USUAL_CHANGES * usual[mine][0] ** 2 + total) / (_USUAL_CHANGES + changes)
+        variance[mine] = share * scale[mine] ** 2
+    return variance
+
+
+def _joint(name: str) -> int:
+    """Number from 0 of the joint of a drive's parameter."""
+    return int("".join(c for c in name if c.isdigit())) - 1
 
 
 def _listed(values: Floats | None) -> list[float] | None:

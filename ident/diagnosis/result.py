@@ -17,7 +17,7 @@ from ident.effects.words import quantity_text
 from ident.model import DynamicModel
 from lwr_driver.notebook import subplots
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,33 @@ class Unexplained:
 
 
 @dataclass(frozen=True, eq=False)
+class Nameless:
+    """A term of the extended model without a name, in the torque of a joint (from 1) and side.
+
+    depends_on : its variables. entries : of the model's effects. interval : 95 % of the fall of the error [Nm].
+    """
+
+    side: str
+    joint: int
+    depends_on: tuple[str, ...]
+    entries: tuple[Mapping[str, Any], ...]
+    test_rms_before: float
+    test_rms_after: float
+    interval: tuple[float, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content."""
+        return {
+            "side": self.side,
+            "joint": self.joint,
+            "depends_on": list(self.depends_on),
+            "test_rms_before": self.test_rms_before,
+            "test_rms_after": self.test_rms_after,
+            "gain_interval_95": list(self.interval),
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class SimulationError:
     """RMS error (n,) of the simulated session: position [rad], motor and joint torque [Nm]."""
 
@@ -141,6 +168,9 @@ class RowStates:
 class Diagnosis(Tabular):
     """Everything that was found; prints itself.
 
+    findings : changes against the reference, or what no healthy arm of the kind has. character : what every such drive
+    has and the base model lacks. nameless : fitted terms without a name. unexplained : remainders that could not be
+    fitted. extension : `cause(joints)` of all in the extended model.
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
     notes : sentences on limits of the data.
@@ -164,14 +194,23 @@ class Diagnosis(Tabular):
     simulation_base: SimulationError | None = None
     simulation_extended: SimulationError | None = None
     notes: tuple[str, ...] = ()
+    character: tuple[Finding, ...] = ()
+    nameless: tuple[Nameless, ...] = ()
+    extension: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
 
+    @property
+    def claims(self) -> tuple[Finding, ...]:
+        """Findings and character."""
+        return (*self.findings, *self.character)
+
     def records(self) -> list[dict[str, Any]]:
-        """One row for each finding."""
+        """One row for each finding and each character of the arm."""
         return [
             {
                 "cause": f.cause,
+                "kind": "finding" if f in self.findings else "character",
                 "side": f.side,
                 "joint": _place(f),
                 "parameters": _values(f),
@@ -180,7 +219,7 @@ class Diagnosis(Tabular):
                 "rms_after": f.evidence.test_rms_after,
                 "gain": f.gain,
             }
-            for f in self.findings
+            for f in self.claims
         ]
 
     def plot(self) -> Any:
@@ -219,6 +258,8 @@ class Diagnosis(Tabular):
                 "simulation_error": base,
             },
             "findings": [finding.to_dict() for finding in self.findings],
+            "character": [finding.to_dict() for finding in self.character],
+            "nameless": [term.to_dict() for term in self.nameless],
             "unexplained": [
                 {
                     "side": u.side,
@@ -235,6 +276,7 @@ class Diagnosis(Tabular):
                 "simulation_error_base": base,
                 "simulation_error_extended": extended,
             },
+            "extension": list(self.extension),
             "model": "model_extended.yaml",
         }
 

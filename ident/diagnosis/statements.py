@@ -138,7 +138,8 @@ class Part:
 class Statements:
     """All that a diagnosis says.
 
-    lines : the summary. answers : of the discriminating experiments already run. asked : causes side by side on
+    character : what every such drive has, numbered on behind the findings. lines : the summary. answers : of the
+    discriminating experiments already run. comparisons : causes side by side, of a finding or on
     request, besides those of a finding. parts : in their order, empty ones left out.
     """
 
@@ -148,6 +149,7 @@ class Statements:
     lines: tuple[Line, ...]
     answers: tuple[str, ...]
     findings: tuple[FindingStatement, ...]
+    character: tuple[FindingStatement, ...]
     comparisons: tuple[Comparison, ...]
     parts: tuple[Part, ...]
 
@@ -155,7 +157,9 @@ class Statements:
         """The whole, for the terminal."""
         found = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
         found += [f"{answer}." for answer in self.answers]
-        for finding in self.findings:
+        for finding in (*self.findings, *self.character):
+            if self.character and finding is self.character[0]:
+                found.append("Character of the arm, as drives of its kind have it:")
             found += finding.lines()
             found += [x for one in self.comparisons if one.finding == finding.number for x in _beside(one)]
         for one in self.comparisons:
@@ -176,13 +180,14 @@ def statements(
 ) -> Statements:
     """The statements of a diagnosis. names : of the joints. answers : of decision.json."""
     sure = float(details.get("sure", SURE))
-    findings = [
-        finding_statement(number, finding, names, sure)
-        for number, finding in enumerate(content.get("findings", []), start=1)
-    ]
+    claims = [*content.get("findings", []), *content.get("character", [])]
+    said = [finding_statement(number, one, names, sure) for number, one in enumerate(claims, start=1)]
+    count = len(content.get("findings", []))
+    findings, character = said[:count], said[count:]
     level, headline = _headline(content, details, findings)
     parts = (
         _experiments(details, names),
+        _nameless(content, names),
         _unexplained(content, names),
         _gain(content, details, names),
         _replay(content, names),
@@ -193,9 +198,10 @@ def statements(
         f"Diagnosis of {', '.join((content.get('sessions') or {}).get('train', []))}",
         level,
         headline,
-        tuple(_lines(content, details, findings, names)),
+        tuple(_lines(content, details, findings, character, names)),
         tuple(answer_statement(answer, names) for answer in answers),
         tuple(findings),
+        tuple(character),
         tuple(comparison(one, names, k) for k, one in enumerate(details.get("look_alikes") or [])),
         tuple(part for part in parts if part.sentences or part.rows),
     )
@@ -320,7 +326,12 @@ def error_change(gain: float) -> str:
 def extension_gain(content: Plain) -> float | None:
     """Share of the error on held-out data removed by the extended model, mean over joints and sides."""
     shares = [share for share, _ in _shares(content, ())]
-    return sum(shares) / len(shares) if shares and content.get("findings") else None
+    return sum(shares) / len(shares) if shares and is_extended(content) else None
+
+
+def is_extended(content: Plain) -> bool:
+    """Whether the extended model holds anything beyond the base model."""
+    return any(content.get(key) for key in ("extension", "findings", "character", "nameless"))
 
 
 def in_short(content: Plain, names: Sequence[str]) -> tuple[Level, str]:
@@ -328,6 +339,9 @@ def in_short(content: Plain, names: Sequence[str]) -> tuple[Level, str]:
     causes = [spoken(str(finding["cause"])) for finding in content.get("findings", [])]
     unexplained = len(content.get("unexplained", []))
     text = f"found: {', '.join(dict.fromkeys(causes))}" if causes else "nothing found"
+    character = [spoken(str(one["cause"])) for one in content.get("character", [])]
+    text += f"; character of the arm: {', '.join(dict.fromkeys(character))}" if character else ""
+    text += f"; terms without a name: {len(content['nameless'])}" if content.get("nameless") else ""
     text += f"; {unexplained} unexplained" if unexplained else ""
     gain = extension_gain(content)
     if gain is not None:
@@ -358,7 +372,9 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
     if count:
         doubt = f", {'one' if doubtful == 1 else doubtful} of them open between look-alikes"
         return "look", f"{count} causes found, the largest effect first" + (doubt if doubtful else "")
-    if content.get("unexplained"):
+    if content.get("character"):
+        return "good", "No cause found beyond the character of such an arm, which the extended model now has"
+    if content.get("nameless") or content.get("unexplained"):
         return "look", "The data support no cause, but the residuals depend on the motion"
     worst = max((row["avoidable_share"] for row in details.get("rows", [])), default=0.0)
     if worst < _AVOIDABLE_LOOK:
@@ -370,7 +386,11 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
 
 
 def _lines(
-    content: Plain, details: Plain, findings: Sequence[FindingStatement], names: Sequence[str]
+    content: Plain,
+    details: Plain,
+    findings: Sequence[FindingStatement],
+    character: Sequence[FindingStatement],
+    names: Sequence[str],
 ) -> list[Line]:
     found = []
     for finding in findings:
@@ -379,6 +399,12 @@ def _lines(
         found.append(Line(finding.title, text, "", "look", "findings"))
     if not findings:
         found.append(Line("causes", "none supported by the data", "none", "good", "findings"))
+    if character:
+        titles = "; ".join(one.title for one in character)
+        found.append(Line("character of the arm", titles, "", "good", "findings"))
+    nameless = ", ".join(f"{_name(u['joint'], names)} {u['side']}" for u in content.get("nameless", []))
+    if nameless:
+        found.append(Line("terms without a name", nameless, "none", "look", "nameless"))
     rest = ", ".join(f"{_name(u['joint'], names)} {u['side']}" for u in content.get("unexplained", []))
     level: Level = "look" if rest else "good"
     found.append(Line("unexplained residuals", rest or "none", "none", level, "unexplained"))
@@ -405,7 +431,7 @@ def _replay_line(content: Plain) -> list[Line]:
             continue
         sizes = [math.hypot(*(v for v in side[key] if v is not None)) * scale for side in (before, after)]
         worse = worse or sizes[1] > _WORSE_REPLAY * sizes[0]
-        change = f"{sizes[0]:.3g} -> {sizes[1]:.3g}" if content.get("findings") else f"{sizes[0]:.3g}"
+        change = f"{sizes[0]:.3g} -> {sizes[1]:.3g}" if is_extended(content) else f"{sizes[0]:.3g}"
         parts.append(f"{label} {change} {unit}")
     text = f"error over all joints together: {', '.join(parts)}"
     return [Line("replay in simulation", text, "less", "look" if worse else "good", "replay")] * bool(parts)
@@ -445,6 +471,24 @@ def _experiments(details: Plain, names: Sequence[str]) -> Part:
     return Part("deciding", "Discriminating experiments", sentences)
 
 
+def _nameless(content: Plain, names: Sequence[str]) -> Part:
+    rows = [
+        (
+            f"{_name(entry['joint'], names)} {entry['side']}",
+            ", ".join(entry.get("depends_on", [])),
+            Number(entry.get("test_rms_before"), ".3g"),
+            Number(entry.get("test_rms_after"), ".3g"),
+        )
+        for entry in content.get("nameless", [])
+    ]
+    sentence = (
+        "No cause of the catalogue fits here. The extended model holds a smooth function of these variables; they are "
+        "all that is claimed."
+    )
+    head = ("torque", "depends on", "error before [Nm]", "after [Nm]")
+    return Part("nameless", "Terms without a name", [sentence] * bool(rows), head, rows)
+
+
 def _unexplained(content: Plain, names: Sequence[str]) -> Part:
     rows = [
         (
@@ -464,7 +508,7 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
     base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
     floor = (content.get("baseline") or {}).get("noise_floor") or {}
     measured = {(row["side"], row["joint"]): row for row in details.get("rows", [])}
-    is_named = bool(content.get("findings"))
+    is_named = is_extended(content)
     rows: list[Row] = []
     for side in base:
         for k, before in enumerate(base[side] or ()):
@@ -522,7 +566,7 @@ def _replay(content: Plain, names: Sequence[str]) -> Part:
     rows: list[Row] = []
     for key, label, unit, scale in REPLAYED:
         for model, errors in (("base model", before), ("extended", after)):
-            if errors.get(key) and (model == "base model" or (content.get("findings") and before.get(key))):
+            if errors.get(key) and (model == "base model" or (is_extended(content) and before.get(key))):
                 cells = [Number(None if v is None else scale * v, ".3f") for v in errors[key]]
                 rows.append((f"{label} [{unit}], {model}", *cells))
     sentence = "The same commands to the simulated arm: measured minus simulated, root mean square."

@@ -15,7 +15,7 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.dynamics.structure import Side
-from ident.effects import channel, drive, link, load
+from ident.effects import channel, drive, link, load, nameless
 from ident.effects.effect import (
     Column,
     Discriminator,
@@ -29,14 +29,16 @@ from ident.effects.effect import (
     Simulated,
 )
 from ident.effects.motion import ArmMotion, Floats
-from ident.effects.words import Values, spoken
+from ident.effects.words import Values, quantity, spoken
 
 __all__ = [
     "DELAYS",
     "EFFECTS",
     "ELASTICITY",
     "LOST_SAMPLES",
+    "NAMELESS",
     "PRESLIDING",
+    "WEAR",
     "ZERO_OFFSET",
     "ArmMotion",
     "Column",
@@ -97,19 +99,31 @@ EFFECTS: dict[str, Effect] = {
         LOST_SAMPLES,
     )
 }
+"""The catalogue of causes by name."""
+
+NAMELESS: dict[str, Effect] = {"motor": nameless.NamelessMotor(), "joint": nameless.NamelessJoint()}
+"""Terms of a model without a name, by side; no causes."""
+
+WEAR = "wear"
+"""Name of a change of a drive's base parameters against the healthy arm: a cause without a torque of its own."""
+
+_KNOWN = EFFECTS | {effect.cause: effect for effect in NAMELESS.values()}
 
 
 def find_effect(cause: str) -> Effect:
-    """The effect of a cause. Raises ConfigurationError, with the nearest name, for an unknown one."""
-    if cause not in EFFECTS:
+    """The effect of a cause, or a term without a name. Raises ConfigurationError, with the nearest name, for an
+    unknown one."""
+    if cause not in _KNOWN:
         near = difflib.get_close_matches(cause, EFFECTS, n=1)
         advice = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(EFFECTS)}"
         raise ConfigurationError(f"effect {cause!r} is unknown; {advice}")
-    return EFFECTS[cause]
+    return _KNOWN[cause]
 
 
 def summary_of(cause: str) -> str:
     """The fault in a few words; the name itself of a cause from a file of another version."""
+    if cause == WEAR:
+        return "friction or inertia of the drive changed against the healthy arm"
     return EFFECTS[cause].summary if cause in EFFECTS else spoken(cause)
 
 
@@ -125,6 +139,8 @@ def described(cause: str, values: Values, form: Any, names: Sequence[str]) -> st
             return "; ".join(effect.sentence(values, effect.form_of(form), names))
         except (ConfigurationError, KeyError):
             return "; ".join(Effect.sentence(effect, values, None, names))
+    if cause == WEAR:
+        return ", ".join(f"{spoken(name)} {quantity(value, share=True)}" for name, value in values.items())
     return ", ".join(f"{spoken(name)} {value:.4g} {unit}" for name, (value, _, unit) in values.items())
 
 

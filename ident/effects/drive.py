@@ -40,6 +40,7 @@ class PreslidingHysteresis(Effect):
 
     cause = "presliding_hysteresis"
     side = "motor"
+    character = True
     summary = "hysteresis around reversals"
     physics = "asperities bend before they slide, so friction turns over a distance after each reversal"
     source = "Dahl, AIAA Journal 14 (1976); Swevers et al., IEEE Trans. Autom. Control 45 (2000)"
@@ -79,6 +80,7 @@ class Stribeck(Effect):
 
     cause = "stribeck"
     side = "motor"
+    character = True
     summary = "friction rises as the velocity falls towards zero"
     physics = "the lubricant film breaks down at low speed, so friction rises as the speed falls towards zero"
     source = "Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994)"
@@ -126,6 +128,7 @@ class ViscousNonlinear(Effect):
 
     cause = "viscous_nonlinear"
     side = "motor"
+    character = True
     summary = "viscous friction is not proportional to velocity"
     physics = "the lubricant thins under shear, so viscous friction grows slower (or faster) than the speed"
     source = "Wolf and Iskandar, ICRA 2018; Tjahjowidodo et al., Mech. Mach. Theory 2013"
@@ -185,6 +188,7 @@ class FrictionAsymmetry(Effect):
 
     cause = "friction_asymmetry"
     side = "motor"
+    character = True
     summary = "friction depends on the direction"
     physics = "gear teeth and bearings engage differently in the two directions"
     source = "Armstrong-Helouvry, Control of Machines with Friction (1991)"
@@ -230,6 +234,7 @@ class FrictionLoad(Effect):
 
     cause = "friction_load"
     side = "motor"
+    character = True
     summary = "friction grows with the transmitted torque"
     physics = (
         "the load presses the gear teeth together, so Coulomb friction grows with the transmitted torque"
@@ -266,6 +271,7 @@ class FrictionTemperature(Drifting):
 
     cause = "friction_temperature"
     side = "motor"
+    character = True
     summary = "friction drifts as the joint warms up"
     physics = "the lubricant thins as it warms up, so friction drifts with the time in use"
     source = "Bittencourt, Wernholt, Sander-Tavallaey and Brogardh, IROS 2010; Simoni et al., Robotica 2017"
@@ -388,6 +394,7 @@ class GearRipple(Effect):
 
     cause = "gear_ripple"
     side = "motor"
+    character = True
     summary = "torque periodic in the motor angle"
     physics = "the elliptic wave generator and the teeth give a torque with one or two cycles a motor turn"
     source = "Taghirad and Belanger, J. Dyn. Syst. Meas. Control 120 (1998)"

@@ -256,6 +256,7 @@ class Effect(ABC):
         search over times. step : it sets in at its `time` and stays. displaces : it turns the link under load.
     channel : the torque channel it delays. counted : seen by counting samples, without a torque of its own.
     hidden : linear parameters equal to 1 by the physics, free in the search and not reported.
+    character : every drive of the kind has it, so it is no fault by itself.
     evidence_factor : multiple of the usual evidence, for a cause the nominal arm itself resembles slightly.
     beside_companions : the law is coarse, so parameters are estimated beside the companions.
     confused_with : causes alike in many motions, for docs/effects.md only; the diagnosis finds look-alikes in the
@@ -282,6 +283,7 @@ class Effect(ABC):
     channel: ClassVar[Literal["motor", "joint"] | None] = None
     counted: ClassVar[bool] = False
     hidden: ClassVar[tuple[str, ...]] = ()
+    character: ClassVar[bool] = False
     evidence_factor: ClassVar[float] = 1.0
     beside_companions: ClassVar[bool] = False
     confused_with: ClassVar[tuple[str, ...]] = ()

@@ -88,6 +88,7 @@ class JointElasticity(_Twisting):
     """The joint twists by `compliance tau_l` beyond the model's twist."""
 
     cause = "joint_elasticity"
+    character = True
     summary = "the link is not where the motor encoder says"
     physics = (
         "the gear's flexspline and the torque sensor twist under load: the link is not where the motor is"

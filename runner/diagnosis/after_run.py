@@ -71,7 +71,7 @@ def decisions(before: Diagnosis, after: Diagnosis, sure: float = SURE) -> tuple[
     for finding in open_findings(before, sure):
         rivals = (_place(finding), *((cause, joints) for cause, joints, _ in finding.alternatives))
         rivals = tuple(dict.fromkeys(rivals))
-        mine = [f for f in after.findings if _place(f) in rivals]
+        mine = [f for f in after.claims if _place(f) in rivals]
         certain = [f for f in mine if f.confidence >= sure]
         if certain:
             found.append(Answer(rivals, "decided", _place(certain[0]), certain[0].confidence))
@@ -79,7 +79,7 @@ def decisions(before: Diagnosis, after: Diagnosis, sure: float = SURE) -> tuple[
             found.append(Answer(rivals, "open", _place(mine[0]), mine[0].confidence))
         else:
             joints = {joint for _, places in rivals for joint in places}
-            other = next((f for f in after.findings if set(f.joints) & joints), None)
+            other = next((f for f in after.claims if set(f.joints) & joints), None)
             named = None if other is None else _place(other)
             found.append(Answer(rivals, "neither", named, 0.0 if other is None else other.confidence))
     return tuple(found)

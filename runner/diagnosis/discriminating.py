@@ -93,7 +93,7 @@ class Discriminating:
 
 def open_findings(diagnosis: Diagnosis, sure: float = SURE) -> tuple[Finding, ...]:
     """The findings open between look-alikes: with alternatives and of a confidence below `sure`."""
-    return tuple(f for f in diagnosis.findings if is_open(f.confidence, f.alternatives, sure))
+    return tuple(f for f in diagnosis.claims if is_open(f.confidence, f.alternatives, sure))
 
 
 def offers(
@@ -125,7 +125,7 @@ def offers(
 
 def offers_after_logs(diagnosis: Diagnosis, experiment: Experiment | None) -> tuple[Discriminating, ...]:
     """The same for logs of an experiment; none without its file."""
-    if experiment is None or not any(finding.alternatives for finding in diagnosis.findings):
+    if experiment is None or not any(finding.alternatives for finding in diagnosis.claims):
         return ()
     try:
         arm, cell = Arm.load(experiment.arm), Cell.load(experiment.cell)

@@ -70,7 +70,7 @@ def moved_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """
     base, extended = diagnosis.base_model, diagnosis.extended_model
     std = extended.std
-    if std is None or not diagnosis.findings:
+    if std is None or not diagnosis.extension:
         return []
     units = dict(zip(extended.names, extended.units, strict=True))
     spread = dict(zip(extended.names, map(float, std), strict=True))
@@ -111,7 +111,7 @@ class Residuals:
                 **vars(state), base=base, extended=extended if extended.shape == base.shape else base
             )
         ratio = np.ones(len(names)) if gear_ratio is None else np.asarray(gear_ratio, dtype=float)
-        return cls(names, tuple(sessions), ratio, sides, bool(diagnosis.findings))
+        return cls(names, tuple(sessions), ratio, sides, bool(diagnosis.extension))
 
     def save(self, path: Path) -> None:
         """Write the file, in single precision."""

@@ -79,10 +79,9 @@ class DiagnosisFolder:
         return cls(results.diagnosis_folder, results.diagnosis, results.joint_names, experiment)
 
     @property
-    def findings(self) -> Sequence[Mapping[str, Any]]:
-        """The findings, the largest effect first."""
-        found: Sequence[Mapping[str, Any]] = self.content.get("findings", [])
-        return found
+    def claims(self) -> Sequence[Mapping[str, Any]]:
+        """Findings and character of the arm, the largest effect first."""
+        return [*self.content.get("findings", []), *self.content.get("character", [])]
 
     @cached_property
     def statements(self) -> Statements:
@@ -137,6 +136,9 @@ def diagnosis_parts(diagnosis: DiagnosisFolder) -> list[tuple[str, str, str]]:
     said = diagnosis.statements
     answers = "".join(paragraph(f"{answer}.") for answer in said.answers)
     found = "".join(_finding(diagnosis, one) for one in said.findings) or paragraph(f"{said.headline}.")
+    if said.character:
+        found += paragraph("Character of the arm, as drives of its kind have it:")
+        found += "".join(_finding(diagnosis, one) for one in said.character)
     asked = "".join(_beside(diagnosis, one) for one in said.comparisons if not one.finding)
     parts = [("findings", "Findings", answers + found), ("side-by-side", "Side by side", asked)]
     parts += [(part.anchor, part.title, _part(diagnosis, part)) for part in said.parts]
@@ -145,14 +147,14 @@ def diagnosis_parts(diagnosis: DiagnosisFolder) -> list[tuple[str, str, str]]:
 
 
 def _finding(diagnosis: DiagnosisFolder, said: FindingStatement) -> str:
-    finding = diagnosis.findings[said.number - 1]
+    finding = diagnosis.claims[said.number - 1]
     side, joints, title = str(finding.get("side", "")), finding.get("joints", []), _capital(said.title)
     text = f"{said.text} {_capital(said.confidence)}.".strip()
     facts = table(("", ""), said.facts, f"Evidence: {title}", classes="facts")
     parts = [f"<h3>{escape(title)}</h3>", paragraph(text), facts]
     if diagnosis.residuals is not None and side != "timing":
         numbers = {name: float(one["value"]) for name, one in (finding.get("parameters") or {}).items()}
-        others = [j for one in diagnosis.findings if one is not finding for j in one.get("joints", [])]
+        others = [j for one in diagnosis.claims if one is not finding for j in one.get("joints", [])]
         figure = finding_figure(diagnosis.residuals, said.cause, side, joints, numbers, others)
         parts += [figure_html(figure)] if figure is not None else []
     parts += [

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 
 from ident.diagnosis.look_alikes import LookAlikes, Trace
 from ident.diagnosis.statements import REPLAYED
-from ident.effects import Parameters, find_effect
+from ident.effects import WEAR, Parameters, find_effect
 from ident.effects.words import joints_text, spoken
 from runner.diagnosis.records import ReplayErrors, Residuals, SideResiduals
 from runner.report.figures import bin_means
@@ -63,8 +63,10 @@ def finding_figure(
     """Held-out residual of a finding without and with the extension, over time and against its variable.
 
     joints : from 1, none for the whole arm. parameters : of the finding. others : joints of other findings, unclear
-    about a cause of the whole arm. None without residuals to show.
+    about a cause of the whole arm. None without residuals to show, as of wear.
     """
+    if cause == WEAR:
+        return None
     effect = find_effect(cause)
     seen = {"motor": ("motor",), "sensor": ("joint",)}.get(side, ("motor", "joint"))
     if effect.channel == "motor":

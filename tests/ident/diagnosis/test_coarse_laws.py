@@ -37,8 +37,8 @@ def stribeck(s: Signals) -> None:
 @pytest.mark.slow
 def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain: Chain) -> None:
     found = diagnose([make("a.mcap", 1, odd_hose), make("b.mcap", 2, odd_hose, 1)], chain)
-    assert {(f.cause, f.joints) for f in found.findings} == {("cable_spring", (3,))}
-    assert found.findings[0].confidence > 0.8
+    assert {(f.cause, f.joints) for f in found.claims} == {("cable_spring", (3,))}
+    assert found.claims[0].confidence > 0.8
     assert 3 in {u.joint for u in found.unexplained}
 
 
@@ -54,9 +54,9 @@ def test_what_the_least_error_of_a_strong_law_explains_is_no_second_cause(
         )
 
     found = diagnose([make("a.mcap", 1, both), make("b.mcap", 2, both, 1)], chain)
-    assert {j for f in found.findings for j in f.joints} == named
-    assert len(found.findings) == len(named)
-    assert found.findings[0].cause == "stribeck"
+    assert {j for f in found.claims for j in f.joints} == named
+    assert len(found.claims) == len(named)
+    assert max(found.claims, key=lambda f: f.gain).cause == "stribeck"
 
 
 @pytest.mark.parametrize("cause", ["joint_elasticity", "backlash"])
@@ -76,6 +76,6 @@ def test_a_cause_is_claimed_only_where_a_motion_that_was_not_fitted_shows_it_too
 ) -> None:
     train = [make("a.mcap", 1, stribeck), make("b.mcap", 2, stribeck, 1)]
     same = diagnose(train, chain, test=[make("c.mcap", 3, stribeck, 2)])
-    assert [(f.cause, f.joints) for f in same.findings] == [("stribeck", (2,))]
+    assert [(f.cause, f.joints) for f in same.claims] == [("stribeck", (2,))]
     gone = diagnose(train, chain, test=[make("c.mcap", 3, None, 2)])
-    assert not gone.findings
+    assert not gone.claims

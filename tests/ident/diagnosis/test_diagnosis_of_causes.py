@@ -73,7 +73,7 @@ def healthy(make: Make, chain: Chain) -> Diagnosis:
 
 
 def test_says_nothing_where_nothing_is_wrong(healthy: Diagnosis) -> None:
-    assert healthy.findings == ()
+    assert healthy.claims == ()
     assert healthy.unexplained == ()
     assert "No model error is detectable" in str(healthy)
 
@@ -107,7 +107,7 @@ def test_names_cause_and_joint_first(
     value: float | None,
 ) -> None:
     found = diagnose(pair(make, change), chain)
-    first = found.findings[0]
+    first = found.claims[0]
     assert (first.cause, first.joints) == (cause, joints)
     assert first.evidence.p_value < 1e-5
     assert first.evidence.gain_interval_95[1] > 0.0
@@ -115,7 +115,7 @@ def test_names_cause_and_joint_first(
         estimate = first.parameters[parameter]
         assert abs(estimate.value - value) < 4.0 * estimate.std + 0.05 * abs(value)
     content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert content["findings"][0]["cause"] == cause
+    assert [*content["findings"], *content["character"]][0]["cause"] == cause
 
 
 def test_speed_and_exponent_are_sought_together(make: Make, chain: Chain) -> None:
@@ -125,7 +125,7 @@ def test_speed_and_exponent_are_sought_together(make: Make, chain: Chain) -> Non
         v = s["qd"][:, 1]
         s["motor"][:, 1] += 0.5 * np.sign(v) * np.exp(-((np.abs(v) / 0.2) ** 1.5))
 
-    (found,) = diagnose(pair(make, gaussian), chain, causes=["stribeck"]).findings
+    (found,) = diagnose(pair(make, gaussian), chain, causes=["stribeck"]).claims
     for name, true in (("amplitude", 0.5), ("velocity", 0.2), ("exponent", 1.5)):
         value = found.parameters[name]
         assert abs(value.value - true) < 2.5 * value.std, name
@@ -168,11 +168,11 @@ def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bo
 
     sessions = pair(make, heavier, seed=5)
     alone = diagnose(sessions, chain)
-    assert alone.findings == ()
+    assert alone.claims == ()
     assert any("no reference" in note for note in alone.notes)
     reference = commission([pair(make, seed=1)], chain)
     found = diagnose(sessions, chain, reference=reference)
-    assert found.findings[0].cause == "payload_error"
+    assert found.claims[0].cause == "payload_error"
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def reference(make: Make, chain: Chain) -> Reference:
 
 
 def test_reference_alone_claims_nothing(make: Make, chain: Chain, reference: Reference) -> None:
-    assert diagnose(pair(make, seed=5), chain, reference=reference).findings == ()
+    assert diagnose(pair(make, seed=5), chain, reference=reference).claims == ()
 
 
 @pytest.mark.slow
@@ -193,13 +193,13 @@ def test_what_shows_faintly_is_named_where_held_out_sessions_bear_it_out(
         s["motor"][:, 1] += 0.035 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
     fitted, held = pair(make, faint, seed=5), [make(f"{k}.mcap", k, faint, k) for k in (10, 11, 12)]
-    (found,) = diagnose(fitted, chain, test=held, reference=reference).findings
+    (found,) = diagnose(fitted, chain, test=held, reference=reference).claims
     assert (found.cause, found.joints) == ("stribeck", (2,))
     assert found.confidence <= 0.7
     without_it = [make(f"{k}.mcap", k, None, k) for k in (10, 11, 12)]
-    assert diagnose(fitted, chain, test=without_it, reference=reference).findings == ()
-    assert diagnose(fitted, chain, reference=reference).findings == ()
-    assert diagnose(fitted, chain, test=held).findings == ()
+    assert diagnose(fitted, chain, test=without_it, reference=reference).claims == ()
+    assert diagnose(fitted, chain, reference=reference).claims == ()
+    assert diagnose(fitted, chain, test=held).claims == ()
 
 
 def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, reference: Reference) -> None:
@@ -207,16 +207,16 @@ def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, referen
         s["joint"][:] = np.column_stack([np.interp(s["time"] - 0.0013, s["time"], c) for c in s["joint"].T])
 
     sessions = pair(make, late, seed=5)
-    (found,) = diagnose(sessions, chain, reference=reference).findings
+    (found,) = diagnose(sessions, chain, reference=reference).claims
     assert found.cause == "joint_torque_delay"
     assert found.parameters["delay"].value == pytest.approx(0.0013, abs=3e-4)
-    assert diagnose(sessions, chain).findings == ()
+    assert diagnose(sessions, chain).claims == ()
 
 
 def test_gain_of_a_late_channel_counts_from_before_it_was_put_in_time(make: Make, chain: Chain) -> None:
     first, second = pair(make, late_motor)
     found = diagnose([first], chain, test=[second])
-    (late,) = found.findings
+    (late,) = found.claims
     base, extended = found.rms_base["motor"], found.rms_extended["motor"]
     assert base[0] > 2.0 * extended[0]
     assert late.evidence.test_rms_before > 2.0 * late.evidence.test_rms_after
@@ -235,7 +235,7 @@ def test_without_a_reference_the_tick_of_another_clock_is_no_delay(make: Make, c
         thin["sequence"] = motor.sequence[: len(thin["effort"])]
         sessions.append(replace(session, motor=replace(motor, **thin)))
     found = diagnose(sessions, chain)
-    assert found.findings == ()
+    assert found.claims == ()
     assert any("motor torques come" in note and "without a reference" in note for note in found.notes)
 
 
@@ -259,7 +259,7 @@ def test_a_gap_that_is_never_crossed_may_be_a_zero_that_is_off(
     sessions = pair(make, turned)
     loads = np.concatenate([session.joint.effort[:, 1] for session in sessions])
     assert np.all(loads > 0.0)
-    (found,) = diagnose(sessions, chain, reference=replace(reference, encoder=encoder)).findings
+    (found,) = diagnose(sessions, chain, reference=replace(reference, encoder=encoder)).claims
     assert (found.cause, found.joints) == ("joint_zero_offset", (2,))
     rivals = [(cause, joints) for cause, joints, _ in found.alternatives]
     if encoder == "link":
@@ -280,7 +280,7 @@ def test_zero_of_each_session_is_no_function_of_the_angle(
         s["joint"][:, 1] += 0.05
 
     sessions = [make("a.mcap", 5, low), make("b.mcap", 6, high, 1)]
-    (found,) = diagnose(sessions, chain, reference=reference).findings
+    (found,) = diagnose(sessions, chain, reference=reference).claims
     assert (found.cause, found.joints, found.mode) == ("sensor_offset_drift", (2,), "between")
     assert found.parameters["drift"].value == pytest.approx(0.17, abs=0.02)
     assert found.parameters["zero"].value == pytest.approx(-0.12, abs=0.02)
@@ -308,7 +308,7 @@ def test_unknown_physics_is_not_named_with_confidence(
         s["motor"][:, 1] += size * np.sign(s["qd"][:, 1]) * np.cos(turns * s["q"][:, 0] + phase)
 
     found = diagnose(pair(make, strange), chain, reference=reference if commissioned else None)
-    assert all(f.confidence < 0.8 for f in found.findings)
+    assert all(f.confidence < 0.8 for f in found.claims)
     assert any(u.joint == 2 and u.side == "motor" and "q1" in u.depends_on for u in found.unexplained)
 
 
@@ -320,7 +320,7 @@ def test_scale_that_follows_another_angle_is_no_sure_gain(
         s["joint"][:, 1] *= 1.05 + 0.05 * np.sin(s["q"][:, 0] + 0.4)
 
     found = diagnose(pair(make, bent), chain, reference=reference)
-    assert all(f.confidence < 0.8 for f in found.findings)
+    assert all(f.confidence < 0.8 for f in found.claims)
     (left,) = [u for u in found.unexplained if u.joint == 2 and u.side == "joint"]
     assert {"q1", "load2"} <= set(left.depends_on)
 
@@ -333,7 +333,7 @@ def test_friction_that_follows_the_acceleration_is_not_named_with_confidence(
         s["motor"][:, 1] += 0.1 * np.abs(np.gradient(s["qd"][:, 1], s["time"])) * np.sign(s["qd"][:, 1])
 
     found = diagnose(pair(make, inertial), chain, reference=reference)
-    assert all(f.confidence < 0.8 for f in found.findings)
+    assert all(f.confidence < 0.8 for f in found.claims)
     assert any(u.joint == 2 and u.side == "motor" and "qdd2" in u.depends_on for u in found.unexplained)
 
 
@@ -344,7 +344,7 @@ def test_what_shakes_the_arm_is_told_with_its_frequency(
         s["motor"][:, 1] += 0.08 * np.sin(2.0 * np.pi * 1.37 * s["time"] + 0.4)
 
     found = diagnose(pair(make, shaken), chain, reference=reference)
-    assert found.findings == ()
+    assert found.claims == ()
     assert [(u.side, u.joint, u.depends_on) for u in found.unexplained] == [("motor", 2, ("time",))]
     (note,) = [note for note in found.notes if "swings" in note]
     assert "motor torque" in note
@@ -369,7 +369,7 @@ def test_samples_older_than_they_say_are_left_out(
     assert apart.min(axis=0).max() < 0.005
     assert apart.min(axis=1).max() < 0.01
     found = diagnose(sessions, chain)
-    assert [finding.cause for finding in found.findings] == causes
+    assert [finding.cause for finding in found.claims] == causes
     assert found.unexplained == ()
 
 
@@ -385,7 +385,7 @@ def test_a_sensor_that_clips_for_a_moment_is_no_contact(make: Make, chain: Chain
     assert np.isnan(limits[0]).all()
     assert np.isnan(limits[1]).all()
     assert np.nanmax([one[1] for one in limits]) == limit
-    (found,) = diagnose(clipped, chain).findings
+    (found,) = diagnose(clipped, chain).claims
     assert (found.cause, found.joints) == ("sensor_saturation", (2,))
     assert found.parameters["limit"].value == pytest.approx(limit, abs=1e-9)
 
@@ -418,7 +418,7 @@ def test_small_motor_torques_that_are_not_reported_are_seen(make: Make, chain: C
         (stuck,) = stuck_at(one.motor, one.joint)
         assert (stuck.joint, stuck.value) == (1, 0.0)
     found = diagnose(sessions, chain)
-    assert found.findings == ()
+    assert found.claims == ()
     assert [(u.side, u.joint, u.depends_on) for u in found.unexplained] == [("motor", 2, ("load2",))]
     assert any("motor torque of two reads exactly 0 Nm" in note for note in found.notes)
 
@@ -434,7 +434,7 @@ def test_what_recurs_in_each_period_is_no_push(
             s["motor"][on, 1] += 2.0
 
     found = diagnose([make("a.mcap", 1, pushed), make("b.mcap", 2, None, 1)], chain, causes=["contact"])
-    assert [f.cause for f in found.findings] == causes
+    assert [f.cause for f in found.claims] == causes
 
 
 @pytest.mark.parametrize(
@@ -450,7 +450,7 @@ def test_a_controller_that_answers_to_ripple_is_no_second_cause(
 
     known = ArmData(gear_ratio=np.full(3, 40.0))
     found = diagnose(pair(make, rippled), chain, arm=known, causes=["sensor_ripple", "gear_ripple"])
-    assert {f.cause for f in found.findings} == causes
+    assert {f.cause for f in found.claims} == causes
 
 
 def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
@@ -460,14 +460,14 @@ def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
     effort[rows] = effort[rows - 1]
     sessions[0] = replace(sessions[0], joint=replace(sessions[0].joint, effort=effort))
     found = diagnose(sessions, chain)
-    lost = [f for f in found.findings if f.cause == "lost_samples"]
+    lost = [f for f in found.claims if f.cause == "lost_samples"]
     assert lost
     assert lost[0].parameters["share"].value == pytest.approx(len(rows) / len(effort), rel=0.05)
 
 
 def test_one_session_without_motor_channel(make: Make, chain: Chain) -> None:
     found = diagnose([replace(make("a.mcap", 1), motor=None)], chain)
-    assert found.findings == ()
+    assert found.claims == ()
     assert found.model_number == 1
     assert any("no motor torque" in note for note in found.notes)
     assert found.to_dict()["baseline"]["test_rms"]["motor"] is None

@@ -78,7 +78,7 @@ def doubt(make: Make, chain: Chain) -> tuple[Diagnosis, Diagnosis]:
 
 
 def test_a_poor_session_leaves_a_doubt(doubt: tuple[Diagnosis, Diagnosis]) -> None:
-    (finding,) = doubt[0].findings
+    (finding,) = doubt[0].claims
     (other, joints, _) = finding.alternatives[0]
     assert {(finding.cause, finding.joints), (other, joints)} == {(cause, (2,)) for cause in PAIR}
     assert finding.confidence < 0.8
@@ -88,5 +88,5 @@ def test_the_sweep_decides_for_what_is_there(doubt: tuple[Diagnosis, Diagnosis])
     (answer,) = decisions(*doubt)
     assert answer.outcome == "decided"
     assert answer.named == ("stribeck", (2,))
-    amplitude = doubt[1].findings[0].parameters["amplitude"]
+    amplitude = doubt[1].claims[0].parameters["amplitude"]
     assert abs(amplitude.value - 0.3) < 4.0 * amplitude.std

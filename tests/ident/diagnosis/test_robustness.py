@@ -87,7 +87,7 @@ def sound(found: Diagnosis) -> Diagnosis:
     json.dumps(found.to_dict(), allow_nan=False)
     assert str(found)
     joints = found.base_model.structure.chain.n
-    for finding in found.findings:
+    for finding in found.claims:
         assert 0.0 <= finding.confidence <= 1.0
         assert all(1 <= j <= joints for j in finding.joints)
     for model in (found.base_model, found.extended_model):
@@ -118,7 +118,7 @@ def sound(found: Diagnosis) -> Diagnosis:
 )
 def test_a_healthy_arm_is_called_healthy_whatever_was_recorded(kind: dict) -> None:
     found = sound(diagnose([session(**kind)], arm(kind.get("joints", 2))))
-    assert found.findings == ()
+    assert found.claims == ()
     notes = " ".join(found.notes)
     assert ("low-passed" in notes) == ("band_hz" in kind)
     assert ("no motion of" in notes) == ("moving" in kind)
@@ -130,7 +130,7 @@ def test_a_healthy_arm_is_called_healthy_whatever_was_recorded(kind: dict) -> No
 )
 def test_a_strong_spring_is_found_in_one_session_of_any_kind(kind: dict) -> None:
     found = sound(diagnose([session(seconds=20.0, extra=6.0, **kind)], arm()))
-    first = found.findings[0]
+    first = found.claims[0]
     assert first.joints == (2,)
     names = {first.cause, *(cause for cause, joints, _ in first.alternatives if joints == (2,))}
     assert "cable_spring" in names
@@ -142,26 +142,26 @@ def test_a_joint_torque_that_never_changes_is_no_cause() -> None:
     dead = session()
     dead.joint.effort[:, 1] = 0.0
     found = sound(diagnose([dead], arm()))
-    assert all(f.confidence < 0.8 for f in found.findings if f.side == "joint")
+    assert all(f.confidence < 0.8 for f in found.claims if f.side == "joint")
 
 
 def test_one_session_for_fitting_and_testing() -> None:
-    assert sound(diagnose([session()], arm(), test=[session(name="b.mcap")])).findings == ()
+    assert sound(diagnose([session()], arm(), test=[session(name="b.mcap")])).claims == ()
 
 
 def test_the_session_for_testing_may_be_the_older_one() -> None:
     older = session(seed=1, name="older.mcap")
-    assert sound(diagnose([session(seed=2)], arm(), test=[older])).findings == ()
+    assert sound(diagnose([session(seed=2)], arm(), test=[older])).claims == ()
 
 
 def test_a_session_with_and_one_without_motor_torque() -> None:
     pair = [session(seed=1), session(seed=2, motor=False, name="b.mcap")]
-    assert sound(diagnose(pair, arm())).findings == ()
+    assert sound(diagnose(pair, arm())).claims == ()
 
 
 def test_a_session_with_and_one_without_joint_torque() -> None:
     pair = [session(seed=1), session(seed=2, joint=False, name="b.mcap")]
-    assert sound(diagnose(pair, arm())).findings == ()
+    assert sound(diagnose(pair, arm())).claims == ()
 
 
 def test_missing_values_are_refused() -> None:
@@ -178,7 +178,7 @@ def test_a_session_that_is_too_short_is_refused(seconds: float) -> None:
 
 
 def test_two_seconds_say_nothing() -> None:
-    assert sound(diagnose([session(seconds=2.0)], arm())).findings == ()
+    assert sound(diagnose([session(seconds=2.0)], arm())).claims == ()
 
 
 def test_a_session_in_which_nothing_moves_is_refused() -> None:
@@ -193,7 +193,7 @@ def test_of_a_long_session_windows_from_beginning_to_end_are_used() -> None:
     assert 25.0 < len(time) * np.median(np.diff(time)) < 40.0
     assert time[0] < 5.0
     assert time[-1] > 75.0
-    assert found.findings[0].cause == "cable_spring"
+    assert found.claims[0].cause == "cable_spring"
 
 
 def test_a_fit_of_no_possible_arm_leaves_links_that_move_on_springs() -> None:

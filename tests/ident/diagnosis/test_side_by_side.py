@@ -43,7 +43,7 @@ def found(make: Make, chain: Chain) -> Study:
 
 
 def test_a_doubt_is_shown_with_both_signatures(found: Study) -> None:
-    finding = found.diagnosis.findings[0]
+    finding = found.diagnosis.claims[0]
     assert (finding.cause, finding.joints) == ("sensor_ripple", (3,))
     assert finding.confidence < 0.8
     pair = found.pairs[0]

@@ -48,7 +48,7 @@ def relative_percent(model: DynamicModel, run: int) -> float:
 
 def finding(found: Diagnosis, cause: str, joints: tuple[int, ...]) -> Finding:
     """The finding of a cause, or with it as a look-alike."""
-    for f in found.findings:
+    for f in found.claims:
         if (cause, joints) in [(f.cause, f.joints), *((c, j) for c, j, _ in f.alternatives)]:
             return f
     pytest.fail(f"no {cause} {joints} in\n{found}")
@@ -71,7 +71,7 @@ def test_cable_of_the_wrist_and_lean_of_the_base_are_named(train, test, bound):
     wrist, lean = finding(found, "cable_spring", (7,)), finding(found, "base_tilt", ())
     assert wrist.evidence.test_rms_after < 0.3 * wrist.evidence.test_rms_before
     assert lean.evidence.test_rms_after < 0.6 * lean.evidence.test_rms_before
-    assert min(f.evidence.gain_interval_95[1] for f in found.findings) > 0.0
+    assert min(f.evidence.gain_interval_95[1] for f in found.claims) > 0.0
     tilt = np.array([lean.parameters[name].value for name in ("tilt_x", "tilt_y")])
     std = np.array([lean.parameters[name].std for name in ("tilt_x", "tilt_y")])
     alone = mounted(train)
@@ -82,7 +82,7 @@ def test_cable_of_the_wrist_and_lean_of_the_base_are_named(train, test, bound):
 @pytest.mark.parametrize(("train", "test", "bound"), SPLITS)
 def test_joint_torque_alone_makes_no_sure_claim_about_a_sensor(train, test, bound):
     found = diagnosis(train, test)
-    for f in found.findings:
+    for f in found.claims:
         assert f.side in ("joint", "sensor")
         if f.side == "sensor":
             assert f.confidence < SURE
@@ -122,9 +122,9 @@ def test_drives_of_the_tx40_grow_slower_than_speed(tmp_path: Path) -> None:
     log = imported("tx40", folder, tmp_path / "tx40.mcap")
     arm = Chain.from_urdf(folder / "tx40_mdh_modified.urdf")
     found = diagnose([log], arm, arm=ArmData(couplings=(Coupling(("joint_5", "joint_6")),)))
-    named = {f.joints: f for f in found.findings if f.cause == "viscous_nonlinear"}
+    named = {f.joints: f for f in found.claims if f.cause == "viscous_nonlinear"}
     assert (2,) in named
-    assert {f.side for f in found.findings} == {"motor"}
+    assert {f.side for f in found.claims} == {"motor"}
     for joints, f in named.items():
         assert f.evidence.test_rms_after < 0.85 * f.evidence.test_rms_before
         speed = np.array([0.5, 1.0, 2.0])
@@ -149,7 +149,7 @@ def test_torque_of_the_iiwas_wrist_repeats_with_its_angle(tmp_path: Path) -> Non
         imported("iiwa14", tmp_path / "friction_model" / "joint6" / s, tmp_path / f"{s}.mcap") for s in speeds
     ]
     found = diagnose(logs, Chain.from_urdf(folder / "iiwa14.urdf"))
-    assert {f.joints for f in found.findings} <= {(6,), ()}
+    assert {f.joints for f in found.claims} <= {(6,), ()}
     assert {u.joint for u in found.unexplained} <= {6}
     ripple = finding(found, "sensor_ripple", (6,))
     assert ripple.confidence < SURE

@@ -1,0 +1,88 @@
+"""Wear: drive parameters of the sessions beside those of the healthy arm.
+
+A change of friction or drive inertia leaves no residual, for the base parameters absorb it. Against a reference it
+shows in the parameters themselves: estimated by these sessions alone, beside all claims, their difference from the
+healthy ones is compared with both uncertainties and with the arm's changes from day to day (`reference.habit`), joint
+by joint (Hotelling's T^2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.diagnosis.bench import DiagnosisBench
+from ident.diagnosis.evidence import Floats
+from ident.diagnosis.held_out import HeldOut
+from ident.diagnosis.reference import Reference
+from ident.diagnosis.result import Evident, Finding, Value
+from ident.effects import WEAR
+from ident.estimators.estimate import fisher_tail
+
+_PARAMETERS = {"Fcm": "coulomb", "Fvm": "viscous", "Ia": "inertia"}
+# Largest probability of such a change in one of the joints on a healthy arm.
+_ONE_IN = 0.01
+# Least relative change that matters to a user, of the largest parameter.
+_MATTERS = 0.03
+# Healthy arms for an arm with wear, before the data.
+_RARE = 10.0
+_TELL_APART = "the same motion with joint {joint} cold and warm: wear stays, warmth goes"
+
+
+def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Finding]:
+    """Findings of changed drives, beside the present columns of the evidence. after : held-out rows with them."""
+    nominal, evidence = bench.nominal, bench.evidence
+    prior = reference.prior(nominal.base)
+    if prior is None or not reference.sets or "motor" not in nominal.rows:
+        return []
+    precision, healthy = prior
+    known = np.flatnonzero(np.diag(precision) > 0.0)
+    spread = np.zeros_like(precision)
+    spread[np.ix_(known, known)] = np.linalg.inv(precision[np.ix_(known, known)])
+    values, covariance = evidence.free()
+    found = []
+    moving = np.flatnonzero(nominal.moving)
+    for joint in moving.tolist():
+        names = {f"{symbol}{joint + 1}": parameter for symbol, parameter in _PARAMETERS.items()}
+        places = [k for k in known.tolist() if nominal.base.names[k] in names and healthy[k] > 0.0]
+        if not places:
+            continue
+        change = values[places] - healthy[places]
+        own = covariance[np.ix_(places, places)] + spread[np.ix_(places, places)]
+        square = float(change @ np.linalg.solve(own, change))
+        freedom = max(float(reference.sets * len(moving)), 2.0)
+        p_value = min(1.0, len(moving) * fisher_tail(square / len(places), len(places), freedom))
+        share, std = change / healthy[places], np.sqrt(np.diag(own)) / healthy[places]
+        if p_value > _ONE_IN or np.max(np.abs(share)) < _MATTERS:
+            continue
+        labels = [names[nominal.base.names[k]] for k in places]
+        before, rms = _errors(bench, after, joint, np.array(places), change)
+        found.append(
+            Finding(
+                WEAR,
+                "motor",
+                (joint + 1,),
+                {
+                    label: Value(float(value), float(s), "1")
+                    for label, value, s in zip(labels, share, std, strict=True)
+                },
+                Evident(-square, p_value, before, rms, (before - rms, before - rms)),
+                1.0 / (1.0 + _RARE * p_value),
+                (),
+                _TELL_APART.format(joint=joint + 1),
+                square,
+            )
+        )
+    return found
+
+
+def _errors(
+    bench: DiagnosisBench, after: HeldOut, joint: int, places: Floats, change: Floats
+) -> tuple[float, float]:
+    """Error [Nm] of the joint's motor torque on held-out rows with the healthy drive, and with the one found."""
+    residual = after.residual["motor"][:, joint]
+    keep = np.isfinite(residual)
+    if not keep.any():
+        return 0.0, 0.0
+    torque = bench.nominal.rows["motor"].matrix[joint][keep][:, places.astype(int)] @ change
+    rms = float(np.sqrt(np.mean(residual[keep] ** 2)))
+    return float(np.sqrt(np.mean((residual[keep] + torque) ** 2))), rms
