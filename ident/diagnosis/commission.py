@@ -314,15 +314,17 @@ def _reference(
     sessions: Sequence[Session],
     null: Mapping[tuple[str, int], float],
 ) -> Reference:
-    precisions = [np.asarray(np.linalg.inv(_sound(day.covariance)), dtype=np.float64) for day in days]
-    within = np.linalg.inv(_sound(np.sum(precisions, axis=0)))
-    pulls = [p @ day.values for p, day in zip(precisions, days, strict=True)]
-    values: Floats = within @ np.sum(pulls, axis=0)
-    covariance: Floats = np.asarray(within, dtype=np.float64)
     rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in days[0].torque_rms}
-    changes = habit(base.names, [day.values for day in days], [day.covariance for day in days], rms)
+    changes = np.diag(habit(base.names, [day.values for day in days], [day.covariance for day in days], rms))
+    # A mean weighted by each day's own uncertainty alone would turn their changes into errors of all parameters.
+    precisions = [
+        np.asarray(np.linalg.inv(_sound(day.covariance + changes)), dtype=np.float64) for day in days
+    ]
+    mean = np.linalg.inv(_sound(np.sum(precisions, axis=0)))
+    pulls = [p @ day.values for p, day in zip(precisions, days, strict=True)]
+    values: Floats = mean @ np.sum(pulls, axis=0)
     # A further day differs from the mean of these.
-    covariance = covariance + np.diag(changes * (1.0 + 1.0 / len(days)))
+    covariance: Floats = np.asarray(mean + changes, dtype=np.float64)
     model = DynamicModel(
         robot or "arm",
         base.structure,

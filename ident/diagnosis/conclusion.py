@@ -20,7 +20,7 @@ from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.result import Diagnosis, Evident, Finding, Nameless, RowStates, Unexplained, Value
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import Baseline, State, Task
-from ident.diagnosis.wear import wear
+from ident.diagnosis.wear import is_level, wear
 from ident.effects import EFFECTS, LOST_SAMPLES, NAMELESS
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -38,6 +38,8 @@ _ALL_BUT = 0.05
 _ENCOMPASSED = 0.8
 # Least fall of the error on held-out rows by a sure claim, as a share: less is felt by nobody.
 _FELT = 0.05
+# Least confidence of a finding.
+_HARDLY = 0.1
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
 _EXCITED = 0.1
 
@@ -48,10 +50,17 @@ def conclude(task: Task, state: State) -> Diagnosis:
     evidence, nominal = bench.evidence, bench.nominal
     baseline = state.baseline if state.timing else None
     baseline = baseline or Baseline.of(bench, nuisance)
-    kept = _confirmed_findings(task, state)
+    kept = [pair for pair in _confirmed_findings(task, state) if not is_level(pair[0])]
     evidence.replace([*(c.trial.rows for c, _ in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     findings = _doubted(task, state, kept, remainders)
+    pairs = list(zip(kept, findings, strict=True))
+    if any(finding.confidence < _HARDLY for finding in findings):
+        # A name hardly believed is no finding; what it explained is left to the remainders.
+        kept = [one for one, finding in pairs if finding.confidence >= _HARDLY]
+        findings = [finding for finding in findings if finding.confidence >= _HARDLY]
+        evidence.replace([*(c.trial.rows for c, _ in kept), *nuisance])
+        remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     worn = []
     if task.reference is not None:
         shown = held_out(evidence, [*(c.trial.rows for c, _ in kept), *nuisance])
@@ -138,13 +147,24 @@ def _extension(
     """The members that leave no row worse than the base model beyond chance, and the held-out rows with them.
 
     Of those acting on a worse row the one of least gain goes first, remainders before claims; then the rest is
-    measured again. The columns of the evidence are those of the result.
+    measured again. A remainder has to lower the error of its own row beyond chance, too. The columns of the evidence
+    are those of the result.
     """
+
+    def with_members(chosen: Sequence[_Member]) -> HeldOut:
+        return held_out(bench.evidence, [*(rows for m in chosen for rows in m.rows), *nuisance])
+
     while True:
-        after = held_out(bench.evidence, [*(rows for m in members for rows in m.rows), *nuisance])
+        after = with_members(members)
+        for member in sorted((m for m in members if m.remainder is not None), key=lambda m: m.gain):
+            assert member.remainder is not None
+            rest = [m for m in members if m is not member]
+            key = (member.remainder.side, member.remainder.joint - 1)
+            if interval(with_members(rest), after, [key], seed)[2] <= 0.0:
+                members, after = rest, with_members(rest)
         worse = set(worse_rows(baseline.held.where(after), after.where(baseline.held), seed))
         if not worse or not members:
-            return members, after
+            return members, with_members(members)
         acting = [m for m in members if any(worse & set(rows) for rows in m.rows)] or members
         out = min(acting, key=lambda m: (m.finding is not None, m.gain))
         members = [m for m in members if m is not out]
@@ -232,7 +252,7 @@ def _felt(claim: Claim, finding: Finding, without: HeldOut, after: HeldOut, seed
     if shown.test_rms_after > (1.0 - _FELT) * shown.test_rms_before:
         return False
     keys = list(claim.trial.rows)
-    return spread_out(without, after, keys) and not worse_rows(without, after, seed)
+    return spread_out(without, after, keys) and not worse_rows(without, after, seed, any_of_them=True)
 
 
 def _confirmed(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float]) -> float:

@@ -50,11 +50,11 @@ def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
 
 
 def interval(
-    before: HeldOut, after: HeldOut, keys: Sequence[Key], seed: int
+    before: HeldOut, after: HeldOut, keys: Sequence[Key], seed: int, *, tail: float = 0.025
 ) -> tuple[float, float, float, float]:
     """RMS before and after, pooled over the rows of `keys`, and the 95 % interval of their difference.
 
-    From 1000 draws of blocks with replacement.
+    tail : share beyond each end of the interval. From 1000 draws of blocks with replacement.
     """
     table = _by_block(before, after, dict.fromkeys(keys, 1.0))
     if not len(table):
@@ -62,7 +62,7 @@ def interval(
     drawn = _drawn(table, seed)
     difference = np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2])
     total = table.sum(axis=0)
-    low, high = np.quantile(difference, [0.025, 0.975])
+    low, high = np.quantile(difference, [tail, 1.0 - tail])
     return float(np.sqrt(total[0] / total[2])), float(np.sqrt(total[1] / total[2])), float(low), float(high)
 
 
@@ -86,17 +86,17 @@ def spread_out(before: HeldOut, after: HeldOut, keys: Sequence[Key]) -> bool:
     return bool(fall.sum() > max(float(fall.max()), 0.0))
 
 
-def worse_rows(before: HeldOut, after: HeldOut, seed: int) -> list[Key]:
-    """Sides and joints with a larger error after than before, beyond the 95 % interval."""
-    found = []
-    for side, values in before.residual.items():
-        for joint in range(values.shape[1]):
-            if (
-                np.isfinite(values[:, joint]).any()
-                and interval(before, after, [(side, joint)], seed)[3] < 0.0
-            ):
-                found.append((side, joint))
-    return found
+def worse_rows(before: HeldOut, after: HeldOut, seed: int, *, any_of_them: bool = False) -> list[Key]:
+    """Sides and joints with a larger error after than before, beyond the 95 % interval; `any_of_them` : beyond chance
+    for the worst of all."""
+    keys = [
+        (side, joint)
+        for side, values in before.residual.items()
+        for joint in range(values.shape[1])
+        if np.isfinite(values[:, joint]).any()
+    ]
+    tail = 0.025 / max(len(keys), 1) if any_of_them else 0.025
+    return [key for key in keys if interval(before, after, [key], seed, tail=tail)[3] < 0.0]
 
 
 def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:

@@ -168,10 +168,10 @@ class Reference:
         more = np.diag(np.where(mine, share * model.values, 0.0) ** 2)
         return replace(self, model=replace(model, covariance=model.covariance + more))
 
-    def prior(self, base: BaseSet) -> tuple[Floats, Floats] | None:
+    def prior(self, base: BaseSet, *, wider: float = _WIDER) -> tuple[Floats, Floats] | None:
         """Precision (p, p) and values (p,) of the base parameters shared with the reference.
 
-        None for a reference without covariance or without shared parameters.
+        wider : factor on their standard deviations. None for a reference without covariance or shared parameters.
         """
         own = self.model
         if own.covariance is None or own.base is None:
@@ -182,7 +182,7 @@ class Reference:
         if not pairs:
             return None
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
-        covariance = own.covariance[np.ix_(there, there)] * _WIDER**2
+        covariance = own.covariance[np.ix_(there, there)] * wider**2
         values = own.values[there]
         # A commissioned arm's covariance holds its changes from day to day.
         usual = np.array([_USUAL.get(_symbol(base.names[b]), _ELSE) for b in here])

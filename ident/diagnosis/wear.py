@@ -3,7 +3,8 @@
 A change of friction or drive inertia leaves no residual, for the base parameters absorb it. Against a reference it
 shows in the parameters themselves: estimated by these sessions alone, beside all claims, their difference from the
 healthy ones is compared with both uncertainties and with the arm's changes from day to day (`reference.habit`), joint
-by joint (Hotelling's T^2).
+by joint (Hotelling's T^2). Friction at another level in all sessions may be worn or warmer; the same motion cold and warm
+decides.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from ident.diagnosis.evidence import Floats
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Evident, Finding, Value
-from ident.effects import WEAR
+from ident.diagnosis.selection import Claim
+from ident.effects import FRICTION_TEMPERATURE, WEAR
+from ident.effects.course import Course
 from ident.estimators.estimate import fisher_tail
 
 _PARAMETERS = {"Fcm": "coulomb", "Fvm": "viscous", "Ia": "inertia"}
@@ -25,13 +28,23 @@ _ONE_IN = 0.01
 _MATTERS = 0.03
 # Healthy arms for an arm with wear, before the data.
 _RARE = 10.0
+# Least change of a drive's inertia for a claim of its own, in standard deviations.
+_CLEAR = 4.0
+# Confidence in wear of friction alone: a drive warmer or colder in all sessions looks the same.
+_WORN_OR_WARM = 0.75
 _TELL_APART = "the same motion with joint {joint} cold and warm: wear stays, warmth goes"
+
+
+def is_level(claim: Claim) -> bool:
+    """Whether a claim is friction at another level in all sessions: told as wear."""
+    same = claim.trial.candidate.cause == FRICTION_TEMPERATURE.cause
+    return same and claim.trial.shape.form is Course.SINCE_REFERENCE
 
 
 def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Finding]:
     """Findings of changed drives, beside the present columns of the evidence. after : held-out rows with them."""
     nominal, evidence = bench.nominal, bench.evidence
-    prior = reference.prior(nominal.base)
+    prior = reference.prior(nominal.base, wider=1.0)
     if prior is None or not reference.sets or "motor" not in nominal.rows:
         return []
     precision, healthy = prior
@@ -55,6 +68,9 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
         if p_value > _ONE_IN or np.max(np.abs(share)) < _MATTERS:
             continue
         labels = [names[nominal.base.names[k]] for k in places]
+        sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
+        heavier = sizes.get("inertia", 0.0) > max(_CLEAR, 0.5 * max(sizes.values()))
+        sure = 1.0 / (1.0 + _RARE * p_value)
         before, rms = _errors(bench, after, joint, np.array(places), change)
         found.append(
             Finding(
@@ -66,8 +82,8 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
                     for label, value, s in zip(labels, share, std, strict=True)
                 },
                 Evident(-square, p_value, before, rms, (before - rms, before - rms)),
-                1.0 / (1.0 + _RARE * p_value),
-                (),
+                sure if heavier else min(sure, _WORN_OR_WARM),
+                () if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
                 _TELL_APART.format(joint=joint + 1),
                 square,
             )

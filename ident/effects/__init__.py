@@ -35,6 +35,7 @@ __all__ = [
     "DELAYS",
     "EFFECTS",
     "ELASTICITY",
+    "FRICTION_TEMPERATURE",
     "LOST_SAMPLES",
     "NAMELESS",
     "PRESLIDING",
@@ -61,6 +62,7 @@ __all__ = [
 
 _ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 
+FRICTION_TEMPERATURE = drive.FrictionTemperature()
 PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 ZERO_OFFSET = link.JointZeroOffset()
@@ -75,7 +77,7 @@ EFFECTS: dict[str, Effect] = {
         drive.ViscousNonlinear(),
         drive.FrictionAsymmetry(),
         drive.FrictionLoad(),
-        drive.FrictionTemperature(),
+        FRICTION_TEMPERATURE,
         drive.FrictionPosition(),
         PRESLIDING,
         drive.GearRipple(),

@@ -1,0 +1,105 @@
+"""Changes of drives that leave no residual, told against the healthy arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ident.diagnosis import Diagnosis, Reference, commission, diagnose
+from ident.diagnosis.reference import habit
+from ident.dynamics.kinematics import Chain
+from lwr_driver.session import Session
+
+Make = Callable[..., Session]
+Signals = dict[str, np.ndarray]
+
+
+def friction(share: float, joint: int = 1) -> Callable[[Signals], None]:
+    """More friction in the motor torque of a joint of the known arm."""
+
+    def change(s: Signals) -> None:
+        v = s["qd"][:, joint]
+        s["motor"][:, joint] += share * (0.6 * np.sign(v) + 0.8 * v)
+
+    return change
+
+
+def pair(make: Make, change: Callable[[Signals], None] | None = None, seed: int = 1) -> list[Session]:
+    return [make("a.mcap", seed, change), make("b.mcap", seed + 1, change, 1)]
+
+
+@pytest.fixture(scope="module")
+def reference(make: Make, chain: Chain) -> Reference:
+    return commission([pair(make, seed=11), pair(make, seed=21)], chain)
+
+
+def worn(found: Diagnosis) -> dict[tuple[int, ...], dict[str, float]]:
+    return {
+        f.joints: {name: v.value for name, v in f.parameters.items()}
+        for f in found.findings
+        if f.cause == "wear"
+    }
+
+
+def test_more_friction_is_wear_of_that_joint_with_its_size(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    model = reference.model
+    healthy = model.value("Fcm2"), model.value("Fvm2")
+    added = 0.6, 0.8
+    found = diagnose(pair(make, friction(1.0)), chain, reference=reference)
+    sizes = worn(found)[2,]
+    (finding,) = [f for f in found.findings if f.cause == "wear"]
+    for name, was, more in zip(("coulomb", "viscous"), healthy, added, strict=True):
+        value = finding.parameters[name]
+        assert sizes[name] == pytest.approx(more / was, abs=3.0 * value.std)
+    assert finding.evidence.test_rms_before > 1.5 * finding.evidence.test_rms_after
+    assert "wear" in str(found)
+
+
+def test_a_healthy_day_and_an_arm_without_reference_show_no_wear(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    assert not worn(diagnose(pair(make, seed=31), chain, reference=reference))
+    assert not worn(diagnose(pair(make, friction(1.0)), chain))
+
+
+def test_wear_is_no_part_of_the_extension(make: Make, chain: Chain, reference: Reference) -> None:
+    found = diagnose(pair(make, friction(1.0)), chain, reference=reference)
+    assert not any(name.startswith("wear") for name in found.extension)
+    assert all(entry["cause"] != "wear" for entry in found.extended_model.effects)
+
+
+def test_an_arm_that_changes_from_day_to_day_has_to_change_more_to_be_worn(make: Make, chain: Chain) -> None:
+    restless = commission(
+        [
+            [
+                make("a.mcap", 11 + 10 * k, friction(share, 0)),
+                make("b.mcap", 12 + 10 * k, friction(share, 0), 1),
+            ]
+            for k, share in enumerate((-0.8, 0.8))
+        ],
+        chain,
+    )
+    assert not worn(diagnose(pair(make, friction(0.5)), chain, reference=restless))
+
+
+def test_habit_of_a_calm_arm_is_less_than_usual_and_of_a_restless_one_more() -> None:
+    names = tuple(f"Fcm{k}" for k in range(1, 8))
+    tiny = np.eye(7) * 1e-8
+    calm = habit(names, [np.ones(7), np.ones(7)], [tiny, tiny], {})
+    rng = np.random.default_rng(0)
+    days = [1.0 + 0.2 * rng.normal(size=7) for _ in range(2)]
+    restless = habit(names, days, [tiny, tiny], {})
+    single = habit(names, [np.ones(7)], [tiny], {})
+    assert np.all(calm < 0.3 * single)
+    assert np.all(restless > 4.0 * single)
+
+
+def test_habit_of_an_offset_is_measured_by_the_torque_of_its_rows() -> None:
+    names = ("offm1", "offl1")
+    rms = {"motor": np.array([10.0]), "joint": np.array([20.0])}
+    found = habit(names, [np.zeros(2)], [np.eye(2) * 1e-8], rms)
+    assert np.sqrt(found) == pytest.approx([0.1, 0.2])
