@@ -1,0 +1,263 @@
+"""Periods of the excitation in a recording without marks, from the measured positions.
+
+A motion repeats with the period T from t0 to t1 if, in every joint that moves,
+
+    e(t) = q(t + T) - q(t),   mean e^2 <= 2 sigma^2 + (eps s)^2,   t0 <= t <= t1 - T,   t1 - t0 >= 2 T,
+
+with the noise sigma of the positions and their standard deviation s in a period. The lags to try are minima of the mean
+square difference over the lag, which is the autocorrelation turned over. Averages over periods take the motion as
+repeated, so a deviation eps counts there as an error of the torque of about eps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import uniform_filter1d
+from scipy.special import comb
+
+from fri.errors import DataError
+from ident.import_log.mapping import PeriodMarks
+from ident.import_log.tables import Floats
+from ident.rows.binned import bins
+
+# Deviation of the motion from period to period over the motion; identified torques err by one to two per cent.
+EPS = 5e-3
+# Positions this noisy, over the motion, cannot tell a repeat from a similar motion.
+_LOUDEST = 0.05
+# Order of the differences for the noise: a motion of 3 Hz at 50 Hz has 1e-4 of its size left in them.
+_ORDER = 5
+_MEAN_S, _GRID_S, _MOST_GRID = 0.01, 0.02, 60_000
+_SHORTEST_S = 0.5
+_CANDIDATES = 40
+_ASIDE, _MOST_BLOCK = 0.03, 1000
+_STEPS = 3
+# Length over which a local deviation is judged, and its size over that of the whole.
+_LOCAL, _EXCESS = 0.05, 2.0
+# A joint moves if it travels more than its noise, and in a period as much as in the whole, by these factors.
+_TRAVEL, _SHARE = 20.0, 0.5
+
+
+@dataclass(frozen=True)
+class Periods:
+    """Consecutive equal periods: beginning after the first sample [s], length [s], number.
+
+    deviation : rms of q(t + T) - q(t) over that of the motion, of the worst joint.
+    """
+
+    start_s: float
+    period_s: float
+    count: int
+    deviation: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.count} of {self.period_s:.6g} s, from {self.start_s:.6g} s on"
+
+    @property
+    def stop_s(self) -> float:
+        """End of the last one [s]."""
+        return self.start_s + self.count * self.period_s
+
+
+def find_periods(time: Floats, position: Floats) -> Periods | None:
+    """The shortest period of a motion that repeats, at least two of them; None for another motion.
+
+    time : (N,) [s], increasing. position : (N, n) [rad]. A motion that is longer than a period outside of the repeated
+    part is no periodic excitation, since marks would leave it out.
+    """
+    motion = _Motion.of(time, position)
+    if motion is None:
+        return None
+    found = [periods for lag in motion.lags() if (periods := motion.periods(lag)) is not None]
+    # A multiple of the period repeats as well.
+    best = min(found, key=lambda one: one.period_s, default=None)
+    return best if best is not None and motion.covered(best) else None
+
+
+def marked_periods(marks: PeriodMarks, time: Floats, position: Floats) -> Periods | None:
+    """The periods of a mapping; None for a `count` of 0.
+
+    time : (N,) [s], increasing. position : (N, n) [rad]. Raises DataError for periods beyond the recording.
+    """
+    if marks.count == 0:
+        return None
+    # The last sample of a period is a step before the next one begins.
+    step = float(np.median(np.diff(time)))
+    length = float(time[-1] - time[0]) + step - marks.start_s
+    period = marks.period_s if marks.period_s is not None else length / (marks.count or 1)
+    fit = int((length + 0.5 * step) / period) if period > 0.0 else 0
+    count = fit if marks.count is None else marks.count
+    if not 1 <= count <= fit:
+        raise DataError(
+            f"`periods`: {max(count, 1)} of {period:.6g} s from {marks.start_s:g} s on end at "
+            f"{marks.start_s + max(count, 1) * period:.6g} s, the recording at {marks.start_s + length:.6g} s; correct "
+            "`period_s`, `start_s` or `count`"
+        )
+    found = Periods(marks.start_s, period, count)
+    return replace(found, deviation=deviation(time, position, found))
+
+
+def deviation(time: Floats, position: Floats, periods: Periods) -> float:
+    """rms of q(t + T) - q(t) over that of the motion, in given periods, of the worst joint; 0 for a single one.
+
+    time : (N,) [s]. position : (N, n) [rad].
+    """
+    motion = _Motion.of(time, position)
+    if motion is None or periods.count < 2:
+        return 0.0
+    first, last = (np.searchsorted(motion.time, at) for at in (periods.start_s, periods.stop_s))
+    share, _ = motion.difference(periods.period_s, slice(int(first), int(last)))
+    return float(share)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Joints in motion on an even grid.
+
+    time : (N,) [s] from the first sample; q : (N, m) [rad], means over 10 ms; noise : (m,) their standard deviation
+    [rad]; step_s : their median step.
+    """
+
+    time: Floats
+    q: Floats
+    noise: Floats
+    step_s: float
+    curve: CubicSpline
+
+    @classmethod
+    def of(cls, time: Floats, position: Floats) -> _Motion | None:
+        """None for positions too short, at rest, or too noisy."""
+        if len(time) < 4 * _ORDER or not time[-1] > time[0]:
+            return None
+        width = max(1, int(_MEAN_S * (len(time) - 1) / (time[-1] - time[0])))
+        seconds, position = bins((time - time[0])[:, None], width)[:, 0], bins(position, width)
+        noise = _noise(position)
+        moving = np.ptp(position, axis=0) > _TRAVEL * np.maximum(noise, 1e-9)
+        q, noise = position[:, moving], noise[moving]
+        if not q.shape[1] or np.any(noise > _LOUDEST * q.std(axis=0)):
+            return None
+        step = float(np.median(np.diff(seconds)))
+        grid_s = max(_GRID_S, step, seconds[-1] / _MOST_GRID)
+        grid = np.arange(seconds[0], seconds[-1] + 1e-9, grid_s)
+        curve = CubicSpline(seconds, q)
+        return cls(grid, curve(grid), noise, step, curve)
+
+    @property
+    def grid_s(self) -> float:
+        """Distance of the samples [s]."""
+        return float(self.time[1] - self.time[0])
+
+    def lags(self) -> Iterator[int]:
+        """Lags in samples with a minimum of the mean square difference, the smallest difference first."""
+        count, least = len(self.time), max(2, round(_SHORTEST_S / self.grid_s))
+        if count < 2 * least:
+            return
+        x = (self.q - self.q.mean(axis=0)) / self.q.std(axis=0)
+        size = next_fast_len(2 * count, real=True)
+        cross = irfft(np.abs(rfft(x, size, axis=0)) ** 2, size, axis=0)[:count].sum(axis=1)
+        square = np.cumsum((x**2).sum(axis=1))
+        lag = np.arange(least, count // 2 + 1)
+        both = square[count - 1 - lag] + square[-1] - square[lag - 1]
+        apart = (both - 2.0 * cross[lag]) / (count - lag)
+        padded = np.pad(apart, 1, constant_values=np.inf)
+        low = np.flatnonzero((apart <= padded[:-2]) & (apart < padded[2:]))
+        yield from (int(lag[k]) for k in low[np.argsort(apart[low])][:_CANDIDATES])
+
+    def periods(self, lag: int) -> Periods | None:
+        """The periods of about `lag` samples; None if the motion does not repeat so."""
+        difference = self.q[lag:] - self.q[:-lag]
+        inside = uniform_filter1d(difference**2, lag, axis=0, mode="nearest")
+        middle = int(np.argmin((inside / self.q.var(axis=0)).max(axis=1)))
+        begin = max(0, middle - lag // 2)
+        lag = self._shifted(begin, lag)
+        period = self._refined(lag * self.grid_s, slice(begin, begin + lag))
+        share, excess = self.difference(period, slice(0, None))
+        width = max(1, round(_LOCAL * period / self.grid_s))
+        fits = uniform_filter1d(excess, width, axis=0, mode="nearest").max(axis=1) <= _EXCESS**2
+        first, stop = _run(fits, min(middle, len(fits) - 1))
+        # The last sample of a period is a step before the next one begins.
+        length = (stop - first - 1) * self.grid_s + max(self.step_s, self.grid_s)
+        count = 1 + int((length + 0.5 * self.grid_s) / period)
+        if count < 2:
+            return None
+        start = max(0.0, min(float(self.time[first]), self.time[-1] + self.step_s - count * period))
+        inner = slice(first, min(len(self.time), first + round(count * period / self.grid_s)))
+        share, excess = self.difference(period, inner)
+        one = self.q[inner][:lag]
+        moves = one.std(axis=0) >= _SHARE * self.q.std(axis=0)
+        if not moves.all() or np.any(excess.mean(axis=0) > 1.0):
+            return None
+        return Periods(start, period, count, share)
+
+    def difference(self, period_s: float, inside: slice) -> tuple[float, Floats]:
+        """q(t + T) - q(t): rms without the noise over that of the motion, of the worst joint; squares over the largest
+        mean square of a repeat, (k, m).
+        """
+        time, q = self.time[inside], self.q[inside]
+        stop = min(time[-1] + self.grid_s, self.time[-1] + 0.5 * self.step_s)
+        early = time <= stop - period_s
+        if not early.any():
+            return 1.0, np.full((1, q.shape[1]), np.inf)
+        later = self.curve(np.minimum(time[early] + period_s, self.time[-1]))
+        square, size = (later - q[early]) ** 2, np.maximum(q.var(axis=0), 1e-18)
+        rest = np.maximum(square.mean(axis=0) - 2.0 * self.noise**2, 0.0) / size
+        return float(np.sqrt(rest.max())), square / (2.0 * self.noise**2 + EPS**2 * size)
+
+    def _shifted(self, begin: int, lag: int) -> int:
+        """The lag near `lag` at which the block of that length from `begin` on comes again: the mean square difference
+        of the whole recording has its minimum a little aside where an approach and a return are in it.
+        """
+        block = slice(begin, begin + lag, max(1, lag // _MOST_BLOCK))
+        near = range(max(2, round((1.0 - _ASIDE) * lag)), round((1.0 + _ASIDE) * lag) + 1)
+        sizes = self.q.var(axis=0)
+
+        def apart(shift: int) -> float:
+            later = self.q[block.start + shift : block.stop + shift : block.step]
+            if len(later) < 0.5 * lag / block.step:
+                return np.inf
+            return float(np.mean((later - self.q[block][: len(later)]) ** 2 / sizes))
+
+        return min(near, key=apart)
+
+    def _refined(self, period_s: float, inside: slice) -> float:
+        """The period near one of the grid, by Gauss-Newton steps on q(t + T) - q(t).
+
+        The rate by central differences has no part in the noise of q(t), so the noise does not draw T aside.
+        """
+        time, q = self.time[inside], self.q[inside]
+        rate, weight = np.gradient(q, self.grid_s, axis=0), 1.0 / self.q.var(axis=0)
+        for _ in range(_STEPS):
+            early = time <= self.time[-1] - period_s
+            change = self.curve(time[early] + period_s) - q[early]
+            power = float(np.sum(weight * rate[early] ** 2))
+            period_s -= float(np.sum(weight * rate[early] * change)) / max(power, 1e-12)
+        return period_s
+
+    def covered(self, periods: Periods) -> bool:
+        """Whether the motion outside the periods is shorter than one of them."""
+        speed = np.abs(np.gradient(self.q, self.grid_s, axis=0))
+        slow = speed <= 1e-2 * speed.max(axis=0)
+        outside = (self.time < periods.start_s) | (self.time > periods.stop_s)
+        moving = float(np.count_nonzero(outside & ~slow.all(axis=1))) * self.grid_s
+        return moving < periods.period_s
+
+
+def _noise(position: Floats) -> Floats:
+    """Standard deviation (n,) of white noise in positions (N, n), from differences of high order."""
+    gain = np.sqrt(comb(2 * _ORDER, _ORDER))
+    middle = np.median(np.abs(np.diff(position, n=_ORDER, axis=0)), axis=0)
+    return np.asarray(middle / (0.6745 * gain))
+
+
+def _run(fits: NDArray[np.bool_], at: int) -> tuple[int, int]:
+    """First and one past the last of the True values around `at`; an empty range where it is False."""
+    if not fits[at]:
+        return at, at
+    breaks = np.flatnonzero(~fits)
+    before, after = breaks[breaks < at], breaks[breaks > at]
+    return (int(before[-1]) + 1 if len(before) else 0), (int(after[0]) if len(after) else len(fits))
