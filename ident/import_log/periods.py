@@ -4,8 +4,8 @@ A motion repeats with the period T from t0 to t1 if, in every joint that moves,
 
     e(t) = q(t + T) - q(t),   mean e^2 <= 2 sigma^2 + (eps s)^2,   t0 <= t <= t1 - T,   t1 - t0 >= 2 T,
 
-with the noise sigma of the positions and their standard deviation s in a period. The lags to try are minima of the mean
-square difference over the lag, which is the autocorrelation turned over. Averages over periods take the motion as
+with the noise sigma of the positions and their standard deviation s in a period. The lags to try are those after which
+a block of the motion comes again, by the correlation of block and motion. Averages over periods take the motion as
 repeated, so a deviation eps counts there as an error of the torque of about eps.
 """
 
@@ -34,11 +34,10 @@ _LOUDEST = 0.05
 _ORDER = 5
 _MEAN_S, _GRID_S, _MOST_GRID = 0.01, 0.02, 60_000
 _SHORTEST_S = 0.5
-_CANDIDATES = 40
-_ASIDE, _MOST_BLOCK = 0.03, 1000
-_STEPS = 3
-# Length over which a local deviation is judged, and its size over that of the whole.
-_LOCAL, _EXCESS = 0.05, 2.0
+# Blocks in a recording, repeats of each to try, and steps to the period.
+_BLOCKS, _REPEATS, _STEPS = 16, 4, 3
+# Length over which a local deviation is judged, its size over that of the whole, and that of a single sample.
+_LOCAL, _EXCESS, _PEAK = 0.05, 2.0, 4.0
 # A joint moves if it travels more than its noise, and in a period as much as in the whole, by these factors.
 _TRAVEL, _SHARE = 20.0, 0.5
 
@@ -73,9 +72,8 @@ def find_periods(time: Floats, position: Floats) -> Periods | None:
     motion = _Motion.of(time, position)
     if motion is None:
         return None
-    found = [periods for lag in motion.lags() if (periods := motion.periods(lag)) is not None]
-    # A multiple of the period repeats as well.
-    best = min(found, key=lambda one: one.period_s, default=None)
+    # A multiple of the period repeats as well, so the first one is taken.
+    best = next((found for lag in motion.lags() if (found := motion.periods(lag)) is not None), None)
     return best if best is not None and motion.covered(best) else None
 
 
@@ -132,10 +130,12 @@ class _Motion:
     @classmethod
     def of(cls, time: Floats, position: Floats) -> _Motion | None:
         """None for positions too short, at rest, or too noisy."""
-        if len(time) < 4 * _ORDER or not time[-1] > time[0]:
+        if not time[-1] > time[0]:
             return None
         width = max(1, int(_MEAN_S * (len(time) - 1) / (time[-1] - time[0])))
         seconds, position = bins((time - time[0])[:, None], width)[:, 0], bins(position, width)
+        if len(seconds) < 4 * _ORDER:
+            return None
         noise = _noise(position)
         moving = np.ptp(position, axis=0) > _TRAVEL * np.maximum(noise, 1e-9)
         q, noise = position[:, moving], noise[moving]
@@ -153,20 +153,27 @@ class _Motion:
         return float(self.time[1] - self.time[0])
 
     def lags(self) -> Iterator[int]:
-        """Lags in samples with a minimum of the mean square difference, the smallest difference first."""
+        """Lags in samples after which a block of the motion comes again, those of the best repeats of each block.
+
+        Blocks, since the autocorrelation of the whole has its peaks aside where an approach and a return are in it.
+        """
         count, least = len(self.time), max(2, round(_SHORTEST_S / self.grid_s))
-        if count < 2 * least:
+        width = count // _BLOCKS
+        if width < least:
             return
         x = (self.q - self.q.mean(axis=0)) / self.q.std(axis=0)
         size = next_fast_len(2 * count, real=True)
-        cross = irfft(np.abs(rfft(x, size, axis=0)) ** 2, size, axis=0)[:count].sum(axis=1)
-        square = np.cumsum((x**2).sum(axis=1))
-        lag = np.arange(least, count // 2 + 1)
-        both = square[count - 1 - lag] + square[-1] - square[lag - 1]
-        apart = (both - 2.0 * cross[lag]) / (count - lag)
-        padded = np.pad(apart, 1, constant_values=np.inf)
-        low = np.flatnonzero((apart <= padded[:-2]) & (apart < padded[2:]))
-        yield from (int(lag[k]) for k in low[np.argsort(apart[low])][:_CANDIDATES])
+        spectrum, total = rfft(x, size, axis=0), np.append(0.0, np.cumsum((x**2).sum(axis=1)))
+        square = total[width:] - total[:-width]
+        found: set[int] = set()
+        for first in range(0, count // 2, max(1, width // 2)):
+            block = rfft(x[first : first + width], size, axis=0)
+            cross = irfft(spectrum * block.conj(), size, axis=0)[: len(square)].sum(axis=1)
+            apart = (square + square[first] - 2.0 * cross)[first + least :]
+            padded = np.pad(apart, 1, constant_values=np.inf)
+            low = np.flatnonzero((apart <= padded[:-2]) & (apart < padded[2:]))
+            found.update(int(k) + least for k in low[np.argsort(apart[low])][:_REPEATS])
+        yield from sorted(lag for lag in found if lag <= count // 2 + 1)
 
     def periods(self, lag: int) -> Periods | None:
         """The periods of about `lag` samples; None if the motion does not repeat so."""
@@ -174,18 +181,23 @@ class _Motion:
         inside = uniform_filter1d(difference**2, lag, axis=0, mode="nearest")
         middle = int(np.argmin((inside / self.q.var(axis=0)).max(axis=1)))
         begin = max(0, middle - lag // 2)
-        lag = self._shifted(begin, lag)
         period = self._refined(lag * self.grid_s, slice(begin, begin + lag))
         share, excess = self.difference(period, slice(0, None))
         width = max(1, round(_LOCAL * period / self.grid_s))
         fits = uniform_filter1d(excess, width, axis=0, mode="nearest").max(axis=1) <= _EXCESS**2
         first, stop = _run(fits, min(middle, len(fits) - 1))
+        # The mean over `width` samples ends half of it before the motion does.
+        first, stop = _widened(excess.max(axis=1) <= _PEAK**2, first, stop, width // 2)
         # The last sample of a period is a step before the next one begins.
         length = (stop - first - 1) * self.grid_s + max(self.step_s, self.grid_s)
         count = 1 + int((length + 0.5 * self.grid_s) / period)
         if count < 2:
             return None
-        start = max(0.0, min(float(self.time[first]), self.time[-1] + self.step_s - count * period))
+        # In the middle of what repeats; a rest before or after the motion repeats as well.
+        spare = max(0.0, length - self.grid_s - (count - 1) * period)
+        latest = float(self.time[-1]) + self.step_s - count * period
+        start = max(0.0, min(float(self.time[first]) + 0.5 * spare, latest))
+        first = int(np.searchsorted(self.time, start))
         inner = slice(first, min(len(self.time), first + round(count * period / self.grid_s)))
         share, excess = self.difference(period, inner)
         one = self.q[inner][:lag]
@@ -207,22 +219,6 @@ class _Motion:
         square, size = (later - q[early]) ** 2, np.maximum(q.var(axis=0), 1e-18)
         rest = np.maximum(square.mean(axis=0) - 2.0 * self.noise**2, 0.0) / size
         return float(np.sqrt(rest.max())), square / (2.0 * self.noise**2 + EPS**2 * size)
-
-    def _shifted(self, begin: int, lag: int) -> int:
-        """The lag near `lag` at which the block of that length from `begin` on comes again: the mean square difference
-        of the whole recording has its minimum a little aside where an approach and a return are in it.
-        """
-        block = slice(begin, begin + lag, max(1, lag // _MOST_BLOCK))
-        near = range(max(2, round((1.0 - _ASIDE) * lag)), round((1.0 + _ASIDE) * lag) + 1)
-        sizes = self.q.var(axis=0)
-
-        def apart(shift: int) -> float:
-            later = self.q[block.start + shift : block.stop + shift : block.step]
-            if len(later) < 0.5 * lag / block.step:
-                return np.inf
-            return float(np.mean((later - self.q[block][: len(later)]) ** 2 / sizes))
-
-        return min(near, key=apart)
 
     def _refined(self, period_s: float, inside: slice) -> float:
         """The period near one of the grid, by Gauss-Newton steps on q(t + T) - q(t).
@@ -261,3 +257,13 @@ def _run(fits: NDArray[np.bool_], at: int) -> tuple[int, int]:
     breaks = np.flatnonzero(~fits)
     before, after = breaks[breaks < at], breaks[breaks > at]
     return (int(before[-1]) + 1 if len(before) else 0), (int(after[0]) if len(after) else len(fits))
+
+
+def _widened(fits: NDArray[np.bool_], first: int, stop: int, most: int) -> tuple[int, int]:
+    """A range that is not empty, longer by up to `most` True values at each end."""
+    if stop > first:
+        wrong = np.flatnonzero(~fits[max(0, first - most) : first])
+        first = max(0, first - most) + (int(wrong[-1]) + 1 if len(wrong) else 0)
+        wrong = np.flatnonzero(~fits[stop : stop + most])
+        stop += int(wrong[0]) if len(wrong) else min(most, len(fits) - stop)
+    return first, stop
