@@ -46,13 +46,15 @@ _TRAVEL, _SHARE = 20.0, 0.5
 class Periods:
     """Consecutive equal periods: beginning after the first sample [s], length [s], number.
 
-    deviation : rms of q(t + T) - q(t) over that of the motion, of the worst joint.
+    deviation : rms of q(t + T) - q(t) over that of the motion, of the worst joint. outside : share of the motion before
+    and after them, by the squared speeds.
     """
 
     start_s: float
     period_s: float
     count: int
     deviation: float = 0.0
+    outside: float = 0.0
 
     def __str__(self) -> str:
         return f"{self.count} of {self.period_s:.6g} s, from {self.start_s:.6g} s on"
@@ -66,15 +68,13 @@ class Periods:
 def find_periods(time: Floats, position: Floats) -> Periods | None:
     """The shortest period of a motion that repeats, at least two of them; None for another motion.
 
-    time : (N,) [s], increasing. position : (N, n) [rad]. A motion that is longer than a period outside of the repeated
-    part is no periodic excitation, since marks would leave it out.
+    time : (N,) [s], increasing. position : (N, n) [rad].
     """
     motion = _Motion.of(time, position)
     if motion is None:
         return None
     # A multiple of the period repeats as well, so the first one is taken.
-    best = next((found for lag in motion.lags() if (found := motion.periods(lag)) is not None), None)
-    return best if best is not None and motion.covered(best) else None
+    return next((found for lag in motion.lags() if (found := motion.periods(lag)) is not None), None)
 
 
 def marked_periods(marks: PeriodMarks, time: Floats, position: Floats) -> Periods | None:
@@ -97,20 +97,12 @@ def marked_periods(marks: PeriodMarks, time: Floats, position: Floats) -> Period
             "`period_s`, `start_s` or `count`"
         )
     found = Periods(marks.start_s, period, count)
-    return replace(found, deviation=deviation(time, position, found))
-
-
-def deviation(time: Floats, position: Floats, periods: Periods) -> float:
-    """rms of q(t + T) - q(t) over that of the motion, in given periods, of the worst joint; 0 for a single one.
-
-    time : (N,) [s]. position : (N, n) [rad].
-    """
     motion = _Motion.of(time, position)
-    if motion is None or periods.count < 2:
-        return 0.0
-    first, last = (np.searchsorted(motion.time, at) for at in (periods.start_s, periods.stop_s))
-    share, _ = motion.difference(periods.period_s, slice(int(first), int(last)))
-    return float(share)
+    if motion is None:
+        return found
+    first, last = (int(np.searchsorted(motion.time, at)) for at in (found.start_s, found.stop_s))
+    change = motion.difference(period, slice(first, last))[0] if count > 1 else 0.0
+    return replace(found, deviation=change, outside=motion.outside(found))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +125,9 @@ class _Motion:
         if not time[-1] > time[0]:
             return None
         width = max(1, int(_MEAN_S * (len(time) - 1) / (time[-1] - time[0])))
-        seconds, position = bins((time - time[0])[:, None], width)[:, 0], bins(position, width)
-        if len(seconds) < 4 * _ORDER:
+        if len(time) < 4 * _ORDER * width:
             return None
+        seconds, position = bins((time - time[0])[:, None], width)[:, 0], bins(position, width)
         noise = _noise(position)
         moving = np.ptp(position, axis=0) > _TRAVEL * np.maximum(noise, 1e-9)
         q, noise = position[:, moving], noise[moving]
@@ -204,7 +196,8 @@ class _Motion:
         moves = one.std(axis=0) >= _SHARE * self.q.std(axis=0)
         if not moves.all() or np.any(excess.mean(axis=0) > 1.0):
             return None
-        return Periods(start, period, count, share)
+        found = Periods(start, period, count, share)
+        return replace(found, outside=self.outside(found))
 
     def difference(self, period_s: float, inside: slice) -> tuple[float, Floats]:
         """q(t + T) - q(t): rms without the noise over that of the motion, of the worst joint; squares over the largest
@@ -234,13 +227,11 @@ class _Motion:
             period_s -= float(np.sum(weight * rate[early] * change)) / max(power, 1e-12)
         return period_s
 
-    def covered(self, periods: Periods) -> bool:
-        """Whether the motion outside the periods is shorter than one of them."""
-        speed = np.abs(np.gradient(self.q, self.grid_s, axis=0))
-        slow = speed <= 1e-2 * speed.max(axis=0)
-        outside = (self.time < periods.start_s) | (self.time > periods.stop_s)
-        moving = float(np.count_nonzero(outside & ~slow.all(axis=1))) * self.grid_s
-        return moving < periods.period_s
+    def outside(self, periods: Periods) -> float:
+        """Share of the motion, by the squared speeds, outside of the periods."""
+        power = np.mean((np.gradient(self.q, self.grid_s, axis=0) / self.q.std(axis=0)) ** 2, axis=1)
+        inside = (self.time >= periods.start_s) & (self.time < periods.stop_s)
+        return float(1.0 - power[inside].sum() / max(power.sum(), 1e-12))
 
 
 def _noise(position: Floats) -> Floats:

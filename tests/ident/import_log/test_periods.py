@@ -110,14 +110,6 @@ def test_rest_noise_and_too_few_samples_have_none() -> None:
     assert find_periods(time[:5], noise[:5]) is None
 
 
-def test_a_short_repetition_in_a_long_other_motion_is_none() -> None:
-    """Marks would leave out most of the recording."""
-    time, q = motion(2, 100.0)
-    further = np.arange(0.01, 30.0, 0.01)
-    other = q[-1] + np.sin(np.outer(further, [0.7, 1.1, 1.9]) ** 1.2)
-    assert find_periods(np.append(time, time[-1] + further), np.vstack([q, other])) is None
-
-
 # ---- imports ----
 
 
@@ -171,6 +163,19 @@ def test_an_import_without_repetition_is_used_whole(tmp_path: Path) -> None:
     report = import_log(mapping(), recording(tmp_path, *motion(1.5, 100.0)), tmp_path / "x.mcap")
     assert report.periods is None
     assert "periods" not in str(report)
+    assert read_session(report.path).phases == ()
+
+
+def test_a_repetition_in_a_long_other_motion_is_told_and_not_marked(tmp_path: Path) -> None:
+    """Marks would keep most of the recording from the estimate."""
+    time, q = motion(2, 100.0)
+    further = np.arange(0.01, 30.0, 0.01)
+    other = q[-1] + np.sin(np.outer(further, [0.7, 1.1, 1.9]) ** 1.2)
+    whole = np.append(time, time[-1] + further), np.vstack([q, other])
+    assert close(find_periods(*whole), 2, slack_s=0.3)
+    report = import_log(mapping(), recording(tmp_path, *whole), tmp_path / "x.mcap")
+    assert report.periods is None
+    assert any("the motion repeats, 2 of" in note and "is not marked" in note for note in report.notes)
     assert read_session(report.path).phases == ()
 
 
