@@ -16,13 +16,16 @@ from ident.import_log import find_periods
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.session import read_session
+from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.hiding.draw import RHO, draw_effect
 from runner.hiding.effect import SEALED, HiddenEffect, with_effect
 from runner.hiding.reveal import Outcome, reveal
 from runner.planning import Excitations
 from runner.report.folder import ResultFolder
+from runner.report.hidden import hidden_section
 from runner.report.page import report_html
+from runner.results import summarise
 from sim_backend.configuration import load_configuration
 from sim_backend.model_arm import Cause
 from tests.runner.experiment.experiment_rig import Finished, experiment_file, records, run
@@ -204,6 +207,29 @@ def test_the_verdict_on_a_diagnosis(
     if outcome in ("right", "named, not first"):
         assert shown.parameters[0].sigmas == pytest.approx(0.5)
         assert "0.052 ± 0.004" in str(shown)
+
+
+@pytest.mark.parametrize(
+    ("state", "text"),
+    [
+        ("nothing", "Nothing was hidden in the emulated arm: what is found here is"),
+        ("in the settings", "settings name effects beyond the model"),
+        ("sealed", "An effect is hidden in the emulated arm"),
+    ],
+)
+def test_the_report_says_whether_anything_was_hidden(tmp_path: Path, state: str, text: str) -> None:
+    content = {"exit_status": "success", "sessions": []}
+    assert hidden_section(ResultFolder(tmp_path, content)) == ""
+    assert text in hidden_section(ResultFolder(tmp_path, content | {"hidden": state}))
+
+
+def test_a_summary_knows_effects_of_the_settings(tmp_path: Path) -> None:
+    plain = Experiment.load(experiment_file(tmp_path))
+    record = Record("unloaded", tmp_path / "unloaded.mcap", "abort", "")
+    assert summarise(plain, [record], None)["hidden"] == "nothing"
+    assert summarise(with_effect(plain, GAIN), [record], None)["hidden"] == "sealed"
+    stated = plain.changed(emulator_settings={"robot.effects": [GAIN.plugin]})
+    assert summarise(stated, [record], None)["hidden"] == "in the settings"
 
 
 def test_a_plugin_with_wrong_parameters_is_refused() -> None:
