@@ -98,7 +98,7 @@ def marked_periods(marks: PeriodMarks, time: Floats, position: Floats) -> Period
         )
     found = Periods(marks.start_s, period, count)
     motion = _Motion.of(time, position)
-    if motion is None:
+    if motion is None or period < motion.grid_s:
         return found
     first, last = (int(np.searchsorted(motion.time, at)) for at in (found.start_s, found.stop_s))
     change = motion.difference(period, slice(first, last))[0] if count > 1 else 0.0
@@ -174,7 +174,9 @@ class _Motion:
         middle = int(np.argmin((inside / self.q.var(axis=0)).max(axis=1)))
         begin = max(0, middle - lag // 2)
         period = self._refined(lag * self.grid_s, slice(begin, begin + lag))
-        share, excess = self.difference(period, slice(0, None))
+        if abs(period - lag * self.grid_s) > self.grid_s:
+            return None
+        _, excess = self.difference(period, slice(0, None))
         width = max(1, round(_LOCAL * period / self.grid_s))
         fits = uniform_filter1d(excess, width, axis=0, mode="nearest").max(axis=1) <= _EXCESS**2
         first, stop = _run(fits, min(middle, len(fits) - 1))
