@@ -132,13 +132,13 @@ def test_the_periods_of_an_emulated_log_are_found_without_its_marks(hidden: Fini
         q = session.joint.position + noise * np.random.default_rng(1).normal(
             size=session.joint.position.shape
         )
-        found = find_periods((log - log[0]) * 1e-9, q)
+        found = find_periods(1e-9 * (log - log[0]).astype(np.float64), q)
         assert found is not None
         assert found.count == 2
         assert found.period_s == pytest.approx((middle - start) * 1e-9, abs=1e-3)
         assert found.start_s == pytest.approx((start - log[0]) * 1e-9, abs=0.3)
     part = (log >= start) & (log < start + 0.75 * (stop - start))
-    assert find_periods((log[part] - start) * 1e-9, session.joint.position[part]) is None
+    assert find_periods(1e-9 * (log[part] - start).astype(np.float64), session.joint.position[part]) is None
 
 
 def test_a_real_arm_takes_no_hidden_effect(tmp_path: Path) -> None:
