@@ -110,6 +110,14 @@ KEYS = {
     "transmission.coupling.motor": ("the motor", "", "j6"),
     "transmission.coupling.joint": ("the other joint", "", "j5"),
     "transmission.coupling.ratio": ("turns of the motor for one turn of that joint", "", "32"),
+    "periods": (
+        "of the excitation; null: as the positions show them",
+        "",
+        "{period_s: 20.0, start_s: 1.5, count: 2}",
+    ),
+    "periods.period_s": ("length; null: the recording from `start_s` on in `count` parts", "s", "20.0"),
+    "periods.start_s": ("beginning of the first one, after the first sample taken", "s", "1.5"),
+    "periods.count": ("number; null: all that fit; 0: none, and none are looked for", "", "2"),
     "offset_rad": ("added to the joint positions, to meet the zero of the URDF", "rad", "[0, -1.5708]"),
 }
 ALIKE = ("velocity.", "joint_torque.", "motor_torque.", "motor_position.", "command.", "position.time.")

@@ -191,7 +191,10 @@ class Replan:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A whole experiment as its file describes it; every key but `name` has a default."""
+    """A whole experiment as its file describes it; every key but `name` has a default.
+
+    sealed : whether an effect is hidden in the emulated arm; its true parameters then stay out of the results.
+    """
 
     name: str
     arm: str = "lwr4plus.yaml"
@@ -212,6 +215,7 @@ class Experiment:
     source: Path = field(default=Path(), init=False)
     folder: Path = field(default=Path(), init=False)
     text: str = field(default="", init=False, repr=False)
+    sealed: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         _require_word(self.name, f"name {self.name!r}: letters, digits, - and _ only, it names a folder")
@@ -245,10 +249,11 @@ class Experiment:
         vars(experiment).update(source=path, folder=folder, text=path.read_text(encoding="utf-8"))
         return experiment
 
-    def changed(self, **values: Any) -> Experiment:
+    def changed(self, *, sealed: bool | None = None, **values: Any) -> Experiment:
         """The same experiment and file with other values of some keys."""
         other = dataclasses.replace(self, **values)
-        vars(other).update(source=self.source, folder=self.folder, text=self.text)
+        sealed = self.sealed if sealed is None else sealed
+        vars(other).update(source=self.source, folder=self.folder, text=self.text, sealed=sealed)
         return other
 
     @property

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
 from runner.terminal import write_json
+from sim_backend.configuration import load_configuration
 from sim_backend.robot import truth
 
 
@@ -62,8 +63,10 @@ def unseen_sessions(experiment: Experiment) -> frozenset[str]:
 
 
 def true_base(experiment: Experiment, found: Identification) -> dict[str, float]:
-    """The emulated arm's true base parameters by name; empty for a real arm."""
-    if experiment.backend != "emulator":
+    """The emulated arm's true base parameters by name; empty for a real arm, and beside a sealed effect, which they
+    would betray.
+    """
+    if experiment.backend != "emulator" or experiment.sealed:
         return {}
     structure = found.structure
     values = truth(experiment.emulator_path, payload=structure.payloads[0] if structure.payloads else None)
@@ -121,6 +124,8 @@ def summarise(
         },
         "versions": versions(),
     }
+    if experiment.backend == "emulator":
+        summary["hidden"] = _hidden(experiment)
     if found is None:
         return summary
     logs: dict[bool, list[Session]] = {False: [], True: []}
@@ -136,6 +141,14 @@ def summarise(
         summary["within_3_sigma"] = agreement(summary["parameters"])
         summary["intervals_95_hold"] = coverage(summary["parameters"], found.structure.chain.n)
     return summary
+
+
+def _hidden(experiment: Experiment) -> Literal["nothing", "sealed", "in the settings"]:
+    """Effects beyond the model's equations in the emulated arm."""
+    if experiment.sealed:
+        return "sealed"
+    robot = load_configuration(experiment.emulator_path, experiment.emulator_settings).robot
+    return "in the settings" if robot.effects or robot.plant is not None else "nothing"
 
 
 def estimated(

@@ -10,7 +10,16 @@ from __future__ import annotations
 from ident.import_log.conversion import ImportReport, import_log
 from ident.import_log.direct import read_recording
 from ident.import_log.guess import Guess, Known, guess_mapping
-from ident.import_log.mapping import Coupling, LogMapping, Signal, TimeBase, Transmission, mapping_path
+from ident.import_log.mapping import (
+    Coupling,
+    LogMapping,
+    PeriodMarks,
+    Signal,
+    TimeBase,
+    Transmission,
+    mapping_path,
+)
+from ident.import_log.periods import Periods, find_periods
 
 __all__ = [
     "Coupling",
@@ -18,9 +27,12 @@ __all__ = [
     "ImportReport",
     "Known",
     "LogMapping",
+    "PeriodMarks",
+    "Periods",
     "Signal",
     "TimeBase",
     "Transmission",
+    "find_periods",
     "guess_mapping",
     "import_log",
     "mapping_path",

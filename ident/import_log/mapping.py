@@ -203,6 +203,30 @@ class Transmission:
 
 
 @dataclass(frozen=True)
+class PeriodMarks:
+    """Periods of the excitation, as known to whoever recorded the motion.
+
+    period_s : length of one; None: from the start to the end of the recording in `count` parts.
+    start_s : beginning of the first one, after the first sample taken.
+    count : number; None: all that fit; 0: none, and none are looked for.
+    """
+
+    period_s: float | None = None
+    start_s: float = 0.0
+    count: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.period_s is None and self.count is None:
+            raise ConfigurationError("`periods` needs `period_s` or `count`; leave it out to have them found")
+        if self.period_s is not None and not self.period_s > 0.0:
+            raise ConfigurationError(f"`period_s` is {self.period_s} s, it must be positive")
+        if self.start_s < 0.0 or (self.count is not None and self.count < 0):
+            raise ConfigurationError(
+                f"`start_s` {self.start_s} s and `count` {self.count} of `periods` cannot be negative"
+            )
+
+
+@dataclass(frozen=True)
 class LogMapping:
     """A mapping file, see the head of the module and the files in `configs/imports/`.
 
@@ -213,6 +237,7 @@ class LogMapping:
     offset_rad : added to the positions of each joint after the gear, to meet the zero of the URDF.
     urdf : file of the arm, found as configuration files are, attached to the session. Its other joints, those of
         a gripper say, are held at zero, or where `held` says [rad or m].
+    periods : of the excitation; None: as the positions show them.
     base, tip : first and last link of the arm in it; None: its root, and behind the last joint.
     delimiter : of text files; None tries semicolon, comma, tab and blanks.
     header : whether text files name their columns in the first row; None looks whether it holds numbers.
@@ -235,6 +260,7 @@ class LogMapping:
     command: Signal | None = None
     transmission: Transmission | None = None
     offset_rad: tuple[float, ...] | None = None
+    periods: PeriodMarks | None = None
     urdf: str | None = None
     held: dict[str, float] | None = None
     base: str | None = None

@@ -498,9 +498,9 @@ def _windows(session: Session, times: Floats) -> tuple[list[tuple[float, float]]
         spans = session.spans(name)
         if spans:
             log = session.joint.log_time
-            starts = np.searchsorted(log, [start for start, _ in spans])
-            stops = np.minimum(np.searchsorted(log, [stop for _, stop in spans]), len(times) - 1)
-            found = [(float(times[a]), float(times[b])) for a, b in zip(starts, stops, strict=True) if b > a]
+            # A period may end between two samples.
+            edges = np.interp(np.array(spans, dtype=np.int64) - log[0], log - log[0], times)
+            found = [(float(a), float(b)) for a, b in edges if b > a]
             if found:
                 return found, name == "period"
     return [(float(times[0]), float(times[-1]))], False
@@ -516,7 +516,9 @@ def _row_grid(
         lengths = np.array([high - low for low, high in windows])
         length = float(np.mean(lengths[:-1]))
         joined = all(abs(a[1] - b[0]) < 0.5 * step for a, b in pairwise(windows))
-        if joined and np.ptp(lengths) < 0.1 * step:
+        # The recording may end with the last sample of the last period, a step before its end.
+        late = length - lengths[-1]
+        if joined and np.ptp(lengths[:-1]) < 0.1 * step and -0.1 * step < late < step:
             count = max(1, round(length / step))
             total = count * len(windows)
             return first + (length / count) * np.arange(total, dtype=np.float64), count

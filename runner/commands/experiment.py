@@ -18,6 +18,7 @@ from lwr_driver.arm.cell import Cell
 from runner.diagnosis.after_run import conclude_run
 from runner.experiment import Bench, ExperimentProgress, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
+from runner.hiding.effect import HiddenEffect, emulated_arm, with_effect
 from runner.laboratory import Laboratory
 from runner.planning import PLAN, Excitations
 from runner.replanning import Rounds, rounds_begun
@@ -47,6 +48,19 @@ COPY = "experiment.yaml"
     metavar="N",
     help="N further rounds, planned with the estimate so far.",
 )
+@click.option(
+    "--hide",
+    type=click.IntRange(min=0),
+    metavar="SEED",
+    help="Hide an effect, drawn from SEED, in the emulated arm; the report shows what is found of it.",
+)
+@click.option(
+    "--reveal",
+    is_flag=False,
+    flag_value="",
+    metavar="[FOLDER]",
+    help="Show the effect hidden in the run of FOLDER (default: the latest) beside the findings.",
+)
 @json_option
 def command(
     file: str | None,
@@ -59,6 +73,8 @@ def command(
     no_diagnosis: bool,
     decide: bool,
     replan: int | None,
+    hide: int | None,
+    reveal: str | None,
     as_json: bool,
 ) -> None:
     """Run the experiment FILE; without one the default, against the built-in emulator.
@@ -74,8 +90,15 @@ def command(
     lwr-run experiment --resume results/monday           go on after an abort
     lwr-run experiment --resume results/monday --decide  discriminate between look-alikes
     lwr-run experiment my_lab.yaml --replan 1            a second round, planned with the first
+    lwr-run experiment --hide 7                          something is wrong with the emulated arm
+    lwr-run experiment --reveal                          what it was, beside the findings
     """
-    experiment, folder = _begin(file, out, resume)
+    if reveal is not None:
+        if file is not None or out is not None or resume is not None or hide is not None:
+            raise ConfigurationError("--reveal shows a finished run; leave FILE, --out, --resume and --hide")
+        _reveal(Path(reveal) if reveal else None, as_json)
+        return
+    experiment, folder = _begin(file, out, resume, hide)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     status = StatusLine()
@@ -84,6 +107,7 @@ def command(
     motions = Excitations.of(experiment, arm, cell, folder)
     status.clear()
     motions.save(folder)
+    experiment = _sealed(experiment, arm, motions, folder, hide)
     laboratory = partial(Laboratory, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
     with laboratory(experiment) as bench, _watched(bench, experiment, live_port if live else None) as watched:
         first = Run(experiment, folder, watched, motions.rows)
@@ -101,6 +125,8 @@ def command(
         status.clear()
         summary |= concluded.to_dict()
         text = f"{text}\n{concluded.text(folder)}"
+    if experiment.sealed:
+        text = f"{text}\nAn effect is hidden in the emulated arm; `lwr-run experiment --reveal {folder}` shows it."
     from runner.report.page import write_report
 
     try:
@@ -128,11 +154,40 @@ def _watched(bench: Bench, experiment: Experiment, port: int | None) -> Iterator
         yield dataclasses.replace(bench, onlooker=view)
 
 
-def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Experiment, Path]:
+def _sealed(
+    experiment: Experiment, arm: Arm, motions: Excitations, folder: Path, seed: int | None
+) -> Experiment:
+    """The experiment with its hidden effect: drawn now, or in an earlier run of the folder."""
+    effect = HiddenEffect.unseal(folder)
+    if effect is None:
+        if seed is None:
+            return experiment
+        from runner.hiding.draw import draw_effect
+
+        effect = draw_effect(seed, experiment, arm, motions)
+        effect.seal(folder)
+    return with_effect(experiment, effect)
+
+
+def _reveal(folder: Path | None, as_json: bool) -> None:
+    from runner.hiding.reveal import hidden_run, reveal
+    from runner.report.page import write_report
+
+    folder = hidden_run(folder)
+    shown = reveal(folder)
+    shown.save(folder)
+    click.echo(str(write_report(folder)), err=as_json)
+    click.echo(to_json(shown.to_dict()) if as_json else str(shown))
+
+
+def _begin(
+    file: str | None, out: Path | None, resume: Path | None, hide: int | None = None
+) -> tuple[Experiment, Path]:
     if resume is not None:
-        if file is not None or out is not None:
+        if file is not None or out is not None or hide is not None:
             raise ConfigurationError(
-                "--resume takes its experiment file and folder from FOLDER; leave FILE and --out"
+                "--resume takes its experiment file, folder and hidden effect from FOLDER; leave FILE, --out and "
+                "--hide"
             )
         if not (resume / COPY).is_file():
             raise ConfigurationError(f"{resume} holds no {COPY}; name the folder of an aborted experiment")
@@ -140,6 +195,8 @@ def _begin(file: str | None, out: Path | None, resume: Path | None) -> tuple[Exp
             (resume / COPY).resolve(), beside=ExperimentProgress.load(resume).origin
         ), resume
     experiment = Experiment.load(file if file is not None else DEFAULT)
+    if hide is not None:
+        emulated_arm(experiment)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out if out is not None else Path("experiments") / f"{experiment.name}-{stamp}"
     if folder.exists() and any(folder.iterdir()):

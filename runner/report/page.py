@@ -11,6 +11,7 @@ from runner.computer import versions
 from runner.report import sections
 from runner.report.diagnosis import DiagnosisFolder, diagnosis_parts, diagnosis_section
 from runner.report.folder import ResultFolder
+from runner.report.hidden import hidden_section
 from runner.report.interactive import plotly_script
 from runner.report.markup import section
 from runner.report.verdicts import Level, Verdict, headline, verdicts
@@ -26,6 +27,7 @@ _SECTIONS = (
     sections.torque_section,
     sections.residual_section,
     sections.assumption_section,
+    hidden_section,
     diagnosis_section,
     sections.parameter_section,
     sections.provenance_section,
@@ -38,6 +40,7 @@ _PARTS = (
     ("torque", "Figure 3"),
     ("residuals", "Residuals"),
     ("assumptions", "Assumptions"),
+    ("hidden", "Hidden"),
     ("diagnosis", "Diagnosis"),
     ("parameters", "Parameters"),
     ("correlation", "Correlation"),
