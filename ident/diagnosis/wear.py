@@ -3,8 +3,8 @@
 A change of friction or drive inertia leaves no residual, for the base parameters absorb it. Against a reference it
 shows in the parameters themselves: estimated by these sessions alone, beside all claims, their difference from the
 healthy ones is compared with both uncertainties and with the arm's changes from day to day (`reference.habit`), joint
-by joint (Hotelling's T^2). Friction at another level in all sessions may be worn or warmer; the same motion cold and warm
-decides.
+by joint (Hotelling's T^2). Friction at another level in all sessions may be worn or warmer; the same motion cold and
+warm decides.
 """
 
 from __future__ import annotations
