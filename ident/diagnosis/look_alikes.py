@@ -181,7 +181,8 @@ def look_alikes(
     wanted: list[tuple[int, Place, Place]] = []
     for number, finding in enumerate(diagnosis.claims, start=1):
         first = (finding.cause, finding.joints)
-        wanted += [(number, first, (c, tuple(j))) for c, j, _ in finding.alternatives[:_RIVALS]]
+        if finding.cause != WEAR:
+            wanted += [(number, first, (c, tuple(j))) for c, j, _ in finding.alternatives[:_RIVALS]]
     asked_for = [pair for pair in pairs if pair not in [(a, b) for _, a, b in wanted]]
     wanted += [(0, *pair) for pair in asked_for]
     if not wanted:

@@ -18,7 +18,7 @@ from ident.diagnosis.look_alikes import Foreseen, LookAlikes, Place
 from ident.diagnosis.signatures import overlap, signature_bench, signatures
 from ident.diagnosis.statements import SURE, is_open
 from ident.dynamics.kinematics import Chain
-from ident.effects import EFFECTS
+from ident.effects import EFFECTS, WEAR
 from ident.effects import Discriminator as Kind
 from ident.excitation import ExcitationPlan
 from ident.excitation.motions import ParametricMotion
@@ -107,6 +107,9 @@ def offers(
     for finding in open_findings(diagnosis, experiment.diagnosis.sure):
         rivals = ((finding.cause, finding.joints), *((c, j) for c, j, _ in finding.alternatives))
         for cause, joints in rivals:
+            if cause == WEAR:
+                # Decided by the experiments of its rivals.
+                continue
             kind = EFFECTS[cause].experiment
             joint = joints[0] if joints else None
             if len(found) >= _MOST:
@@ -222,7 +225,7 @@ def _payloads(experiment: Experiment, causes: Sequence[str]) -> tuple[Payload | 
     """Every payload of the experiment for causes that depend on the load, else the last one mounted."""
     used = list(dict.fromkeys(session.payload for session in experiment.sessions))
     last = experiment.sessions[-1].payload
-    if not any(EFFECTS[cause].every_payload for cause in causes):
+    if not any(cause in EFFECTS and EFFECTS[cause].every_payload for cause in causes):
         return (last,)
     return (last, *(payload for payload in used if payload != last))
 

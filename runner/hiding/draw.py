@@ -24,6 +24,7 @@ from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure, Side
 from ident.effects import EFFECTS, ArmMotion, Effect, Setting, Shape
+from ident.effects.load import PayloadError
 from ident.model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
 from lwr_driver.arm import Arm
@@ -44,7 +45,7 @@ RHO = (1.2, 2.0)
 # Largest torque of an effect over the largest healthy one: beyond, the arm is broken at first sight.
 _MOST = 0.5
 # On the emulated flange it acts without the payload as well, and is then a cause of another name.
-_OTHERWISE = ("payload_error",)
+_OTHERWISE = (PayloadError.cause,)
 
 
 def draw_effect(seed: int, experiment: Experiment, arm: Arm, motions: Excitations) -> HiddenEffect:

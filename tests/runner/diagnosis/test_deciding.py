@@ -42,7 +42,7 @@ def finding(cause: str, joint: int, confidence: float, *others: Place) -> Findin
 
 
 def diagnosis(*findings: Finding) -> Any:
-    return SimpleNamespace(findings=findings)
+    return SimpleNamespace(claims=findings)
 
 
 def offered(found: Any, experiment: Experiment, arm: Arm) -> tuple[Discriminating, ...]:
