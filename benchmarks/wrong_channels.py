@@ -116,6 +116,23 @@ def constant(channel: str, field: str, value: float, *joints: str, only: int | N
     return change
 
 
+def frozen(channel: str, field: str, joint: str, *, only: int | None = None) -> Change:
+    """The joint keeps the value of a quarter of the log until three quarters, in all sessions or one."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values, k = getattr(columns, field).copy(), JOINTS.index(joint)
+        first, last = len(values) // 4, 3 * len(values) // 4
+        values[first:last, k] = values[first, k]
+        return replace(columns, **{field: values})
+
+    return lambda sessions: [
+        done if only in (None, number) else session
+        for number, (session, done) in enumerate(
+            zip(sessions, _channel(sessions, channel, edit), strict=True)
+        )
+    ]
+
+
 def paced(
     factor: float,
     channels: tuple[str, ...] = ("joint", "motor", "command"),
@@ -266,6 +283,11 @@ CASES: tuple[Case, ...] = (
     Case("joint A2 reads 12.3", constant(*L, 12.3, "A2"), (JOINT, "A2")),
     Case("position A5 reads 0.4", constant(*Q, 0.4, "A5"), (POSITION, "A5")),
     Case("position A5 reads 0.4 in one log", constant(*Q, 0.4, "A5", only=0), (POSITION, "A5")),
+    Case("motor A2 frozen half the time", frozen(*M, "A2"), (MOTOR, "A2")),
+    Case("motor A6 frozen half of one log", frozen(*M, "A6", only=0), (MOTOR, "A6")),
+    Case("joint A1 frozen half the time", frozen(*L, "A1"), (JOINT, "A1")),
+    Case("joint A4 frozen half of one log", frozen(*L, "A4", only=0), (JOINT, "A4")),
+    Case("position E1 frozen half of one log", frozen(*Q, "E1", only=0), (POSITION, "E1")),
     # One torque alone.
     Case("joint only: A2 x 1.3", without("motor", scaled(*L, 1.3, "A2")), (JOINT, "A2")),
     Case("joint only: A5 sign", without("motor", scaled(*L, -1.0, "A5")), (JOINT, "A5")),
