@@ -155,13 +155,15 @@ class Statements:
         """The whole, for the terminal."""
         found = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
         found += [f"{answer}." for answer in self.answers]
+        found += [line for part in self.parts if part.anchor == "data" for line in part.lines()]
         for finding in self.findings:
             found += finding.lines()
             found += [x for one in self.comparisons if one.finding == finding.number for x in _beside(one)]
         for one in self.comparisons:
             if not one.finding:
                 found += [f"Side by side: {one.title}", *_beside(one)]
-        return "\n".join([*found, *(line for part in self.parts for line in part.lines())])
+        rest = (part for part in self.parts if part.anchor != "data")
+        return "\n".join([*found, *(line for part in rest for line in part.lines())])
 
     def brief(self) -> str:
         """Headline and summary, at most ten lines."""
@@ -182,6 +184,7 @@ def statements(
     ]
     level, headline = _headline(content, details, findings)
     parts = (
+        _data(content, names),
         _experiments(details, names),
         _unexplained(content, names),
         _gain(content, details, names),
@@ -351,7 +354,22 @@ def _shares(content: Plain, names: Sequence[str]) -> list[tuple[float, str]]:
     ]
 
 
+def _data(content: Plain, names: Sequence[str]) -> Part:
+    sentences = []
+    for one in content.get("data", []):
+        subject = (
+            f"{_name(one['joint'], names)} {one['channel']}" if one.get("joint") else str(one["channel"])
+        )
+        sentences.append(f"{_capital(subject)}: {one['what']}; {one['advice']}")
+    return Part("data", "Channels that cannot be what they say", tuple(dict.fromkeys(sentences)))
+
+
 def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatement]) -> tuple[Level, str]:
+    if content.get("data") and not findings:
+        return (
+            "look",
+            "Channels of these data cannot be what they say: mend them first; no cause is named from them",
+        )
     doubtful, count = sum(finding.is_open for finding in findings), len(findings)
     if count == 1:
         return "look", "One cause found" + (", open between look-alikes" if doubtful else "")
@@ -373,6 +391,12 @@ def _lines(
     content: Plain, details: Plain, findings: Sequence[FindingStatement], names: Sequence[str]
 ) -> list[Line]:
     found = []
+    if content.get("data"):
+        listed = [
+            f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}" for d in content["data"]
+        ]
+        text = ", ".join(dict.fromkeys(one.strip() for one in listed))
+        found.append(Line("broken channels", text, "none", "look", "data"))
     for finding in findings:
         parts = [finding.text, *(f"{label} {text}" for label, text in finding.facts[:1]), finding.confidence]
         text = "; ".join(part.rstrip(".") for part in parts if part)

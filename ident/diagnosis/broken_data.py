@@ -1,0 +1,117 @@
+"""Channels that cannot be what they say: told first, left out of the rows, and no cause is named from them.
+
+A torque of one joint is left out alone: the rows of the other joints and of the other side stay. A wrong position, a
+wrong clock, or interchanged or mis-scaled torques of several joints reach all rows, and the diagnosis ends with them.
+What is wrong by some percent is no broken channel but a cause of the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fri.errors import LwrError
+from ident.diagnosis.recording import SessionRecord
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
+from ident.rows.filters import SignalSettings
+from ident.screening.doubts import Doubt, settle
+from ident.screening.screen import screen
+from lwr_driver.session import Session
+
+_TORQUES = ("joint torque", "motor torque")
+
+
+@dataclass(frozen=True)
+class BrokenChannel:
+    """A channel of a joint (from 1, None for all) in a session (empty for all). lost : whether its rows alone are."""
+
+    channel: str
+    joint: int | None
+    what: str
+    advice: str
+    session: str = ""
+    lost: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content."""
+        where = f"{self.session}: " if self.session else ""
+        return {
+            "channel": self.channel,
+            "joint": self.joint,
+            "what": where + self.what,
+            "advice": self.advice,
+        }
+
+
+def broken_channels(
+    sessions: Sequence[Session],
+    chain: Chain,
+    signals: SignalSettings,
+    couplings: Sequence[Coupling] = (),
+) -> tuple[BrokenChannel, ...]:
+    """The channels of the sessions that `ident.screening` is certain about, and dead ones."""
+    found = []
+    for doubt in screen(sessions, chain, signals, couplings):
+        if doubt.certain or doubt.lost:
+            alone = doubt.lost or (doubt.channel in _TORQUES and len(doubt.joints) == 1)
+            what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
+            for joint in [chain.joint_names.index(name) + 1 for name in doubt.joints] or [None]:
+                found.append(BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, alone))
+    return tuple(found)
+
+
+def worthless(broken: Sequence[BrokenChannel]) -> bool:
+    """Whether a broken channel reaches the rows of other joints."""
+    return any(not one.lost for one in broken)
+
+
+def is_broken(broken: Sequence[BrokenChannel], side: str, joint: int) -> bool:
+    """Whether the torque of a joint (from 1) is among them."""
+    return any((one.channel, one.joint) == (f"{side} torque", joint) for one in broken)
+
+
+def without_broken(
+    records: Sequence[SessionRecord], broken: Sequence[BrokenChannel]
+) -> tuple[SessionRecord, ...]:
+    """The records without the torques of broken channels."""
+    return tuple(_usable(record, [b for b in broken if b.session in ("", record.name)]) for record in records)
+
+
+def _usable(record: SessionRecord, broken: Sequence[BrokenChannel]) -> SessionRecord:
+    out = {
+        side: [b.joint - 1 for b in broken if b.joint is not None and b.channel == f"{side} torque"]
+        for side in ("joint", "motor")
+    }
+    stretches = []
+    for stretch in record.stretches:
+        usable, motor = stretch.usable.copy(), stretch.motor_usable.copy()
+        usable[:, out["joint"]], motor[:, out["motor"]] = False, False
+        stretches.append(replace(stretch, usable=usable, motor_usable=motor))
+    return replace(record, stretches=tuple(stretches))
+
+
+@contextmanager
+def blamed(broken: Sequence[BrokenChannel], names: Sequence[str]) -> Iterator[None]:
+    """An error inside is one of the broken channels, where there are any: DataError with all of them."""
+    try:
+        yield
+    except (LwrError, np.linalg.LinAlgError):
+        doubts = [
+            Doubt(
+                b.channel,
+                () if b.joint is None else (names[b.joint - 1],),
+                b.what,
+                "",
+                b.advice,
+                True,
+                b.session,
+            )
+            for b in broken
+        ]
+        settle(doubts)
+        raise
