@@ -82,8 +82,13 @@ def test_a_drive_that_turns_slowly_has_its_reversals_left_out():
     before, now = (np.sign(arm.fourier(at, 10.0, 5)[1]) for at in (time - late, time))
     effort = session.motor.effort + arm.drive("Fcm") * (before - now)
     turned = dataclasses.replace(session, motor=dataclasses.replace(session.motor, effort=effort))
-    assert chosen(turned).settings.reversal_s >= late
+    assert late <= chosen(turned).settings.reversal_s <= 0.1
     assert chosen(session).settings.reversal_s < late
+
+
+def test_samples_beside_the_reversals_of_an_ideal_drive_without_noise_stay():
+    found = chosen(arm.session(), coulomb=Coulomb())
+    assert found.settings.reversal_s == 0.0
 
 
 def test_a_long_recording_is_judged_by_a_part_of_it():
