@@ -19,6 +19,7 @@ from ident.diagnosis.recording import SessionRecord
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
 from ident.rows.filters import SignalSettings
+from ident.screening.channels import asked_to_move
 from ident.screening.doubts import Doubt, settle
 from ident.screening.screen import screen
 from lwr_driver.session import Session
@@ -56,13 +57,22 @@ def broken_channels(
 ) -> tuple[BrokenChannel, ...]:
     """The channels of the sessions that `ident.screening` is certain about, and dead ones."""
     found = []
-    for doubt in screen(sessions, chain, signals, couplings):
-        if doubt.certain or doubt.lost:
+    chosen = [session.select(chain.joint_names) for session in sessions]
+    for doubt in screen(chosen, chain, signals, couplings):
+        if (doubt.certain or doubt.lost) and not _stands(doubt, chosen):
             alone = doubt.lost or (doubt.channel in _TORQUES and len(doubt.joints) == 1)
             what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
             for joint in [chain.joint_names.index(name) + 1 for name in doubt.joints] or [None]:
                 found.append(BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, alone))
     return tuple(found)
+
+
+def _stands(doubt: Doubt, sessions: Sequence[Session]) -> bool:
+    """Whether the doubt is of a joint that never moves and is not asked to: a diagnosis does without its motion."""
+    if doubt.channel != "position" or len(doubt.joints) != 1:
+        return False
+    joint = sessions[0].joint_names.index(doubt.joints[0])
+    return all(np.ptp(s.joint.position[:, joint]) == 0.0 and not asked_to_move(s, joint) for s in sessions)
 
 
 def worthless(broken: Sequence[BrokenChannel]) -> bool:

@@ -467,7 +467,8 @@ def _excitation_warnings(problem: Problem, estimate: Estimate, full_rank: bool) 
     weak = weak_parameters(problem, estimate)
     if not weak:
         return []
+    other = ", or use an estimator with a prior" if estimate.prior_scale is None else ""
     return [
-        f"the motion hardly shows {', '.join(map(str, weak[:8]))}, by standard deviations; excite these parameters, or "
-        "use an estimator with a prior"
+        f"the motion hardly shows {', '.join(map(str, weak[:8]))}, by standard deviations; excite these "
+        f"parameters{other}"
     ]

@@ -124,7 +124,7 @@ def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
     names = sessions[0].joint_names if sessions else ()
     for joint, name in enumerate(names):
         still = [s for s in sessions if len(s.joint) and np.ptp(s.joint.position[:, joint]) == 0.0]
-        driven = [s for s in still if _asked_to_move(s, joint)]
+        driven = [s for s in still if asked_to_move(s, joint)]
         if not still or (len(still) < len(sessions) and not driven and _others_stand(still, joint)):
             continue
         value = float(still[0].joint.position[0, joint])
@@ -143,7 +143,8 @@ def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
         yield Doubt("position", (name,), seen, looks, mend, certain, where)
 
 
-def _asked_to_move(session: Session, joint: int) -> bool:
+def asked_to_move(session: Session, joint: int) -> bool:
+    """Whether the joint (from 0) is commanded to move, or moves by its velocity."""
     name = session.joint_names[joint]
     command = session.command
     asked = command is not None and name in command.names and bool(command.position.shape[1])
