@@ -315,10 +315,10 @@ def identify(
         settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
-    if not needs_motor:
-        chosen = [replace(session, motor=None) for session in chosen]
     first = known is None
-    known = known or Known(tuple(require_sound(chosen, chain, settings.signals, settings.couplings)))
+    if known is None:
+        found = require_sound(chosen, chain, settings.signals, settings.couplings, motor=needs_motor)
+        known = Known(tuple(found))
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     laws = (settings.coulomb, settings.row_coulomb)

@@ -195,14 +195,14 @@ def _screened(model: DynamicModel, sessions: Sequence[Session], signals: SignalS
     """Doubts about the channels of the model in those sessions with its joints."""
     chain = model.structure.chain
     whole = [session for session in sessions if set(chain.joint_names) <= set(session.joint_names)]
-    found = screen([_in_use(model, session) for session in whole], chain, signals, model.structure.couplings)
+    structure = model.structure
+    found = screen(whole, chain, signals, structure.couplings, motor=_has_motor(model))
     # A log given twice is scored twice, without harm to the scores.
     return tuple(replace(doubt, certain=doubt.certain and doubt.channel != "log") for doubt in found)
 
 
-def _in_use(model: DynamicModel, session: Session) -> Session:
-    """The session without motor torques the model has no use for."""
-    return session if {"motor", "difference"} & set(model.structure.sides) else replace(session, motor=None)
+def _has_motor(model: DynamicModel) -> bool:
+    return bool({"motor", "difference"} & set(model.structure.sides))
 
 
 def signals_for(
@@ -264,11 +264,11 @@ def prepared_session(
     model: DynamicModel, session: Session, settings: SignalSettings | None
 ) -> PreparedSession:
     """The session with the joints of the model, filtered as for the estimation (settings: `signals_for`)."""
-    chosen = _in_use(model, session.select(model.structure.chain.joint_names))
+    chosen = session.select(model.structure.chain.joint_names)
     signals, own = signals_for(model, settings), signals_for(model)
     # Cut-offs of the model are no choice of the session's.
     advise = (signals.cutoff_hz, signals.decimate_hz) != (own.cutoff_hz, own.decimate_hz)
-    return prepare(chosen, signals, motor=chosen.motor is not None, advise=advise)
+    return prepare(chosen, signals, motor=_has_motor(model), advise=advise)
 
 
 def _few(lines: Sequence[str], count: int) -> list[str]:
@@ -335,8 +335,8 @@ def cross_validate(
     sessions = as_sessions(sessions)
     if len(sessions) < 2:
         raise DataError(f"{len(sessions)} session cannot be cross-validated; give two at least")
-    used = [replace(session, motor=None) for session in sessions] if settings.model == 1 else sessions
-    doubts = tuple(require_sound(used, chain, settings.signals, settings.couplings))
+    motor = settings.model != 1
+    doubts = tuple(require_sound(sessions, chain, settings.signals, settings.couplings, motor=motor))
     scores, skipped = [], []
     for number, session in enumerate(sessions):
         others = [other for k, other in enumerate(sessions) if k != number]
