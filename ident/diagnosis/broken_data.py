@@ -92,6 +92,24 @@ def without_broken(
     return tuple(_usable(record, [b for b in broken if b.session in ("", record.name)]) for record in records)
 
 
+def unseen(records: Sequence[SessionRecord], chain: Chain) -> tuple[str, ...]:
+    """Parameters without any row: of a drive without motor torques, and of the link side of a joint without joint
+    torques, as the drive's own take their place.
+    """
+    stretches = [stretch for record in records for stretch in record.stretches]
+    motor = np.any([np.any(s.motor_usable, axis=0) for s in stretches], axis=0)
+    joint = np.any([np.any(s.usable, axis=0) for s in stretches], axis=0)
+    if not any(record.has_effort for record in records):
+        joint = np.ones_like(joint)
+    return tuple(
+        f"{symbol}{j + 1}"
+        for j in range(chain.n)
+        for seen, symbols in ((motor[j], ("Ia", "Fvm", "Fcm", "offm")), (joint[j], ("Fvl", "Fcl", "offl")))
+        if not seen
+        for symbol in symbols
+    )
+
+
 def _usable(record: SessionRecord, broken: Sequence[BrokenChannel]) -> SessionRecord:
     out = {
         side: [b.joint - 1 for b in broken if b.joint is not None and b.channel == f"{side} torque"]

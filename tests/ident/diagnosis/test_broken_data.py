@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fri.errors import DataError
 from ident.diagnosis import diagnose
 from ident.diagnosis.broken_data import blamed, broken_channels
 from ident.dynamics.kinematics import Chain
+from ident.model.model_file import read_model, write_model
 from ident.rows.filters import SignalSettings
 from lwr_driver.session import Session
 
@@ -114,3 +116,21 @@ def test_an_error_of_the_fit_is_blamed_on_the_broken_channel(pair: list[Session]
         raise DataError("singular")
     with pytest.raises(DataError, match="singular"), blamed((), chain.joint_names):
         raise DataError("singular")
+
+
+@pytest.mark.parametrize(
+    ("side", "edit"), [("motor", dead), ("joint", dead), ("motor", swapped), ("joint", milli)]
+)
+def test_the_models_of_a_diagnosis_with_lost_rows_are_written_and_read(
+    pair: list[Session], chain: Chain, side: str, edit: Edit, tmp_path: Path
+) -> None:
+    found = diagnose(edited(pair, side, "effort", edit), chain)
+    lost = {"motor": "Ia", "joint": "Fcl"}[side]
+    gone = {f"{lost}{one.joint}" for one in found.data}
+    for name, model in (("base", found.base_model), ("extended", found.extended_model)):
+        write_model(model, tmp_path / f"{name}.yaml")
+        read = read_model(tmp_path / f"{name}.yaml")
+        assert read.names == model.names
+        assert not gone & set(read.names)
+        assert read.std is not None
+        assert np.all(np.isfinite(read.std) & (read.std > 0.0))
