@@ -1,8 +1,8 @@
 """Channels that cannot be what they say: told first, left out of the rows, and no cause is named from them.
 
-A torque of one joint is left out alone: the rows of the other joints and of the other side stay. A wrong position, a
-wrong clock, or interchanged or mis-scaled torques of several joints reach all rows, and the diagnosis ends with them.
-What is wrong by some percent is no broken channel but a cause of the catalogue.
+Dead and frozen torques, and a turned or mis-scaled torque of one joint, are left out alone: the rows of the other
+joints and of the other side stay. A wrong position, a wrong clock, or such torques of several joints put the log as a
+whole in doubt, and the diagnosis ends with them. What is wrong by some percent is no broken channel but a cause of the catalogue.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TORQUES = ("joint torque", "motor torque")
 
 @dataclass(frozen=True)
 class BrokenChannel:
-    """A channel of a joint (from 1, None for all) in a session (empty for all). lost : whether its rows alone are."""
+    """A channel of a joint (from 1, None for all) in a session (empty for all). lost : whether it holds nothing."""
 
     channel: str
     joint: int | None
@@ -60,10 +60,9 @@ def broken_channels(
     chosen = [session.select(chain.joint_names) for session in sessions]
     for doubt in screen(chosen, chain, signals, couplings):
         if (doubt.certain or doubt.lost) and not _stands(doubt, chosen):
-            alone = doubt.lost or (doubt.channel in _TORQUES and len(doubt.joints) == 1)
             what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
             for joint in [chain.joint_names.index(name) + 1 for name in doubt.joints] or [None]:
-                found.append(BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, alone))
+                found.append(BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, doubt.lost))
     return tuple(found)
 
 
@@ -76,8 +75,9 @@ def _stands(doubt: Doubt, sessions: Sequence[Session]) -> bool:
 
 
 def worthless(broken: Sequence[BrokenChannel]) -> bool:
-    """Whether a broken channel reaches the rows of other joints."""
-    return any(not one.lost for one in broken)
+    """Whether more is in doubt than dead and frozen torques, or one torque beside them."""
+    wrong = {(one.channel, one.joint) for one in broken if not one.lost}
+    return len(wrong) > 1 or any(channel not in _TORQUES for channel, _ in wrong)
 
 
 def is_broken(broken: Sequence[BrokenChannel], side: str, joint: int) -> bool:

@@ -255,7 +255,16 @@ def _frozen(session: Session) -> Iterator[Doubt]:
             seen = f"reads {values[first, k]:.4g} from {start:.1f} to {end:.1f} s, in the middle of a motion"
             mend = "cut that part off the log, or repair the channel"
             certain = last - first > _OFTEN * len(values)
-            yield Doubt(channel, (session.joint_names[k],), seen, "a frozen channel", mend, certain, name)
+            yield Doubt(
+                channel,
+                (session.joint_names[k],),
+                seen,
+                "a frozen channel",
+                mend,
+                certain,
+                name,
+                lost=channel != "position",
+            )
 
 
 def _longest_run(values: Floats) -> tuple[int, int]:

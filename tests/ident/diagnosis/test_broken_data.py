@@ -82,6 +82,20 @@ def test_a_broken_torque_is_data_and_no_cause(
     assert words in str(found)
 
 
+def test_torques_of_several_joints_in_another_unit_end_the_diagnosis(make: Make, chain: Chain) -> None:
+    def drift(s: dict[str, np.ndarray]) -> None:
+        s["motor"][:, 0] += 0.8 * (1.0 - np.exp(-s["time"] / 8.0))
+
+    def all_milli(values: np.ndarray) -> None:
+        values *= 1e3
+
+    drifting = [make("a.mcap", 1, drift), make("b.mcap", 2, drift, 1)]
+    found = diagnose(edited(drifting, "joint", "effort", all_milli), chain)
+    # Without bodies in the URDF neither side is known to be right.
+    assert {one.joint for one in found.data} == {1, 2, 3}
+    assert found.findings == ()
+
+
 @pytest.mark.parametrize("edit", [frozen, reversed_sign])
 def test_a_broken_position_ends_the_diagnosis(pair: list[Session], chain: Chain, edit: Edit) -> None:
     found = diagnose(edited(pair, "joint", "position", edit), chain)
