@@ -2,7 +2,8 @@
 
 Dead and frozen torques, and a turned or mis-scaled torque of one joint, are left out alone: the rows of the other
 joints and of the other side stay. A wrong position, a wrong clock, or such torques of several joints put the log as a
-whole in doubt, and the diagnosis ends with them. What is wrong by some percent is no broken channel but a cause of the catalogue.
+whole in doubt, and the diagnosis ends with them. What is wrong by some percent is no broken channel but a cause of the
+catalogue.
 """
 
 from __future__ import annotations
