@@ -117,6 +117,10 @@ def test_a_jolt_of_one_joint_of_two_or_beside_a_gap_is_not_stale():
     assert stale(whole).any()
     late = whole.publish_time + np.where(np.arange(COUNT) > 1200, 4_000_000, 0)
     assert not stale(replace(whole, publish_time=late)).any()
+    # Without stamps of the source those of the host tell.
+    unstamped = replace(whole, publish_time=np.zeros_like(late))
+    assert stale(unstamped).any()
+    assert not stale(replace(unstamped, log_time=late)).any()
 
 
 def test_a_clipped_joint_has_its_limit_and_the_others_none():

@@ -145,6 +145,8 @@ def test_the_share_of_flagged_samples_is_that_of_their_weight():
     flagged = np.column_stack([times > 10.0, times < -1.0, times > -1.0])
     np.testing.assert_allclose(parallel.share(flagged), [[0, 0, 1], [0.5, 0, 1], [1, 0, 1]], atol=0.03)
     assert not parallel.share(np.zeros(len(times), dtype=bool)).any()
+    nowhere = ParallelFilter(times, np.array([90.0]), 2.0)
+    assert (nowhere.share(flagged).tolist(), nowhere.coverage().tolist()) == ([[0.0, 0.0, 0.0]], [0.0])
 
 
 def test_a_joint_that_hardly_moves_has_no_part_in_the_excitation():
@@ -343,8 +345,10 @@ def test_unequal_or_separate_periods_have_no_common_phase():
 
     assert prepare(moved("brake", 0.01)).period_rows == 30
     assert prepare(moved("brake", 0.06)).period_rows is None
-    pause = Phase(whole.phases[2].log_time - 200_000_000, "pause")
-    assert prepare(replace(whole, phases=(*whole.phases[:2], pause, *whole.phases[2:]))).period_rows is None
+    apart = tuple(m._replace(name="pause") if m.name == "period 2" else m for m in whole.phases)
+    assert prepare(replace(whole, phases=apart)).period_rows is None
+    shorter = Phase(whole.phases[2].log_time - 60_000_000, "pause")
+    assert prepare(replace(whole, phases=(*whole.phases[:2], shorter, *whole.phases[2:]))).period_rows is None
 
 
 def test_a_jumping_channel_is_named_with_its_joint():
@@ -362,6 +366,18 @@ def test_a_jumping_channel_is_named_with_its_joint():
     bad = replace(session, joint=replace(session.joint, effort=jumping(session.joint.effort, 2)))
     (said,) = prepare(bad, SignalSettings(motor_delay_s=0.0), advise=False).warnings
     assert "E1 joint torque jumps too often" in said
+
+
+@pytest.mark.parametrize(("shift_s", "aligned"), [(12.0, False), (14.0, True), (20.0, True), (-14.0, True)])
+def test_clocks_that_share_less_than_half_their_time_are_aligned_by_the_host(shift_s: float, aligned: bool):
+    session = arm.session()
+    late = session.motor.publish_time + round(1e9 * shift_s)
+    shifted = replace(session, motor=replace(session.motor, publish_time=late))
+    prepared = prepare(shifted, SignalSettings(motor_delay_s=0.0), advise=False)
+    assert len(prepared.warnings) == int(aligned)
+    if aligned:
+        assert f"differs from the joint channel's by {-shift_s:.3f} s" in prepared.warnings[0]
+        assert prepared.passages[0].motor.times[0] < 1.0
 
 
 def test_advice_is_given_on_request_alone():
