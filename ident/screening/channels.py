@@ -43,7 +43,10 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
     for session in sessions:
-        found += [*_clocks(session), *_frozen(session), *_clipped(session), *_velocity(session)]
+        frozen = list(_frozen(session))
+        named = {(doubt.channel, doubt.joints) for doubt in frozen}
+        clipped = [doubt for doubt in _clipped(session) if (doubt.channel, doubt.joints) not in named]
+        found += [*_clocks(session), *frozen, *clipped, *_velocity(session)]
     return found
 
 
