@@ -62,7 +62,8 @@ def broken_channels(
     for doubt in screen(chosen, chain, signals, couplings):
         if (doubt.certain or doubt.lost) and not _stands(doubt, chosen):
             what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
-            for joint in [chain.joint_names.index(name) + 1 for name in doubt.joints] or [None]:
+            joints: list[int | None] = [chain.joint_names.index(name) + 1 for name in doubt.joints]
+            for joint in joints or [None]:
                 found.append(BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, doubt.lost))
     return tuple(found)
 

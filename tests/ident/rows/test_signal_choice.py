@@ -172,3 +172,11 @@ def test_rows_beside_a_reversal_are_unknown_in_their_stretch_alone():
     turning = dataclasses.replace(rows, speed=speed, stretches=(slice(0, 6), slice(6, 12)))
     assert np.flatnonzero(~turning.known(1, 0.1)).tolist() == [2, 3]
     assert np.flatnonzero(~turning.known(0, 0.1)).tolist() == []
+
+
+def test_noisy_positions_have_a_lower_cut_off_than_clean_ones():
+    clean, noisy = (
+        chosen(arm.session(motor=False, sensors=sensors(position=some))).settings.cutoff_hz
+        for some in (1e-7, 1e-3)
+    )
+    assert (clean, noisy) == (25.0, 5.0)

@@ -120,9 +120,9 @@ def test_the_stop_band_is_as_deep_as_asked_for(attenuation_db: float, worst: flo
 
 
 def test_samples_at_a_gap_and_at_the_ends_count_for_their_time_alone():
-    times = np.array([0.0, 1.0, 2.0, 3.0, 9.0, 10.0])
+    times = 0.5 * np.array([0.0, 1.0, 2.0, 3.0, 9.0, 10.0])
     np.testing.assert_allclose(
-        ParallelFilter(times, times, 1.0).sample_weights, [1.0, 1.0, 1.0, 1.5, 1.5, 1.0]
+        ParallelFilter(times, times, 1.0).sample_weights, [0.5, 0.5, 0.5, 0.75, 0.75, 0.5]
     )
     assert ParallelFilter(times[:1], times, 1.0).sample_weights.tolist() == []
 
