@@ -3,8 +3,9 @@
 Run `python -m benchmarks.wrong_channels [--seed 700] [--healthy 40] [--case TEXT]`. Two logs of the default emulator
 (bare arm, payload) are changed in memory, one channel at a time, and identified with the settings as they come. For
 each change the table says: error, warning or silent; whether the messages name channel and joint; the largest
-deviation of a parameter from the truth in its standard deviations, where there is a result. Unchanged logs follow:
-other motions, lengths, paces, and arms with a day's tolerances.
+deviation of a parameter from the truth in its standard deviations, where there is a result. Unchanged logs follow,
+identified as by `lwr-run identify`: other motions, lengths, paces, and arms with a day's tolerances. They shall say
+nothing: no doubt, no warning of the fit, no advice, no disagreement with the URDF.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import AUTO, Identification, IdentificationSettings, identify
 from ident.screening.screen import screen
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
@@ -114,6 +115,23 @@ def constant(channel: str, field: str, value: float, *joints: str, only: int | N
         )
 
     return change
+
+
+def frozen(channel: str, field: str, joint: str, *, only: int | None = None) -> Change:
+    """The joint keeps the value of a quarter of the log until three quarters, in all sessions or one."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values, k = getattr(columns, field).copy(), JOINTS.index(joint)
+        first, last = len(values) // 4, 3 * len(values) // 4
+        values[first:last, k] = values[first, k]
+        return replace(columns, **{field: values})
+
+    return lambda sessions: [
+        done if only in (None, number) else session
+        for number, (session, done) in enumerate(
+            zip(sessions, _channel(sessions, channel, edit), strict=True)
+        )
+    ]
 
 
 def paced(
@@ -266,6 +284,11 @@ CASES: tuple[Case, ...] = (
     Case("joint A2 reads 12.3", constant(*L, 12.3, "A2"), (JOINT, "A2")),
     Case("position A5 reads 0.4", constant(*Q, 0.4, "A5"), (POSITION, "A5")),
     Case("position A5 reads 0.4 in one log", constant(*Q, 0.4, "A5", only=0), (POSITION, "A5")),
+    Case("motor A2 frozen half the time", frozen(*M, "A2"), (MOTOR, "A2")),
+    Case("motor A6 frozen half of one log", frozen(*M, "A6", only=0), (MOTOR, "A6")),
+    Case("joint A1 frozen half the time", frozen(*L, "A1"), (JOINT, "A1")),
+    Case("joint A4 frozen half of one log", frozen(*L, "A4", only=0), (JOINT, "A4")),
+    Case("position E1 frozen half of one log", frozen(*Q, "E1", only=0), (POSITION, "E1")),
     # One torque alone.
     Case("joint only: A2 x 1.3", without("motor", scaled(*L, 1.3, "A2")), (JOINT, "A2")),
     Case("joint only: A5 sign", without("motor", scaled(*L, -1.0, "A5")), (JOINT, "A5")),
@@ -303,15 +326,20 @@ class Outcome:
         return all(word in self.text for word in words)
 
 
-def outcome(sessions: Sessions, chain: Chain) -> Outcome:
+def outcome(sessions: Sessions, chain: Chain, estimator: str = "wls") -> Outcome:
     """Identification with the settings as they come."""
     start = time.perf_counter()
     model = 2 if any(session.motor is not None for session in sessions) else 1
     try:
-        found = identify(sessions, chain, IdentificationSettings(model=model, essential=None))
+        settings = IdentificationSettings(model=model, estimator=estimator, essential=None)
+        found = identify(sessions, chain, settings)
     except DataError as error:
         return Outcome("error", str(error), seconds=time.perf_counter() - start)
-    text = "\n".join(found.warnings)
+    said = [*found.warnings]
+    if found.choice is not None:
+        apart = found.choice.disagreement
+        said += [*found.choice.advice, *([str(apart)] if apart and "disagree" in str(apart) else [])]
+    text = "\n".join(said)
     spent = time.perf_counter() - start
     try:
         scores = _scores(found)
@@ -374,7 +402,7 @@ def main() -> None:
     for number in range(options.healthy):
         with tempfile.TemporaryDirectory() as folder:
             unchanged = healthy(number, Path(folder))
-        found = outcome(unchanged, chain)
+        found = outcome(unchanged, chain, AUTO)
         doubted = screen(unchanged, chain)
         alarms += bool(doubted) or found.verdict == "error"
         others += found.verdict == "warning" and not doubted
@@ -382,7 +410,7 @@ def main() -> None:
             print(f"healthy {number}: {found.verdict}: {found.text}", flush=True)
     if options.healthy:
         print(f"{alarms} of {options.healthy} healthy sets with an error or a doubt about a channel,")
-        print(f"{others} with a warning of the fit alone (excitation, delay)")
+        print(f"{others} with a warning of the fit or of the estimator's choice alone")
 
 
 if __name__ == "__main__":

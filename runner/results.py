@@ -169,7 +169,10 @@ def estimated(
     content["unscored"] = []
     for key, sessions in scores.items():
         if sessions:
-            scored = validate(model, sessions, allow_seen=key == "fit", keep_going=True).to_dict()
+            known = found.known if key == "fit" else None
+            scored = validate(
+                model, sessions, allow_seen=known is not None, keep_going=True, known=known
+            ).to_dict()
             content[key] = scored["sessions"]
             content["unscored"] += scored["unscored"]
     return content

@@ -16,6 +16,14 @@ from ident.diagnosis.bench import (
     slow_delay,
     some_joint_moves,
 )
+from ident.diagnosis.broken_data import (
+    BrokenChannel,
+    blamed,
+    broken_channels,
+    is_broken,
+    without_broken,
+    worthless,
+)
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import conclude, timing_finding
 from ident.diagnosis.evidence import Score
@@ -76,12 +84,29 @@ def diagnose(
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     held = {id(s) for s in test}
     known = None if reference is None else signal_settings(reference.model)
-    settings = settled(settings if known is None else replace(settings, signals=known), sessions, chain)
-    recordings = tuple(record(s, k, chain, settings, test=id(s) in held) for k, s in enumerate(everything))
-    some_joint_moves(recordings)
-    nominal = nominal_arm(chain, arm, reference)
-    task = Task(sessions, test, nominal, recordings, settings, reference, causes, model, simulate)
-    return conclude(task, _refined(task, _in_time(task, _first(task))))
+    settings = settings if known is None else replace(settings, signals=known)
+    broken = broken_channels(everything, chain, settings.signals, () if arm is None else arm.couplings)
+    with blamed(broken, chain.joint_names):
+        settings = settled(settings, sessions, chain)
+        recordings = tuple(
+            record(s, k, chain, settings, test=id(s) in held) for k, s in enumerate(everything)
+        )
+        some_joint_moves(recordings)
+        recordings = without_broken(recordings, broken)
+        nominal = nominal_arm(chain, arm, reference)
+        task = Task(sessions, test, nominal, recordings, settings, reference, causes, model, simulate)
+        if worthless(broken):
+            return _ended(task, broken)
+        found = conclude(task, _refined(task, _in_time(task, _first(task))))
+        nameless = tuple(u for u in found.unexplained if not is_broken(broken, u.side, u.joint))
+        return replace(found, unexplained=nameless, data=broken)
+
+
+def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
+    """The base model alone, without a cause: from worthless data nothing is concluded."""
+    task = replace(task, simulate=None)
+    state = State(task.bench(task.arm, task.reference, fit_compliance=False), Selection([], {}, {}))
+    return replace(conclude(task, state), findings=(), unexplained=(), data=tuple(broken))
 
 
 def _first(task: Task) -> State:

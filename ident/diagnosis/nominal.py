@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
 
+from ident.diagnosis.broken_data import unseen
 from ident.diagnosis.recording import RecordStretch, SessionRecord
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics import regressor
@@ -95,7 +96,8 @@ def structure_of(arm: NominalArm, recordings: Sequence[SessionRecord]) -> tuple[
     """Columns for the sessions' payloads and sides."""
     payloads = tuple(dict.fromkeys(r.payload for r in recordings if r.payload is not None))
     motor = any(r.has_motor for r in recordings)
-    structure = ModelStructure(arm.chain, 2 if motor else 1, payloads, couplings=arm.couplings)
+    left_out = unseen(recordings, arm.chain) if motor else ()
+    structure = ModelStructure(arm.chain, 2 if motor else 1, payloads, left_out, arm.couplings)
     conditions = dict.fromkeys(Condition(r.payload, r.sides) for r in recordings)
     return structure, numeric_base(structure, tuple(conditions))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.diagnosis.broken_data import BrokenChannel
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.statements import Statements, finding_statement, statements
 from ident.dynamics.tables import Tabular
@@ -173,7 +174,7 @@ class Diagnosis(Tabular):
     fitted. extension : `cause(joints)` of all in the extended model.
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
-    notes : sentences on limits of the data.
+    notes : sentences on limits of the data. data : broken channels, left out.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
     states : of the arm in these rows, by side.
     """
@@ -199,6 +200,7 @@ class Diagnosis(Tabular):
     extension: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
+    data: tuple[BrokenChannel, ...] = ()
 
     @property
     def claims(self) -> tuple[Finding, ...]:
@@ -257,6 +259,7 @@ class Diagnosis(Tabular):
                 "noise_floor": _sides(self.noise_floor),
                 "simulation_error": base,
             },
+            "data": [broken.to_dict() for broken in self.data],
             "findings": [finding.to_dict() for finding in self.findings],
             "character": [finding.to_dict() for finding in self.character],
             "nameless": [term.to_dict() for term in self.nameless],

@@ -157,6 +157,7 @@ class Statements:
         """The whole, for the terminal."""
         found = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
         found += [f"{answer}." for answer in self.answers]
+        found += [line for part in self.parts if part.anchor == "data" for line in part.lines()]
         for finding in (*self.findings, *self.character):
             if self.character and finding is self.character[0]:
                 found.append("Character of the arm, as drives of its kind have it:")
@@ -165,7 +166,8 @@ class Statements:
         for one in self.comparisons:
             if not one.finding:
                 found += [f"Side by side: {one.title}", *_beside(one)]
-        return "\n".join([*found, *(line for part in self.parts for line in part.lines())])
+        rest = (part for part in self.parts if part.anchor != "data")
+        return "\n".join([*found, *(line for part in rest for line in part.lines())])
 
     def brief(self) -> str:
         """Headline and summary, at most ten lines."""
@@ -186,6 +188,7 @@ def statements(
     findings, character = said[:count], said[count:]
     level, headline = _headline(content, details, findings)
     parts = (
+        _data(content, names),
         _experiments(details, names),
         _nameless(content, names),
         _unexplained(content, names),
@@ -365,7 +368,22 @@ def _shares(content: Plain, names: Sequence[str]) -> list[tuple[float, str]]:
     ]
 
 
+def _data(content: Plain, names: Sequence[str]) -> Part:
+    sentences = []
+    for one in content.get("data", []):
+        subject = (
+            f"{_name(one['joint'], names)} {one['channel']}" if one.get("joint") else str(one["channel"])
+        )
+        sentences.append(f"{_capital(subject)}: {one['what']}; {one['advice']}")
+    return Part("data", "Channels that cannot be what they say", tuple(dict.fromkeys(sentences)))
+
+
 def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatement]) -> tuple[Level, str]:
+    if content.get("data") and not findings:
+        return (
+            "look",
+            "Channels of these data cannot be what they say: mend them first; no cause is named from them",
+        )
     doubtful, count = sum(finding.is_open for finding in findings), len(findings)
     if count == 1:
         return "look", "One cause found" + (", open between look-alikes" if doubtful else "")
@@ -393,6 +411,12 @@ def _lines(
     names: Sequence[str],
 ) -> list[Line]:
     found = []
+    if content.get("data"):
+        listed = [
+            f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}" for d in content["data"]
+        ]
+        text = ", ".join(dict.fromkeys(one.strip() for one in listed))
+        found.append(Line("broken channels", text, "none", "look", "data"))
     for finding in findings:
         parts = [finding.text, *(f"{label} {text}" for label, text in finding.facts[:1]), finding.confidence]
         text = "; ".join(part.rstrip(".") for part in parts if part)

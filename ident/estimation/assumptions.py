@@ -11,7 +11,8 @@ verdict is by consequence, beside the statistic:
 * what bends the estimates (variance, outliers, noise in the regressor) is mended, by weights or by instruments, and
   counts if a parameter leaves its own 95 % interval and a computed torque moves by two hundredths of itself;
 * correlation is allowed for by the robust covariance, if there are blocks enough to compute it from. With the
-  textbook covariance it counts by the ratio of the two.
+  textbook covariance it counts by the ratio of the two;
+* the condition number counts where the standard deviation of a parameter moves a torque by more than the same Nm.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, no
 from ident.estimators.problem import Problem
 
 _LEVEL = 0.01
-_WIDE_CONDITION = 100.0
 # Share of a joint's torque that matters: the accuracy of joint torque sensors.
 _MATTERS = 0.02
 # Half width of a 95 % interval in standard deviations.
@@ -118,7 +118,7 @@ def check_assumptions(
         _equal_variance(series, problem, estimate),
         _normality(series, problem, estimate),
         _exogeneity(series, problem, estimate, instrumental),
-        _condition(problem),
+        _condition(problem, estimate),
     ]
     if period_rows is not None:
         checks.append(_lack_of_fit(problem, estimate, period_rows))
@@ -375,13 +375,49 @@ def _exogeneity(
     )
 
 
-def _condition(problem: Problem) -> Check:
-    normalised = problem.normalised_condition
+@dataclass(frozen=True)
+class Weak:
+    """A parameter that the motion hardly shows: the torque [Nm] of its standard deviation, and what matters there."""
+
+    name: str
+    place: str
+    torque: float
+    matters: float
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.torque:.2g} Nm in {self.place}, {self.matters:.2g} Nm matters)"
+
+
+def weak_parameters(problem: Problem, estimate: Estimate) -> list[Weak]:
+    """Parameters with a standard deviation that moves a torque by more than what matters, the worst first.
+
+    With v the inflation of the variance by the other columns and n independent rows, std^2 mean(w^2) = v sigma^2 / n.
+    A condition number shows v alone; more rows make up for it.
+    """
+    found: dict[str, Weak] = {}
+    for row_class, series in zip(problem.classes, _joined(problem, estimate), strict=True):
+        matters = max(_matters(series), 1e-300)
+        size = np.linalg.norm(row_class.factor.r[:, :-1], axis=0) / np.sqrt(max(row_class.factor.rows, 1))
+        for k in np.flatnonzero(estimate.std * size > matters):
+            weak = Weak(problem.names[k], row_class.label, float(estimate.std[k] * size[k]), matters)
+            if (
+                weak.name not in found
+                or weak.torque / matters > found[weak.name].torque / found[weak.name].matters
+            ):
+                found[weak.name] = weak
+    return sorted(found.values(), key=lambda weak: -weak.torque / weak.matters)
+
+
+def _condition(problem: Problem, estimate: Estimate) -> Check:
+    normalised, weak = problem.normalised_condition, weak_parameters(problem, estimate)
+    finding = f"{problem.condition:.1f}, columns normalised {normalised:.1f}"
+    if weak:
+        finding += f"; too uncertain: {', '.join(one.name for one in weak[:8])}"
     return Check(
         "condition number",
-        normalised < _WIDE_CONDITION,
-        f"{problem.condition:.1f}, columns normalised {normalised:.1f} (limit {_WIDE_CONDITION:.0f})",
-        "the motion hardly separates some parameters: see their RSD, or plan a better excitation",
+        bool(np.isfinite(normalised)) and not weak,
+        finding,
+        "the motion hardly shows some parameters: see their RSD, or plan a better excitation",
         normalised,
     )
 

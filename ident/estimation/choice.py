@@ -31,7 +31,13 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.effects.channel import SensorGain
-from ident.estimation.identify import Identification, IdentificationSettings, estimator_factory, identify
+from ident.estimation.identify import (
+    Identification,
+    IdentificationSettings,
+    Known,
+    estimator_factory,
+    identify,
+)
 from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
 from ident.estimation.parts import beside, held_back_parts
 from ident.estimators.covariance import CovarianceSettings, effective_rows
@@ -175,6 +181,7 @@ def choose(
     settings: IdentificationSettings | None = None,
     *,
     tilt: bool | None = None,
+    known: Known | None = None,
 ) -> Identification:
     """The arm identified by the candidate with the least held-back error; arguments as for `identify`.
 
@@ -185,7 +192,8 @@ def choose(
     settings = settings or IdentificationSettings()
     sessions = as_sessions(sessions)
     prior = chain.urdf is not None and settings.model != 3
-    first = identify(sessions, chain, replace(settings, estimator="map" if prior else "wls", essential=None))
+    plain = replace(settings, estimator="map" if prior else "wls", essential=None)
+    first = identify(sessions, chain, plain, known=known)
     choice = compared(first, sessions, tilt=tilt)
     winner = choice.winner
     options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
@@ -193,14 +201,12 @@ def choose(
     final = replace(settled, estimator=estimator_factory(winner.estimator, **options))
     sessions = [_calibrated(session, choice.gains) for session in sessions]
     if winner.tilt:
-        mounting = find_mounting(sessions, chain, final)
+        mounting = find_mounting(sessions, chain, final, known=first.known)
         found, choice = mounting.identification, replace(choice, mounting=mounting)
     else:
-        found = identify(sessions, chain, final)
+        found = identify(sessions, chain, final, known=first.known)
     effects = tuple(_entry(chain, joint, *gain) for joint, gain in choice.gains.items())
-    return replace(
-        found, settings=settled, choice=choice, signal_reasons=first.signal_reasons, effects=effects
-    )
+    return replace(found, settings=settled, choice=choice, effects=effects)
 
 
 def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> Session:

@@ -16,9 +16,9 @@ from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 from ident.dynamics.tables import Tabular
-from ident.estimation.assumptions import Assumptions, check_assumptions
+from ident.estimation.assumptions import Assumptions, check_assumptions, weak_parameters
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
-from ident.estimation.plausibility import require_plausible
+from ident.estimation.plausibility import payload_warnings, require_plausible
 from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
@@ -30,7 +30,7 @@ from ident.model.signals import signals_entry
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
-from ident.rows.sessions import payload_name, require, stated_mass
+from ident.rows.sessions import payload_name, require
 from ident.rows.signal_choice import choose_signals
 from ident.screening.screen import require_sound, without_dead
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -44,8 +44,6 @@ logger = logging.getLogger(__name__)
 
 AUTO = "auto"
 """In place of the name of an estimator: the one that predicts best, see `ident.estimation.choice`."""
-
-_WIDE_CONDITION = 100.0
 
 
 @dataclass(frozen=True)
@@ -86,13 +84,25 @@ class IdentificationSettings:
 
 
 @dataclass(frozen=True)
+class Known:
+    """What an earlier step of the same command knows of its sessions.
+
+    doubts : sentences of their screening. signal_reasons : why the signal settings are as they are, where the data
+    chose them.
+    """
+
+    doubts: tuple[str, ...] = ()
+    signal_reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Identification(Tabular):
     """Result of `identify`.
 
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
-    warnings : sentences for the report. choice : of the estimator, with "auto". signal_reasons : why the signal
-    settings are as they are, where the data chose them. effects : of the model beside its parameters (sensor gains).
+    warnings : sentences for the report. choice : of the estimator, with "auto". known : of the sessions, for a further
+    identification of them. effects : of the model beside its parameters (sensor gains).
     """
 
     settings: IdentificationSettings
@@ -108,7 +118,7 @@ class Identification(Tabular):
     essential: Essential | None
     robot: str
     warnings: tuple[str, ...]
-    signal_reasons: tuple[str, ...] = ()
+    known: Known = field(default_factory=Known)
     choice: Choice | None = None
     effects: tuple[Mapping[str, Any], ...] = ()
 
@@ -192,7 +202,8 @@ class Identification(Tabular):
                 for session, payload in zip(self.prepared, self.payloads, strict=True)
             ],
             "counts": self.counts,
-            "signals": dataclasses.asdict(self.settings.signals) | {"reasons": list(self.signal_reasons)},
+            "signals": dataclasses.asdict(self.settings.signals)
+            | {"reasons": list(self.known.signal_reasons)},
             "condition": self.condition,
             "condition_normalised": self.condition_normalised,
             "parameters": self.parameters,
@@ -244,7 +255,7 @@ class Identification(Tabular):
                     f"{session.name}: stamps jitter by {1e3 * session.jitter_s:.2g} ms rms about an even sample time; "
                     f"times counted by the motion, {session.counts['stale']} repeated samples left out"
                 )
-        lines += self.signal_reasons
+        lines += self.known.signal_reasons
         lines.append(
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
         )
@@ -259,12 +270,18 @@ class Identification(Tabular):
 
 
 def identify(
-    sessions: Sessions, chain: Chain, settings: IdentificationSettings | None = None
+    sessions: Sessions,
+    chain: Chain,
+    settings: IdentificationSettings | None = None,
+    *,
+    known: Known | None = None,
 ) -> Identification:
     """Identify the arm `chain` from one or more sessions, stacked.
 
     sessions : a session, the path of a log, or several of either. The payload of each comes from its metadata
         (`none`: the bare arm). A session without motor or joint torques adds the rows of the other side only.
+    known : of these sessions, from an earlier identification with the same signal settings; they are not screened
+        again.
 
     Raises ConfigurationError for arguments of a wrong type, DataError for unusable sessions.
     """
@@ -274,7 +291,7 @@ def identify(
     if settings.estimator == AUTO:
         from ident.estimation.choice import choose
 
-        return choose(sessions, chain, settings)
+        return choose(sessions, chain, settings, known=known)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file")
@@ -308,11 +325,15 @@ def identify(
         settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
-    doubts = require_sound(chosen, chain, settings.signals, settings.couplings)
+    first = known is None
+    if known is None:
+        found = require_sound(chosen, chain, settings.signals, settings.couplings, motor=needs_motor)
+        known = Known(tuple(found))
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     laws = (settings.coulomb, settings.row_coulomb)
     signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, laws)
+    known = replace(known, signal_reasons=known.signal_reasons or signals.reasons)
     rows_structure = replace(structure, coulomb=signals.row_coulomb)
     structure = replace(structure, coulomb=signals.coulomb)
     base = replace(base, structure=structure)
@@ -327,7 +348,8 @@ def identify(
             settings.signals,
             resonance_hz=settings.resonance_hz,
             motor=needs_motor,
-            advise=not signals.reasons,
+            log=first,
+            advise=not known.signal_reasons,
         )
         seen = observe(
             [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units
@@ -340,7 +362,7 @@ def identify(
             seen = observe([motion], [payload], rows_structure, columns=base.columns)
             instruments.append(without_dead(seen, session))
             del motion
-    warnings = doubts + [warning for session in prepared for warning in session.warnings]
+    warnings = [*known.doubts, *(warning for session in prepared for warning in session.warnings)]
     _every_joint_moves(prepared, chain)
     problem = stack(problems)
     # With instrumental variables, this is the WLS compared with them.
@@ -369,8 +391,8 @@ def identify(
     if settings.essential is not None and full_rank:
         essential = find_essential(problem, estimate, settings.essential, settings.covariance)
     warnings += require_plausible(problem, estimate, chain.joint_names)
-    warnings += _payload_warnings(chosen, payloads, base, estimate, structure)
-    warnings += _condition_warnings(normalised, estimate)
+    warnings += payload_warnings(chosen, payloads, base, estimate, structure)
+    warnings += _excitation_warnings(problem, estimate, full_rank)
     return Identification(
         settings=settings,
         structure=structure,
@@ -385,7 +407,7 @@ def identify(
         essential=essential,
         robot=settings.robot or chosen[0].metadata.get("robot", "") or "arm",
         warnings=tuple(warnings),
-        signal_reasons=signals.reasons,
+        known=known,
     )
 
 
@@ -446,66 +468,17 @@ def _conditions(
     return tuple(found)
 
 
-def _payload_warnings(
-    sessions: Sequence[Session],
-    payloads: Sequence[str | None],
-    base: BaseSet,
-    estimate: Estimate,
-    structure: ModelStructure,
-) -> list[str]:
-    """Estimated against stated mass of each payload. DataError for a payload not mounted as stated."""
-    found = []
-    if structure.payloads and None not in payloads:
-        found.append(
-            "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into "
-            "the arm's; add an unloaded session of the same arm"
-        )
-    for payload in structure.payloads:
-        link = structure.payload_link(payload)
-        assert link is not None
-        name = f"M{link + 1}"
-        if name not in base.names:
-            continue
-        place = base.names.index(name)
-        mass, std = float(estimate.values[place]), float(estimate.std[place])
-        carriers = [s for s, p in zip(sessions, payloads, strict=True) if p == payload]
-        stated = next((m for m in map(stated_mass, carriers) if m is not None), None)
-        estimated = f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg"
-        absent = mass < 3.0 * std if stated is None else mass + 3.0 * std < 0.5 * stated
-        if absent:
-            names = ", ".join(s.path.name for s in carriers)
-            bare = ", ".join(s.path.name for s, p in zip(sessions, payloads, strict=True) if p is None)
-            doubt = (
-                f"the payloads of {names} and {bare} are interchanged"
-                if bare and mass < -3.0 * std
-                else f"it was not mounted in {names}, or it was mounted in {bare or 'all sessions'} as well"
-            )
-            raise DataError(
-                f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; name "
-                "the mounted payload (`--payload FILE=NAME`, `none`: the bare arm) or record the session again"
-            )
-        if stated is not None and abs(mass - stated) > max(0.1 * stated, 3.0 * std):
-            found.append(
-                f"{estimated} against {stated:.3f} kg stated; check the mounted payload and the torque "
-                "sensors' gain"
-            )
-        elif mass < 3.0 * std:
-            found.append(f"{estimated} is not above zero; the motion excites so light a payload too little")
-    return found
-
-
-def _condition_warnings(normalised: float, estimate: Estimate) -> list[str]:
-    if normalised < _WIDE_CONDITION:
-        return []
-    if not np.isfinite(normalised):
+def _excitation_warnings(problem: Problem, estimate: Estimate, full_rank: bool) -> list[str]:
+    if not full_rank:
         named = ", ".join(estimate.prior_only)
         return [
             f"the motion does not determine all parameters: it does not show {named}, known from the prior alone"
         ]
-    inverse = np.linalg.inv(estimate.correlation + 1e-12 * np.eye(len(estimate.names)))
-    worst = np.argsort(-np.diag(inverse))[:8]
-    names = ", ".join(estimate.names[k] for k in worst)
+    weak = weak_parameters(problem, estimate)
+    if not weak:
+        return []
+    other = ", or use an estimator with a prior" if estimate.prior_scale is None else ""
     return [
-        f"condition number of the normalised columns {normalised:.0f} exceeds {_WIDE_CONDITION:.0f}; the "
-        f"motion hardly separates {names}: excite them, or judge them by their RSD"
+        f"the motion hardly shows {', '.join(map(str, weak[:8]))}, by standard deviations; excite these "
+        f"parameters{other}"
     ]

@@ -22,7 +22,7 @@ from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.effects.link import sideways_gravity
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
@@ -106,10 +106,11 @@ def find_mounting(
     *,
     prior_std_rad: float = float(np.deg2rad(2.0)),
     steps: int = 6,
+    known: Known | None = None,
 ) -> Mounting:
     """Tilt of the base of `chain` from the sessions, and the arm identified under it.
 
-    sessions, settings : as for `identify`. The steps are maximum a posteriori with the inertials of the URDF as
+    sessions, settings, known : as for `identify`. The steps are maximum a posteriori with the inertials of the URDF as
         prior (`cad_prior`; weighted least squares without a URDF), so that weakly excited parameters do not
         absorb the tilt.
     prior_std_rad : standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree
@@ -131,8 +132,7 @@ def find_mounting(
     tilt = np.zeros(2)
     # The steps need plausible values of all parameters, with any final estimator.
     inner = replace(settings, essential=None, estimator="wls" if chain.urdf is None else "map")
-    found = identify(sessions, chain, inner)
-    reasons = found.signal_reasons
+    found = identify(sessions, chain, inner, known=known)
     settings = replace(found.settings, essential=settings.essential, estimator=settings.estimator)
     inner = found.settings
     done, converged = 0, False
@@ -142,10 +142,10 @@ def find_mounting(
         step, covariance = _step(found, sessions, axes, tilt, prior_std_rad)
         tilt = tilt + step
         turned = replace(chain, gravity=_turned(chain.gravity, axes, tilt))
-        found = identify(sessions, turned, inner)
+        found = identify(sessions, turned, inner, known=found.known)
         converged = bool(np.all(np.abs(step) < 0.1 * covariance.std))
     assert covariance is not None
-    found = replace(identify(sessions, found.structure.chain, settings), signal_reasons=reasons)
+    found = identify(sessions, found.structure.chain, settings, known=found.known)
     gravity = found.structure.chain.gravity
     return Mounting(axes, tilt, covariance, chain.gravity, gravity, found, done, converged)
 
@@ -227,7 +227,7 @@ def _columns(
     for session, payload in zip(sessions, found.payloads, strict=True):
         chosen = session.select(structure.chain.joint_names)
         moving = prepare(
-            chosen, settings.signals, resonance_hz=settings.resonance_hz, motor=settings.model == 2
+            chosen, settings.signals, resonance_hz=settings.resonance_hz, motor=settings.model == 2, log=False
         )
         still = _at_rest(moving)
         groups = [observe([still], [payload], s, columns=found.base.columns).groups for s in structures]

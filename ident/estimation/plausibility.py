@@ -1,4 +1,4 @@
-"""Whether an estimate can be an arm: friction dissipates and drives have inertia.
+"""Whether an estimate can be an arm: friction dissipates, drives have inertia, payloads the stated mass.
 
 A bound is broken when it is missed by five standard deviations and the torque of it is a visible share of the joint's:
 the hysteresis of a sensor looks like a little negative friction. Friction counts by its power, because its viscous and
@@ -11,10 +11,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fri.errors import DataError
+from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import split_name
+from ident.dynamics.structure import ModelStructure
 from ident.estimators.estimate import Estimate
 from ident.estimators.problem import Problem
+from ident.rows.sessions import stated_mass
 from ident.screening.doubts import Doubt, settle
+from lwr_driver.session import Session
 
 _DEVIATIONS = 5.0
 # Least share of the torque of the joint.
@@ -46,6 +51,54 @@ def check_estimate(problem: Problem, estimate: Estimate, joints: Sequence[str]) 
 def require_plausible(problem: Problem, estimate: Estimate, joints: Sequence[str]) -> list[str]:
     """Sentences of `check_estimate` for the report. Raises DataError when most joints of a side are impossible."""
     return settle(check_estimate(problem, estimate, joints))
+
+
+def payload_warnings(
+    sessions: Sequence[Session],
+    payloads: Sequence[str | None],
+    base: BaseSet,
+    estimate: Estimate,
+    structure: ModelStructure,
+) -> list[str]:
+    """Estimated against stated mass of each payload. DataError for a payload not mounted as stated."""
+    found = []
+    if structure.payloads and None not in payloads:
+        found.append(
+            "no session of the bare arm is stacked, so the payload's parameters are partly regrouped into "
+            "the arm's; add an unloaded session of the same arm"
+        )
+    for payload in structure.payloads:
+        link = structure.payload_link(payload)
+        assert link is not None
+        name = f"M{link + 1}"
+        if name not in base.names:
+            continue
+        place = base.names.index(name)
+        mass, std = float(estimate.values[place]), float(estimate.std[place])
+        carriers = [s for s, p in zip(sessions, payloads, strict=True) if p == payload]
+        stated = next((m for m in map(stated_mass, carriers) if m is not None), None)
+        estimated = f"payload {payload!r}: estimated mass {mass:.3f} ± {std:.3f} kg"
+        absent = mass < 3.0 * std if stated is None else mass + 3.0 * std < 0.5 * stated
+        if absent:
+            names = ", ".join(s.path.name for s in carriers)
+            bare = ", ".join(s.path.name for s, p in zip(sessions, payloads, strict=True) if p is None)
+            doubt = (
+                f"the payloads of {names} and {bare} are interchanged"
+                if bare and mass < -3.0 * std
+                else f"it was not mounted in {names}, or it was mounted in {bare or 'all sessions'} as well"
+            )
+            raise DataError(
+                f"{estimated}{'' if stated is None else f' against {stated:.3f} kg stated'}: {doubt}; name "
+                "the mounted payload (`--payload FILE=NAME`, `none`: the bare arm) or record the session again"
+            )
+        if stated is not None and abs(mass - stated) > max(0.1 * stated, 3.0 * std):
+            found.append(
+                f"{estimated} against {stated:.3f} kg stated; check the mounted payload and the torque "
+                "sensors' gain"
+            )
+        elif mass < 3.0 * std:
+            found.append(f"{estimated} is not above zero; the motion excites so light a payload too little")
+    return found
 
 
 def _impossible(problem: Problem, estimate: Estimate, side: str, joint: str, number: int) -> str:

@@ -1,7 +1,7 @@
 """Test of a model on sessions it was not fitted to, by the torque error (`ident.estimation.scores`).
 
 A session is filtered and put in time as those of the model's estimate. Cross-validation predicts each session with
-a model identified from all the others.
+a model identified from all the others. Wrong channels are named before (`ident.screening`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identify import IdentificationSettings, Known, identify
 from ident.estimation.scores import Predictor, SessionScore, score_session
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
@@ -26,6 +26,8 @@ from ident.model.signals import signal_settings
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import payload_name
+from ident.screening.doubts import Doubt, settle
+from ident.screening.screen import require_sound, screen
 from lwr_driver.session import Session, Sessions, as_sessions
 
 
@@ -49,7 +51,7 @@ class Unscored:
 class Validation(Tabular):
     """Scores of the model and of its competitors in all sessions; prints itself.
 
-    unscored : sessions without a score, where `validate` was to go on past them.
+    unscored : sessions without a score, where `validate` was to go on past them. warnings : doubts about channels.
     """
 
     robot: str
@@ -57,6 +59,7 @@ class Validation(Tabular):
     competitors: tuple[SessionScore, ...] = ()
     notes: tuple[str, ...] = field(default=())
     unscored: tuple[Unscored, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def require_all(self) -> None:
         """Raise the error of the sessions without a score, of the type of the first; nothing without any."""
@@ -77,6 +80,7 @@ class Validation(Tabular):
             "sessions": [score.to_dict() for score in self.scores],
             "competitors": [score.to_dict() for score in self.competitors],
             "unscored": [one.to_dict() for one in self.unscored],
+            "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
 
@@ -106,6 +110,7 @@ class Validation(Tabular):
         if self.competitors:
             parts.append(self._comparison())
         parts += [f"not validated: {one}" for one in self.unscored]
+        parts += [f"warning: {warning}" for warning in self.warnings]
         parts += list(self.notes)
         return "\n\n".join(parts)
 
@@ -136,6 +141,7 @@ def validate(
     allow_seen: bool = False,
     estimate_delay: bool = False,
     keep_going: bool = False,
+    known: Known | None = None,
 ) -> Validation:
     """Computed-torque test of a model on sessions.
 
@@ -144,17 +150,22 @@ def validate(
     allow_seen : score sessions the model was fitted to as well, and label them; otherwise they are refused.
     estimate_delay : estimate the delay of the motor channel in each session instead.
     keep_going : list sessions without a score in `unscored` instead of raising.
+    known : of the sessions, from an earlier step; they are not screened again.
 
     Raises ConfigurationError for arguments of a wrong type. Raises DataError for a session of another robot,
-    with a payload missing in the model, without any channel of the model, or seen by the estimate.
+    with a payload missing in the model, without any channel of the model, with a channel that is certainly wrong,
+    or seen by the estimate.
     """
     model = as_model(model)
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file the model was not fitted to")
     settings = signals_for(model, settings, estimate_delay=estimate_delay)
+    seen = seen_sessions(model, sessions)
+    new = [session for session, flag in zip(sessions, seen, strict=True) if allow_seen or not flag]
+    doubts = () if known else _screened(model, new, settings)
     scores, unscored = [], []
-    for session, flag in zip(sessions, seen_sessions(model, sessions), strict=True):
+    for session, flag in zip(sessions, seen, strict=True):
         try:
             if flag and not allow_seen:
                 raise DataError(
@@ -162,6 +173,7 @@ def validate(
                     "nothing; give a session of another motion, or --allow-seen to see the fit anyway"
                 )
             predict = predictor(model, mounted(model, session))
+            settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])
             prepared = prepared_session(model, session, settings)
             sides = model.structure.sides
             scores.append(score_session(prepared, predict, sides, session, "identified model", seen=flag))
@@ -173,7 +185,24 @@ def validate(
     if model.effects:
         named = ", ".join(str(effect["cause"]) for effect in model.effects)
         notes = (f"The torque has the effects of the model: {named}.",)
-    return Validation(model.robot, tuple(scores), notes=notes, unscored=tuple(unscored))
+    warnings = settle([doubt for doubt in doubts if not doubt.certain])
+    return Validation(
+        model.robot, tuple(scores), notes=notes, unscored=tuple(unscored), warnings=tuple(warnings)
+    )
+
+
+def _screened(model: DynamicModel, sessions: Sequence[Session], signals: SignalSettings) -> tuple[Doubt, ...]:
+    """Doubts about the channels of the model in those sessions with its joints."""
+    chain = model.structure.chain
+    whole = [session for session in sessions if set(chain.joint_names) <= set(session.joint_names)]
+    structure = model.structure
+    found = screen(whole, chain, signals, structure.couplings, motor=_has_motor(model))
+    # A log given twice is scored twice, without harm to the scores.
+    return tuple(replace(doubt, certain=doubt.certain and doubt.channel != "log") for doubt in found)
+
+
+def _has_motor(model: DynamicModel) -> bool:
+    return bool({"motor", "difference"} & set(model.structure.sides))
 
 
 def signals_for(
@@ -236,8 +265,10 @@ def prepared_session(
 ) -> PreparedSession:
     """The session with the joints of the model, filtered as for the estimation (settings: `signals_for`)."""
     chosen = session.select(model.structure.chain.joint_names)
-    wants_motor = "motor" in model.structure.sides or "difference" in model.structure.sides
-    return prepare(chosen, signals_for(model, settings), motor=wants_motor)
+    signals, own = signals_for(model, settings), signals_for(model)
+    # Cut-offs of the model are no choice of the session's.
+    advise = (signals.cutoff_hz, signals.decimate_hz) != (own.cutoff_hz, own.decimate_hz)
+    return prepare(chosen, signals, motor=_has_motor(model), advise=advise)
 
 
 def _few(lines: Sequence[str], count: int) -> list[str]:
@@ -248,10 +279,11 @@ def _few(lines: Sequence[str], count: int) -> list[str]:
 
 @dataclass(frozen=True)
 class CrossValidation(Tabular):
-    """One score for each session left out, and the sessions never left out with the reason."""
+    """One score for each session left out, the sessions never left out with the reason, and doubts about channels."""
 
     scores: tuple[SessionScore, ...]
     skipped: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def rms(self) -> dict[str, float]:
@@ -267,6 +299,7 @@ class CrossValidation(Tabular):
         return {
             "folds": [score.to_dict() for score in self.scores],
             "skipped": list(self.skipped),
+            "warnings": list(self.warnings),
             "rms": self.rms,
         }
 
@@ -287,7 +320,7 @@ class CrossValidation(Tabular):
         lines += ["", *("\n".join([str(score), ""]) for score in self.scores)]
         lines.append("RMS over the folds [Nm]")
         lines += [f"  {key:<14}{value:>8.3f}" for key, value in self.rms.items()]
-        return "\n".join([*lines, *self.skipped])
+        return "\n".join([*lines, *self.skipped, *(f"warning: {warning}" for warning in self.warnings)])
 
 
 def cross_validate(
@@ -296,12 +329,14 @@ def cross_validate(
     """Leave out one session at a time.
 
     sessions : two at least, as for `identify`. A session with a payload of its own is skipped and named: the
-    others cannot predict it. Raises DataError when no fold is left.
+    others cannot predict it. Raises DataError when no fold is left, or for a channel that is certainly wrong.
     """
     settings = settings or IdentificationSettings()
     sessions = as_sessions(sessions)
     if len(sessions) < 2:
         raise DataError(f"{len(sessions)} session cannot be cross-validated; give two at least")
+    motor = settings.model != 1
+    doubts = tuple(require_sound(sessions, chain, settings.signals, settings.couplings, motor=motor))
     scores, skipped = [], []
     for number, session in enumerate(sessions):
         others = [other for k, other in enumerate(sessions) if k != number]
@@ -310,13 +345,13 @@ def cross_validate(
             skipped.append(f"{session.path.name}: payload {payload!r} is in no other session; not left out")
             continue
         try:
-            found = identify(others, chain, settings)
+            found = identify(others, chain, settings, known=Known(doubts))
         except DataError as error:
             skipped.append(f"{session.path.name}: the others do not identify a model: {error}")
             continue
-        fold = validate(found.model, [session], keep_going=True)
+        fold = validate(found.model, [session], keep_going=True, known=found.known)
         scores += list(fold.scores)
         skipped += [f"{one}; not scored" for one in fold.unscored]
     if not scores:
         raise DataError("no session can be predicted by the others: " + "; ".join(skipped))
-    return CrossValidation(tuple(scores), tuple(skipped))
+    return CrossValidation(tuple(scores), tuple(skipped), doubts)

@@ -26,6 +26,8 @@ _FLAT, _OVER_NEXT = 10, 10
 _MOVING_RAD_S = 0.01
 # Share of the power above a quarter of the sampling rate without any sensor's noise: a 17-bit converter makes more.
 _SILENT = 1e-10
+# Halvings of an interval of shares, for a millionth.
+_BISECTIONS = 20
 # Share of the power above the band's edge, and least number of samples.
 _BEYOND, _LEAST = 1e-6, 64
 
@@ -185,8 +187,14 @@ def _repeated(effort: Floats) -> int:
         return 0
     same = _same(effort)[1:]
     each = np.mean(np.diff(effort, axis=0) == 0.0, axis=0)
-    expected = float(np.prod(np.maximum(each - same.mean(), 0.0))) * len(same)
-    return max(0, int(same.sum() - np.ceil(expected + 3.0 * np.sqrt(expected))))
+    # With a share r repeated and a chance e_j of each joint: each_j = r + (1 - r) e_j, same = r + (1 - r) prod e_j.
+    share, low, high = float(same.mean()), 0.0, float(same.mean())
+    for _ in range(_BISECTIONS):
+        r = 0.5 * (low + high)
+        chance = float(np.prod((each - r) / (1.0 - r)))
+        low, high = (r, high) if r + (1.0 - r) * chance < share else (low, r)
+    expected = (share - low) * len(same)
+    return max(0, int(same.sum()) - round(expected + 3.0 * np.sqrt(expected)))
 
 
 def passed_band(values: Floats, dt: float) -> float | None:

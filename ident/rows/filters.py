@@ -249,7 +249,8 @@ class ParallelFilter:
         if flat.any():
             for rows, samples, weights in self.blocks():
                 size = np.abs(weights)
-                result[rows] = (size @ flat[samples]) / size.sum(axis=1, keepdims=True)
+                total = size.sum(axis=1, keepdims=True)
+                result[rows] = (size @ flat[samples]) / np.where(total > 0.0, total, 1.0)
         return result.reshape(len(self.outputs), *flagged.shape[1:])
 
     def coverage(self) -> Floats:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
@@ -27,8 +28,13 @@ _SPEED_UNITS = {180.0 / np.pi: "deg/s for rad/s", 30.0 / np.pi: "revolutions per
 _OVER, _OUTLIERS = 1.1, 0.001
 # Corners at a flat top: least number, length of the top, way before it over the one of a usual stop, time of that way.
 _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
+# Steps of an encoder of 12 bits [rad], no jump.
+_STEP_RAD = 2.0 * np.pi / 4096.0
 # Share of the motion at one torque, wherever it is.
 _OFTEN = 0.05
+# A frozen channel: least length over nearly all (the quantile) of its other runs of one value, and least share of the
+# samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
+_LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
 # Share of the rows of two logs equal to the last bit.
 _SAME_ROWS = 0.2
 
@@ -37,7 +43,10 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
     for session in sessions:
-        found += [*_clocks(session), *_clipped(session), *_velocity(session)]
+        frozen = list(_frozen(session))
+        named = {(doubt.channel, doubt.joints) for doubt in frozen}
+        clipped = [doubt for doubt in _clipped(session) if (doubt.channel, doubt.joints) not in named]
+        found += [*_clocks(session), *frozen, *clipped, *_velocity(session)]
     return found
 
 
@@ -118,7 +127,7 @@ def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
     names = sessions[0].joint_names if sessions else ()
     for joint, name in enumerate(names):
         still = [s for s in sessions if len(s.joint) and np.ptp(s.joint.position[:, joint]) == 0.0]
-        driven = [s for s in still if _asked_to_move(s, joint)]
+        driven = [s for s in still if asked_to_move(s, joint)]
         if not still or (len(still) < len(sessions) and not driven and _others_stand(still, joint)):
             continue
         value = float(still[0].joint.position[0, joint])
@@ -137,7 +146,8 @@ def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
         yield Doubt("position", (name,), seen, looks, mend, certain, where)
 
 
-def _asked_to_move(session: Session, joint: int) -> bool:
+def asked_to_move(session: Session, joint: int) -> bool:
+    """Whether the joint (from 0) is commanded to move, or moves by its velocity."""
     name = session.joint_names[joint]
     command = session.command
     asked = command is not None and name in command.names and bool(command.position.shape[1])
@@ -214,7 +224,89 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
                     mend = "repair the channel, add a session with it, or leave the joint torques aside"
                 seen = f"reads {float(columns.effort[0, joint]):.4g} Nm in every sample"
                 names = (session.joint_names[joint],)
-                yield Doubt(channel, names, seen, "a dead sensor", mend, motor or never, session.path.name)
+                certain = motor or never
+                yield Doubt(
+                    channel, names, seen, "a dead sensor", mend, certain, session.path.name, lost=True
+                )
+
+
+def _frozen(session: Session) -> Iterator[Doubt]:
+    """Channels of single joints that stop in the middle of a motion. All joints at once: lost samples."""
+    name, joint = session.path.name, session.joint
+    for channel, columns, values in [
+        *((channel, columns, columns.effort) for channel, columns in _torques(session)),
+        ("position", joint, joint.position),
+    ]:
+        for k in range(values.shape[1]):
+            first, last = _longest_run(values[:, k])
+            stamps = columns.log_time[[first, last]]
+            span = (joint.log_time >= stamps[0]) & (joint.log_time <= stamps[1])
+            if (stamps[1] - stamps[0]) * 1e-9 < _LONG_S or not span.any():
+                continue
+            others = np.delete(values[first : last + 1], k, axis=1)
+            if others.shape[1] and not np.any(
+                np.ptp(others, axis=0) > (_MOVED if channel == "position" else 0.0)
+            ):
+                continue
+            if channel == "position":
+                stopped = _driven(session, k, stamps) or _abrupt(joint, k, first, last)
+            else:
+                stopped = np.ptp(joint.position[span, k]) > _MOVED and _once(values[:, k], first, last)
+            if not stopped or last - first + 1 == len(values):
+                continue
+            start, end = (stamps - joint.log_time[0]) * 1e-9
+            seen = f"reads {values[first, k]:.4g} from {start:.1f} to {end:.1f} s, in the middle of a motion"
+            mend = "cut that part off the log, or repair the channel"
+            certain = last - first > _OFTEN * len(values)
+            yield Doubt(
+                channel,
+                (session.joint_names[k],),
+                seen,
+                "a frozen channel",
+                mend,
+                certain,
+                name,
+                lost=channel != "position",
+            )
+
+
+def _longest_run(values: Floats) -> tuple[int, int]:
+    """First and last sample of the longest run of one value."""
+    edges = np.flatnonzero(np.diff(values) != 0.0) + 1
+    bounds = np.concatenate([[0], edges, [len(values)]])
+    longest = int(np.argmax(np.diff(bounds)))
+    return int(bounds[longest]), int(bounds[longest + 1]) - 1
+
+
+def _once(values: Floats, first: int, last: int) -> bool:
+    """Whether a run is far longer than others, inside the range, and nearly all there is of its value."""
+    lengths = np.diff(np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1, [len(values)]]))
+    count = last - first + 1
+    usual = float(np.quantile(lengths, _NEARLY)) if len(lengths) > 2 else np.inf
+    inside = values.min() < values[first] < values.max()
+    return bool(inside and count > _LONGER * usual and count > _ONE_RUN * np.sum(values == values[first]))
+
+
+def _driven(session: Session, joint: int, stamps: NDArray[np.int64]) -> bool:
+    """Whether the joint is commanded to move, or measured to move by its velocity, between two times."""
+    name, command, speed = session.joint_names[joint], session.command, session.joint.velocity
+    if command is not None and name in command.names and command.position.shape[1]:
+        inside = (command.log_time >= stamps[0]) & (command.log_time <= stamps[1])
+        return bool(inside.any() and np.ptp(command.position[inside, command.names.index(name)]) > _MOVED)
+    times = session.joint.log_time
+    inside = (times >= stamps[0]) & (times <= stamps[1])
+    return bool(speed.shape[1]) and bool(np.percentile(np.abs(speed[inside, joint]), 90) > _MOVED)
+
+
+def _abrupt(columns: JointColumns, joint: int, first: int, last: int) -> bool:
+    """Whether the standstill begins or ends by a jump: a joint with the acceleration a covers a T^2 / 2 in T."""
+    values, lag = columns.position[:, joint], _lag(columns)
+    bends = np.abs(values[2 * lag :] - 2.0 * values[lag:-lag] + values[: -2 * lag])
+    middle = np.arange(lag, len(values) - lag)
+    usual = bends[(np.abs(middle - first) > 2 * lag) & (np.abs(middle - last) > 2 * lag)]
+    before, after = values[max(first - lag, 0)], values[min(last + lag, len(values) - 1)]
+    jump = max(abs(before - values[first]), abs(after - values[first]))
+    return bool(len(usual) and jump > max(_SHARP * float(np.quantile(usual, 1.0 - _OUTLIERS)), _STEP_RAD))
 
 
 def _clipped(session: Session) -> Iterator[Doubt]:
@@ -263,8 +355,7 @@ def _flat_tops(columns: JointColumns) -> Iterator[tuple[int, float]]:
     A joint stopping with the acceleration a covers a T^2 / 2 in the time T before; a clipped one covers its speed
     times T. Second differences at the lag T are a T^2.
     """
-    position, period = columns.position, columns.period_s
-    lag = max(3, round(_LAG_S / period)) if period > 0.0 else 3
+    position, lag = columns.position, _lag(columns)
     for joint, values in enumerate(position.T):
         steps = np.abs(np.diff(values))
         if len(values) < 20 * lag or not steps.any():
@@ -283,6 +374,10 @@ def _flat_tops(columns: JointColumns) -> Iterator[tuple[int, float]]:
             ]
             if sum(sharp) >= _CORNERS:
                 yield joint, level
+
+
+def _lag(columns: JointColumns) -> int:
+    return max(3, round(_LAG_S / columns.period_s)) if columns.period_s > 0.0 else 3
 
 
 def _velocity(session: Session) -> Iterator[Doubt]:

@@ -14,7 +14,7 @@ class Doubt:
 
     channel : "position", "velocity", "joint torque", "motor torque", "time", "payload", "log".
     joints : names; empty for the channel as a whole. session : file name; empty for all sessions.
-    certain : whether the data are worthless with it.
+    certain : whether the data are worthless with it. lost : whether the channel holds nothing, and the rows do without.
     """
 
     channel: str
@@ -24,6 +24,7 @@ class Doubt:
     mend: str
     certain: bool = False
     session: str = ""
+    lost: bool = False
 
     @property
     def subject(self) -> str:

@@ -105,8 +105,11 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
 
 def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
     yield from sorted(_torque_gains(data, gains), key=lambda one: -len(one.joints))
-    for side, joint in gains:
+    for (side, joint), gain in gains.items():
         for factor in (-1.0, 1e3, 1e-3):
+            if is_wrong(gain) and abs(gain.value / factor - 1.0) < _NEAR:
+                # Measured above, with its deviation.
+                continue
             scale = np.eye(data.chain.n)
             scale[joint, joint] = 1.0 / factor
             mended = _mapped(data, side, scale)

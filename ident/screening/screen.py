@@ -58,19 +58,33 @@ def screen(
     chain: Chain,
     signals: SignalSettings | None = None,
     couplings: Sequence[Coupling] = (),
+    *,
+    motor: bool = True,
 ) -> tuple[Doubt, ...]:
     """Doubts about the channels of the sessions of one arm.
 
-    signals : as for `prepare`. couplings : coupled joints of the motor side.
+    signals : as for `prepare`. couplings : coupled joints of the motor side. motor : False asks for no doubt about the
+        motor torques; sound ones still tell of the other channels.
 
     Raises ConfigurationError for sessions of other joints than the chain's.
     """
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
+    found = _doubts(chosen, chain, signals or SignalSettings(), couplings)
+    if motor or not any("motor" in doubt.channel + doubt.seen for doubt in found):
+        return found
+    return _doubts(
+        [replace(session, motor=None) for session in chosen], chain, signals or SignalSettings(), ()
+    )
+
+
+def _doubts(
+    chosen: Sequence[Session], chain: Chain, signals: SignalSettings, couplings: Sequence[Coupling]
+) -> tuple[Doubt, ...]:
     doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
     if any(doubt.certain for doubt in (*doubts, *beyond)):
         # A certain fault bends everything computed from it.
         return (*doubts, *beyond)
-    data = _rows(chosen, chain, signals or SignalSettings(), couplings)
+    data = _rows(chosen, chain, signals, couplings)
     contradictions = [] if data is None else _contradictions(data, chosen)
     found = [doubt for doubt in contradictions if not _shared(doubt, doubts)]
     return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
@@ -116,9 +130,11 @@ def require_sound(
     chain: Chain,
     signals: SignalSettings | None = None,
     couplings: Sequence[Coupling] = (),
+    *,
+    motor: bool = True,
 ) -> list[str]:
     """Sentences of `screen` for the report. Raises DataError when a doubt is certain."""
-    return settle(screen(sessions, chain, signals, couplings))
+    return settle(screen(sessions, chain, signals, couplings, motor=motor))
 
 
 def _silent(sessions: Sequence[Session]) -> frozenset[Class]:

@@ -20,6 +20,7 @@ from ident.diagnosis.statements import SURE, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect
+from ident.estimation.identify import Known
 from ident.estimation.scores import finite
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
@@ -210,7 +211,7 @@ def _torque_errors(found: Diagnosis, sessions: Sequence[Session]) -> tuple[Mappi
     if not sessions:
         return ()
     base, extended = (
-        validate(model, sessions, allow_seen=True, keep_going=True).scores
+        validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
         for model in (found.base_model, found.extended_model)
     )
     return tuple(

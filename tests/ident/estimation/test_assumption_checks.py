@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.estimation.assumptions import check_assumptions, repeatability
+from ident.estimation.assumptions import check_assumptions, repeatability, weak_parameters
 from ident.estimators import InstrumentalVariables, Problem, RowGroup, WeightedLeastSquares
 from ident.estimators.covariance import CovarianceSettings
 from tests.ident.regression_problems import ar1, design, problem
@@ -149,3 +149,33 @@ def test_the_verdict_table_names_every_check_and_what_follows():
     assert "VIOLATED" in text
     assert "state a robust covariance" in text
     assert found.to_dict()["serially uncorrelated"]["verdict"] == "VIOLATED"
+
+
+def nearly_alike(samples: int, apart: float) -> Problem:
+    """Two columns that differ by a small wave, beside others."""
+    random = np.random.default_rng(3)
+    time = 0.2 * np.arange(samples)
+    wave = np.sin(0.5 * time)
+    matrix = np.column_stack([wave, wave + apart * np.cos(0.9 * time), np.ones(samples)])
+    noise = random.normal(size=samples)
+    return Problem(("a", "b", "c"), (RowGroup("A1", "joint", 0, matrix, noise, np.arange(samples)),), 0.2)
+
+
+@pytest.mark.parametrize(
+    ("samples", "apart", "weak"), [(4000, 0.05, False), (100, 0.05, True), (100, 0.5, False)]
+)
+def test_a_condition_number_counts_where_a_torque_is_uncertain(
+    samples: int, apart: float, weak: bool
+) -> None:
+    case = nearly_alike(samples, apart)
+    estimate = WeightedLeastSquares().fit(case)
+    check = check_assumptions(case, estimate)["condition number"]
+    assert check.holds != weak
+    assert {one.name for one in weak_parameters(case, estimate)} == ({"a", "b"} if weak else set())
+    if weak:
+        assert "a" in check.finding
+        (first, _) = weak_parameters(case, estimate)
+        size = np.sqrt(np.mean(case.groups[0].matrix[:, case.names.index(first.name)] ** 2))
+        assert first.torque == pytest.approx(estimate.std[case.names.index(first.name)] * size)
+        assert first.torque > first.matters
+    assert (check.statistic > 25.0) == (apart == 0.05)

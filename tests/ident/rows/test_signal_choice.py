@@ -10,7 +10,7 @@ import pytest
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.filters import SignalSettings
-from ident.rows.signal_choice import SignalChoice, choose_signals
+from ident.rows.signal_choice import SignalChoice, _error, _fit, _Rows, choose_signals
 from tests.ident import estimation_arm as arm
 
 
@@ -45,13 +45,48 @@ def test_a_fast_motion_has_a_wider_band_of_rows_and_positions():
     slow = chosen(arm.session(motor=False, sensors=sensors())).settings
     fast = chosen(arm.session(motor=False, sensors=sensors(), period_s=2.0, periods=8)).settings
     assert slow.decimate_hz == 2.0
-    assert fast.decimate_hz > 4.0
+    # Five harmonics of half a hertz.
+    assert fast.decimate_hz == pytest.approx(2.5 * 2.5, rel=0.15)
     assert fast.cutoff_hz > slow.cutoff_hz
 
 
 def test_a_short_recording_has_rows_enough():
     session = arm.session(phases=False, run_in_s=0.5, period_s=2.0, periods=1, motor=False, sensors=sensors())
     assert chosen(session).settings.decimate_hz > 4.0
+
+
+def test_a_part_of_a_slow_motion_has_forty_rows():
+    whole = arm.session(phases=False, period_s=20.0, periods=1, motor=False, sensors=sensors())
+    first = int(whole.joint.log_time[0])
+    session = dataclasses.replace(whole, joint=whole.joint.rows(first + 5 * 10**9, first + 10 * 10**9))
+    found = chosen(session)
+    assert found.settings.decimate_hz == pytest.approx(40.0 / (2.5 * session.duration_s), rel=5e-3)
+    assert f"for a recording of {session.duration_s:.1f} s" in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "stated", "band_hz", "why"),
+    [
+        (20.0, {}, 20.0 * 0.2 / 1.5, "the sampling rate of 20 Hz"),
+        (250.0, {"cutoff_hz": 2.4}, 1.6, "cut-off of 2.4 Hz"),
+    ],
+)
+def test_the_band_of_the_rows_ends_where_the_channels_do(rate_hz, stated, band_hz, why):
+    session = arm.session(motor=False, sensors=sensors(), rate_hz=rate_hz, period_s=4.0, periods=4)
+    found = chosen(session, SignalSettings(**stated))
+    assert found.settings.decimate_hz == pytest.approx(band_hz, rel=5e-3)
+    assert why in found.reasons[0]
+
+
+def test_half_the_band_of_an_earlier_filter_is_the_limit():
+    session = arm.session(motor=False, sensors=sensors(), period_s=2.0, periods=8)
+    spectrum = np.fft.rfft(session.joint.effort, axis=0)
+    spectrum[np.fft.rfftfreq(len(session.joint), 0.004) > 4.0] = 0.0
+    smooth = np.fft.irfft(spectrum, len(session.joint), axis=0)
+    found = chosen(dataclasses.replace(session, joint=dataclasses.replace(session.joint, effort=smooth)))
+    assert 1.5 < found.settings.decimate_hz < 2.4
+    assert "an earlier low-pass at" in found.reasons[0]
+    assert found.settings.reversal_s == 0.0
 
 
 def test_an_ideal_drive_keeps_the_sign():
@@ -82,11 +117,66 @@ def test_a_drive_that_turns_slowly_has_its_reversals_left_out():
     before, now = (np.sign(arm.fourier(at, 10.0, 5)[1]) for at in (time - late, time))
     effort = session.motor.effort + arm.drive("Fcm") * (before - now)
     turned = dataclasses.replace(session, motor=dataclasses.replace(session.motor, effort=effort))
-    assert chosen(turned).settings.reversal_s >= late
+    assert late <= chosen(turned).settings.reversal_s <= 0.1
     assert chosen(session).settings.reversal_s < late
+
+
+def test_samples_beside_the_reversals_of_an_ideal_drive_without_noise_stay():
+    found = chosen(arm.session(), coulomb=Coulomb())
+    assert found.settings.reversal_s == 0.0
 
 
 def test_a_long_recording_is_judged_by_a_part_of_it():
     session = arm.session(motor=False, sensors=sensors(), period_s=10.0, periods=14)
     assert session.duration_s > 130.0
     assert chosen(session).settings.decimate_hz == 2.0
+
+
+def made(torque, matrix, even) -> _Rows:
+    count = len(torque)
+    whole = np.ones(count, dtype=bool)
+    return _Rows(matrix, torque, np.ones(count), whole, even, (), (slice(0, count),))
+
+
+def test_a_loud_class_has_little_weight_in_the_fit():
+    random = np.random.default_rng(0)
+    matrix = random.normal(size=(400, 1))
+    even = np.arange(400) % 2 == 0
+    clean = made(2.0 * matrix[:, 0] + 0.01 * random.normal(size=400), matrix, even)
+    loud = made(3.0 * matrix[:, 0] + 5.0 * random.normal(size=400), matrix, even)
+    masks = {key: np.ones(400, dtype=bool) for key in (("joint", 0), ("joint", 1))}
+    values = _fit({("joint", 0): clean, ("joint", 1): loud}, masks)
+    assert values[0] == pytest.approx(2.0, abs=3e-3)
+
+
+def test_even_blocks_are_fitted_and_odd_ones_predicted():
+    matrix, even = np.ones((40, 1)), np.arange(40) < 20
+    torque = np.where(even, 1.0, 4.0)
+    rows = {("joint", 0): made(torque, matrix, even), ("motor", 0): made(2.0 * torque, 2.0 * matrix, even)}
+    masks = {key: np.ones(40, dtype=bool) for key in rows}
+    values = _fit(rows, masks)
+    assert values == pytest.approx([1.0])
+    assert _error(rows, values, masks) == pytest.approx(np.mean(np.log([3.0, 6.0])))
+
+
+@pytest.mark.parametrize(("count", "error"), [(7, 0.0), (8, np.log(3.0))])
+def test_a_class_with_fewer_than_eight_rows_has_no_error(count: int, error: float):
+    even = np.zeros(40, dtype=bool)
+    rows = {("joint", 0): made(np.full(40, 3.0), np.ones((40, 1)), even)}
+    assert _error(rows, np.zeros(1), {("joint", 0): np.arange(40) < count}) == pytest.approx(error)
+
+
+def test_rows_beside_a_reversal_are_unknown_in_their_stretch_alone():
+    rows = made(np.ones(12), np.ones((12, 1)), np.ones(12, dtype=bool))
+    speed = np.array([1, 1, 1, -1, -1, -1, 1, 1, 1, 1, 1, 1.0])
+    turning = dataclasses.replace(rows, speed=speed, stretches=(slice(0, 6), slice(6, 12)))
+    assert np.flatnonzero(~turning.known(1, 0.1)).tolist() == [2, 3]
+    assert np.flatnonzero(~turning.known(0, 0.1)).tolist() == []
+
+
+def test_noisy_positions_have_a_lower_cut_off_than_clean_ones():
+    clean, noisy = (
+        chosen(arm.session(motor=False, sensors=sensors(position=some))).settings.cutoff_hz
+        for some in (1e-7, 1e-3)
+    )
+    assert (clean, noisy) == (25.0, 5.0)

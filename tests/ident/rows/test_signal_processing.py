@@ -265,8 +265,9 @@ def test_a_slow_motor_channel_is_aligned_within_a_fraction_of_its_sample_time():
     assert found.std < 1e-3
 
 
-def test_a_delay_beyond_the_search_is_refused_with_advice():
-    session = arm.session(sensors=arm.Sensors(motor_delay_s=0.15))
+@pytest.mark.parametrize("delay", [0.15, -0.15])
+def test_a_delay_beyond_the_search_is_refused_with_advice(delay):
+    session = arm.session(sensors=arm.Sensors(motor_delay_s=delay))
     with pytest.raises(DataError, match="delay_search_s"):
         prepare(session)
 

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.wrong_channels import clipped, constant, labelled, paced, scaled, swapped, with_speed, without
+from benchmarks.wrong_channels import (
+    clipped,
+    constant,
+    frozen,
+    labelled,
+    paced,
+    scaled,
+    swapped,
+    with_speed,
+    without,
+)
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.screening.channels import check_channels
@@ -141,6 +151,72 @@ def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> N
     units = found(with_speed(None, 180.0 / np.pi, *chain().joint_names))
     assert (units.channel, units.certain) == ("velocity", False)
     assert check_channels(with_speed()(pair), chain()) == []
+
+
+@pytest.mark.parametrize(
+    ("channel", "field", "name"),
+    [
+        ("motor", "effort", "motor torque"),
+        ("joint", "effort", "joint torque"),
+        ("joint", "position", "position"),
+    ],
+)
+def test_a_channel_frozen_in_the_middle_of_a_motion_is_named(
+    pair: list[Session], channel: str, field: str, name: str
+) -> None:
+    for commanded in (True, False):
+        logs = pair if commanded else [replace(session, command=None) for session in pair]
+        (found,) = check_channels(frozen(channel, field, "A3", only=1)(logs), chain())
+        assert (found.channel, found.joints, found.session, found.certain) == (
+            name,
+            ("A3",),
+            "loaded.mcap",
+            True,
+        )
+        assert "from 6.5 to 19.5 s" in found.seen
+        assert found.lost == (field == "effort")
+
+
+def held(session: Session, joint: int, seconds: float) -> Session:
+    """The joint torque of a joint keeps its value for some seconds from t = 8 s on."""
+    effort = session.joint.effort.copy()
+    first = round(8.0 / session.joint.period_s)
+    effort[first : first + round(seconds / session.joint.period_s) + 1, joint] = effort[first, joint]
+    return replace(session, joint=replace(session.joint, effort=effort))
+
+
+@pytest.mark.parametrize(("seconds", "certain"), [(1.9, False), (2.1, True), (1.0, False)])
+def test_a_short_freeze_is_a_warning_and_a_moment_is_none(
+    pair: list[Session], seconds: float, certain: bool
+) -> None:
+    found = check_channels([held(pair[0], 1, seconds)], chain())
+    assert [doubt.certain for doubt in found] == ([certain] if seconds > 2.0 else [])
+
+
+def test_dead_zones_coarse_sensors_and_resting_joints_are_not_frozen(pair: list[Session]) -> None:
+    whole = pair[0]
+
+    def frozen_ones(session: Session) -> list[Doubt]:
+        return [doubt for doubt in check_channels([session], chain()) if "frozen" in doubt.looks_like]
+
+    coarse = np.round(whole.joint.effort / 4.0) * 4.0
+    assert frozen_ones(replace(whole, joint=replace(whole.joint, effort=coarse))) == []
+    assert whole.motor is not None
+    effort = whole.motor.effort.copy()
+    effort[np.abs(effort) < 6.0] = 0.0
+    assert frozen_ones(replace(whole, motor=replace(whole.motor, effort=effort))) == []
+    time = (whole.joint.log_time - whole.joint.log_time[0]) * 1e-9
+    position = whole.joint.position.copy()
+    swing = 0.5 * (1.0 - np.cos(1.0 * np.clip(time, 0.0, 2.0 * np.pi)))
+    position[:, 2] = 0.3 + swing + 0.5 * (1.0 - np.cos(np.clip(time - 15.0, 0.0, 2.0 * np.pi)))
+    resting = replace(whole, joint=replace(whole.joint, position=position), command=None)
+    assert frozen_ones(resting) == []
+    stopped = position.copy()
+    stopped[(time > 2.0) & (time < 9.0), 2] = position[np.searchsorted(time, 2.0), 2]
+    assert [
+        d.joints
+        for d in frozen_ones(replace(whole, joint=replace(whole.joint, position=stopped), command=None))
+    ] == [("E1",)]
 
 
 def test_a_log_given_twice_is_known_by_uid_and_by_content(pair: list[Session]) -> None:

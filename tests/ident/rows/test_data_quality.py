@@ -1,0 +1,206 @@
+"""Lost, repeated, stale, clipped and stuck samples, and the work of an earlier filter, in small made channels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ident.rows.data_quality import (
+    SampleLoss,
+    clipped_at,
+    passed_band,
+    sample_loss,
+    stale,
+    stuck_at,
+)
+from lwr_driver.session import JointColumns, Session
+
+RATE = 250.0
+COUNT = 2000
+
+
+def columns(
+    effort: np.ndarray, position: np.ndarray | None = None, sequence: np.ndarray | None = None
+) -> JointColumns:
+    """A channel of two joints that swing, with the efforts (n, 2)."""
+    time = np.arange(len(effort)) / RATE
+    if position is None:
+        position = np.column_stack([np.sin(time), np.cos(1.3 * time)])
+    stamps = np.rint(time * 1e9).astype(np.int64)
+    sequence = np.arange(1, len(effort) + 1) if sequence is None else sequence
+    empty = np.zeros((len(effort), 0))
+    return JointColumns(
+        "/joint_states", ("a", "b"), stamps + 10**15, stamps, sequence, position, empty, effort
+    )
+
+
+def noisy(seed: int = 0, count: int = COUNT) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    time = np.arange(count) / RATE
+    return np.column_stack([10.0 * np.sin(time), 5.0 * np.cos(2.0 * time)]) + 0.05 * random.normal(
+        size=(count, 2)
+    )
+
+
+def session(joint: JointColumns, motor: JointColumns | None = None) -> Session:
+    return Session(Path("run.mcap"), {}, {}, joint.names, joint, motor, None, ())
+
+
+def test_a_loss_is_counted_by_kind_with_session_and_channel():
+    effort = noisy()
+    position = columns(effort).position.copy()
+    rows = [300, 700, 1100, 1500]
+    for values in (effort, position):
+        for row in rows:
+            values[row] = values[row - 1]
+    sequence = np.arange(1, COUNT + 1)
+    sequence[1000:] += 6
+    (found,) = sample_loss([session(columns(effort, position, sequence), columns(noisy(1)))])
+    assert found == SampleLoss("run.mcap", "joint", 6, 4, 0, COUNT)
+    assert (found.amiss, found.share) == (10, pytest.approx(10 / (COUNT + 6)))
+
+
+def test_a_few_samples_or_a_small_share_are_no_finding():
+    def matters(repeated: int, samples: int) -> bool:
+        return SampleLoss("a", "joint", 0, repeated, 0, samples).matters
+
+    assert [matters(2, 100), matters(3, 100)] == [False, True]
+    assert [matters(4, 8000), matters(5, 8000)] == [False, True]
+    assert sample_loss([session(columns(noisy()))]) == ()
+
+
+def test_the_worst_channel_comes_first():
+    effort, held = noisy(), noisy(1)
+    for row in range(100, 200, 10):
+        effort[row] = effort[row - 1]
+    for row in range(100, 300, 10):
+        held[row] = held[row - 1]
+    found = sample_loss([session(columns(effort), columns(held))])
+    assert [(one.channel, one.repeated) for one in found] == [("motor", 20), ("joint", 10)]
+
+
+def test_repeats_of_one_joint_or_of_coarse_sensors_prove_nothing():
+    effort = noisy()
+    effort[:, 0] = np.repeat(effort[::10, 0], 10)
+    assert sample_loss([session(columns(effort))]) == ()
+    coarse = np.round(noisy() / 2.0)
+    assert np.mean(np.all(np.diff(coarse, axis=0) == 0.0, axis=1)) > 0.5
+    assert sample_loss([session(columns(coarse))]) == ()
+    one = JointColumns(
+        "/j", ("a",), *[np.arange(50)] * 3, np.zeros((50, 1)), np.zeros((50, 0)), np.ones((50, 1))
+    )
+    assert sample_loss([session(one)]) == ()
+
+
+def test_stale_samples_are_the_repeated_ones_and_those_of_jolting_positions():
+    effort, position = noisy(), columns(noisy()).position.copy()
+    assert not stale(columns(effort, position)).any()
+    position[800] = position[799]
+    effort[800] = effort[799]
+    position[1200] += [0.004, 0.004]
+    found = np.flatnonzero(stale(columns(effort, position)))
+    assert 800 in found
+    assert 1200 in found
+    assert found.min() >= 798
+    assert set(found) <= {*range(798, 804), *range(1198, 1204)}
+
+
+def test_a_jolt_of_one_joint_of_two_or_beside_a_gap_is_not_stale():
+    effort, position = noisy(), columns(noisy()).position.copy()
+    position[1200, 0] += 0.004
+    assert not stale(columns(effort, position)).any()
+    position[1200, 1] += 0.004
+    whole = columns(effort, position)
+    assert stale(whole).any()
+    late = whole.publish_time + np.where(np.arange(COUNT) > 1200, 4_000_000, 0)
+    assert not stale(replace(whole, publish_time=late)).any()
+    # Without stamps of the source those of the host tell.
+    unstamped = replace(whole, publish_time=np.zeros_like(late))
+    assert stale(unstamped).any()
+    assert not stale(replace(unstamped, log_time=late)).any()
+
+
+def test_a_clipped_joint_has_its_limit_and_the_others_none():
+    effort = noisy()
+    effort[:, 0] = np.clip(effort[:, 0], -np.inf, 8.0)
+    effort[:, 1] = np.clip(effort[:, 1], -4.5, 4.0)
+    assert clipped_at(columns(effort)).tolist() == [8.0, 4.5]
+    assert np.isnan(clipped_at(columns(noisy()))).all()
+    assert np.isnan(clipped_at(columns(noisy(count=1)))).all()
+
+
+@pytest.mark.parametrize(("count", "seen"), [(10, False), (11, True)])
+def test_a_limit_needs_over_ten_samples_at_it(count: int, seen: bool):
+    effort = noisy()
+    effort[np.argsort(effort[:, 0])[-count:], 0] = 20.0
+    assert np.isfinite(clipped_at(columns(effort))[0]) == seen
+
+
+@pytest.mark.parametrize(("count", "seen"), [(20, False), (21, True)])
+def test_a_limit_has_over_ten_times_the_samples_of_the_values_beside(count: int, seen: bool):
+    effort = noisy()
+    effort[:, 0] += np.linspace(0.0, 1e-3, COUNT)
+    order = np.argsort(effort[:, 0])
+    effort[order[-count:], 0] = 20.0
+    effort[order[-count - 2 : -count], 0] = 15.0
+    assert np.isfinite(clipped_at(columns(effort))[0]) == seen
+
+
+def test_a_dead_zone_is_counted_in_the_motion_alone():
+    effort = noisy()
+    effort[np.abs(effort[:, 0]) < 1.0, 0] = 0.0
+    position = columns(effort).position.copy()
+    (found,) = stuck_at(columns(effort), columns(noisy(), position))
+    assert (found.joint, found.value, found.count) == (0, 0.0, int(np.sum(effort[1:, 0] == 0.0)))
+    # Every sample but the first, which has no speed, and a few at the turning points.
+    assert COUNT - 20 < found.samples < COUNT
+    position[:, 0] = 0.3
+    assert stuck_at(columns(effort), columns(noisy(), position)) == ()
+
+
+def test_a_joint_slower_than_a_hundredth_rests():
+    effort = noisy()
+    effort[np.abs(effort[:, 0]) < 1.0, 0] = 0.0
+    time = np.arange(COUNT) / RATE
+    for speed, found in ((0.009, 0), (0.011, 1)):
+        position = np.column_stack([speed * time, time])
+        assert len(stuck_at(columns(effort), columns(noisy(), position))) == found
+
+
+def test_the_motor_channel_is_compared_at_the_times_of_the_host():
+    effort = noisy()
+    effort[400:500, 0] = 1.25
+    time = np.arange(COUNT) / RATE
+    position = np.column_stack([np.where((time > 1.6) & (time < 2.0), 0.0, 0.5 * time), time])
+    joint = columns(noisy(), position)
+    motor = columns(effort)
+    assert stuck_at(motor, joint) == ()
+    shifted = replace(motor, log_time=motor.log_time + 2_000_000_000, publish_time=motor.publish_time)
+    assert [one.value for one in stuck_at(shifted, joint)] == [1.25]
+    assert stuck_at(columns(noisy(count=1)), joint) == ()
+    assert stuck_at(motor, columns(noisy(count=1))) == ()
+
+
+def test_noise_up_to_the_highest_frequency_shows_no_earlier_filter():
+    assert passed_band(noisy(), 1.0 / RATE) is None
+
+
+@pytest.mark.parametrize("edge_hz", [5.0, 20.0])
+def test_the_edge_of_an_earlier_filter_is_found(edge_hz: float):
+    spectrum = np.fft.rfft(np.random.default_rng(3).normal(size=(4000, 2)), axis=0)
+    spectrum[np.fft.rfftfreq(4000, 1.0 / RATE) > edge_hz] = 0.0
+    signal = np.fft.irfft(spectrum, axis=0)
+    assert passed_band(signal, 1.0 / RATE) == pytest.approx(edge_hz, rel=0.05)
+    assert passed_band(np.column_stack([signal, np.ones(4000)]), 1.0 / RATE) == pytest.approx(
+        edge_hz, rel=0.05
+    )
+    assert passed_band(np.column_stack([signal[:, :1], noisy(count=4000)[:, :1]]), 1.0 / RATE) is None
+
+
+def test_short_or_constant_channels_show_nothing():
+    smooth = np.sin(0.05 * np.arange(200))[:, None]
+    assert passed_band(np.ones((200, 2)), 0.004) is None
+    assert passed_band(smooth[:63], 0.004) is None
