@@ -131,7 +131,7 @@ def individual(kind: Kind, random: np.random.Generator) -> Individual:
         coulomb_kelvin=-between(0.001, 0.004),
         viscous_kelvin=-between(0.003, 0.012),
         heat=between(0.001, 0.004) * 100.0 / (kind.coulomb * kind.speed * 10.0),
-        presliding=between(1e-4, 8e-4),
+        presliding=between(1e-4, 6e-4),
         ripple=ripple,
         ripple_phase=random.uniform(0.0, 2.0 * np.pi, (2, n)),
         bearing=between(0.0, 0.03) * kind.coulomb,

@@ -101,7 +101,17 @@ def diagnosed(folder: Path, again: bool, home: Path | None = None) -> tuple[dict
     train = [str(path) for path in sorted(folder.glob("train_*.mcap"))]
     test = [item for path in sorted(folder.glob("test_*.mcap")) for item in ("--test", str(path))]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = ["diagnose", *train, *test, "--reference", str(reference), *gear, "--no-simulation", "--out", str(out)]
+    command = [
+        "diagnose",
+        *train,
+        *test,
+        "--reference",
+        str(reference),
+        *gear,
+        "--no-simulation",
+        "--out",
+        str(out),
+    ]
     _command(command, folder / "diagnose.txt")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

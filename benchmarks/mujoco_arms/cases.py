@@ -171,9 +171,7 @@ def record(setup: Setup, truth: Truth) -> Record:
     return Record(times, q, joint, late, motor, setup.label.payload != "none")
 
 
-def changed(
-    case: Case, hidden: Sequence[Hidden]
-) -> tuple[tuple[Setup, ...], list[dict[str, Parameter]]]:
+def changed(case: Case, hidden: Sequence[Hidden]) -> tuple[tuple[Setup, ...], list[dict[str, Parameter]]]:
     """The sessions of the day with these faults, and the parameters of each."""
     setups, parameters = list(case.healthy), []
     for one in hidden:

@@ -46,6 +46,7 @@ class Cause:
     strengths : where the search for the wanted visibility begins and ends. encoder : that it needs
     where : joints that it is drawn for: all, elastic, heavy (loaded by gravity), arm (no joint)
     absorbed : base parameters take it up, so that it shows only against a healthy model
+    listed : in the catalogue. also : further names that are as right
     """
 
     name: str
@@ -57,7 +58,6 @@ class Cause:
     absorbed: bool = False
     listed: bool = True
     also: tuple[str, ...] = ()
-    channel: str = ""
 
     def joints(self, kind: Kind) -> list[int]:
         """Joints that it can be in, from 0."""
@@ -276,7 +276,10 @@ def _late(side: str) -> Change:
 
 def _lost(s: Setup, v: Variant, p: float) -> Outcome:
     loss = Loss("held", p, 0.02 + 0.06 * v.share)
-    return replace(s, sensing=replace(s.sensing, loss=loss)), {"share": (p, "1"), "length": (loss.length, "s")}
+    return replace(s, sensing=replace(s.sensing, loss=loss)), {
+        "share": (p, "1"),
+        "length": (loss.length, "s"),
+    }
 
 
 def _wear(s: Setup, v: Variant, p: float) -> Outcome:
@@ -301,7 +304,7 @@ CAUSES = {
         Cause("friction_load", "motor", _load, (0.005, 0.6), where="heavy"),
         Cause("friction_temperature", "motor", _temperature, (0.001, 0.03)),
         Cause("friction_position", "motor", _position, (0.02, 0.9)),
-        Cause("presliding_hysteresis", "motor", _presliding, (1.0, 300.0)),
+        Cause("presliding_hysteresis", "motor", _presliding, (0.5, 100.0)),
         Cause("gear_ripple", "motor", _gear_ripple, (0.02, 20.0)),
         Cause("motor_torque_gain", "motor", _gain("motor"), (0.01, 0.3), absorbed=True, also=("wear",)),
         Cause("backlash", "joint", _backlash, (1e-4, 0.05), "elastic", "motor"),
@@ -312,15 +315,15 @@ CAUSES = {
         Cause("payload_change", "joint", _payload_change, (0.01, 2.0), "arm"),
         Cause("joint_zero_offset", "joint", _zero, (0.0005, 0.1), "heavy", absorbed=True),
         Cause("contact", "joint", _contact, (0.2, 80.0), "arm"),
-        Cause("sensor_gain", "sensor", _gain("joint"), (0.01, 0.3), "heavy", absorbed=True, channel="joint"),
-        Cause("sensor_crosstalk", "sensor", _crosstalk, (0.001, 0.3), channel="joint"),
-        Cause("sensor_hysteresis", "sensor", _hysteresis, (0.02, 20.0), channel="joint"),
-        Cause("sensor_saturation", "sensor", _saturation, (0.05, 0.8), "heavy", channel="joint"),
-        Cause("sensor_offset_drift", "sensor", _drift, (0.02, 20.0), channel="joint"),
-        Cause("sensor_ripple", "sensor", _sensor_ripple, (0.02, 20.0), channel="joint"),
+        Cause("sensor_gain", "sensor", _gain("joint"), (0.01, 0.3), "heavy", absorbed=True),
+        Cause("sensor_crosstalk", "sensor", _crosstalk, (0.001, 0.3)),
+        Cause("sensor_hysteresis", "sensor", _hysteresis, (0.02, 20.0)),
+        Cause("sensor_saturation", "sensor", _saturation, (0.05, 0.8), "heavy"),
+        Cause("sensor_offset_drift", "sensor", _drift, (0.02, 20.0)),
+        Cause("sensor_ripple", "sensor", _sensor_ripple, (0.02, 20.0)),
         Cause("motor_torque_delay", "timing", _late("motor"), (0.0005, 0.08), "arm"),
-        Cause("joint_torque_delay", "timing", _late("joint"), (0.0005, 0.08), "arm", channel="joint"),
-        Cause("lost_samples", "timing", _lost, (0.002, 0.5), "arm"),
+        Cause("joint_torque_delay", "timing", _late("joint"), (0.0005, 0.08), "arm"),
+        Cause("lost_samples", "timing", _lost, (2e-4, 0.5), "arm"),
         Cause("wear", "motor", _wear, (0.10, 0.25), absorbed=True, also=("motor_torque_gain",)),
         Cause("encoder_eccentricity", "joint", _eccentric, (2e-4, 0.08)),
     )

@@ -120,7 +120,9 @@ def drive_torques(p, th, om, q, qd, tl, z, slips, zb, kelvin, rest, dt, f, g, s)
         total += viscous * v + p[j].quadratic * speed * v
         kelvin[j] += dt * (p[j].heat * abs(total * v) - kelvin[j] / p[j].cooling)
         turn = p[j].gear * th[j]
-        total += p[j].ripple_1 * np.sin(turn + p[j].phase_1) + p[j].ripple_2 * np.sin(2.0 * turn + p[j].phase_2)
+        total += p[j].ripple_1 * np.sin(turn + p[j].phase_1) + p[j].ripple_2 * np.sin(
+            2.0 * turn + p[j].phase_2
+        )
         f[j] = total
         if p[j].bearing != 0.0:
             zb[j] += p[j].bearing * qd[j] * dt / _BEARING_M
@@ -141,7 +143,9 @@ def make_loop():
     step = stepper()
 
     @njit
-    def loop(model, data, p, state, qpos, qvel, qacc, applied, actuated, ctrl, places, external, push, ref, rec):
+    def loop(
+        model, data, p, state, qpos, qvel, qacc, applied, actuated, ctrl, places, external, push, ref, rec
+    ):
         """Steps of one stretch; `ref` (steps, 2 n), `rec` (records, 5 n); see `simulation`."""
         z, slips, zb, kelvin, rest, tl = state
         motor, spring = places

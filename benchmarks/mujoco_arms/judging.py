@@ -79,9 +79,7 @@ def judge(
         "unexplained": len(diagnosis.get("unexplained", ())),
         "nameless": len(diagnosis.get("nameless", ())),
         "character_listed": [label(f) for f in diagnosis.get("character", ())],
-        "claims": [
-            [confidence(f), any(names(f, h) or lists(f, h) for h in hidden)] for f in findings
-        ],
+        "claims": [[confidence(f), any(names(f, h) or lists(f, h) for h in hidden)] for f in findings],
         "deviations": deviations(findings, hidden),
         "worse": _worse(diagnosis),
     }
@@ -130,7 +128,9 @@ def _worse(diagnosis: Mapping[str, Any]) -> list[str]:
     gain, rows = diagnosis.get("gain", {}), []
     base, extended = gain.get("test_rms_base", {}), gain.get("test_rms_extended", {})
     for side in ("motor", "joint"):
-        for j, (one, other) in enumerate(zip(base.get(side) or (), extended.get(side) or (), strict=False), 1):
+        for j, (one, other) in enumerate(
+            zip(base.get(side) or (), extended.get(side) or (), strict=False), 1
+        ):
             if one is not None and other is not None and other > 1.01 * one:
                 rows.append(f"{side} {j} {one:.3g} to {other:.3g}")
     return rows

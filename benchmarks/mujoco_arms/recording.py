@@ -17,9 +17,7 @@ Floats = NDArray[np.float64]
 _EPOCH_NS = 1_700_000_000_000_000_000
 
 
-def logged(
-    setup: Setup, truth: Truth
-) -> tuple[NDArray[np.bool_], Floats, Floats, Floats, Floats, Floats]:
+def logged(setup: Setup, truth: Truth) -> tuple[NDArray[np.bool_], Floats, Floats, Floats, Floats, Floats]:
     """Rows that reach the log, times, positions, joint torques, times of the motor torques, motor torques."""
     random = np.random.default_rng(setup.seed)
     times, q, joint, late, motor = sense(setup.arm, setup.sensing, truth, random)

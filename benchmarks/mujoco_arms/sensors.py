@@ -20,8 +20,8 @@ class Torque:
 
     leak : (n, n) torque of other joints that leaks in. play : half width of its hysteresis [Nm]
     limit : where it clips [Nm]. ripple, cycles, phase : error periodic in the joint angle [Nm]
-    drift : [Nm/s]. hum [Nm] at 50 Hz. inertia : error per acceleration [Nm s2/rad]
-    bend : gain lost per torque [1/Nm]. jitter : of its clock [s]. turns : cycles of the motor instead of the joint
+    drift : [Nm/s]. hum [Nm] at hum_hz, as sampled. inertia : error per acceleration [Nm s2/rad]
+    bend : gain lost per torque [1/Nm]. steps : change of the zero in the middle [Nm]. jitter : of its clock [s]
     """
 
     gain: Floats
@@ -42,6 +42,7 @@ class Torque:
     bend: Floats
     steps: Floats
     jitter: float = 0.0
+    hum_hz: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def _torque(
     value = channel.gain * value + channel.zero + channel.drift * grid[:, None]
     value += channel.steps * (grid[:, None] > 0.5 * grid[-1])
     value += channel.ripple * np.sin(channel.cycles * truth.link + channel.phase)
-    value += channel.hum * np.sin(2.0 * np.pi * 50.0 * grid[:, None] + 0.3)
+    value += channel.hum * np.sin(2.0 * np.pi * channel.hum_hz * grid[:, None])
     b, a = butter(1, channel.cutoff, fs=1.0 / RECORD_S)
     for j in range(value.shape[1]):
         value[:, j] = lfilter(b, a, value[:, j], zi=lfiltic(b, a, value[:1, j], value[:1, j]))[0]

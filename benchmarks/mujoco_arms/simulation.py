@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from functools import cache
@@ -22,6 +23,20 @@ SETTLE_S = 1.0
 """At rest before the record, so that the springs are in balance."""
 
 _COOLING_S = 900.0
+_OF_THE_ARM = (
+    *(
+        "inertia",
+        "coulomb",
+        "viscous",
+        "stiffness",
+        "stribeck",
+        "stribeck_speed",
+        "curve",
+        "asymmetry",
+        "load",
+    ),
+    *("coulomb_kelvin", "viscous_kelvin", "heat", "presliding", "bearing"),
+)
 
 
 @dataclass(frozen=True)
@@ -101,10 +116,7 @@ class Truth:
 def drives(arm: Individual) -> NDArray[Any]:
     """Parameters of all drives of the healthy arm."""
     drive = np.zeros(arm.kind.size, dtype=DRIVE)
-    for name in (
-        "inertia coulomb viscous stiffness stribeck stribeck_speed curve asymmetry load coulomb_kelvin "
-        "viscous_kelvin heat presliding bearing"
-    ).split():
+    for name in _OF_THE_ARM:
         drive[name] = getattr(arm, name)
     drive["damping"] = arm.kind.damping
     drive["speed"], drive["gear"], drive["cooling"] = arm.kind.speed, arm.kind.gear, _COOLING_S
@@ -117,6 +129,7 @@ def drives(arm: Individual) -> NDArray[Any]:
 def build(kind: Kind, drive: NDArray[Any], body: Body) -> mujoco.MjModel:
     """The MuJoCo model: per joint a motor with its rotor, and a second hinge behind it where it is elastic."""
     spec = mujoco.MjSpec.from_string(_on_stand(kind, body.base <= 0.0))
+    spec.compiler.fusestatic = False
     spec.option.timestep = STEP_S
     spec.option.gravity = body.gravity
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -154,6 +167,7 @@ def _payload(spec: mujoco.MjSpec, kind: Kind, body: Body) -> None:
     flange.add_body(
         name="payload",
         pos=body.payload.centre,
+        ipos=(0.0, 0.0, 0.0),
         mass=mass,
         inertia=mass * np.square(body.payload.gyration),
         explicitinertial=True,
@@ -164,6 +178,7 @@ def _payload(spec: mujoco.MjSpec, kind: Kind, body: Body) -> None:
         part = flange.add_body(
             name="fluid",
             pos=body.payload.centre,
+            ipos=(0.0, 0.0, 0.0),
             mass=fluid,
             inertia=[fluid * 1e-4] * 3,
             explicitinertial=True,
@@ -182,6 +197,7 @@ def _payload(spec: mujoco.MjSpec, kind: Kind, body: Body) -> None:
         part = flange.add_body(
             name="loose",
             pos=body.payload.centre,
+            ipos=(0.0, 0.0, 0.0),
             mass=loose,
             inertia=[loose * 1e-4] * 3,
             explicitinertial=True,
@@ -230,6 +246,14 @@ def _hoses(spec: mujoco.MjSpec, kind: Kind, body: Body, drive: NDArray[Any]) -> 
         tendon.wrap_joint(kind.joints[j], 1.0)
         if drive["stiffness"][j] > 0.0:
             tendon.wrap_joint(f"{kind.joints[j]}_spring", 1.0)
+    if body.long_hose > 0.0:
+        # From a hook above the shoulder to the middle of the forearm.
+        hook = spec.worldbody.add_site(name="hook", pos=(0.2, 0.3, 1.2))
+        arm = spec.joint(kind.joints[kind.size // 2]).parent.add_site(name="clamp", pos=(0.05, 0.05, 0.1))
+        tendon = spec.add_tendon(name="long_hose", springlength=[0.2, 0.2])
+        tendon.stiffness = _first(tendon.stiffness, body.long_hose)
+        tendon.wrap_site(hook.name)
+        tendon.wrap_site(arm.name)
 
 
 def _first(like: Any, value: float) -> Any:
@@ -289,7 +313,7 @@ def simulate(plant: Plant, q: Floats, qd: Floats) -> Truth:
     cuts = [0, len(reference)]
     if plant.change is not None:
         cuts.insert(1, every * round((plant.change[0] + SETTLE_S) / RECORD_S))
-    for begin, end in zip(cuts[:-1], cuts[1:], strict=True):
+    for begin, end in itertools.pairwise(cuts):
         if begin:
             assert plant.change is not None
             _exchange(model, plant.change[1])

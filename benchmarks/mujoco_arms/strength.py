@@ -72,7 +72,9 @@ class Yardstick:
         motor, joint = (sosfiltfilt(low_pass, x, axis=0) for x in (motor, record.joint))
         near = np.column_stack([_near_reversal(record.times, x) for x in qd.T])
         used = ~near & (np.abs(qd) > _SLOW_RAD_S)
-        places = np.arange(round(_EDGE_S * rate), len(q) - round(_EDGE_S * rate), max(1, round(_BIN_S * rate)))
+        places = np.arange(
+            round(_EDGE_S * rate), len(q) - round(_EDGE_S * rate), max(1, round(_BIN_S * rate))
+        )
         model, data = _pinocchio(self.urdf)
         n = model.nv
         bodies = np.stack(
@@ -80,7 +82,11 @@ class Yardstick:
         )
         payload = bodies[:, :, -10:] * float(record.loaded)
         unit = np.eye(n)
-        columns = [qd[places, :, None] * unit, np.sign(qd[places, :, None]) * unit, np.broadcast_to(unit, (len(places), n, n))]
+        columns = [
+            qd[places, :, None] * unit,
+            np.sign(qd[places, :, None]) * unit,
+            np.broadcast_to(unit, (len(places), n, n)),
+        ]
         zero = [np.zeros_like(column) for column in columns]
         inertia = qdd[places, :, None] * unit
         rigid = np.concatenate([bodies, payload], axis=2)

@@ -52,9 +52,22 @@ def table(results: Sequence[Result]) -> str:
     if healthy:
         silent = sum(r["verdict"]["silent"] for r in healthy)
         rest = sum(r["verdict"]["unexplained"] + r["verdict"]["nameless"] for r in healthy) / len(healthy)
-        lines.append(f"healthy, no finding: {silent} of {len(healthy)}; nameless or unexplained: {rest:.1f} a case")
-    lines += ["", *_findings(judged), "", *_calibration(judged), "", *_parameters(judged), "", *_causes(judged)]
-    lines += [f"crash: {r['truth']['kind']} {r['truth']['seed']}: {r['crash'].splitlines()[-1]}" for r in crashed]
+        lines.append(
+            f"healthy, no finding: {silent} of {len(healthy)}; nameless or unexplained: {rest:.1f} a case"
+        )
+    lines += [
+        "",
+        *_findings(judged),
+        "",
+        *_calibration(judged),
+        "",
+        *_parameters(judged),
+        "",
+        *_causes(judged),
+    ]
+    lines += [
+        f"crash: {r['truth']['kind']} {r['truth']['seed']}: {r['crash'].splitlines()[-1]}" for r in crashed
+    ]
     return "\n".join(lines)
 
 
