@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -57,6 +57,8 @@ class Kind:
 class Individual:
     """One arm of a kind. What a healthy drive of the kind has besides Coulomb and viscous friction.
 
+    encoder : side of the joints that the positions are of. rate : of them [Hz]
+    motor_divider : of the motor torques' rate. has_sensors : whether joint torques are measured
     stribeck : rise over Coulomb at standstill. stribeck_speed [rad/s]. curve : share of the viscous friction
     lost at full speed. load : friction per transmitted torque. coulomb_kelvin, viscous_kelvin : change per
     kelvin. heat : warming by friction [K/J]. presliding : displacement to full slip [rad]. ripple : torque of
@@ -85,21 +87,24 @@ class Individual:
     bearing: Floats
     hose: Floats
     has_sensors: bool = True
-    traits: frozenset[str] = field(
-        default=frozenset(
-            {
-                "stribeck",
-                "viscous_nonlinear",
-                "friction_asymmetry",
-                "friction_load",
-                "friction_temperature",
-                "presliding_hysteresis",
-                "gear_ripple",
-                "joint_elasticity",
-                "cable_spring",
-            }
-        )
-    )
+
+    def traits(self) -> dict[str, dict[int, dict[str, float]]]:
+        """What is true of the healthy arm, by cause, joint (from 1) and, where it has one, parameter."""
+        joints = range(self.kind.size)
+        elastic = [j for j in joints if self.kind.stiffness[j] > 0.0]
+        amplitude = self.stribeck * self.coulomb
+        ripple = self.ripple.max(axis=0)
+        return {
+            "stribeck": {j + 1: {"amplitude": float(amplitude[j])} for j in joints},
+            "viscous_nonlinear": {j + 1: {} for j in joints},
+            "friction_asymmetry": {j + 1: {} for j in joints},
+            "friction_load": {j + 1: {"factor": float(self.load[j])} for j in joints},
+            "friction_temperature": {j + 1: {} for j in joints},
+            "presliding_hysteresis": {j + 1: {} for j in joints},
+            "gear_ripple": {j + 1: {"amplitude": float(ripple[j])} for j in joints},
+            "joint_elasticity": {j + 1: {"stiffness": float(self.stiffness[j])} for j in elastic},
+            "cable_spring": {j + 1: {"stiffness": float(self.hose[j])} for j in joints},
+        }
 
 
 def individual(kind: Kind, random: np.random.Generator) -> Individual:

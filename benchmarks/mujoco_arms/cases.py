@@ -26,6 +26,7 @@ KINDS_OF_CASES = ("single", "pair", "healthy", "wear", "outside")
 _MIX = ("single", "single", "healthy", "single", "outside", "single", "pair", "single", "wear", "single")
 _RHO = (1.03, 3.0)
 _AFFECTED = 1.03
+_WITHOUT_SENSORS = 0.35
 ALL = {**CAUSES, **OUTSIDE}
 
 
@@ -72,9 +73,11 @@ def draw(seed: int, kind: str, cause: str | None = None, arm: str | None = None)
     random = np.random.default_rng([seed, KINDS_OF_CASES.index(kind)])
     name = str(random.choice(sorted(KINDS)))
     body = individual(KINDS[arm or name](), random)
-    chosen = _causes(kind, cause, random)
+    chosen = _causes(seed, kind, cause, random)
     encoder = next((c.encoder for c in chosen if c.encoder), None)
-    body = replace(body, encoder=encoder or body.encoder)
+    blind = body.kind.name == "UR5" and random.random() < _WITHOUT_SENSORS
+    sensed = any(c.side == "sensor" or c.name == "joint_torque_delay" for c in chosen)
+    body = replace(body, encoder=encoder or body.encoder, has_sensors=sensed or not blind)
     usual = float(np.round(random.uniform(*body.kind.payloads), 2))
     base = seed * 10 + KINDS_OF_CASES.index(kind)
     reference = tuple(tuple(day(body, (base, number), usual)) for number in (1, 2))
@@ -82,7 +85,8 @@ def draw(seed: int, kind: str, cause: str | None = None, arm: str | None = None)
     return Case(seed, kind, body, reference, tuple(day(body, (base, 3), usual)), hidden)
 
 
-def _causes(kind: str, asked: str | None, random: np.random.Generator) -> list[Cause]:
+def _causes(seed: int, kind: str, asked: str | None, random: np.random.Generator) -> list[Cause]:
+    """What is hidden; singles and what is outside the catalogue take turns with the seed."""
     if asked is not None:
         return [ALL[asked]]
     if kind == "healthy":
@@ -90,8 +94,9 @@ def _causes(kind: str, asked: str | None, random: np.random.Generator) -> list[C
     if kind == "wear":
         return [CAUSES["wear"]]
     names = sorted(OUTSIDE) if kind == "outside" else sorted(name for name in CAUSES if name != "wear")
-    count = 2 if kind == "pair" else 1
-    return [ALL[str(name)] for name in random.choice(names, count, replace=False)]
+    if kind == "pair":
+        return [ALL[str(name)] for name in random.choice(names, 2, replace=False)]
+    return [ALL[names[(seed // len(_MIX) if kind == "outside" else seed) % len(names)]]]
 
 
 def _hidden(cause: Cause, arm: Individual, random: np.random.Generator) -> Hidden:
@@ -124,7 +129,8 @@ class Bench:
 
     def __init__(self, case: Case) -> None:
         self.case = case
-        self.yardstick = Yardstick(case.arm.kind.urdf, case.healthy[0].sensing.motor.delay)
+        delay = case.healthy[0].sensing.motor.delay
+        self.yardstick = Yardstick(case.arm.kind.urdf, delay, case.arm.has_sensors)
 
     @cached_property
     def healthy(self) -> list[Truth]:
@@ -158,11 +164,16 @@ class Bench:
         error = self.yardstick.errors(self.yardstick.model(rows[:2]), rows[2:])
         absolute = self.yardstick.errors(model, rows)
         own = self.yardstick.errors(model, self._rows(self.case.healthy))
-        return Visibility(inflation(error, healthy), inflation(absolute, own), error / healthy)
+        return Visibility(inflation(error, healthy), inflation(absolute, own), _ratios(error, healthy))
 
     def peaks(self) -> Floats:
         """Largest healthy joint torques [Nm], (n,)."""
         return np.asarray(np.max([np.abs(truth.joint).max(axis=0) for truth in self.healthy], axis=0))
+
+
+def _ratios(error: Floats, healthy: Floats) -> Floats:
+    """Of errors (2 n,); 1 where a row is not measured."""
+    return np.asarray(np.divide(error, healthy, out=np.ones_like(error), where=healthy > 0.0))
 
 
 def record(setup: Setup, truth: Truth) -> Record:
@@ -246,7 +257,8 @@ def _truth(
         "rate": case.arm.rate,
         "motor_rate": case.arm.rate / case.arm.motor_divider,
         "gear_ratio": [float(ratio) for ratio in case.arm.kind.gear],
-        "traits": sorted(case.arm.traits),
+        "sensors": case.arm.has_sensors,
+        "traits": case.arm.traits(),
         "hidden": [
             {
                 "cause": one.cause.name,

@@ -9,6 +9,8 @@ SURE = 0.8
 """Confidence from which a finding claims its cause; below it says what it may be."""
 
 
+_SIGMAS = 3.0
+
 Finding = Mapping[str, Any]
 
 
@@ -45,6 +47,21 @@ def lists(finding: Finding, hidden: Mapping[str, Any]) -> bool:
     )
 
 
+def habitual(finding: Finding, traits: Mapping[str, Any]) -> bool:
+    """Whether the healthy arm has this, at these joints, and of about this size where the size is known."""
+    having = traits.get(finding["cause"], {})
+    joints = [str(joint) for joint in finding["joints"]]
+    if not joints or any(joint not in having for joint in joints):
+        return False
+    for name, value in having[joints[0]].items():
+        stated = finding.get("parameters", {}).get(name)
+        if stated is not None and abs(float(stated["value"]) - value) > max(
+            value, _SIGMAS * float(stated.get("std") or 0.0)
+        ):
+            return False
+    return True
+
+
 def judge(
     diagnosis: Mapping[str, Any], truth: Mapping[str, Any], twin: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -63,8 +80,8 @@ def judge(
     listed = [any(lists(f, h) for f in first) for h in hidden]
     right = [f for f in findings if any(names(f, h) or lists(f, h) for h in hidden)]
     rest = [f for f in findings if not any(f is r for r in right)]
-    character = [f for f in rest if f["cause"] in truth["traits"]]
-    false = [f for f in rest if f["cause"] not in truth["traits"]]
+    character = [f for f in rest if habitual(f, truth["traits"])]
+    false = [f for f in rest if not any(f is c for c in character)]
     outside = any(not h["listed"] for h in hidden)
     verdict = {
         "sure": sure,

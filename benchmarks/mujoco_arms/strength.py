@@ -54,10 +54,11 @@ class Rows:
 
 @dataclass(frozen=True)
 class Yardstick:
-    """The base model of an arm: kinematics and the healthy delay of its motor channel [s]."""
+    """The base model of an arm: kinematics, the healthy delay of its motor channel [s], joint torque sensors or not."""
 
     urdf: str
     motor_delay: float
+    sensors: bool = True
 
     def rows(self, record: Record) -> Rows:
         """Equations of a session, every 24 ms."""
@@ -105,7 +106,7 @@ class Yardstick:
         for _ in range(_PASSES):
             normal, right = 0.0, 0.0
             for rows in train:
-                for side, (matrix, torque) in enumerate(_sides(rows)):
+                for side, (matrix, torque) in enumerate(self._sides(rows)):
                     for j in range(n):
                         use = rows.used[:, j]
                         y, t = matrix[use, j], torque[use, j]
@@ -123,15 +124,15 @@ class Yardstick:
         n = test[0].used.shape[1]
         squares, counts = np.zeros(2 * n), np.zeros(2 * n)
         for rows in test:
-            for side, (matrix, torque) in enumerate(_sides(rows)):
+            for side, (matrix, torque) in enumerate(self._sides(rows)):
                 error = (torque - matrix @ model) * rows.used
                 squares[side * n : side * n + n] += np.sum(error**2, axis=0)
                 counts[side * n : side * n + n] += rows.used.sum(axis=0)
         return np.sqrt(squares / np.maximum(counts, 1))
 
-
-def _sides(rows: Rows) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    return (rows.motor, rows.motor_torque), (rows.joint, rows.joint_torque)
+    def _sides(self, rows: Rows) -> tuple[tuple[Floats, Floats], ...]:
+        sides = ((rows.motor, rows.motor_torque), (rows.joint, rows.joint_torque))
+        return sides if self.sensors else sides[:1]
 
 
 @cache
