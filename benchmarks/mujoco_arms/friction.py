@@ -97,7 +97,7 @@ def drive_torques(p, th, om, q, qd, tl, z, slips, zb, kelvin, rest, dt, f, g, s)
         limit *= 1.0 + p[j].place_amplitude * np.cos(p[j].place_cycles * q[j] - p[j].place_phase)
         if p[j].neighbour != 0.0:
             limit += p[j].neighbour * abs(om[j - 1 if j > 0 else 1])
-        if p[j].window != 0.0 and np.cos(p[j].gear * th[j] / 25.0 - p[j].window_phase) > _WINDOW:
+        if p[j].window != 0.0 and np.cos(0.1 * p[j].gear * th[j] - p[j].window_phase) > _WINDOW:
             limit += p[j].window
         if p[j].gravity_friction != 0.0:
             limit += p[j].gravity_friction * max(0.0, tl[j])

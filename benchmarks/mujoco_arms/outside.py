@@ -46,6 +46,7 @@ def _stand(s: Setup, v: Variant, p: float) -> Outcome:
 
 
 def _brake_disc(s: Setup, v: Variant, p: float) -> Outcome:
+    """A disc on a stage that turns a tenth as fast as the motor rubs in a fifth of its turn."""
     return _drive(s, v.joint, window=p, window_phase=v.angle), {"torque": (p, "Nm")}
 
 
