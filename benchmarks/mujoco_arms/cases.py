@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.mujoco_arms.arms import KINDS, Individual, individual
 from benchmarks.mujoco_arms.causes import CAUSES, Cause, Parameter, Variant
-from benchmarks.mujoco_arms.days import Setup, day
+from benchmarks.mujoco_arms.days import Setup, day, payload
 from benchmarks.mujoco_arms.outside import OUTSIDE
 from benchmarks.mujoco_arms.recording import logged, write
 from benchmarks.mujoco_arms.simulation import Truth, simulate
@@ -78,11 +78,11 @@ def draw(seed: int, kind: str, cause: str | None = None, arm: str | None = None)
     blind = body.kind.name == "UR5" and random.random() < _WITHOUT_SENSORS
     sensed = any(c.side == "sensor" or c.name == "joint_torque_delay" for c in chosen)
     body = replace(body, encoder=encoder or body.encoder, has_sensors=sensed or not blind)
-    usual = float(np.round(random.uniform(*body.kind.payloads), 2))
+    loads = payload(body.kind, random), payload(body.kind, random)
     base = seed * 10 + KINDS_OF_CASES.index(kind)
-    reference = tuple(tuple(day(body, (base, number), usual)) for number in (1, 2))
+    reference = tuple(tuple(day(body, (base, number), loads)) for number in (1, 2))
     hidden = tuple(_hidden(one, body, random) for one in chosen)
-    return Case(seed, kind, body, reference, tuple(day(body, (base, 3), usual)), hidden)
+    return Case(seed, kind, body, reference, tuple(day(body, (base, 3), loads)), hidden)
 
 
 def _causes(seed: int, kind: str, asked: str | None, random: np.random.Generator) -> list[Cause]:

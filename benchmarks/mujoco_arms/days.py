@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 
 _HERTZ = (6.0, 11.0)
 """Bandwidth of the position controllers; the tuning of a day is drawn in it."""
+
+_OTHER_PAYLOAD = 0.25
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,17 @@ class Setup:
 ROLES = ("train_1", "train_2", "test_1")
 
 
-def day(arm: Individual, seed: tuple[int, ...], usual: float) -> list[Setup]:
+def payload(kind: Kind, random: np.random.Generator) -> Payload:
+    """A payload as it is mounted every time."""
+    centre = np.array(kind.tool) + random.uniform(-0.02, 0.02, 3)
+    mass = float(np.round(random.uniform(*kind.payloads), 2))
+    return Payload(mass, (float(centre[0]), float(centre[1]), float(centre[2])))
+
+
+def day(arm: Individual, seed: tuple[int, ...], payloads: tuple[Payload, Payload]) -> list[Setup]:
     """The three sessions of a healthy day: two to fit, without and with a payload, and another motion.
 
-    usual : mass of the payload that hangs there on most days [kg]
+    payloads : the one that hangs there on most days, and the other
     """
     random = np.random.default_rng(seed)
     kind, n = arm.kind, arm.kind.size
@@ -59,9 +68,9 @@ def day(arm: Individual, seed: tuple[int, ...], usual: float) -> list[Setup]:
     drive["stribeck"] *= random.uniform(0.7, 1.3, n)
     kp, kd = _tuning(kind, arm.inertia, random)
     warmth = random.uniform(0.0, 8.0)
-    name, mass = "load_A", usual
-    if random.random() < 0.25:
-        name, mass = "load_B", float(np.round(random.uniform(*kind.payloads), 2))
+    name, load = "load_A", payloads[0]
+    if random.random() < _OTHER_PAYLOAD:
+        name, load = "load_B", payloads[1]
     hoses = tuple((j, float(arm.hose[j]), 0.0) for j in range(n))
     sensing = Sensing(
         Encoder(
@@ -76,22 +85,20 @@ def day(arm: Individual, seed: tuple[int, ...], usual: float) -> list[Setup]:
         torque_channel(arm, "joint", random),
     )
     styles = [str(style) for style in random.choice(STYLES, 2, replace=False)]
-    centre = np.array(kind.tool) + random.uniform(-0.02, 0.02, 3)
-    payload = Payload(mass, (float(centre[0]), float(centre[1]), float(centre[2])))
     setups = []
     for index, role in enumerate(ROLES):
         seconds = float(random.uniform(20.0, 40.0)) if random.random() > 0.15 else 60.0
         q, qd = motion(kind, styles[0] if index < 2 else styles[1], seconds, random)
         kelvin = warmth + random.uniform(0.0, 2.0) * index * np.ones(n)
         loaded = index > 0
-        body = Body(payload=payload if loaded else Payload(), hoses=hoses)
+        body = Body(payload=load if loaded else Payload(), hoses=hoses)
         setups.append(
             Setup(
                 role=role,
                 arm=arm,
                 plant=Plant(kind, drive.copy(), body, kp, kd, kelvin, np.zeros(n)),
                 sensing=sensing,
-                label=Label(name, mass) if loaded else Label(),
+                label=Label(name, load.mass) if loaded else Label(),
                 q=q,
                 qd=qd,
                 seed=int(random.integers(2**31)),
@@ -107,8 +114,3 @@ def _tuning(kind: Kind, inertia: Floats, random: np.random.Generator) -> tuple[F
     moved = 1.5 * inertia + 0.1
     kp = (2.0 * np.pi * hertz) ** 2 * moved
     return kp, 2.0 * ratio * np.sqrt(kp * moved)
-
-
-def with_plant(setup: Setup, plant: Plant) -> Setup:
-    """The session with another plant."""
-    return replace(setup, plant=plant)
