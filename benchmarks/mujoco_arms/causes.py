@@ -149,7 +149,7 @@ def _gain(side: str) -> Change:
     def change(s: Setup, v: Variant, p: float) -> Outcome:
         gain = getattr(s.sensing, side).gain
         s = _channel(s, side, gain=_at(gain, v.joint, gain[v.joint] * (1.0 + v.sign * p)))
-        return s, {"gain": (v.sign * p, "1")}
+        return s, {"gain": (v.sign * p, "1"), "error": (v.sign * p, "1")}
 
     return change
 
@@ -170,11 +170,11 @@ def _cable(s: Setup, v: Variant, p: float) -> Outcome:
 
 
 def _tilt(s: Setup, v: Variant, p: float) -> Outcome:
-    """Gravity turned by p about a level axis at `angle`."""
+    """The base leans by p about a level axis at `angle`: about its x and its y axis by small angles."""
     x, y = p * np.cos(v.angle), p * np.sin(v.angle)
-    gravity = (9.81 * -np.sin(y), 9.81 * np.sin(x), -9.81 * np.cos(p))
+    gravity = (9.81 * np.sin(y), -9.81 * np.sin(x), -9.81 * np.cos(p))
     plant = replace(s.plant, body=replace(s.plant.body, gravity=gravity))
-    return replace(s, plant=plant), {"angle": (p, "rad")}
+    return replace(s, plant=plant), {"tilt_x": (x, "rad"), "tilt_y": (y, "rad")}
 
 
 def _lighter(payload: Payload, mass: float) -> Payload:
