@@ -32,6 +32,9 @@ from benchmarks.mujoco_arms.tally import table
 @click.option("--arm", type=click.Choice(["lwr4plus", "ur5"]), help="Only this arm.")
 @click.option("--diagnose", is_flag=True, help="Commission, diagnose and judge.")
 @click.option("--again", is_flag=True, help="Commission and diagnose once more what has a verdict.")
+@click.option(
+    "--twins", is_flag=True, help="Diagnose the healthy twin of every case, not only where no name is right."
+)
 @click.option("--jobs", default=1, show_default=True, help="Processes at a time.")
 @click.option("--report", is_flag=True, help="Run nothing; print the table of what is there.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("mujoco_cases"), show_default=True)
@@ -43,13 +46,14 @@ def main(
     arm: str | None,
     diagnose: bool,
     again: bool,
+    twins: bool,
     jobs: int,
     report: bool,
     out: Path,
 ) -> None:
     """Make cases, have them diagnosed, and judge what is said."""
     if not report:
-        run(Plan(out, seed, cases, kind, cause, arm, diagnose, again), jobs, click.echo)
+        run(Plan(out, seed, cases, kind, cause, arm, diagnose, again, twins), jobs, click.echo)
     results = read_results(out)
     if results:
         click.echo(table(results))

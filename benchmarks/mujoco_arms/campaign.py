@@ -33,6 +33,7 @@ class Plan:
     arm: str | None = None
     diagnose: bool = False
     again: bool = False
+    twins: bool = False
 
     def wanted(self) -> list[tuple[int, str]]:
         """Seed and kind of every case."""
@@ -54,8 +55,22 @@ def run(plan: Plan, jobs: int, say: Callable[[str], Any]) -> None:
 
 
 def read_results(out: Path) -> list[dict[str, Any]]:
-    """Verdicts of a folder, in order of the cases' names."""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*/verdict.json"))]
+    """Verdicts on all diagnoses in a folder, or their crashes, in order of the cases' names."""
+    return [read_result(path.parent) for path in sorted(out.glob("*/verdict.json"))]
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """The verdict on the diagnosis of a case, judged anew."""
+    result = {**_json(folder / "verdict.json"), "truth": _json(folder / "truth.json")}
+    if "crash" not in result:
+        twin = folder / "twin" / "diagnosis" / "diagnosis.json"
+        told = _json(folder / "diagnosis" / "diagnosis.json")
+        result["verdict"] = judge(told, result["truth"], _json(twin) if twin.is_file() else None)
+    return result
+
+
+def _json(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def _one(plan: Plan, seed: int, kind: str) -> str:
@@ -69,28 +84,28 @@ def _one(plan: Plan, seed: int, kind: str) -> str:
         return f"{line} {time.monotonic() - began:.0f} s"
     verdict = folder / "verdict.json"
     if not verdict.is_file() or plan.again:
-        result: dict[str, Any] = {"truth": truth}
+        result: dict[str, Any] = {}
         try:
-            diagnosis, seconds = diagnosed(folder, plan.again)
-            twin = diagnosed(folder / "twin", plan.again, folder)[0] if kind == "outside" else None
-            result |= {"verdict": judge(diagnosis, truth, twin), "seconds": seconds}
-        except RuntimeError as error:
+            result["seconds"] = diagnosed(folder, plan.again)
+            if truth["hidden"] and (kind == "outside" or plan.twins):
+                diagnosed(folder / "twin", plan.again, folder)
+        except (RuntimeError, subprocess.TimeoutExpired) as error:
             result["crash"] = str(error)
         verdict.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    result = json.loads(verdict.read_text(encoding="utf-8"))
+    result = read_result(folder)
     if "crash" in result:
         return f"{line} CRASH {result['crash'].splitlines()[-1]}"
     return f"{line} {'; '.join(result['verdict']['findings']) or 'silent'}"
 
 
-def diagnosed(folder: Path, again: bool, home: Path | None = None) -> tuple[dict[str, Any], float]:
-    """Content of `diagnosis.json`, and the processor time of it [s], with the reference of the folder `home`.
+def diagnosed(folder: Path, again: bool, home: Path | None = None) -> float:
+    """Write `diagnosis` in a folder; returns its processor time [s].
 
-    RuntimeError with the last lines of a command that fails.
+    home : folder of the reference days, where it is another. RuntimeError with the last lines of a command that fails.
     """
     home = home or folder
     reference, out = home / "reference.yaml", folder / "diagnosis"
-    ratios = json.loads((home / "truth.json").read_text(encoding="utf-8"))["gear_ratio"]
+    ratios = _json(home / "truth.json")["gear_ratio"]
     gear = ["--gear-ratio", ",".join(f"{ratio:g}" for ratio in ratios)]
     if not reference.is_file() or (again and home == folder):
         reference.unlink(missing_ok=True)
@@ -114,8 +129,7 @@ def diagnosed(folder: Path, again: bool, home: Path | None = None) -> tuple[dict
     ]
     _command(command, folder / "diagnose.txt")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return json.loads((out / "diagnosis.json").read_text(encoding="utf-8")), seconds
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def _command(arguments: Sequence[str], log: Path) -> None:

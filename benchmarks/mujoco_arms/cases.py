@@ -219,7 +219,7 @@ def sized(case: Case, bench: Bench, random: np.random.Generator) -> Case:
 def make(case: Case, folder: Path) -> dict[str, Any]:
     """Write the sessions and `truth.json`; returns the truth. What is there already is kept.
 
-    Where the catalogue lacks the fault, the healthy twin's sessions go to `twin`.
+    The healthy twin's sessions go to `twin`: the same day without the fault.
     """
     path = folder / "truth.json"
     if path.is_file():
@@ -233,7 +233,7 @@ def make(case: Case, folder: Path) -> dict[str, Any]:
     setups, parameters = changed(case, case.hidden)
     for setup, truth in zip(setups, bench.truths(setups), strict=True):
         write(folder / f"{setup.role}.mcap", setup, truth)
-    if case.kind == "outside":
+    if case.hidden:
         for setup, truth in zip(case.healthy, bench.healthy, strict=True):
             write(folder / "twin" / f"{setup.role}.mcap", setup, truth)
     content = _truth(case, parameters, bench.visible(setups) if case.hidden else None)

@@ -10,6 +10,7 @@ SURE = 0.8
 
 
 _SIGMAS = 3.0
+_AFFECTED = 1.03
 
 Finding = Mapping[str, Any]
 
@@ -71,6 +72,7 @@ def judge(
     listed : whether an unsure one has it. right : one of them, for all faults
     false : findings of nothing hidden and of no habit of the arm. character : of a habit
     flagged : joints of the fault at which more is reported than of the healthy twin
+    exact : right, and no finding is false. efficiency : error removed over error that the fault brought
     claims : (confidence, whether right) of all findings. deviations : of parameters, in their sigmas
     """
     hidden = list(truth["hidden"])
@@ -99,7 +101,9 @@ def judge(
         "claims": [[confidence(f), any(names(f, h) or lists(f, h) for h in hidden)] for f in findings],
         "deviations": deviations(findings, hidden),
         "worse": _worse(diagnosis),
+        "efficiency": None if twin is None else _efficiency(diagnosis, twin),
     }
+    verdict["exact"] = verdict["right"] and not verdict["false"]
     if outside:
         verdict["flagged"] = bool(_beyond(diagnosis, twin or {}) & set(_places(truth)))
     return verdict
@@ -138,6 +142,18 @@ def _entries(diagnosis: Mapping[str, Any]) -> set[tuple[str, int]]:
 def _beyond(diagnosis: Mapping[str, Any], twin: Mapping[str, Any]) -> set[int]:
     """Joints of which more is reported than of the twin; 0 is the whole arm."""
     return {joint for _, joint in _entries(diagnosis) - _entries(twin)}
+
+
+def _efficiency(diagnosis: Mapping[str, Any], twin: Mapping[str, Any]) -> float | None:
+    """Of the held-out rows where the base model is worse than the twin's by 3 %; None if there is none."""
+    gain, healthy = diagnosis["gain"], twin["gain"]["test_rms_base"]
+    removed = brought = 0.0
+    for side in ("motor", "joint"):
+        rows = (gain["test_rms_base"].get(side), gain["test_rms_extended"].get(side), healthy.get(side))
+        for base, extended, without in zip(*(row or () for row in rows), strict=False):
+            if None not in (base, extended, without) and base > _AFFECTED * without:
+                removed, brought = removed + base - extended, brought + base - without
+    return removed / brought if brought > 0.0 else None
 
 
 def _worse(diagnosis: Mapping[str, Any]) -> list[str]:

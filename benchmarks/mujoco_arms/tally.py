@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from statistics import median
 from typing import Any
 
 Result = dict[str, Any]
@@ -43,6 +44,7 @@ def table(results: Sequence[Result]) -> str:
                     lambda r: r["verdict"]["right"] and not all(r["verdict"]["sure"]),
                 ),
                 _row(f"{kind}: right", of, lambda r: r["verdict"]["right"]),
+                _row(f"{kind}: right and nothing false", of, lambda r: r["verdict"]["exact"]),
             ]
     outside = [r for r in judged if r["truth"]["kind"] == "outside"]
     if outside:
@@ -84,11 +86,20 @@ def _findings(judged: Sequence[Result]) -> list[str]:
     count = sum(len(v["findings"]) for v in within)
     false = Counter(f.split("(")[0] for v in within for f in v["false"])
     habit = Counter(f.split("(")[0] for v in within for f in v["character"])
+    removed = sorted(e for r in judged if (e := r["verdict"]["efficiency"]) is not None)
     worse = [r for r in judged if r["verdict"]["worse"]]
     return [
         f"findings: {count}; of nothing hidden {sum(false.values())} ({_counts(false)}); "
         f"of a habit of the arm {sum(habit.values())} ({_counts(habit)})",
         f"extended model worse by more than 1 % at a joint: {len(worse)} of {len(judged)} cases",
+        *(
+            [f"error removed of what the fault brought, median of {len(removed)}: {median(removed):.2f}"]
+            if removed
+            else ()
+        ),
+        f"processor time of a diagnosis, median: {median([r['seconds'] for r in judged]):.0f} s"
+        if judged
+        else "",
     ]
 
 

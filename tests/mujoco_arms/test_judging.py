@@ -29,7 +29,8 @@ def truth(cause: str = "stribeck", joint: int = 2, listed: bool = True) -> dict[
 
 
 def said(*findings: dict[str, Any], **more: Any) -> dict[str, Any]:
-    return {"findings": list(findings), "unexplained": [], **more}
+    gain = {"test_rms_base": {"motor": [1.0, 1.5]}, "test_rms_extended": {"motor": [1.0, 1.1]}}
+    return {"findings": list(findings), "unexplained": [], "gain": gain, **more}
 
 
 def test_a_sure_first_finding_with_name_and_joint_is_right() -> None:
@@ -74,8 +75,15 @@ def test_what_the_healthy_twin_has_too_is_not_flagged() -> None:
     assert not judge(with_it, outside, with_it)["flagged"]
 
 
+def test_the_gain_is_held_against_what_the_fault_brought() -> None:
+    healthy = {"test_rms_base": {"motor": [1.0, 1.0]}, "test_rms_extended": {"motor": [1.0, 1.0]}}
+    verdict = judge(said(finding("stribeck", 2, 0.95)), truth(), said(gain=healthy))
+    assert verdict["efficiency"] == pytest.approx(0.8)
+    assert verdict["worse"] == []
+
+
 def test_the_table_has_rates_calibration_and_crashes() -> None:
-    right = {"truth": truth(), "verdict": judge(said(finding("stribeck", 2, 0.95)), truth())}
+    right = {"truth": truth(), "verdict": judge(said(finding("stribeck", 2, 0.95)), truth()), "seconds": 1.0}
     crash = {"truth": {**truth(), "seed": 2}, "crash": "Traceback\nZeroDivisionError: x"}
     text = table([right, crash])
     assert "1 crashes" in text
