@@ -18,7 +18,7 @@ from benchmarks.mujoco_arms.days import Setup, day, payload
 from benchmarks.mujoco_arms.outside import OUTSIDE
 from benchmarks.mujoco_arms.recording import logged, write
 from benchmarks.mujoco_arms.simulation import Truth, simulate
-from benchmarks.mujoco_arms.strength import Record, Rows, Yardstick, found_strength, inflation
+from benchmarks.mujoco_arms.strength import Record, Rows, Yardstick, found_strength, inflation, ten
 
 Floats = NDArray[np.float64]
 
@@ -117,7 +117,7 @@ def _hidden(cause: Cause, arm: Individual, random: np.random.Generator) -> Hidde
 
 @dataclass(frozen=True)
 class Visibility:
-    """rho of the base model, of the healthy twin's model, and the ratios of all rows (2 n,)."""
+    """rho of the base model, of the reference days' model, and the base model's ratios of all rows (2 n,)."""
 
     rho: float
     rho_reference: float
@@ -144,27 +144,42 @@ class Bench:
             for k, (s, twin) in enumerate(zip(setups, self.case.healthy, strict=True))
         ]
 
-    def _rows(self, setups: Sequence[Setup]) -> list[Rows]:
+    @cached_property
+    def reference(self) -> list[list[Truth]]:
+        """Motions of the reference days."""
+        return [[simulate(s.plant, s.q, s.qd) for s in day] for day in self.case.reference]
+
+    def _rows(self, setups: Sequence[Setup], truths: Sequence[Truth]) -> list[Rows]:
+        return [self.yardstick.rows(record(s, truth)) for s, truth in zip(setups, truths, strict=True)]
+
+    def _known(self, healthy: Sequence[Setup], rows: Sequence[Rows]) -> list[Rows]:
+        """With the payloads of the healthy sessions known."""
+        loads = [setup.plant.body.payload for setup in healthy]
         return [
-            self.yardstick.rows(record(setup, truth))
-            for setup, truth in zip(setups, self.truths(setups), strict=True)
+            self.yardstick.known(one, ten(load.mass, load.centre, load.gyration))
+            for one, load in zip(rows, loads, strict=True)
         ]
 
     @cached_property
-    def _twin(self) -> tuple[Floats, Floats]:
-        """Parameters of the healthy twin's base model, and its held-out errors."""
-        rows = self._rows(self.case.healthy)
-        model = self.yardstick.model(rows[:2])
-        return model, self.yardstick.errors(model, rows[2:])
+    def _twin(self) -> tuple[Floats, Floats, Floats]:
+        """Held-out errors of the twin's base model; model of the reference days, and its errors on the twin."""
+        rows = self._rows(self.case.healthy, self.healthy)
+        own = self.yardstick.errors(self.yardstick.model(rows[:2]), rows[2:])
+        earlier = [
+            one
+            for setups, truths in zip(self.case.reference, self.reference, strict=True)
+            for one in self._known(setups, self._rows(setups, truths))
+        ]
+        model = self.yardstick.model(earlier)
+        return own, model, self.yardstick.errors(model, self._known(self.case.healthy, rows))
 
     def visible(self, setups: Sequence[Setup]) -> Visibility:
         """How visible the faults in these sessions are."""
-        model, healthy = self._twin
-        rows = self._rows(setups)
+        own, model, before = self._twin
+        rows = self._rows(setups, self.truths(setups))
         error = self.yardstick.errors(self.yardstick.model(rows[:2]), rows[2:])
-        absolute = self.yardstick.errors(model, rows)
-        own = self.yardstick.errors(model, self._rows(self.case.healthy))
-        return Visibility(inflation(error, healthy), inflation(absolute, own), _ratios(error, healthy))
+        after = self.yardstick.errors(model, self._known(self.case.healthy, rows))
+        return Visibility(inflation(error, own), inflation(after, before), _ratios(error, own))
 
     def peaks(self) -> Floats:
         """Largest healthy joint torques [Nm], (n,)."""
@@ -204,7 +219,7 @@ def sized(case: Case, bench: Bench, random: np.random.Generator) -> Case:
 
         def rho(p: float, one: Hidden = one, seen: dict[float, Visibility] = seen) -> float:
             seen[p] = bench.visible(changed(case, [replace(one, strength=p)])[0])
-            return seen[p].rho_reference if one.cause.absorbed else seen[p].rho
+            return max(seen[p].rho, seen[p].rho_reference) if one.cause.absorbed else seen[p].rho
 
         if one.cause.name == "wear":
             strength = float(random.uniform(low, high))
@@ -225,10 +240,9 @@ def make(case: Case, folder: Path) -> dict[str, Any]:
     if path.is_file():
         return dict(json.loads(path.read_text(encoding="utf-8")))
     bench = Bench(case)
-    for number, setups in enumerate(case.reference, 1):
-        for index, setup in enumerate(setups, 1):
-            place = folder / f"reference_day_{number}" / f"session_{index}.mcap"
-            write(place, setup, simulate(setup.plant, setup.q, setup.qd))
+    for number, (setups, truths) in enumerate(zip(case.reference, bench.reference, strict=True), 1):
+        for index, (setup, truth) in enumerate(zip(setups, truths, strict=True), 1):
+            write(folder / f"reference_day_{number}" / f"session_{index}.mcap", setup, truth)
     case = sized(case, bench, np.random.default_rng([case.seed, 7]))
     setups, parameters = changed(case, case.hidden)
     for setup, truth in zip(setups, bench.truths(setups), strict=True):

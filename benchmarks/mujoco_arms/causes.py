@@ -45,7 +45,7 @@ class Cause:
 
     strengths : where the search for the wanted visibility begins and ends. encoder : that it needs
     where : joints that it is drawn for: all, elastic, heavy (loaded by gravity), arm (no joint)
-    absorbed : base parameters take it up, so that it shows only against a healthy model
+    absorbed : base parameters take it up, so that it shows only against the reference days
     listed : in the catalogue. also : further names that are as right
     """
 
@@ -298,29 +298,29 @@ def _wear(s: Setup, v: Variant, p: float) -> Outcome:
 CAUSES = {
     cause.name: cause
     for cause in (
-        Cause("stribeck", "motor", _stribeck, (0.05, 3.0)),
-        Cause("viscous_nonlinear", "motor", _viscous, (0.05, 0.7)),
-        Cause("friction_asymmetry", "motor", _asymmetry, (0.02, 0.6), absorbed=True),
-        Cause("friction_load", "motor", _load, (0.005, 0.6), where="heavy"),
-        Cause("friction_temperature", "motor", _temperature, (0.001, 0.03)),
+        Cause("stribeck", "motor", _stribeck, (0.02, 3.0)),
+        Cause("viscous_nonlinear", "motor", _viscous, (0.01, 0.7)),
+        Cause("friction_asymmetry", "motor", _asymmetry, (0.003, 0.6), absorbed=True),
+        Cause("friction_load", "motor", _load, (0.001, 0.6), where="heavy"),
+        Cause("friction_temperature", "motor", _temperature, (0.0001, 0.03)),
         Cause("friction_position", "motor", _position, (0.02, 0.9)),
         Cause("presliding_hysteresis", "motor", _presliding, (0.5, 100.0)),
         Cause("gear_ripple", "motor", _gear_ripple, (0.02, 20.0)),
-        Cause("motor_torque_gain", "motor", _gain("motor"), (0.01, 0.3), absorbed=True, also=("wear",)),
+        Cause("motor_torque_gain", "motor", _gain("motor"), (0.001, 0.3), absorbed=True, also=("wear",)),
         Cause("backlash", "joint", _backlash, (1e-4, 0.05), "elastic", "motor"),
         Cause("joint_elasticity", "joint", _elasticity, (0.1, 8.0), "elastic", "motor"),
         Cause("cable_spring", "joint", _cable, (0.02, 30.0)),
-        Cause("base_tilt", "joint", _tilt, (0.0005, 0.2), "arm"),
-        Cause("payload_error", "joint", _payload_error, (0.02, 3.0), "arm", absorbed=True),
+        Cause("base_tilt", "joint", _tilt, (0.0001, 0.2), "arm"),
+        Cause("payload_error", "joint", _payload_error, (0.003, 3.0), "arm", absorbed=True),
         Cause("payload_change", "joint", _payload_change, (0.01, 2.0), "arm"),
-        Cause("joint_zero_offset", "joint", _zero, (0.0005, 0.1), "heavy", absorbed=True),
+        Cause("joint_zero_offset", "joint", _zero, (0.0002, 0.1), "heavy", absorbed=True),
         Cause("contact", "joint", _contact, (0.2, 80.0), "arm"),
-        Cause("sensor_gain", "sensor", _gain("joint"), (0.01, 0.3), "heavy", absorbed=True),
-        Cause("sensor_crosstalk", "sensor", _crosstalk, (0.001, 0.3)),
-        Cause("sensor_hysteresis", "sensor", _hysteresis, (0.02, 20.0)),
+        Cause("sensor_gain", "sensor", _gain("joint"), (0.0005, 0.3), "heavy", absorbed=True),
+        Cause("sensor_crosstalk", "sensor", _crosstalk, (0.0002, 0.3)),
+        Cause("sensor_hysteresis", "sensor", _hysteresis, (0.004, 20.0)),
         Cause("sensor_saturation", "sensor", _saturation, (0.05, 0.8), "heavy"),
-        Cause("sensor_offset_drift", "sensor", _drift, (0.02, 20.0)),
-        Cause("sensor_ripple", "sensor", _sensor_ripple, (0.02, 20.0)),
+        Cause("sensor_offset_drift", "sensor", _drift, (0.002, 20.0)),
+        Cause("sensor_ripple", "sensor", _sensor_ripple, (0.002, 20.0)),
         Cause("motor_torque_delay", "timing", _late("motor"), (0.0005, 0.08), "arm"),
         Cause("joint_torque_delay", "timing", _late("joint"), (0.0005, 0.08), "arm"),
         Cause("lost_samples", "timing", _lost, (2e-4, 0.5), "arm"),

@@ -110,21 +110,21 @@ def _hum(s: Setup, v: Variant, p: float) -> Outcome:
 OUTSIDE = {
     cause.name: cause
     for cause in (
-        Cause("soft_stand", "joint", _stand, (1e-6, 4e-4), "arm", listed=False),
+        Cause("soft_stand", "joint", _stand, (3e-07, 4e-4), "arm", listed=False),
         Cause("brake_disc", "motor", _brake_disc, (0.1, 60.0), listed=False),
-        Cause("aliased_hum", "sensor", _hum, (0.02, 30.0), listed=False),
+        Cause("aliased_hum", "sensor", _hum, (0.004, 30.0), listed=False),
         Cause(
             "shaken_sensor", "sensor", _channel("joint", "inertia", "Nm s2/rad"), (0.002, 5.0), listed=False
         ),
         Cause("sloshing_payload", "joint", _slosh, (0.01, 0.9), "arm", listed=False),
         Cause("loose_bolt", "joint", _loose_bolt, (1e-4, 0.06), "arm", listed=False),
-        Cause("long_hose", "joint", _long_hose, (0.5, 500.0), "arm", listed=False),
+        Cause("long_hose", "joint", _long_hose, (0.1, 500.0), "arm", listed=False),
         Cause("neighbour_friction", "motor", _parameter("neighbour", "Nm s/rad"), (0.05, 40.0), listed=False),
         Cause(
             "gravity_friction",
             "motor",
             _parameter("gravity_friction", "1"),
-            (0.01, 1.5),
+            (0.001, 1.5),
             "heavy",
             listed=False,
         ),

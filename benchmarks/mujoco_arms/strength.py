@@ -3,7 +3,8 @@
 rho is the held-out error of the base model over that of the healthy twin, the largest of the joints' ratios
 on either side. The base model has rigid bodies, a payload, drive inertia, viscous and Coulomb friction and an
 offset on either side of the gear, by weighted least squares; what is slow or near a reversal is left out. What
-these columns take up leaves no such error: there the model of the healthy twin is held against the same sessions.
+these columns take up leaves no such error. There the model of the reference days, the announced payload known, is
+held against the sessions and against those of the twin, so that the days' own differences count as the twin's.
 """
 
 from __future__ import annotations
@@ -99,6 +100,28 @@ class Yardstick:
             used=used[places],
         )
 
+    def known(self, rows: Rows, payload: Floats) -> Rows:
+        """The equations with the payload's ten parameters known, about the flange."""
+        place = slice(self._bodies, self._bodies + 10)
+
+        def without(matrix: Floats) -> Floats:
+            matrix = matrix.copy()
+            matrix[:, :, place] = 0.0
+            return matrix
+
+        return Rows(
+            motor=without(rows.motor),
+            joint=without(rows.joint),
+            motor_torque=rows.motor_torque - rows.motor[:, :, place] @ payload,
+            joint_torque=rows.joint_torque - rows.joint[:, :, place] @ payload,
+            used=rows.used,
+        )
+
+    @property
+    def _bodies(self) -> int:
+        """Number of the arm's own inertial columns."""
+        return 10 * int(_pinocchio(self.urdf)[0].nv)
+
     def model(self, train: Sequence[Rows]) -> Floats:
         """Parameters of the base model, by least squares weighted with each row's own error."""
         n = train[0].used.shape[1]
@@ -150,6 +173,12 @@ def _near_reversal(times: Floats, speed: Floats) -> NDArray[np.bool_]:
     return np.asarray(np.minimum(np.abs(times - later), np.abs(times - before)) < _REVERSAL_S)
 
 
+def ten(mass: float, centre: Sequence[float], gyration: Sequence[float]) -> Floats:
+    """Ten parameters of a payload in the frame that its centre is given in, in pinocchio's order."""
+    turned = mass * np.diag(np.square(gyration))
+    return np.asarray(pinocchio.Inertia(mass, np.array(centre), turned).toDynamicParameters())
+
+
 def inflation(error: Floats, twin: Floats) -> float:
     """rho of errors (2 n,)."""
     good = twin > 0.0
@@ -157,7 +186,7 @@ def inflation(error: Floats, twin: Floats) -> float:
 
 
 def found_strength(
-    rho: Callable[[float], float], target: float, low: float, high: float, tries: int = 6
+    rho: Callable[[float], float], target: float, low: float, high: float, tries: int = 8
 ) -> tuple[float, float]:
     """Strength within [low, high] whose rho is the target, and its rho; the nearest found.
 

@@ -15,11 +15,10 @@ _SIGMAS = 3.0
 
 
 def rho_of(result: Result) -> float:
-    """How visible the case is: against the healthy model where base parameters take the fault up."""
-    hidden = result["truth"]["hidden"]
-    if len(hidden) == 1 and hidden[0]["absorbed"]:
-        return float(result["truth"]["rho_reference"])
-    return float(result["truth"]["rho"])
+    """How visible the case is: against the reference days too where base parameters take a fault up."""
+    truth = result["truth"]
+    absorbed = any(one["absorbed"] for one in truth["hidden"])
+    return float(max(truth["rho"], truth["rho_reference"]) if absorbed else truth["rho"])
 
 
 def table(results: Sequence[Result]) -> str:

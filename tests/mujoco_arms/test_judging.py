@@ -25,7 +25,15 @@ def truth(cause: str = "stribeck", joint: int = 2, listed: bool = True) -> dict[
     }
     traits = {"gear_ripple": {"3": {"amplitude": 0.1}}}
     kind = "single" if listed else "outside"
-    return {"kind": kind, "seed": 1, "rho": 1.2, "hidden": [hidden], "traits": traits, "affected": [joint]}
+    return {
+        "kind": kind,
+        "seed": 1,
+        "rho": 1.2,
+        "rho_reference": 1.0,
+        "hidden": [hidden],
+        "traits": traits,
+        "affected": [joint],
+    }
 
 
 def said(*findings: dict[str, Any], **more: Any) -> dict[str, Any]:
