@@ -49,6 +49,7 @@ def test_days_differ_and_the_arm_does_not() -> None:
         assert (np.abs(np.log(change)) < 2.0 * most + 0.03).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [1.15, 2.0])
 def test_strength_makes_the_wanted_visibility(target: float) -> None:
     case = shortened(draw(2, "single", "stribeck", "lwr4plus"), 15.0)
@@ -63,6 +64,7 @@ def test_search_stays_within_the_strengths() -> None:
     assert rho < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _OF_ONE_TORQUE)
 def test_a_fault_changes_the_torque_of_its_joint_most(name: str, lwr, bench) -> None:
     cause = ALL[name]
