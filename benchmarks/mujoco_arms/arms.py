@@ -57,7 +57,7 @@ class Kind:
 class Individual:
     """One arm of a kind. What a healthy drive of the kind has besides Coulomb and viscous friction.
 
-    encoder : side of the joints that the positions are of. rate : of them [Hz]
+    encoder : side of the joints that the positions are of. rate : of them [Hz]. resolution : of them [rad]
     motor_divider : of the motor torques' rate. has_sensors : whether joint torques are measured
     stribeck : rise over Coulomb at standstill. stribeck_speed [rad/s]. curve : share of the viscous friction
     lost at full speed. load : friction per transmitted torque. coulomb_kelvin, viscous_kelvin : change per
@@ -87,6 +87,7 @@ class Individual:
     bearing: Floats
     hose: Floats
     has_sensors: bool = True
+    resolution: float = 2.0 * np.pi / 2**19
 
     def traits(self) -> dict[str, dict[int, dict[str, float]]]:
         """What is true of the healthy arm, by cause, joint (from 1) and, where it has one, parameter."""

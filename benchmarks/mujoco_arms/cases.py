@@ -27,6 +27,8 @@ _MIX = ("single", "single", "healthy", "single", "outside", "single", "pair", "s
 _RHO = (1.03, 3.0)
 _AFFECTED = 1.03
 _WITHOUT_SENSORS = 0.35
+_BITS = (18.0, 24.0)
+"""Of the encoders, a turn: 24 to 0.4 microradians a step."""
 ALL = {**CAUSES, **OUTSIDE}
 
 
@@ -77,7 +79,13 @@ def draw(seed: int, kind: str, cause: str | None = None, arm: str | None = None)
     encoder = next((c.encoder for c in chosen if c.encoder), None)
     blind = body.kind.name == "UR5" and random.random() < _WITHOUT_SENSORS
     sensed = any(c.side == "sensor" or c.name == "joint_torque_delay" for c in chosen)
-    body = replace(body, encoder=encoder or body.encoder, has_sensors=sensed or not blind)
+    bits = np.random.default_rng([seed, KINDS_OF_CASES.index(kind), 1]).uniform(*_BITS)
+    body = replace(
+        body,
+        encoder=encoder or body.encoder,
+        has_sensors=sensed or not blind,
+        resolution=float(2.0 * np.pi / 2.0**bits),
+    )
     loads = payload(body.kind, random), payload(body.kind, random)
     base = seed * 10 + KINDS_OF_CASES.index(kind)
     reference = tuple(tuple(day(body, (base, number), loads)) for number in (1, 2))
@@ -268,6 +276,7 @@ def _truth(
         "seed": case.seed,
         "arm": case.arm.kind.name,
         "encoder": case.arm.encoder,
+        "resolution": case.arm.resolution,
         "rate": case.arm.rate,
         "motor_rate": case.arm.rate / case.arm.motor_divider,
         "gear_ratio": [float(ratio) for ratio in case.arm.kind.gear],

@@ -18,6 +18,8 @@ _HERTZ = (6.0, 11.0)
 """Bandwidth of the position controllers; the tuning of a day is drawn in it."""
 
 _OTHER_PAYLOAD = 0.25
+_NOISE = 0.35
+"""Of an encoder, in its steps."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ def day(arm: Individual, seed: tuple[int, ...], payloads: tuple[Payload, Payload
     hoses = tuple((j, float(arm.hose[j]), 0.0) for j in range(n))
     sensing = Sensing(
         Encoder(
-            quantum=2.0 * np.pi / 2**19,
-            noise=4e-6,
+            quantum=arm.resolution,
+            noise=_NOISE * arm.resolution,
             zero=np.zeros(n),
             once=np.zeros(n),
             twice=np.zeros(n),
