@@ -95,10 +95,11 @@ class Individual:
         elastic = [j for j in joints if self.kind.stiffness[j] > 0.0]
         amplitude = self.stribeck * self.coulomb
         ripple = self.ripple.max(axis=0)
+        half = self.asymmetry * self.coulomb
         return {
             "stribeck": {j + 1: {"amplitude": float(amplitude[j])} for j in joints},
             "viscous_nonlinear": {j + 1: {} for j in joints},
-            "friction_asymmetry": {j + 1: {} for j in joints},
+            "friction_asymmetry": {j + 1: {"coulomb": float(half[j])} for j in joints},
             "friction_load": {j + 1: {"factor": float(self.load[j])} for j in joints},
             "friction_temperature": {j + 1: {} for j in joints},
             "presliding_hysteresis": {j + 1: {} for j in joints},

@@ -105,7 +105,8 @@ def _viscous(s: Setup, v: Variant, p: float) -> Outcome:
 
 def _asymmetry(s: Setup, v: Variant, p: float) -> Outcome:
     value = _value(s, "asymmetry", v.joint) + v.sign * p
-    return _drive(s, v.joint, asymmetry=value), {"asymmetry": (v.sign * p, "1")}
+    coulomb = v.sign * p * _value(s, "coulomb", v.joint)
+    return _drive(s, v.joint, asymmetry=value), {"asymmetry": (v.sign * p, "1"), "coulomb": (coulomb, "Nm")}
 
 
 def _load(s: Setup, v: Variant, p: float) -> Outcome:

@@ -57,7 +57,7 @@ def habitual(finding: Finding, traits: Mapping[str, Any]) -> bool:
     for name, value in having[joints[0]].items():
         stated = finding.get("parameters", {}).get(name)
         if stated is not None and abs(float(stated["value"]) - value) > max(
-            value, _SIGMAS * float(stated.get("std") or 0.0)
+            abs(value), _SIGMAS * float(stated.get("std") or 0.0)
         ):
             return False
     return True
