@@ -1,0 +1,1 @@
+"""Sessions of arms in MuJoCo with a known fault, for a diagnosis that never met them."""

@@ -1,0 +1,1 @@
+"""The second generator of hidden cases, in `benchmarks/mujoco_arms`."""
