@@ -38,6 +38,8 @@ _ALL_BUT = 0.05
 _ENCOMPASSED = 0.8
 # Least fall of the error on held-out rows by a sure claim, as a share: less is felt by nobody.
 _FELT = 0.05
+# The same for a brief event, in the rows of its session.
+_FELT_EVENT = 0.02
 # Least confidence of a finding.
 _HARDLY = 0.1
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
@@ -68,8 +70,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
     members = [
         _Member((claim.trial.rows,), claim.gain, finding=finding)
         for (claim, _), finding in zip(kept, findings, strict=True)
-        # A change between sessions has no value in a further one.
-        if finding.mode != "between"
+        # A change between sessions has no value in a further one, and an event cannot be predicted.
+        if finding.mode != "between" and (nominal.held_out or not claim.trial.candidate.effect.event)
     ]
     members += [
         _Member(tuple(dict.fromkeys([(r.side, r.joint - 1)], t.column) for t in r.terms), r.gain, remainder=r)
@@ -234,19 +236,36 @@ def _confirmed_findings(task: Task, state: State) -> list[tuple[Claim, Finding]]
         finding = _finding(claim, bench, without, after, seed)
         weights = {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
         most = _confirmed(claim, finding, bench, fall(without, after, weights, seed))
-        if most > 0.0 and not _felt(claim, finding, without, after, seed):
+        if most > 0.0 and not _felt(claim, finding, bench, without, after, seed):
             most = min(most, _OPEN)
         if most > 0.0:
             kept.append((claim, _at_most(most, finding)))
     return kept
 
 
-def _felt(claim: Claim, finding: Finding, without: HeldOut, after: HeldOut, seed: int) -> bool:
+def _power(claim: Claim, bench: DiagnosisBench) -> float:
+    """Power of a claim's torque over the noise, in the rows of the side and joint with most of it."""
+    found = [0.0]
+    for (side, joint), columns in claim.trial.rows.items():
+        rows = bench.nominal.rows[side]
+        keep = rows.valid[:, joint] & ~rows.test
+        torque = columns[keep] @ claim.score.coefficients
+        active = np.isin(rows.session[keep], rows.session[keep][torque != 0.0])
+        if active.any():
+            found.append(float(np.mean(torque[active] ** 2)) / float(bench.evidence.sigma[side][joint]) ** 2)
+    return max(found)
+
+
+def _felt(
+    claim: Claim, finding: Finding, bench: DiagnosisBench, without: HeldOut, after: HeldOut, seed: int
+) -> bool:
     """Whether held-out rows show a claim plainly: a fall of the error by `_FELT` in the rows of its joints, in two
-    blocks at least, with no other row worse beyond chance. Of changes between sessions, brief events and causes seen
-    in the samples they need not."""
+    blocks at least, with no other row worse beyond chance. Of changes between sessions and causes seen in the samples
+    they need not. A brief event has to be felt in the rows of its own session."""
     effect = claim.trial.candidate.effect
-    if finding.mode == "between" or effect.repeats or effect.seen_in_samples(claim.trial.shape):
+    if effect.repeats:
+        return bool(_power(claim, bench) > (1.0 - _FELT_EVENT) ** -2 - 1.0)
+    if finding.mode == "between" or effect.seen_in_samples(claim.trial.shape):
         return True
     shown = finding.evidence
     if shown.test_rms_after > (1.0 - _FELT) * shown.test_rms_before:

@@ -12,6 +12,8 @@ from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 _DRAWS = 1000
 # A rise of an error by less is felt by nobody, however sure: all rows share base parameters.
 _FELT_WORSE = 0.01
+# A rise beyond this counts, though it came from a single block.
+_MUCH_WORSE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +91,10 @@ def spread_out(before: HeldOut, after: HeldOut, keys: Sequence[Key]) -> bool:
 
 
 def worse_rows(before: HeldOut, after: HeldOut, seed: int, *, any_of_them: bool = False) -> list[Key]:
-    """Sides and joints with a larger error after than before, by a percent and beyond the 95 % interval;
-    `any_of_them` : beyond chance for the worst of all."""
+    """Sides and joints with a larger error after than before: by 5 %, or by 1 % and beyond the 95 % interval.
+
+    any_of_them : beyond chance for the worst of all.
+    """
     keys = [
         (side, joint)
         for side, values in before.residual.items()
@@ -99,7 +103,11 @@ def worse_rows(before: HeldOut, after: HeldOut, seed: int, *, any_of_them: bool 
     ]
     tail = 0.025 / max(len(keys), 1) if any_of_them else 0.025
     found = {key: interval(before, after, [key], seed, tail=tail) for key in keys}
-    return [key for key, (a, b, _, high) in found.items() if high < 0.0 and b > (1.0 + _FELT_WORSE) * a]
+    return [
+        key
+        for key, (a, b, _, high) in found.items()
+        if b > (1.0 + (_FELT_WORSE if high < 0.0 else _MUCH_WORSE)) * a
+    ]
 
 
 def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:

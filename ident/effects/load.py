@@ -226,6 +226,10 @@ def leaning(motion: ArmMotion) -> Floats:
 _COURSE = 0.1
 
 
+# Push beyond what the torque sensors of any such arm can read.
+_STRONGEST_N = 1000.0
+
+
 class Contact(Effect):
     """A force [N] on a link, in axes of the base, half a sine of length `duration` around `time`."""
 
@@ -235,7 +239,16 @@ class Contact(Effect):
     physics = "something or somebody outside pushes the arm for a while"
     source = "Haddadin, De Luca and Albu-Schaeffer, IEEE Trans. Robotics 33 (2017)"
     parameters = (
-        *(Parameter(f"force_{axis}", "N", f"largest force along {axis} of the base") for axis in "xyz"),
+        *(
+            Parameter(
+                f"force_{axis}",
+                "N",
+                f"largest force along {axis} of the base",
+                low=-_STRONGEST_N,
+                high=_STRONGEST_N,
+            )
+            for axis in "xyz"
+        ),
         Parameter("time", "s", "middle of the contact, from the start of the session", shape=True),
         Parameter("duration", "s", "of the contact", shape=True, low=0.02),
         Parameter("session", "1", "number of the session", shape=True, fixed=True),

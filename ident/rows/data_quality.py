@@ -17,6 +17,8 @@ Flags = NDArray[np.bool_]
 _LEAST_AMISS, _SHARE = 3, 0.0005
 # Least third difference of a jolt over the usual one, itself at least this many steps of the encoder.
 _JOLT, _STEPS = 16.0, 4.0
+# Least age of a stale sample in sample times, and largest share of its displacement across the motion.
+_AGE, _ACROSS = 0.15, 0.5
 # Distance in samples of a jolt from a repeated sample.
 _NEAR = 4
 # Count of one value beyond chance in a noisy channel, also over the counts of the next values; a coarse channel
@@ -162,7 +164,25 @@ def _jolts(position: Floats) -> Flags:
     step = np.min(np.where(steps > 0.0, steps, np.inf), axis=0)
     usual = np.maximum(np.median(third, axis=0), _STEPS * step)
     found[2:-1] = np.mean(third > _JOLT * usual, axis=1) > 0.5
-    return found
+    return found & _behind(q)
+
+
+def _behind(q: Floats) -> Flags:
+    """Samples (N,) beside one with all joints behind their path by one share of their progress.
+
+    A sample is displaced from the cubic through its four neighbours. One of an older moment lies back along the motion,
+    by its age in all joints alike; a jerk of the motion itself does not.
+    """
+    found = np.zeros(len(q), dtype=bool)
+    if len(q) < 5:
+        return found
+    away = q[2:-2] - (4.0 * (q[1:-3] + q[3:-1]) - q[:-4] - q[4:]) / 6.0
+    progress = (q[4:] - q[:-4]) / 4.0
+    power = np.maximum(np.einsum("ij,ij->i", progress, progress), 1e-300)
+    age = -np.einsum("ij,ij->i", away, progress) / power
+    across = np.linalg.norm(away + age[:, None] * progress, axis=1)
+    found[2:-2] = (age > _AGE) & (across < _ACROSS * np.linalg.norm(away, axis=1))
+    return np.asarray(binary_dilation(found, iterations=1))
 
 
 def _channel(session: str, channel: str, columns: JointColumns) -> SampleLoss:
