@@ -462,7 +462,11 @@ class _State:
             sure, alike = min(sure, _EITHER), (*alike, (twin, _gain(again)))
         # Of many times tried, one always fits to some degree.
         lasting = (t for t in close if not t.candidate.effect.event)
-        outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
+        # What a rival gains on a healthy arm, too, explains nothing here.
+        outdone = any(
+            _gain(t) - self.null.get(t.candidate.key, 0.0) > _gain(again) and not self.carried(t)
+            for t in lasting
+        )
         return Claim(again, again.score, alike, sure, outdone, self.weak)
 
     def same_torque(self, candidate: Candidate) -> Candidate | None:
