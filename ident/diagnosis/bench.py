@@ -68,6 +68,7 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             far=reference.far,
             far_share=reference.far_share,
             couplings=data.couplings,
+            healthy=reference.model.effects,
         )
     return NominalArm(chain, compliance, ratio, couplings=data.couplings)
 

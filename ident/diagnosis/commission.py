@@ -7,7 +7,8 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +16,17 @@ from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
+from ident.diagnosis.candidates import Trial
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.nominal import Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import DELAY_STD_S, Reference, habit
-from ident.diagnosis.selection import gains, select
+from ident.diagnosis.selection import Claim, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
+from ident.effects import ELASTICITY, PRESLIDING
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -227,6 +230,7 @@ def commission(
             motor_delay_s=known.motor_delay_s + late["motor"],
             joint_delay_s=known.joint_delay_s + late["joint"],
         )
+    known = replace(known, healthy=character(known, recorded, settings))
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     null: dict[tuple[str, int], float] = {}
     for number, recordings in enumerate(recorded):
@@ -240,6 +244,60 @@ def commission(
     found = _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals)}
     return replace(found, model=replace(found.model, provenance=provenance))
+
+
+def character(
+    arm: NominalArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
+) -> tuple[dict[str, Any], ...]:
+    """Entries of the lasting effects that most of the healthy sets show in the same joint: ripple, Stribeck friction,
+    warmth, habits of the sensors. Their shape is that of the set with the most evidence, their size the mean of all;
+    an effect of another size in each set is no character. Stiffness and presliding are the nominal arm's own."""
+    benches, votes = [], dict[tuple[str, int], list[Claim]]()
+    for recordings in recorded:
+        bench = prepare_bench(arm, recordings, settings, None, None, fit_compliance=False)
+        found = select(bench.dictionary, bench.evidence, settings, None)
+        benches.append((bench, found.nuisance_rows))
+        for claim in found.claims:
+            effect, shape = claim.trial.candidate.effect, claim.trial.shape
+            passing = effect.event or effect.channel or effect.counted or effect.mode(shape) == "between"
+            if not passing and effect not in (ELASTICITY, PRESLIDING):
+                votes.setdefault(claim.trial.candidate.key, []).append(claim)
+    chosen = [max(v, key=lambda c: c.gain).trial for v in votes.values() if 2 * len(v) > len(recorded)]
+    sizes = []
+    for bench, nuisance in benches:
+        columns = [bench.dictionary.rows(t.candidate, t.shape) for t in chosen]
+        bench.evidence.replace([*columns, *nuisance])
+        values = bench.evidence.full.values[bench.evidence.base_count :]
+        widths = np.cumsum([0, *(next(iter(rows.values())).shape[1] for rows in columns)])
+        sizes.append([values[a:b] for a, b in pairwise(widths)])
+    entries = []
+    for k, trial in enumerate(chosen):
+        each = np.array([size[k] for size in sizes])
+        mean, std = each.mean(axis=0), each.std(axis=0, ddof=1) if len(each) > 1 else np.zeros(each.shape[1])
+        if np.linalg.norm(mean) > _CLEAR * np.linalg.norm(std):
+            entries.append(_entry(trial, mean, std))
+            log.info("character: %s", trial.candidate.key)
+    return tuple(entries)
+
+
+def _entry(trial: Trial, coefficients: Floats, std: Floats) -> dict[str, Any]:
+    """A trial as an entry of a model's effects."""
+    effect, shape = trial.candidate.effect, trial.shape
+    linear = {p.name: (c, s) for p, c, s in zip(effect.linear, coefficients, std, strict=False)}
+    units = {p.name: p.unit for p in effect.parameters}
+    values = linear | {name: (value, 0.0) for name, value in shape.items()}
+    form = {} if shape.form is None else {"form": str(shape.form.value)}
+    return {
+        "cause": effect.cause,
+        "side": effect.side,
+        "joints": list(trial.candidate.joints),
+        **form,
+        "parameters": {
+            name: {"value": float(value), "std": float(s), "unit": units[name]}
+            for name, (value, s) in values.items()
+            if name not in effect.hidden
+        },
+    }
 
 
 def _tuned(
@@ -333,6 +391,7 @@ def _reference(
         _sound(covariance),
         base,
         {"sessions": [s.path.name for s in sessions]},
+        arm.healthy,
     )
     noise = {side: np.mean([day.sigma[side] for day in days], axis=0) for side in days[0].sigma}
     return Reference(

@@ -98,7 +98,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
     simulation = extended_simulation = None
     if task.simulate is not None:
         simulation = task.simulate(task.model or base_model, replayed)
-        extended_simulation = task.simulate(extended, replayed) if extended.effects else simulation
+        changed = extended.effects != base_model.effects
+        extended_simulation = task.simulate(extended, replayed) if changed else simulation
     is_character = {id(f): task.reference is None and EFFECTS[f.cause].character for f in findings}
     return Diagnosis(
         train=tuple(r.name for r in nominal.recordings if not r.test),
@@ -107,7 +108,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings=tuple(f for f in findings if not is_character[id(f)]),
         character=tuple(f for f in findings if is_character[id(f)]),
         nameless=nameless,
-        extension=tuple(_title(entry) for entry in extended.effects),
+        extension=tuple(_title(entry) for entry in extended.effects[len(base_model.effects) :]),
         unexplained=tuple(
             Unexplained(
                 side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])
@@ -520,9 +521,10 @@ def _models(
         baseline.covariance,
         replace(nominal.base, structure=structure),
         provenance,
+        nominal.arm.healthy,
     )
     values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]
-    extended = replace(base, values=values, covariance=covariance, effects=effects)
+    extended = replace(base, values=values, covariance=covariance, effects=(*base.effects, *effects))
     assert extended.std is not None
     shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
     order = np.argsort(-np.abs(shift))[:10]

@@ -12,9 +12,9 @@ follows from the predicted torque, so no sensor's noise or error leaks from one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
+from ident.effects import effects_torque
 from ident.effects.motion import ArmMotion, dahl
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
@@ -61,7 +62,8 @@ class NominalArm:
     presliding : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
     unknown.
     far, far_share : (n,) longer distance [rad] for a share of that friction, and the share.
-    couplings : pairs of joints with coupled drives.
+    couplings : pairs of joints with coupled drives. healthy : entries of the healthy arm's own effects
+    (`ident.effects`); their torque is part of the nominal one, so that a cause is a change against this arm.
     """
 
     chain: Chain
@@ -75,6 +77,7 @@ class NominalArm:
     far: Floats | None = None
     far_share: Floats | None = None
     couplings: tuple[Coupling, ...] = ()
+    healthy: tuple[Mapping[str, Any], ...] = ()
 
     def slip(self, speed: Floats, dt: float) -> Floats:
         """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum of
@@ -334,6 +337,11 @@ class Nominal:
 
     def _make_rows(self) -> None:
         self.rows = {side: self._side_rows(side) for side in self.sides}
+        for side in self.sides if self.arm.healthy else ():
+            of: Side = "motor" if side == "motor" else "joint"
+            torques = [effects_torque(self.arm.healthy, m, side=of, measured=True) for m in self.motions]
+            rows = self.rows[side]
+            self.rows[side] = replace(rows, target=rows.target - self.reduce(side, torques))
 
     def _side_rows(self, side: str) -> SideRows:
         parts = []

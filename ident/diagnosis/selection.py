@@ -274,6 +274,11 @@ class _State:
 
         return [t for t in found if needed(t)]
 
+    def rivals(self) -> list[Trial]:
+        """The simplest candidates by their gain, best first. A gain as on the healthy arm explains nothing."""
+        found = [t for t in self.simplest() if _gain(t) > self.null.get(t.candidate.key, 0.0)]
+        return sorted(found, key=_gain, reverse=True)
+
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
         """The foremost of the trials, without remainders of the accepted ones; None if there is none."""
         refined: dict[tuple[str, int], Trial] = {}
@@ -382,8 +387,7 @@ class _State:
                 rest = self.beside(accepted, k)
                 taken = {t.candidate.key for t in rest if not t.candidate.effect.repeats}
                 again = self.dictionary.trial(here.candidate, here.shape, self.choices(here))
-                rivals = [t for t in self.simplest() if t.candidate.key not in taken]
-                rivals.sort(key=_gain, reverse=True)
+                rivals = [t for t in self.rivals() if t.candidate.key not in taken]
                 contest = [t for t in rivals[:3] if again is None or _gain(t) > 0.9 * _gain(again)]
                 contest = [self.dictionary.refine(t, self.choices(t)) for t in contest]
                 if again is not None:
@@ -434,11 +438,7 @@ class _State:
         rest = self.beside(accepted, k)
         taken = {t.candidate.key for t in rest if not t.candidate.effect.repeats}
         again = self.dictionary.trial(here.candidate, here.shape, self.choices(here)) or here
-        rivals = sorted(
-            (t for t in self.simplest() if t.candidate.key not in {*taken, here.candidate.key}),
-            key=_gain,
-            reverse=True,
-        )
+        rivals = [t for t in self.rivals() if t.candidate.key not in {*taken, here.candidate.key}]
         # A rival in other rows, or in rows with little power of this one, explains something else.
         mine = self.powers(again, again.score)
         least = _SAME_ROWS * sum(mine.values())
@@ -462,11 +462,7 @@ class _State:
             sure, alike = min(sure, _EITHER), (*alike, (twin, _gain(again)))
         # Of many times tried, one always fits to some degree.
         lasting = (t for t in close if not t.candidate.effect.event)
-        # What a rival gains on a healthy arm, too, explains nothing here.
-        outdone = any(
-            _gain(t) - self.null.get(t.candidate.key, 0.0) > _gain(again) and not self.carried(t)
-            for t in lasting
-        )
+        outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
         return Claim(again, again.score, alike, sure, outdone, self.weak)
 
     def same_torque(self, candidate: Candidate) -> Candidate | None:

@@ -89,12 +89,17 @@ def judge(
         false=tuple(_label(finding) for finding in false),
         sure_wrong=tuple(_label(finding) for finding in false if _sure(finding)),
         findings=tuple(_label(finding) for finding in findings),
-        unexplained=len(diagnosis.get("unexplained", ())),
+        unexplained=len(_rests(diagnosis)),
         flagged=bool(outside) and _flagged(diagnosis, outside),
         depends=_depends(diagnosis, outside),
         deviations=_deviations(findings, hidden, fits),
         efficiency=float("nan") if twin is None else _efficiency(diagnosis, twin),
     )
+
+
+def _rests(diagnosis: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """What was told without a name: fitted terms, and remainders."""
+    return [*diagnosis.get("nameless", ()), *diagnosis.get("unexplained", ())]
 
 
 def _sure(finding: Mapping[str, Any]) -> bool:
@@ -133,7 +138,7 @@ def _fits(finding: Mapping[str, Any], cause: Hidden) -> bool:
 def _flagged(diagnosis: Mapping[str, Any], outside: Sequence[Hidden]) -> bool:
     if any(_sure(finding) for finding in diagnosis["findings"]):
         return False
-    stated = {int(entry["joint"]) for entry in diagnosis.get("unexplained", ())}
+    stated = {int(entry["joint"]) for entry in _rests(diagnosis)}
     return any(stated & set(cause.joints) for cause in outside)
 
 
@@ -141,7 +146,7 @@ def _depends(diagnosis: Mapping[str, Any], outside: Sequence[Hidden]) -> float:
     wanted = {name for cause in outside for name in cause.depends_on}
     if not wanted:
         return float("nan")
-    stated = {str(name) for entry in diagnosis.get("unexplained", ()) for name in entry["depends_on"]}
+    stated = {str(name) for entry in _rests(diagnosis) for name in entry["depends_on"]}
     return len(wanted & stated) / len(wanted)
 
 
