@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -97,6 +98,33 @@ def test_a_tilt_is_found_where_it_helps():
     upright = choose([log], turned, MODEL_1, tilt=False)
     assert upright.choice is not None
     assert not any(candidate.tilt for candidate in upright.choice.candidates)
+
+
+def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
+    log = session(sensors=SENSORS, motor=False, periods=3)
+    effort = log.joint.effort.copy()
+    effort[:, 1] *= 1.08
+    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), MODEL_1)
+    assert found.choice is not None
+    (joint,) = found.choice.gains
+    assert joint == chain().joint_names[1]
+    error, std = found.choice.gains[joint]
+    assert error == pytest.approx(0.08, abs=3.0 * std)
+    assert std < 0.02
+    (effect,) = found.model.effects
+    assert (effect["cause"], effect["joints"]) == ("sensor_gain", [2])
+    assert found.model.torque(log.joint.position, *np.zeros((2, *effort.shape)), measured=True)[
+        :, 1
+    ] == pytest.approx(
+        (1.0 + error) * found.model.torque(log.joint.position, *np.zeros((2, *effort.shape)))[:, 1]
+    )
+    assert "joint torque sensors read too much by" in found.summary()
+
+
+def test_healthy_sensors_get_no_gain():
+    assert chosen().choice is not None
+    assert not chosen().choice.gains
+    assert not chosen().model.effects
 
 
 def test_a_placeholder_in_the_urdf_loses_and_is_named():
