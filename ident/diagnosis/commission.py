@@ -407,6 +407,7 @@ def _reference(
         arm.far,
         arm.far_share,
         {side: delay_std([day.late[side] for day in days]) for side in _CHANNELS},
+        habits=True,
     )
 
 

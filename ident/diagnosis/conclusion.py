@@ -38,7 +38,7 @@ _ALL_BUT = 0.05
 _ENCOMPASSED = 0.8
 # Least fall of the error on held-out rows by a sure claim, as a share: less is felt by nobody.
 _FELT = 0.05
-# The same for a brief event, in the rows of its session.
+# The same for a brief event in the rows of its session, and for a remainder without a name.
 _FELT_EVENT = 0.02
 # Least confidence of a finding.
 _HARDLY = 0.1
@@ -93,7 +93,11 @@ def conclude(task: Task, state: State) -> Diagnosis:
         task, bench, baseline, (*entries, *(e for term in nameless for e in term.entries))
     )
     fitted = {(term.side, term.joint) for term in nameless}
-    left = [(r.side, r.joint, r.depends_on) for r in remainders if (r.side, r.joint) not in fitted]
+    left = [
+        (r.side, r.joint, r.depends_on)
+        for r in remainders
+        if (r.side, r.joint) not in fitted and r.inflation > (1.0 - _FELT_EVENT) ** -2 - 1.0
+    ]
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
     if task.simulate is not None:
@@ -147,11 +151,11 @@ class _Member:
 def _extension(
     bench: DiagnosisBench, baseline: Baseline, members: list[_Member], nuisance: Sequence[Rows], seed: int
 ) -> tuple[list[_Member], HeldOut]:
-    """The members that leave no row worse than the base model beyond chance, and the held-out rows with them.
+    """The members of the extension, and the held-out rows with them.
 
-    Of those acting on a worse row the one of least gain goes first, remainders before claims; then the rest is
-    measured again. A remainder has to lower the error of its own row beyond chance, too. The columns of the evidence
-    are those of the result.
+    A member acting on a row worse than the base model beyond chance goes, if the power of the error, over the base
+    model's in each row, is less without it on average. A remainder has to lower the error of its own row beyond chance.
+    The columns of the evidence are those of the result.
     """
 
     def with_members(chosen: Sequence[_Member]) -> HeldOut:
@@ -169,8 +173,19 @@ def _extension(
         if not worse or not members:
             return members, with_members(members)
         acting = [m for m in members if any(worse & set(rows) for rows in m.rows)] or members
-        out = min(acting, key=lambda m: (m.finding is not None, m.gain))
-        members = [m for m in members if m is not out]
+        left = [[m for m in members if m is not out] for out in acting]
+        errors = [_power_left(baseline.held, with_members(rest)) for rest in left]
+        best = int(np.argmin(errors))
+        if errors[best] > _power_left(baseline.held, after):
+            return members, with_members(members)
+        members = left[best]
+
+
+def _power_left(before: HeldOut, after: HeldOut) -> float:
+    """Power of the error after over that before, mean of all rows of a side and joint."""
+    was, now = before.where(after).rms(), after.where(before).rms()
+    share = np.concatenate([(now[side] / np.maximum(was[side], 1e-12)) ** 2 for side in was])
+    return float(np.nanmean(share))
 
 
 def _nameless(
@@ -272,7 +287,7 @@ def _felt(
     if shown.test_rms_after > (1.0 - _FELT) * shown.test_rms_before:
         return False
     keys = list(claim.trial.rows)
-    return spread_out(without, after, keys) and not worse_rows(without, after, seed, any_of_them=True)
+    return spread_out(without, after, keys) and not worse_rows(without, after, seed)
 
 
 def _confirmed(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float]) -> float:

@@ -90,18 +90,16 @@ def spread_out(before: HeldOut, after: HeldOut, keys: Sequence[Key]) -> bool:
     return bool(fall.sum() > max(float(fall.max()), 0.0))
 
 
-def worse_rows(before: HeldOut, after: HeldOut, seed: int, *, any_of_them: bool = False) -> list[Key]:
-    """Sides and joints with a larger error after than before: by 5 %, or by 1 % and beyond the 95 % interval.
-
-    any_of_them : beyond chance for the worst of all.
-    """
+def worse_rows(before: HeldOut, after: HeldOut, seed: int) -> list[Key]:
+    """Sides and joints with a larger error after than before: by 5 %, or by 1 % and beyond chance for the worst of all
+    rows, once in twenty."""
     keys = [
         (side, joint)
         for side, values in before.residual.items()
         for joint in range(values.shape[1])
         if np.isfinite(values[:, joint]).any()
     ]
-    tail = 0.025 / max(len(keys), 1) if any_of_them else 0.025
+    tail = 0.025 / max(len(keys), 1)
     found = {key: interval(before, after, [key], seed, tail=tail) for key in keys}
     return [
         key

@@ -49,7 +49,8 @@ class Reference:
     noise : of a row [Nm] by side, (n,). null : mean gain of each candidate by (cause, joint from 0).
     sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
     presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal.Arm`.
-    delay_std_s : of the channels' delays from day to day, by side.
+    delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
+    the changes from day to day.
     """
 
     model: DynamicModel
@@ -64,6 +65,7 @@ class Reference:
     far: Floats | None = None
     far_share: Floats | None = None
     delay_std_s: Mapping[str, float] = field(default_factory=dict)
+    habits: bool = False
 
     def __repr__(self) -> str:
         joints = self.model.structure.chain.joint_names
@@ -111,7 +113,10 @@ class Reference:
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
         side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
-        return cls(model, compliance, *delays, noise, null, sets, side, presliding, far, far_share, delay_std)
+        habits = bool(stored.get("habits", False))
+        return cls(
+            model, compliance, *delays, noise, null, sets, side, presliding, far, far_share, delay_std, habits
+        )
 
     def stored(self) -> dict[str, Any]:
         """Content for the provenance of the model."""
@@ -126,6 +131,7 @@ class Reference:
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
                 },
                 "sets": self.sets,
+                "habits": self.habits,
                 "encoder": self.encoder,
                 "reach": _listed(self.presliding),
                 "far": _listed(self.far),
@@ -184,9 +190,8 @@ class Reference:
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
         covariance = own.covariance[np.ix_(there, there)] * wider**2
         values = own.values[there]
-        # A commissioned arm's covariance holds its changes from day to day.
         usual = np.array([_USUAL.get(_symbol(base.names[b]), _ELSE) for b in here])
-        tolerance = np.zeros(len(here)) if self.sets else usual * np.abs(values)
+        tolerance = np.zeros(len(here)) if self.habits else usual * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
         precision = np.zeros((len(base), len(base)))

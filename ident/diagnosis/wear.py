@@ -52,10 +52,14 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
     spread = np.zeros_like(precision)
     spread[np.ix_(known, known)] = np.linalg.inv(precision[np.ix_(known, known)])
     values, covariance = evidence.free()
+    # Motor torques sampled at another phase of the commands show another inertia.
+    other = ("Ia",) if nominal.arm.motor_delay_s != reference.motor_delay_s else ()
     found = []
     moving = np.flatnonzero(nominal.moving)
     for joint in moving.tolist():
-        names = {f"{symbol}{joint + 1}": parameter for symbol, parameter in _PARAMETERS.items()}
+        names = {
+            f"{symbol}{joint + 1}": label for symbol, label in _PARAMETERS.items() if symbol not in other
+        }
         places = [k for k in known.tolist() if nominal.base.names[k] in names and healthy[k] > 0.0]
         if not places:
             continue

@@ -17,7 +17,7 @@ from ident.model import DynamicModel
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:
-    return Reference(model, np.zeros(3), 0.0, 0.0, {}, null, sets)
+    return Reference(model, np.zeros(3), 0.0, 0.0, {}, null, sets, habits=True)
 
 
 @pytest.fixture(scope="module")
