@@ -149,7 +149,9 @@ def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) 
         return {**result, "crash": traceback.format_exc()}
     result["seconds"] = seconds
     result["verdict"] = judge(diagnosis, case.hidden, clean).to_dict()
-    result["diagnosis"] = {key: diagnosis[key] for key in ("findings", "nameless", "unexplained", "extension", "gain")}
+    result["diagnosis"] = {
+        key: diagnosis[key] for key in ("findings", "nameless", "unexplained", "extension", "gain")
+    }
     if plan.discard and case.hidden:
         _discard(store, case)
     return result
