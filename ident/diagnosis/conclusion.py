@@ -38,8 +38,9 @@ _ALL_BUT = 0.05
 _ENCOMPASSED = 0.8
 # Least fall of the error on held-out rows by a sure claim, as a share: less is felt by nobody.
 _FELT = 0.05
-# The same for a brief event in the rows of its session, and for a remainder without a name.
-_FELT_EVENT = 0.02
+# The same for a brief event in the rows of its session, and for a remainder without a name: power over the noise of
+# 2 % of the error.
+_FELT_POWER = 0.98**-2 - 1.0
 # Least confidence of a finding.
 _HARDLY = 0.1
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
@@ -56,11 +57,10 @@ def conclude(task: Task, state: State) -> Diagnosis:
     evidence.replace([*(c.trial.rows for c, _ in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     findings = _doubted(task, state, kept, remainders)
-    pairs = list(zip(kept, findings, strict=True))
     if any(finding.confidence < _HARDLY for finding in findings):
         # A name hardly believed is no finding; what it explained is left to the remainders.
-        kept = [one for one, finding in pairs if finding.confidence >= _HARDLY]
-        findings = [finding for finding in findings if finding.confidence >= _HARDLY]
+        kept = [one for one, f in zip(kept, findings, strict=True) if f.confidence >= _HARDLY]
+        findings = [f for f in findings if f.confidence >= _HARDLY]
         evidence.replace([*(c.trial.rows for c, _ in kept), *nuisance])
         remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     worn = []
@@ -96,7 +96,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     left = [
         (r.side, r.joint, r.depends_on)
         for r in remainders
-        if (r.side, r.joint) not in fitted and r.inflation > (1.0 - _FELT_EVENT) ** -2 - 1.0
+        if (r.side, r.joint) not in fitted and r.inflation > _FELT_POWER
     ]
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
@@ -280,7 +280,7 @@ def _felt(
     they need not. A brief event has to be felt in the rows of its own session."""
     effect = claim.trial.candidate.effect
     if effect.repeats:
-        return bool(_power(claim, bench) > (1.0 - _FELT_EVENT) ** -2 - 1.0)
+        return bool(_power(claim, bench) > _FELT_POWER)
     if finding.mode == "between" or effect.seen_in_samples(claim.trial.shape):
         return True
     shown = finding.evidence
