@@ -216,6 +216,14 @@ def test_a_hole_longer_than_the_longest_bridge_ends_a_stretch(missing: int, part
     assert (len(found), lost) == (parts, missing)
 
 
+def test_the_step_of_a_stretch_is_that_of_its_own_clock():
+    time = 3.0 + np.arange(500) * 0.010001
+    ((part,), lost) = stretches(time, time[:, None], np.zeros(500, dtype=bool), 0.01, 0.02)
+    assert (part.dt, part.end, lost) == (pytest.approx(0.010001, abs=1e-9), pytest.approx(time[-1]), 0)
+    assert not part.resampled
+    np.testing.assert_allclose(part.times, time, atol=1e-9)
+
+
 def test_flagged_samples_are_bridged_like_lost_ones():
     time = np.arange(100) * 0.01
     values = np.sin(3.0 * time)[:, None]
@@ -281,6 +289,15 @@ def test_averaged_periods_have_the_mean_torque_and_the_mean_regressor():
         rows = phase == mean.groups[place].time_index[0]
         np.testing.assert_allclose(column[0], slopes[place][rows].mean(), atol=1e-9)
         assert np.std(column) > 0.0
+
+
+def test_a_problem_knows_the_period_of_each_record():
+    structure = ModelStructure(arm.chain(), 1)
+    made = [prepare(arm.session(motor=False, periods=count, period_s=6.0)) for count in (1, 2)]
+    found = observe([*made, replace(made[1], period_rows=None)], [None] * 3, structure)
+    assert found.periods == (None, 30, None)
+    assert found.record_names == ("unloaded.mcap",) * 3
+    assert found.sample_time_s == pytest.approx(0.2)
 
 
 def test_one_period_is_not_averaged():
