@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +25,7 @@ from ident.diagnosis.selection import Claim, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
-from ident.effects import ELASTICITY, PRESLIDING
+from ident.effects import ELASTICITY, PRESLIDING, entry_of
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -267,9 +266,7 @@ def character(
     for bench, nuisance in benches:
         columns = [bench.dictionary.rows(t.candidate, t.shape) for t in chosen]
         bench.evidence.replace([*columns, *nuisance])
-        values = bench.evidence.full.values[bench.evidence.base_count :]
-        widths = np.cumsum([0, *(next(iter(rows.values())).shape[1] for rows in columns)])
-        sizes.append([values[a:b] for a, b in pairwise(widths)])
+        sizes.append(bench.evidence.coefficients())
     entries = []
     for k, trial in enumerate(chosen):
         each = np.array([size[k] for size in sizes])
@@ -284,20 +281,10 @@ def _entry(trial: Trial, coefficients: Floats, std: Floats) -> dict[str, Any]:
     """A trial as an entry of a model's effects."""
     effect, shape = trial.candidate.effect, trial.shape
     linear = {p.name: (c, s) for p, c, s in zip(effect.linear, coefficients, std, strict=False)}
-    units = {p.name: p.unit for p in effect.parameters}
     values = linear | {name: (value, 0.0) for name, value in shape.items()}
-    form = {} if shape.form is None else {"form": str(shape.form.value)}
-    return {
-        "cause": effect.cause,
-        "side": effect.side,
-        "joints": list(trial.candidate.joints),
-        **form,
-        "parameters": {
-            name: {"value": float(value), "std": float(s), "unit": units[name]}
-            for name, (value, s) in values.items()
-            if name not in effect.hidden
-        },
-    }
+    return entry_of(
+        effect, trial.candidate.joints, values, None if shape.form is None else str(shape.form.value)
+    )
 
 
 def _tuned(

@@ -21,7 +21,7 @@ from ident.diagnosis.result import Diagnosis, Evident, Finding, Nameless, RowSta
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.wear import is_level, wear
-from ident.effects import EFFECTS, LOST_SAMPLES, NAMELESS
+from ident.effects import EFFECTS, LOST_SAMPLES, NAMELESS, entry_of
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.data_quality import SampleLoss, sample_loss
@@ -193,13 +193,8 @@ def _nameless(
 ) -> tuple[Nameless, ...]:
     """The nameless terms of an extension, their functions scaled as in the common fit."""
     evidence, found = bench.evidence, []
-    values = evidence.full.values[evidence.base_count :].copy()
-    place = 0
-    scales = {}
-    for member in members:
-        widths = [next(iter(rows.values())).shape[1] for rows in member.rows]
-        scales[id(member)] = values[place : place + sum(widths)]
-        place += sum(widths)
+    groups = iter(evidence.coefficients())
+    scales = {id(member): np.concatenate([next(groups) for _ in member.rows]) for member in members}
     for member in members:
         remainder = member.remainder
         if remainder is None:
@@ -208,25 +203,25 @@ def _nameless(
         key = (remainder.side, remainder.joint - 1)
         without = held_out(evidence, [*others, *nuisance])
         before, rms, low, high = interval(without, after, [key], seed)
-        cause, side = NAMELESS[remainder.side].cause, remainder.side
         entries = tuple(
-            {
-                "cause": cause,
-                "side": side,
-                "joints": [remainder.joint],
-                "form": term.form,
-                "parameters": {
+            entry_of(
+                NAMELESS[remainder.side],
+                [remainder.joint],
+                {
                     **{
-                        f"value_{k + 1}": {"value": float(c * v), "std": float(abs(c) * s), "unit": "Nm"}
+                        f"value_{k + 1}": (c * v, abs(c) * s)
                         for k, (v, s) in enumerate(zip(term.values, term.std, strict=True))
                     },
-                    "low": {"value": term.low, "std": 0.0, "unit": "SI"},
-                    "high": {"value": term.high, "std": 0.0, "unit": "SI"},
+                    "low": (term.low, 0.0),
+                    "high": (term.high, 0.0),
                 },
-            }
+                term.form,
+            )
             for c, term in zip(scales[id(member)], remainder.terms, strict=True)
         )
-        found.append(Nameless(side, remainder.joint, remainder.depends_on, entries, before, rms, (low, high)))
+        found.append(
+            Nameless(remainder.side, remainder.joint, remainder.depends_on, entries, before, rms, (low, high))
+        )
     evidence.replace([*(rows for m in members for rows in m.rows), *nuisance])
     return tuple(found)
 

@@ -219,6 +219,10 @@ class Evidence:
             yield slice(place, place + _width(rows)), rows
             place += _width(rows)
 
+    def coefficients(self) -> list[Floats]:
+        """Values (k,) of each group of further columns in the full fit."""
+        return [self.full.values[place].copy() for place, _ in self._places()]
+
     def _gram(self) -> None:
         """Products of base and further columns, and the fits with and without each part of the motion."""
         p = self.base_count

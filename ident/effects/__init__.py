@@ -55,6 +55,7 @@ __all__ = [
     "check_entry",
     "described",
     "effects_torque",
+    "entry_of",
     "find_effect",
     "parameter_values",
     "summary_of",
@@ -165,6 +166,27 @@ def check_entry(entry: Mapping[str, Any], joints: int) -> None:
         wanted = "no joint, for it belongs to the whole arm" if effect.whole_arm else "the joints it acts on"
         raise ConfigurationError(f"effect {effect.cause}: `joints` is {numbers}; give {wanted}")
     effect.check(entry["parameters"], entry.get("form"))
+
+
+def entry_of(
+    effect: Effect,
+    joints: Sequence[int],
+    values: Mapping[str, tuple[float, float]],
+    form: str | None = None,
+) -> dict[str, Any]:
+    """An entry of a model's effects. joints : from 1. values : value and standard deviation by parameter."""
+    units = {p.name: p.unit for p in effect.parameters}
+    return {
+        "cause": effect.cause,
+        "side": effect.side,
+        "joints": list(joints),
+        **({} if form is None else {"form": form}),
+        "parameters": {
+            name: {"value": float(value), "std": float(std), "unit": units[name]}
+            for name, (value, std) in values.items()
+            if name not in effect.hidden
+        },
+    }
 
 
 def parameter_values(entry: Mapping[str, Any]) -> dict[str, float]:

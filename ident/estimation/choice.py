@@ -30,6 +30,7 @@ from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
+from ident.effects import entry_of
 from ident.effects.channel import SensorGain
 from ident.estimation.identify import (
     Identification,
@@ -205,7 +206,10 @@ def choose(
         found, choice = mounting.identification, replace(choice, mounting=mounting)
     else:
         found = identify(sessions, chain, final, known=first.known)
-    effects = tuple(_entry(chain, joint, *gain) for joint, gain in choice.gains.items())
+    effects = tuple(
+        entry_of(SensorGain(), [chain.joint_names.index(joint) + 1], {"error": gain})
+        for joint, gain in choice.gains.items()
+    )
     return replace(found, settings=settled, choice=choice, effects=effects)
 
 
@@ -215,17 +219,6 @@ def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> S
     if not gains or not session.joint.effort.shape[1]:
         return session
     return replace(session, joint=replace(session.joint, effort=session.joint.effort / np.array(scale)))
-
-
-def _entry(chain: Chain, joint: str, error: float, std: float) -> dict[str, Any]:
-    """The gain as an entry of a model's effects."""
-    effect = SensorGain()
-    return {
-        "cause": effect.cause,
-        "side": effect.side,
-        "joints": [chain.joint_names.index(joint) + 1],
-        "parameters": {"error": {"value": error, "std": std, "unit": "1"}},
-    }
 
 
 def compared(
