@@ -25,8 +25,9 @@ from ident.diagnosis.broken_data import (
     worthless,
 )
 from ident.diagnosis.candidates import Candidate, Dictionary
-from ident.diagnosis.conclusion import conclude, timing_finding
+from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.evidence import Score
+from ident.diagnosis.findings import timing_finding
 from ident.diagnosis.recording import record, settled
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis

@@ -45,7 +45,8 @@ class Evident:
 class Finding:
     """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions, or None.
 
-    alternatives : (cause, joints, delta_bic). gain : fall of the cross-validated chi-square.
+    alternatives : (cause, joints, delta_bic). gain : fall of the cross-validated chi-square. grounds : of the
+    confidence, see `confidence.Grounds`.
     """
 
     cause: str
@@ -59,6 +60,7 @@ class Finding:
     gain: float
     mode: str | None = None
     form: str | None = None
+    grounds: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def values(self) -> dict[str, tuple[float, float, str]]:
@@ -92,6 +94,8 @@ class Finding:
             content["mode"] = self.mode
         if self.form is not None:
             content["form"] = self.form
+        if self.grounds:
+            content["grounds"] = dict(self.grounds)
         return content
 
     def __str__(self) -> str:

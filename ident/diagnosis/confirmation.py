@@ -1,0 +1,231 @@
+"""Held-out rows and remainders as tests of claims, and the confidence that is left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.diagnosis.bench import DiagnosisBench
+from ident.diagnosis.confidence import Grounds, probability
+from ident.diagnosis.evidence import Rows
+from ident.diagnosis.findings import finding_of
+from ident.diagnosis.held_out import HeldOut, fall, held_out, spread_out, worse_rows
+from ident.diagnosis.model_form import model_form_error
+from ident.diagnosis.probes import Remainder, find_remainders
+from ident.diagnosis.result import Finding
+from ident.diagnosis.selection import Claim
+from ident.diagnosis.task import State, Task
+
+# Largest confidence in a claim that the held-out rows do not show plainly, and its least gain over the usual one.
+_OPEN, _TO_SPARE = 0.7, 2.0
+# Lowest tolerated lower bound of the held-out gain, as a share of its upper bound; with hardly any excitation in the
+# held-out sessions the lowest upper bound, as a share of the claim's gain.
+_ALL_BUT = 0.05
+# Least fall of the error on held-out rows by a sure claim, as a share: less is felt by nobody.
+_FELT = 0.05
+# The same for a brief event in the rows of its session, and for a remainder without a name: power over the noise of
+# 2 % of the error.
+FELT_POWER = 0.98**-2 - 1.0
+# Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
+_EXCITED = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmed:
+    """A claim not refuted by held-out rows. most : the largest confidence that they allow."""
+
+    claim: Claim
+    finding: Finding
+    grounds: Grounds
+    most: float
+
+
+def confirmed(task: Task, state: State) -> list[Confirmed]:
+    """The claims of a selection not refuted by held-out rows.
+
+    A deviation of the healthy arm, or the error of a stronger cause's law, is significant in the rows fitted but
+    predicts nothing.
+    """
+    bench, nuisance, seed = state.bench, state.selection.nuisance_rows, task.settings.seed
+    claims = state.selection.claims
+    rows_of = [c.trial.rows for c in claims]
+    after = held_out(bench.evidence, [*rows_of, *nuisance])
+    kept = []
+    for k, claim in enumerate(claims):
+        without = held_out(bench.evidence, [*(r for i, r in enumerate(rows_of) if i != k), *nuisance])
+        finding = finding_of(claim, bench, without, after, seed)
+        weights = {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
+        fallen = fall(without, after, weights, seed)
+        if _refuted(claim, finding, bench, fallen):
+            continue
+        grounds = _grounds(claim, finding, bench, without, after, fallen, seed)
+        grounds = replace(grounds, company=float(len(claims) - 1))
+        most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
+        kept.append(Confirmed(claim, finding, grounds, most))
+    return kept
+
+
+def doubted(
+    task: Task, state: State, kept: Sequence[Confirmed], remainders: tuple[Remainder, ...]
+) -> list[Finding]:
+    """The findings with their confidence, beside the remainders in their rows."""
+    bench, nuisance = state.bench, state.selection.nuisance_rows
+    doubts = _beyond(task, bench, [one.claim for one in kept], nuisance, remainders)
+    unnamed = {(r.side, r.joint - 1) for r in remainders}
+    findings = []
+    for one in kept:
+        claim, mine = one.claim, set(one.claim.trial.rows)
+        others = [c.claim.trial.rows for c in kept if c is not one]
+        left = sum(r.gain for r in doubts if (r.side, r.joint - 1) in mine)
+        if len(mine) > bench.nominal.arm.chain.n:
+            left /= 2.0
+        grounds = replace(
+            one.grounds,
+            rest=left / claim.gain,
+            replaceable=_encompassed(claim, [*others, *nuisance], bench, doubts),
+        )
+        # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
+        like = one.finding.mode == "between" and bool(unnamed & mine)
+        most = min(one.most, claim.confidence, _OPEN if like else 1.0)
+        findings.append(
+            replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())
+        )
+    return findings
+
+
+def _untested(claim: Claim, finding: Finding) -> bool:
+    """Whether held-out sessions say nothing: of a change between sessions, a brief event, or what samples show."""
+    effect = claim.trial.candidate.effect
+    return finding.mode == "between" or effect.repeats or effect.seen_in_samples(claim.trial.shape)
+
+
+def _refuted(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float]) -> bool:
+    """Whether the held-out rows contradict a claim.
+
+    fallen : interval of the fall of their chi-square by it; above zero it confirms the claim. If the held-out sessions
+    hardly excite the cause, they need only not contradict it. A cause with ample evidence in the rows fitted, or almost
+    confirmed by the others, may be this one or another. A weak claim has to be confirmed.
+    """
+    low, high = fallen
+    if _untested(claim, finding) or low > 0.0:
+        return False
+    if claim.weak:
+        return True
+    hardly = _excitation(claim, bench) < _EXCITED
+    least = claim.trial.candidate.effect.evidence_factor * bench.evidence.settings.least_gain
+    shown = low + high > 0.0 and claim.gain > _TO_SPARE * least
+    silent = hardly and high > -_ALL_BUT * claim.gain
+    return not (shown or silent or low > -_ALL_BUT * high)
+
+
+def _plain(
+    claim: Claim, finding: Finding, bench: DiagnosisBench, grounds: Grounds, fallen: tuple[float, float]
+) -> bool:
+    """Whether held-out rows show a claim plainly: a fall of the error by `_FELT` in the rows of its joints, in two
+    blocks at least, with no other row worse beyond chance. Of changes between sessions and causes seen in the samples
+    they need not. A brief event has to be felt in the rows of its own session.
+    """
+    if claim.trial.candidate.effect.repeats:
+        return _power(claim, bench) > FELT_POWER
+    if _untested(claim, finding):
+        return True
+    low, high = fallen
+    hardly = _excitation(claim, bench) < _EXCITED and high > 0.0
+    certain = not claim.weak and (low > 0.0 or hardly)
+    return certain and grounds.felt >= _FELT and not grounds.one_block and not grounds.worse
+
+
+def _grounds(
+    claim: Claim,
+    finding: Finding,
+    bench: DiagnosisBench,
+    without: HeldOut,
+    after: HeldOut,
+    fallen: tuple[float, float],
+    seed: int,
+) -> Grounds:
+    """The grounds from the rows fitted and held out."""
+    effect, shown, (low, high) = claim.trial.candidate.effect, finding.evidence, fallen
+    untested = _untested(claim, finding) or _excitation(claim, bench) < _EXCITED
+    least = effect.evidence_factor * bench.evidence.settings.least_gain
+    sure = min(max(claim.confidence, 1e-6), 1.0 - 1e-6)
+    before = max(shown.test_rms_before, 1e-12)
+    return Grounds(
+        gain=math.log(max(claim.gain / least, 1e-3)),
+        significance=-math.log10(max(shown.p_value, 1e-300)),
+        rivals=math.log(sure / (1.0 - sure)),
+        held_out=0.0 if untested else (low + high) / max(high - low, 1e-12),
+        untested=float(untested),
+        felt=0.0 if untested else 1.0 - shown.test_rms_after / before,
+        one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
+        worse=float(not _untested(claim, finding) and bool(worse_rows(without, after, seed))),
+        habitual=float(effect.character),
+    )
+
+
+def _power(claim: Claim, bench: DiagnosisBench) -> float:
+    """Power of a claim's torque over the noise, in the rows of the side and joint with most of it."""
+    found = [0.0]
+    for (side, joint), columns in claim.trial.rows.items():
+        rows = bench.nominal.rows[side]
+        keep = rows.valid[:, joint] & ~rows.test
+        torque = columns[keep] @ claim.score.coefficients
+        active = np.isin(rows.session[keep], rows.session[keep][torque != 0.0])
+        if active.any():
+            found.append(float(np.mean(torque[active] ** 2)) / float(bench.evidence.sigma[side][joint]) ** 2)
+    return max(found)
+
+
+def _excitation(claim: Claim, bench: DiagnosisBench) -> float:
+    """Power of the claim's torque in the held-out rows over that in the rows fitted, 1 without held-out sessions."""
+    power, counts = np.zeros(2), np.zeros(2)
+    for (side, joint), columns in claim.trial.rows.items():
+        rows = bench.nominal.rows[side]
+        torque = columns @ claim.score.coefficients
+        weight = 1.0 / bench.evidence.sigma[side][joint] ** 2
+        for k, chosen in enumerate((~rows.test, rows.test)):
+            keep = chosen & rows.valid[:, joint]
+            if keep.any():
+                power[k] += weight * float(np.sum((torque[keep] - torque[keep].mean()) ** 2))
+            counts[k] += float(keep.sum())
+    if not any(rows.test.any() for rows in bench.nominal.rows.values()) or power[0] <= 0.0:
+        return 1.0
+    return float(power[1] / max(counts[1], 1.0) / (power[0] / max(counts[0], 1.0)))
+
+
+def _beyond(
+    task: Task,
+    bench: DiagnosisBench,
+    claims: Sequence[Claim],
+    nuisance: Sequence[Rows],
+    remainders: tuple[Remainder, ...],
+) -> tuple[Remainder, ...]:
+    """Remainders beside the claims and the errors of their laws.
+
+    A hose unlike a plain spring leaves a large function of the joint's angle on both sides: evidence of a coarse law,
+    not of a wrong name.
+    """
+    errors = (model_form_error(bench.dictionary, c.trial) for c in claims)
+    wide = [rows for rows in errors if rows is not None]
+    if not remainders or not wide:
+        return remainders
+    bench.evidence.replace([*(c.trial.rows for c in claims), *nuisance, *wide])
+    return find_remainders(bench.dictionary, bench.evidence, task.settings, task.null)
+
+
+def _encompassed(
+    claim: Claim, others: Sequence[Rows], bench: DiagnosisBench, remainders: Sequence[Remainder]
+) -> float:
+    """Share of a claim's gain lost with all remainders in the base, beside the columns of the others.
+
+    Friction as a function of another joint's angle differs between sessions, like a warmer drive. Its remainder then
+    explains the same as that claim, and the claim is unnecessary.
+    """
+    if not remainders:
+        return 0.0
+    bench.evidence.replace([*others, *(rows for r in remainders for rows in r.rows)])
+    again = bench.dictionary.trial(claim.trial.candidate, claim.trial.shape)
+    return 1.0 if again is None else 1.0 - max(again.score.gain, 0.0) / claim.gain

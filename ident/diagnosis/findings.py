@@ -1,0 +1,121 @@
+"""Findings from claims: parameters with intervals, and evidence on held-out rows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.diagnosis.bench import DiagnosisBench
+from ident.diagnosis.candidates import Trial
+from ident.diagnosis.evidence import Key
+from ident.diagnosis.held_out import HeldOut, held_out, interval
+from ident.diagnosis.intervals import estimated
+from ident.diagnosis.model_form import companions
+from ident.diagnosis.reference import DELAY_STD_S
+from ident.diagnosis.result import Evident, Finding, Value
+from ident.diagnosis.selection import Claim
+from ident.diagnosis.task import State, Task
+from ident.effects import LOST_SAMPLES
+from ident.rows.data_quality import SampleLoss
+
+
+def finding_of(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
+    """The finding of a claim beside the columns of the evidence, with all other claims among them."""
+    candidate, score, form = claim.trial.candidate, claim.score, claim.trial.shape.form
+    keys = [key for key in claim.trial.rows if np.any(claim.trial.rows[key])]
+    keys = sorted(keys, key=lambda key: -_relative(without, after, key))[: max(1, len(keys) // 7)]
+    rms_before, rms_after, low, high = interval(without, after, keys, seed)
+    cost = np.log(sum(float(m.sum()) for m in bench.evidence.mask.values()))
+    delta_bic = float(-score.fitted + len(candidate.effect.parameters) * cost)
+    return Finding(
+        cause=candidate.cause,
+        side=candidate.effect.side,
+        joints=candidate.joints,
+        parameters=_parameters(claim.trial, bench),
+        evidence=Evident(delta_bic, score.p_value, rms_before, rms_after, (low, high)),
+        confidence=claim.confidence,
+        alternatives=tuple((c.cause, c.joints, float(-gain + cost)) for c, gain in claim.alternatives),
+        tell_apart=candidate.effect.tell_apart.format(joint=candidate.joint + 1),
+        gain=score.gain,
+        mode=candidate.effect.mode(claim.trial.shape),
+        form=None if form is None else str(form.value),
+    )
+
+
+def _relative(without: HeldOut, after: HeldOut, key: Key) -> float:
+    side, joint = key
+    a, b = without.residual[side][:, joint], after.residual[side][:, joint]
+    power = np.nanmean(b**2) if np.isfinite(b).any() else 1.0
+    return float((np.nanmean(a**2) - power) / power) if np.isfinite(a).any() else 0.0
+
+
+def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
+    """Values with standard deviations, see `intervals`.
+
+    Friction near standstill is estimated beside all ways of reversing, beyond its law; the change of the values is
+    part of the uncertainty.
+    """
+    effect, evidence = trial.candidate.effect, bench.evidence
+    values, deviations = estimated(bench.dictionary, evidence, trial)
+    columns = companions(bench.dictionary, trial) if effect.beside_companions else None
+    if columns is not None:
+        kept = list(evidence.extra)
+        evidence.replace([*kept, columns])
+        beside = bench.dictionary.trial(trial.candidate, trial.shape)
+        if beside is not None:
+            alone = values
+            values, own = estimated(bench.dictionary, evidence, bench.dictionary.refine(beside))
+            deviations = {name: float(np.hypot(own[name], values[name] - alone[name])) for name in own}
+        evidence.replace(kept)
+    return {
+        p.name: Value(values[p.name], deviations[p.name], p.unit)
+        for p in effect.parameters
+        if p.name in values and p.name not in effect.hidden
+    }
+
+
+def timing_finding(task: Task, after: State, claim: Claim, rest: tuple[float, float]) -> Finding:
+    """Finding of a late channel.
+
+    after : with the shift made, and the baseline before it. rest : remaining delay and its standard deviation [s].
+    """
+    assert after.baseline is not None
+    bench, selection, effect = after.bench, after.selection, claim.trial.candidate.effect
+    side = effect.channel or ""
+    arm, known = bench.nominal.arm, task.arm
+    motor, joint = arm.motor_delay_s - known.motor_delay_s, arm.joint_delay_s - known.joint_delay_s
+    # The delay of the healthy channel itself varies from day to day.
+    days = (task.reference.delay_std_s if task.reference is not None else {}).get(side, DELAY_STD_S)
+    std = float(np.hypot(rest[1], days))
+    now = held_out(bench.evidence, [*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
+    keys = [(side, j) for j in range(arm.chain.n)]
+    rms_before, rms_after, low, high = interval(after.baseline.held, now, keys, task.settings.seed)
+    return Finding(
+        effect.cause,
+        "timing",
+        (),
+        {"delay": Value((motor if side == "motor" else joint) + rest[0], std, "s")},
+        Evident(-claim.score.fitted, claim.score.p_value, rms_before, rms_after, (low, high)),
+        claim.confidence,
+        tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),
+        effect.tell_apart,
+        claim.gain,
+    )
+
+
+def loss_finding(worst: SampleLoss) -> Finding:
+    """Finding of lost, repeated or stale samples, counted in the channel with most of them."""
+    count = worst.samples + worst.lost
+    std = float(np.sqrt(worst.share * (1.0 - worst.share) / count))
+    return Finding(
+        LOST_SAMPLES.cause,
+        LOST_SAMPLES.side,
+        (),
+        {"share": Value(worst.share, std, "1")},
+        Evident(-float(count) * worst.share, 1e-12, 0.0, 0.0, (0.0, 0.0)),
+        0.99,
+        (),
+        LOST_SAMPLES.tell_apart,
+        float(worst.amiss),
+        mode=f"{worst.lost} lost, {worst.repeated} repeated and {worst.stale} stale of {count} {worst.channel} "
+        f"samples in {worst.session}",
+    )
