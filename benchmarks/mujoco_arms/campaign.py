@@ -61,15 +61,16 @@ def read_results(out: Path) -> list[dict[str, Any]]:
 
 def read_result(folder: Path) -> dict[str, Any]:
     """The verdict on the diagnosis of a case, judged anew."""
-    result = {**_json(folder / "verdict.json"), "truth": _json(folder / "truth.json")}
+    result = {**read_json(folder / "verdict.json"), "truth": read_json(folder / "truth.json")}
     if "crash" not in result:
         twin = folder / "twin" / "diagnosis" / "diagnosis.json"
-        told = _json(folder / "diagnosis" / "diagnosis.json")
-        result["verdict"] = judge(told, result["truth"], _json(twin) if twin.is_file() else None)
+        told = read_json(folder / "diagnosis" / "diagnosis.json")
+        result["verdict"] = judge(told, result["truth"], read_json(twin) if twin.is_file() else None)
     return result
 
 
-def _json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """Plain content of a file."""
     return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
@@ -105,7 +106,7 @@ def diagnosed(folder: Path, again: bool, home: Path | None = None) -> float:
     """
     home = home or folder
     reference, out = home / "reference.yaml", folder / "diagnosis"
-    ratios = _json(home / "truth.json")["gear_ratio"]
+    ratios = read_json(home / "truth.json")["gear_ratio"]
     gear = ["--gear-ratio", ",".join(f"{ratio:g}" for ratio in ratios)]
     if not reference.is_file() or (again and home == folder):
         reference.unlink(missing_ok=True)

@@ -1,0 +1,230 @@
+"""Fits the confidence of findings to cases of known truth, and checks it on cases that it was not fitted to.
+
+    python -m benchmarks.confidence campaign/results.jsonl mujoco_cases
+    python -m benchmarks.confidence campaign/results.jsonl mujoco_cases --write
+    python -m benchmarks.confidence --check other/results.jsonl --check other_mujoco_cases --diagram docs/images/confidence.svg
+
+Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms`
+(their folder). The weights of `ident/diagnosis/confidence.yaml` are those of a logistic regression with the signs of
+`ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and a ridge chosen by cross-validation over
+whole cases. The reliability printed for the fit is that of cross-validation too. `--check` judges the confidence as
+the diagnoses stated it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+import ident.diagnosis.confidence as stored
+from benchmarks.discovery.tally import read_results
+from benchmarks.mujoco_arms import campaign as mujoco
+from benchmarks.mujoco_arms.judging import habitual, names
+
+Floats = NDArray[np.float64]
+
+_RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)
+_PARTS = 10
+_BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 1.0001)
+
+
+@dataclass(frozen=True)
+class Said:
+    """A finding of a case. grounds : as stored, empty for findings that are counted. right : named truly."""
+
+    source: str
+    case: str
+    label: str
+    confidence: float
+    grounds: Mapping[str, float]
+    right: bool
+
+
+def read(path: Path) -> list[Said]:
+    """All findings of a campaign about what is in the catalogue, but for habits of the healthy arm."""
+    said = []
+    for case, hidden, traits, findings in _mujoco(path) if path.is_dir() else _own(path):
+        for finding in findings:
+            right = any(names(finding, one) for one in hidden)
+            if right or not habitual(finding, traits):
+                label = f"{finding['cause']}{finding['joints']}"
+                grounds = finding.get("grounds", {})
+                said.append(Said(path.as_posix(), case, label, float(finding["confidence"]), grounds, right))
+    return said
+
+
+Content = tuple[str, list[dict[str, Any]], Mapping[str, Any], list[dict[str, Any]]]
+
+
+def _own(path: Path) -> list[Content]:
+    found = []
+    for result in read_results(path):
+        if "crash" not in result:
+            hidden = [{**one, "also": one.get("also", ())} for one in result["truth"]["hidden"]]
+            for one in hidden:
+                # A joint of 0 is the whole arm.
+                one["joints"] = [joint for joint in one["joints"] if joint]
+            found.append((result["id"], hidden, {}, result["diagnosis"]["findings"]))
+    return found
+
+
+def _mujoco(path: Path) -> list[Content]:
+    found = []
+    for verdict in sorted(path.glob("*/verdict.json")):
+        folder = verdict.parent
+        if (folder / "diagnosis" / "diagnosis.json").is_file():
+            truth = mujoco.read_result(folder)["truth"]
+            told = mujoco.read_json(folder / "diagnosis" / "diagnosis.json")
+            found.append((folder.name, truth["hidden"], truth["traits"], told["findings"]))
+    return found
+
+
+def fit(points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:
+    """Intercept and weights (1 + k,) of the logistic regression; points (n, k) from 0 to 1."""
+    signs = [stored.SIGNS[name] for name in stored.LIMITS]
+    columns = np.column_stack([np.ones(len(points)), points])
+
+    def loss(theta: Floats) -> tuple[float, Floats]:
+        odds = columns @ theta
+        value = float(weight @ (np.logaddexp(0.0, odds) - right * odds)) + 0.5 * ridge * float(
+            theta[1:] @ theta[1:]
+        )
+        slope = columns.T @ (weight * (1.0 / (1.0 + np.exp(-odds)) - right))
+        slope[1:] += ridge * theta[1:]
+        return value, slope
+
+    bounds = [(None, None), *((0.0 if s > 0 else None, 0.0 if s < 0 else None) for s in signs)]
+    return np.asarray(minimize(loss, np.zeros(columns.shape[1]), jac=True, bounds=bounds).x)
+
+
+def held_back(said: Sequence[Said], points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:
+    """Probability (n,) of each finding by a fit to the cases of other parts."""
+    cases = [f"{one.source} {one.case}" for one in said]
+    order = {case: k for k, case in enumerate(np.random.default_rng(1).permutation(sorted(set(cases))))}
+    part = np.array([order[case] % _PARTS for case in cases])
+    found = np.zeros(len(said))
+    for k in range(_PARTS):
+        out = part == k
+        if out.any():
+            theta = fit(points[~out], right[~out], weight[~out], ridge)
+            found[out] = 1.0 / (1.0 + np.exp(-(theta[0] + points[out] @ theta[1:])))
+    return found
+
+
+def log_loss(p: Floats, right: Floats, weight: Floats) -> float:
+    """Mean of -log p of what is true."""
+    p = np.clip(p, 1e-6, 1.0 - 1e-6)
+    return float(-(weight @ (right * np.log(p) + (1.0 - right) * np.log(1.0 - p))) / weight.sum())
+
+
+def reliability(p: Floats, right: Floats) -> tuple[list[tuple[float, float, int]], float]:
+    """Of each range of confidence its mean, the share that is right and the number; the expected calibration error."""
+    rows, error = [], 0.0
+    for low, high in zip(_BINS, _BINS[1:], strict=False):
+        mine = (p >= low) & (p < high)
+        if mine.any():
+            rows.append((float(p[mine].mean()), float(right[mine].mean()), int(mine.sum())))
+            error += mine.mean() * abs(rows[-1][0] - rows[-1][1])
+    return rows, float(error)
+
+
+def table(sources: Sequence[str], p: Floats, right: Floats) -> str:
+    """The reliability of each source and of all as text."""
+    lines, places = [], np.array(sources)
+    for source in [*dict.fromkeys(sources), "all"]:
+        mine = (places == source) | (source == "all")
+        rows, error = reliability(p[mine], right[mine])
+        sure = p[mine] >= 0.9
+        share = f"{right[mine][sure].sum():.0f} of {sure.sum()}"
+        lines.append(
+            f"{source}: {mine.sum()} findings, calibration error {error:.3f}; said with 0.9 or more: {share} right"
+        )
+        lines += [f"   said {a:.2f}  right {b:.2f}  of {n}" for a, b, n in rows]
+    return "\n".join(lines)
+
+
+@click.command()
+@click.argument("campaigns", nargs=-1, type=click.Path(path_type=Path, exists=True))
+@click.option("--write", is_flag=True, help="Store the weights.")
+@click.option(
+    "--check",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Campaign for the reliability of the confidence as it was said.",
+)
+@click.option("--diagram", type=click.Path(path_type=Path), help="Draw the reliability of --check.")
+def main(campaigns: tuple[Path, ...], write: bool, check: tuple[Path, ...], diagram: Path | None) -> None:
+    """Fit the confidence to campaigns, or check it on others."""
+    if campaigns:
+        _fit([one for path in campaigns for one in read(path)], write)
+    if check:
+        said = [one for path in check for one in read(path)]
+        p, right = (np.array([getattr(one, key) for one in said], float) for key in ("confidence", "right"))
+        click.echo(table([one.source for one in said], p, right))
+        if diagram is not None:
+            _draw([one.source for one in said], p, right, diagram)
+
+
+def _fit(said: Sequence[Said], write: bool) -> None:
+    said = [one for one in said if one.grounds]
+    if not said:
+        raise click.ClickException("no finding with grounds in these campaigns; diagnose their cases again")
+    points = np.array([stored.scaled(one.grounds) for one in said])
+    right = np.array([one.right for one in said], float)
+    count = {source: sum(one.source == source for one in said) for source in {one.source for one in said}}
+    weight = np.array([len(said) / len(count) / count[one.source] for one in said])
+    losses = {
+        ridge: log_loss(held_back(said, points, right, weight, ridge), right, weight) for ridge in _RIDGES
+    }
+    ridge = min(losses, key=lambda r: losses[r])
+    p = held_back(said, points, right, weight, ridge)
+    click.echo(f"ridge {ridge}: -log p of what is true {losses[ridge]:.3f} in cross-validation")
+    click.echo(table([one.source for one in said], p, right))
+    theta = fit(points, right, weight, ridge)
+    weights = dict(zip(stored.LIMITS, (round(float(v), 3) for v in theta[1:]), strict=True))
+    content = {
+        "findings": len(said),
+        "cases": len({(one.source, one.case) for one in said}),
+        "ridge": ridge,
+        "intercept": round(float(theta[0]), 3),
+        "weights": weights,
+    }
+    text = yaml.safe_dump(content, sort_keys=False)
+    click.echo(text)
+    if write:
+        path = Path(stored.__file__).with_name(stored.WEIGHTS)
+        path.write_text(f"# Written by `python -m benchmarks.confidence`.\n{text}", encoding="utf-8")
+
+
+def _draw(sources: Sequence[str], p: Floats, right: Floats, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot([0, 1], [0, 1], color="0.7", lw=1)
+    places = np.array(sources)
+    for source in dict.fromkeys(sources):
+        rows, error = reliability(p[places == source], right[places == source])
+        said, share, count = (np.array(column) for column in zip(*rows, strict=True))
+        # Interval of a share by Wilson, one standard deviation.
+        middle = (share + 0.5 / count) / (1.0 + 1.0 / count)
+        half = np.sqrt(share * (1.0 - share) / count + 0.25 / count**2) / (1.0 + 1.0 / count)
+        label = f"{Path(source).name or source}: {count.sum()} findings, error {error:.3f}"
+        axes.errorbar(
+            said, share, [share - middle + half, middle + half - share], fmt="o-", capsize=3, label=label
+        )
+    axes.set(xlabel="confidence stated", ylabel="share right", xlim=(0, 1.02), ylim=(0, 1.02))
+    axes.legend(fontsize="small", loc="upper left")
+    figure.savefig(path, metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
