@@ -2,7 +2,7 @@
 
     python -m benchmarks.confidence campaign/results.jsonl mujoco_cases
     python -m benchmarks.confidence campaign/results.jsonl mujoco_cases --write
-    python -m benchmarks.confidence --check other/results.jsonl --check other_mujoco_cases --diagram docs/images/confidence.svg
+    python -m benchmarks.confidence --check other/results.jsonl --check other_cases --diagram confidence.svg
 
 Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms`
 (their folder). The weights of `ident/diagnosis/confidence.yaml` are those of a logistic regression with the signs of
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +129,7 @@ def log_loss(p: Floats, right: Floats, weight: Floats) -> float:
 def reliability(p: Floats, right: Floats) -> tuple[list[tuple[float, float, int]], float]:
     """Of each range of confidence its mean, the share that is right and the number; the expected calibration error."""
     rows, error = [], 0.0
-    for low, high in zip(_BINS, _BINS[1:], strict=False):
+    for low, high in pairwise(_BINS):
         mine = (p >= low) & (p < high)
         if mine.any():
             rows.append((float(p[mine].mean()), float(right[mine].mean()), int(mine.sum())))
