@@ -1,0 +1,196 @@
+"""How many cases of a campaign change their verdict if a number of the diagnosis is doubled or halved.
+
+    python -m benchmarks.discovery --cases 40 --days 2 --out campaign
+    python -m benchmarks.sensitivity campaign --cases 40 --jobs 2
+    python -m benchmarks.sensitivity campaign --report
+
+The numbers are the constants of `ident/diagnosis` and the settings of `DiagnosisSettings`. A verdict is the cause and
+joint named first and whether it is said for sure; silence is one, too. Logs and references are those of the campaign;
+a number with its result in `sensitivity.jsonl` is not tried again.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import dataclasses
+import importlib
+import json
+import logging
+import pkgutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+from joblib import Parallel, delayed
+
+import ident.diagnosis
+from benchmarks.discovery.tally import read_results
+from ident.diagnosis.settings import DiagnosisSettings
+from tests.hidden_physics.cases import Store, draw
+from tests.hidden_physics.engine import commissioned, diagnosed
+
+FACTORS = (0.5, 2.0)
+_SETTINGS = "settings"
+# Not decisions: seeds, and what only the text shows.
+_LEFT_OUT = ("seed", "SCHEMA_VERSION", "_WIDTH", "_REPR_LINES")
+_SURE = 0.8
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number by module (`settings` for a default of `DiagnosisSettings`) and name."""
+
+    module: str
+    name: str
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.module}.{self.name}"
+
+
+def numbers() -> Iterator[Number]:
+    """All of them; tuples, texts and counts of zero aside."""
+    for field in dataclasses.fields(DiagnosisSettings):
+        value = field.default
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and field.name not in _LEFT_OUT:
+            yield Number(_SETTINGS, field.name, value)
+    for module in pkgutil.iter_modules(ident.diagnosis.__path__):
+        loaded = importlib.import_module(f"ident.diagnosis.{module.name}")
+        for name, value in vars(loaded).items():
+            own = name.isupper() and name not in _LEFT_OUT and _is_own(loaded, name)
+            if own and isinstance(value, (int, float)) and not isinstance(value, bool) and value:
+                yield Number(module.name, name, value)
+
+
+def _is_own(module: Any, name: str) -> bool:
+    """Whether a module assigns the name, unlike an imported one."""
+    text = Path(module.__file__).read_text(encoding="utf-8")
+    return any(
+        line.split("=")[0].replace(" ", "").split(",").count(name)
+        for line in text.splitlines()
+        if "=" in line
+    )
+
+
+def verdict(findings: Sequence[dict[str, Any]]) -> str:
+    """What a user takes from a diagnosis: the first name, its joints, and whether it is sure."""
+    if not findings:
+        return "silent"
+    first = findings[0]
+    sure = "" if first["confidence"] >= _SURE else "?"
+    return f"{first['cause']}({','.join(map(str, first['joints']))}){sure}"
+
+
+def _tried(
+    number: Number, factor: float, cases: Sequence[dict[str, Any]], out: Path, days: int
+) -> dict[str, Any]:
+    """Cases with another verdict with a number times a factor."""
+    logging.getLogger("ident").setLevel(logging.ERROR)
+    value = number.value * factor
+    changed = type(number.value)(max(round(value), 1)) if isinstance(number.value, int) else value
+    with _changed(number, changed):
+        flips = []
+        for result in cases:
+            store = Store(out / "sessions")
+            _, kind, cause, encoder = result["id"].split()
+            case = draw(
+                result["truth"]["seed"],
+                kind,
+                store,
+                causes=None if cause == "any" else [cause],
+                encoder=encoder,
+            )
+            try:
+                told, _ = diagnosed(store.sessions(case), commissioned(store, case.day.encoder, days))
+                now = verdict(told["findings"])
+            except Exception as error:
+                now = f"{type(error).__name__}: {error}"
+            before = verdict(result["diagnosis"]["findings"])
+            if now != before:
+                flips.append([result["id"], before, now])
+    return {
+        "number": str(number),
+        "value": number.value,
+        "factor": factor,
+        "cases": len(cases),
+        "flips": flips,
+    }
+
+
+class _changed:
+    """A number with another value for a while."""
+
+    def __init__(self, number: Number, value: float) -> None:
+        self.number, self.value = number, value
+
+    def __enter__(self) -> None:
+        self._set(self.value)
+
+    def __exit__(self, *_: object) -> None:
+        self._set(self.number.value)
+
+    def _set(self, value: float) -> None:
+        name = self.number.name
+        if self.number.module != _SETTINGS:
+            for module in pkgutil.iter_modules(ident.diagnosis.__path__):
+                loaded = importlib.import_module(f"ident.diagnosis.{module.name}")
+                if module.name == self.number.module or (not name.startswith("_") and hasattr(loaded, name)):
+                    setattr(loaded, name, value)
+            return
+        names = [field.name for field in dataclasses.fields(DiagnosisSettings)]
+        init = DiagnosisSettings.__init__
+        defaults = list(init.__defaults__ or ())
+        defaults[names.index(name) - (len(names) - len(defaults))] = value
+        init.__defaults__ = tuple(defaults)
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--cases", default=20, show_default=True, help="Number of cases of the campaign.")
+@click.option("--days", default=2, show_default=True, help="Days of its reference.")
+@click.option("--only", default="", help="Only numbers with this in their name.")
+@click.option("--jobs", default=1, show_default=True)
+@click.option("--report", is_flag=True, help="Run nothing.")
+def main(out: Path, cases: int, days: int, only: str, jobs: int, report: bool) -> None:
+    """Double and halve every number of the diagnosis."""
+    path = out / "sensitivity.jsonl"
+    done = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    if not report:
+        chosen = [r for r in read_results(out / "results.jsonl") if "crash" not in r][:cases]
+        known = {(one["number"], one["factor"]) for one in done}
+        wanted = [(n, f) for n in numbers() for f in FACTORS if only in str(n) and (str(n), f) not in known]
+        work = Parallel(n_jobs=jobs, return_as="generator_unordered")
+        with path.open("a", encoding="utf-8") as stream:
+            for one in work(delayed(_tried)(n, f, chosen, out, days) for n, f in wanted):
+                stream.write(json.dumps(one) + "\n")
+                stream.flush()
+                done.append(one)
+                click.echo(f"{one['number']} x {one['factor']}: {len(one['flips'])} of {one['cases']}")
+    click.echo(table(done))
+
+
+def table(done: Sequence[dict[str, Any]]) -> str:
+    """The results as a table in Markdown, those with most changes first."""
+    by_number: dict[str, dict[float, dict[str, Any]]] = {}
+    for one in done:
+        by_number.setdefault(one["number"], {})[one["factor"]] = one
+    order = sorted(by_number.items(), key=lambda pair: -sum(len(one["flips"]) for one in pair[1].values()))
+    lines = [
+        "| number | value | halved | doubled | verdicts that change |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name, tried in order:
+        counts = [f"{len(tried[f]['flips'])} of {tried[f]['cases']}" if f in tried else "–" for f in FACTORS]
+        flips = sorted({f"{before} → {now}" for one in tried.values() for _, before, now in one["flips"]})
+        value = next(iter(tried.values()))["value"]
+        lines.append(f"| {name} | {value:g} | {counts[0]} | {counts[1]} | {'; '.join(flips)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
