@@ -20,7 +20,7 @@ from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.nominal import Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
-from ident.diagnosis.reference import DELAY_STD_S, Reference, habit
+from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference, habit
 from ident.diagnosis.selection import Claim, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
@@ -48,7 +48,6 @@ _TUNING_SETS = 3
 _ROUNDS = 3
 _LATEST_S = 0.02
 _CHANNELS = ("motor", "joint")
-_USUAL_DAYS = 4
 
 SlowTurns = NDArray[np.float64]
 """(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
@@ -407,7 +406,7 @@ def delay_std(late: Sequence[tuple[float, float]]) -> float:
     values, deviations = np.array(late).T
     own = float(np.sum((values - values.mean()) ** 2 - (1.0 - 1.0 / len(values)) * deviations**2))
     days = len(values) - 1
-    variance = (_USUAL_DAYS * DELAY_STD_S**2 + max(own, 0.0)) / (_USUAL_DAYS + days)
+    variance = (USUAL_DAYS * DELAY_STD_S**2 + max(own, 0.0)) / (USUAL_DAYS + days)
     return float(np.sqrt(variance * (1.0 + 1.0 / len(values))))
 
 

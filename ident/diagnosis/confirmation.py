@@ -11,13 +11,15 @@ import numpy as np
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import Grounds, probability
 from ident.diagnosis.evidence import Rows
-from ident.diagnosis.findings import finding_of
+from ident.diagnosis.findings import finding_of, timing_finding
 from ident.diagnosis.held_out import HeldOut, fall, held_out, spread_out, worse_rows
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.probes import Remainder, find_remainders
+from ident.diagnosis.reference import USUAL_DAYS
 from ident.diagnosis.result import Finding
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import State, Task
+from ident.estimators.estimate import fisher_tail
 
 # Largest confidence in a claim that the held-out rows do not show plainly, and its least gain over the usual one.
 _OPEN, _TO_SPARE = 0.7, 2.0
@@ -61,7 +63,8 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
         fallen = fall(without, after, weights, seed)
         if _refuted(claim, finding, bench, fallen):
             continue
-        grounds = _grounds(claim, finding, bench, without, after, fallen, seed)
+        untested = _untested(claim, finding) or _excitation(claim, bench) < _EXCITED
+        grounds = _grounds(claim, finding, bench, without, after, fallen, untested, seed)
         grounds = replace(grounds, company=float(len(claims) - 1))
         most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
@@ -94,6 +97,29 @@ def doubted(
             replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())
         )
     return findings
+
+
+def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, float]) -> Finding:
+    """Finding of a late channel, see `timing_finding`, its p-value against the healthy delays of other days.
+
+    Their standard deviation comes from few days, so the probability is that of Student's distribution.
+    """
+    assert after.baseline is not None
+    bench, selection, seed = after.bench, after.selection, task.settings.seed
+    before = after.baseline.held
+    now = held_out(bench.evidence, [*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
+    finding = timing_finding(task, after, claim, rest, before, now)
+    delay, sets = finding.parameters["delay"], 1 if task.reference is None else max(task.reference.sets, 1)
+    p_value = fisher_tail((delay.value / delay.std) ** 2, 1, USUAL_DAYS + sets - 1)
+    finding = replace(finding, evidence=replace(finding.evidence, p_value=p_value))
+    low, high = finding.evidence.gain_interval_95
+    grounds = replace(
+        _grounds(claim, finding, bench, before, now, (low, high), False, seed),
+        company=float(len(selection.claims)),
+    )
+    plain = low > 0.0 and grounds.felt >= _FELT and not grounds.one_block and not grounds.worse
+    confidence = min(claim.confidence, probability(grounds), 1.0 if plain else _OPEN)
+    return replace(finding, confidence=confidence, grounds=grounds.to_dict())
 
 
 def _untested(claim: Claim, finding: Finding) -> bool:
@@ -132,9 +158,7 @@ def _plain(
         return _power(claim, bench) > FELT_POWER
     if _untested(claim, finding):
         return True
-    low, high = fallen
-    hardly = _excitation(claim, bench) < _EXCITED and high > 0.0
-    certain = not claim.weak and (low > 0.0 or hardly)
+    certain = not claim.weak and fallen[0] > 0.0
     return certain and grounds.felt >= _FELT and not grounds.one_block and not grounds.worse
 
 
@@ -145,11 +169,11 @@ def _grounds(
     without: HeldOut,
     after: HeldOut,
     fallen: tuple[float, float],
+    untested: bool,
     seed: int,
 ) -> Grounds:
-    """The grounds from the rows fitted and held out."""
+    """The grounds from the rows fitted and, unless untested, held out."""
     effect, shown, (low, high) = claim.trial.candidate.effect, finding.evidence, fallen
-    untested = _untested(claim, finding) or _excitation(claim, bench) < _EXCITED
     least = effect.evidence_factor * bench.evidence.settings.least_gain
     sure = min(max(claim.confidence, 1e-6), 1.0 - 1e-6)
     before = max(shown.test_rms_before, 1e-12)
@@ -161,7 +185,7 @@ def _grounds(
         untested=float(untested),
         felt=0.0 if untested else 1.0 - shown.test_rms_after / before,
         one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
-        worse=float(not _untested(claim, finding) and bool(worse_rows(without, after, seed))),
+        worse=float(not untested and bool(worse_rows(without, after, seed))),
         habitual=float(effect.character),
     )
 

@@ -26,8 +26,8 @@ from ident.diagnosis.broken_data import (
 )
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import conclude
+from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
-from ident.diagnosis.findings import timing_finding
 from ident.diagnosis.recording import record, settled
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis
@@ -41,6 +41,8 @@ from ident.model.signals import signal_settings
 from ident.rows.sessions import require
 from lwr_driver.session import Sessions, as_sessions
 
+# Largest probability of a late channel's delay on a healthy arm.
+_ONE_IN = 0.0027
 # Largest number of shifts of a late channel.
 _SHIFTS = 5
 # Unit of delay for a column [s].
@@ -160,12 +162,12 @@ def _in_time(task: Task, state: State) -> State:
     timing, notes = [], []
     after = State(bench, selection, baseline=baseline, left_out=tuple(doubtful))
     for claim in late:
-        finding = timing_finding(task, after, claim, rest[claim.trial.candidate.cause])
-        delay, unknown = finding.parameters["delay"], _unknown_delay(task, claim)
-        if abs(delay.value) <= unknown:
+        finding = confirmed_delay(task, after, claim, rest[claim.trial.candidate.cause])
+        unknown = _unknown_delay(task, claim)
+        if abs(finding.parameters["delay"].value) <= unknown:
             notes.append(_own_delay(claim, unknown))
-        # A delay explained by the rest of the model is no finding.
-        elif abs(delay.value) > 3.0 * delay.std:
+        # A delay explained by the rest of the model, or usual from day to day, is no finding.
+        elif finding.evidence.p_value < _ONE_IN:
             timing.append(finding)
     selection.claims = [c for c in selection.claims if c not in _late(selection)]
     return replace(after, timing=tuple(timing), notes=tuple(notes))

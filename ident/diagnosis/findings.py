@@ -7,7 +7,7 @@ import numpy as np
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
 from ident.diagnosis.evidence import Key
-from ident.diagnosis.held_out import HeldOut, held_out, interval
+from ident.diagnosis.held_out import HeldOut, interval
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions
 from ident.diagnosis.reference import DELAY_STD_S
@@ -73,22 +73,23 @@ def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
     }
 
 
-def timing_finding(task: Task, after: State, claim: Claim, rest: tuple[float, float]) -> Finding:
+def timing_finding(
+    task: Task, after: State, claim: Claim, rest: tuple[float, float], before: HeldOut, now: HeldOut
+) -> Finding:
     """Finding of a late channel.
 
-    after : with the shift made, and the baseline before it. rest : remaining delay and its standard deviation [s].
+    after : with the shift made. rest : remaining delay and its standard deviation [s]. before, now : without the shift
+    and with it.
     """
-    assert after.baseline is not None
-    bench, selection, effect = after.bench, after.selection, claim.trial.candidate.effect
+    bench, effect = after.bench, claim.trial.candidate.effect
     side = effect.channel or ""
     arm, known = bench.nominal.arm, task.arm
     motor, joint = arm.motor_delay_s - known.motor_delay_s, arm.joint_delay_s - known.joint_delay_s
     # The delay of the healthy channel itself varies from day to day.
     days = (task.reference.delay_std_s if task.reference is not None else {}).get(side, DELAY_STD_S)
     std = float(np.hypot(rest[1], days))
-    now = held_out(bench.evidence, [*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
     keys = [(side, j) for j in range(arm.chain.n)]
-    rms_before, rms_after, low, high = interval(after.baseline.held, now, keys, task.settings.seed)
+    rms_before, rms_after, low, high = interval(before, now, keys, task.settings.seed)
     return Finding(
         effect.cause,
         "timing",

@@ -26,6 +26,8 @@ from ident.model import DynamicModel, write_model
 
 DELAY_STD_S = 2e-4
 """Usual standard deviation [s] of a healthy channel's delay from day to day."""
+USUAL_DAYS = 4
+"""Weight of the usual deviation of a delay, in days."""
 
 _KEY = "commissioning"
 _WIDER = 1.5
