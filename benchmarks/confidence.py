@@ -13,6 +13,7 @@ the diagnoses stated it.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,7 +28,6 @@ from scipy.optimize import minimize
 
 import ident.diagnosis.confidence as stored
 from benchmarks.discovery.tally import read_results
-from benchmarks.mujoco_arms import campaign as mujoco
 from benchmarks.mujoco_arms.judging import habitual, names
 
 Floats = NDArray[np.float64]
@@ -82,8 +82,8 @@ def _mujoco(path: Path) -> list[Content]:
     for verdict in sorted(path.glob("*/verdict.json")):
         folder = verdict.parent
         if (folder / "diagnosis" / "diagnosis.json").is_file():
-            truth = mujoco.read_result(folder)["truth"]
-            told = mujoco.read_json(folder / "diagnosis" / "diagnosis.json")
+            truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+            told = json.loads((folder / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
             found.append((folder.name, truth["hidden"], truth["traits"], told["findings"]))
     return found
 

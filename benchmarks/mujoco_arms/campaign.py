@@ -61,16 +61,15 @@ def read_results(out: Path) -> list[dict[str, Any]]:
 
 def read_result(folder: Path) -> dict[str, Any]:
     """The verdict on the diagnosis of a case, judged anew."""
-    result = {**read_json(folder / "verdict.json"), "truth": read_json(folder / "truth.json")}
+    result = {**_json(folder / "verdict.json"), "truth": _json(folder / "truth.json")}
     if "crash" not in result:
         twin = folder / "twin" / "diagnosis" / "diagnosis.json"
-        told = read_json(folder / "diagnosis" / "diagnosis.json")
-        result["verdict"] = judge(told, result["truth"], read_json(twin) if twin.is_file() else None)
+        told = _json(folder / "diagnosis" / "diagnosis.json")
+        result["verdict"] = judge(told, result["truth"], _json(twin) if twin.is_file() else None)
     return result
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Plain content of a file."""
+def _json(path: Path) -> dict[str, Any]:
     return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
@@ -106,7 +105,7 @@ def diagnosed(folder: Path, again: bool, home: Path | None = None) -> float:
     """
     home = home or folder
     reference, out = home / "reference.yaml", folder / "diagnosis"
-    ratios = read_json(home / "truth.json")["gear_ratio"]
+    ratios = _json(home / "truth.json")["gear_ratio"]
     gear = ["--gear-ratio", ",".join(f"{ratio:g}" for ratio in ratios)]
     if not reference.is_file() or (again and home == folder):
         reference.unlink(missing_ok=True)

@@ -67,6 +67,7 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             presliding=reference.presliding,
             far=reference.far,
             far_share=reference.far_share,
+            gain_std=reference.gain_std,
             couplings=data.couplings,
             healthy=reference.model.effects,
         )
@@ -107,7 +108,7 @@ def prepare_bench(
         arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)
     nominal = Nominal(arm, recordings, settings, structure, base)
-    prior = reference.prior(base) if reference is not None else _drawn(base)
+    prior = _drawn(base) if reference is None else reference.prior(base, nominal.masses)
     fitted = fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2
     # Predictions of the second round include the reference; a third changes nothing.
     rounds = 3 if fitted else 2 if reference is not None else 1

@@ -13,7 +13,7 @@ from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Scor
 from ident.diagnosis.nominal import Nominal
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
 
-# Bursts: window, least excess over its standard deviation, longest duration, largest number.
+# Bursts: shortest, least excess over its standard deviation, longest, largest number.
 _WINDOW_S, _FAR, _LONGEST_S, _MOST = 0.1, 8.0, 4.0, 4
 # Distance from the ends of a session within which filters and wide bins are unreliable.
 _EDGE_S = 0.6
@@ -59,23 +59,44 @@ def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
         window = ((time - time[0]) / _WINDOW_S).astype(int)
         counts = np.bincount(window, np.isfinite(values).sum(axis=1))
         sums = np.bincount(window, np.nansum(values, axis=1))
-        usual = float(np.median(sums[counts > 0] / counts[counts > 0])) if np.any(counts > 0) else 1.0
-        excess = sums - usual * counts
-        far = (counts > 0) & (excess > _FAR * (usual * np.sqrt(2.0 * np.maximum(counts, 1.0))))
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], _closed(far).astype(int), [0]])))
-        for low, high in zip(edges[::2], edges[1::2], strict=True):
-            if (high - low) * _WINDOW_S <= _LONGEST_S:
-                start, total = float(time[0] + low * _WINDOW_S), float(excess[low:high].sum())
-                found.append(Burst(int(session), start, (high - low) * _WINDOW_S, total))
+        for low, length, excess in _scan(counts.astype(np.float64), sums.astype(np.float64)):
+            start = float(time[0] + low * _WINDOW_S)
+            found.append(Burst(int(session), start, length * _WINDOW_S, excess))
     return tuple(sorted(found, key=lambda b: -b.excess)[:_MOST])
 
 
-def _closed(far: np.ndarray) -> np.ndarray:
-    """The same with holes of up to two windows filled."""
-    out = far.copy()
-    for k in range(1, len(far) - 1):
-        out[k] |= far[max(0, k - 2) : k].any() and far[k + 1 : k + 3].any()
-    return out
+def _scan(counts: Floats, sums: Floats) -> Iterator[tuple[int, int, float]]:
+    """First window, number of windows and excess of bursts, the clearest first.
+
+    counts, sums : rows and chi-square of each window. A weak push for two seconds stands out in no single window, so
+    intervals of 1, 2, 4 ... windows are tried. An interval stands out from the level of the session and from those of
+    its length before and after it.
+    """
+    usual = float(np.median(sums[counts > 0] / counts[counts > 0])) if np.any(counts > 0) else 1.0
+    free = np.ones(len(counts), dtype=bool)
+    number, total = (np.concatenate([[0.0], np.cumsum(values)]) for values in (counts, sums))
+    for _ in range(_MOST):
+        best = (0.0, 0, 0, 0.0)
+        for length in (2**k for k in range(int(np.log2(_LONGEST_S / _WINDOW_S)) + 1)):
+            starts = np.arange(len(counts) - length + 1)
+            rows, chi = (table[starts + length] - table[starts] for table in (number, total))
+            level = np.full(len(starts), usual)
+            for beside in (starts - length, starts + length):
+                at = np.clip(beside, 0, len(counts) - length)
+                there = (total[at + length] - total[at]) / np.maximum(number[at + length] - number[at], 1.0)
+                # An end of the session has one neighbour only.
+                level = np.where((at == beside) & (there > level), there, level)
+            excess = chi - level * rows
+            clear = excess / (level * np.sqrt(2.0 * np.maximum(rows, 1.0)))
+            clear[(rows == 0.0) | [not free[k : k + length].all() for k in starts]] = 0.0
+            place = int(np.argmax(clear)) if len(clear) else 0
+            if len(clear) and clear[place] > best[0]:
+                best = (float(clear[place]), place, length, float(excess[place]))
+        if best[0] <= _FAR:
+            return
+        _, low, length, _ = best
+        yield best[1:]
+        free[max(low - length // 2, 0) : low + length + length // 2 + 1] = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,11 +17,11 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
 from ident.diagnosis.candidates import Trial
 from ident.diagnosis.evidence import Evidence, Floats
-from ident.diagnosis.nominal import Nominal, NominalArm
+from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
-from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference, habit
-from ident.diagnosis.selection import Claim, gains, select
+from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference, habit, shared
+from ident.diagnosis.selection import GAIN, Claim, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
@@ -48,6 +48,8 @@ _TUNING_SETS = 3
 _ROUNDS = 3
 _LATEST_S = 0.02
 _CHANNELS = ("motor", "joint")
+# Weight of the usual change of a gain, in changes.
+_USUAL_GAINS = 2.0
 
 SlowTurns = NDArray[np.float64]
 """(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
@@ -159,9 +161,12 @@ def with_far_presliding(arm: NominalArm, days: Sequence[SlowTurns], coulomb: Seq
 class _Day:
     """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of the
     drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels beyond the arm's, with standard
-    deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm].
+    deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm]. masses : announced, of its payloads [kg].
+    gains : (2, n) errors of the torque sensors' gains with standard deviations, NaN where unknown.
     """
 
+    base: BaseSet
+    masses: Mapping[str, float | None]
     values: Floats
     covariance: Floats
     sigma: Mapping[str, Floats]
@@ -169,6 +174,7 @@ class _Day:
     coulomb: Floats
     slow_turns: SlowTurns
     late: Mapping[str, tuple[float, float]]
+    gains: Floats
 
 
 def commission(
@@ -186,7 +192,7 @@ def commission(
     The side of the joints that the positions come from, stiffness and presliding come from the first sets;
     parameters and noise from all, with what changed between them; the null, the mean gain of each candidate,
     from each set against a reference made of the others. Raises DataError for sessions that cannot
-    be used, and where the sets differ in their payloads or channels.
+    be used, and where the sets differ in their channels or in the number of payloads.
     """
     settings = settings or DiagnosisSettings()
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
@@ -233,13 +239,13 @@ def commission(
     null: dict[tuple[str, int], float] = {}
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
-        rest = _reference(others, base, known, robot, parts[0], {}) if others else None
+        rest = _reference(others, known, robot, parts[0], {}) if others else None
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
             null[key] = null.get(key, 0.0) + gain / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))
-    found = _reference(days, base, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
+    found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals)}
     return replace(found, model=replace(found.model, provenance=provenance))
 
@@ -332,14 +338,17 @@ def _day(
     bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=False)
     if bench.nominal.base.names != base.names:
         raise DataError(
-            "the healthy sets have different payloads or channels, and so different parameters; give sets of the "
-            "same kind"
+            "the healthy sets differ in their channels or in the number of payloads, and so in their parameters; give "
+            "sets of the same kind"
         )
     evidence = bench.evidence
     # `select` adds the tolerated deviations to the base.
+    # Any gain within the tolerance of these days belongs to the healthy arm.
     nuisance = select(bench.dictionary, evidence, settings, None).nuisance
     p = evidence.base_count
     return _Day(
+        bench.nominal.base,
+        bench.nominal.masses,
         evidence.full.values[:p].copy(),
         evidence.covariance()[:p, :p],
         evidence.sigma,
@@ -347,39 +356,43 @@ def _day(
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
         {side: mean_delay(nuisance, side) for side in _CHANNELS},
+        np.array([nuisance.get(f"{GAIN} {j + 1}", (np.nan, np.nan)) for j in range(arm.chain.n)]).T,
     )
 
 
 def _reference(
     days: Sequence[_Day],
-    base: BaseSet,
     arm: NominalArm,
     robot: str,
     sessions: Sequence[Session],
     null: Mapping[tuple[str, int], float],
 ) -> Reference:
-    rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in days[0].torque_rms}
-    changes = np.diag(habit(base.names, [day.values for day in days], [day.covariance for day in days], rms))
-    # A mean weighted by each day's own uncertainty alone would turn their changes into errors of all parameters.
-    precisions = [
-        np.asarray(np.linalg.inv(_sound(day.covariance + changes)), dtype=np.float64) for day in days
-    ]
-    mean = np.linalg.inv(_sound(np.sum(precisions, axis=0)))
-    pulls = [p @ day.values for p, day in zip(precisions, days, strict=True)]
-    values: Floats = mean @ np.sum(pulls, axis=0)
+    kinds = [sorted(day.masses.items()) for day in days]
+    usual = days[max(range(len(days)), key=lambda k: kinds.count(kinds[k]))]
+    base, known = usual.base, [_known(day, usual) for day in days]
+    rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in usual.torque_rms}
+    variance = habit(base.names, [values for values, _ in known], [c for _, c in known], rms)
+    precision, pull = np.zeros((len(base), len(base))), np.zeros(len(base))
+    for values, covariance in known:
+        # A mean weighted by each day's own uncertainty alone would turn their changes into errors of all parameters.
+        here = np.flatnonzero(np.isfinite(values))
+        own = np.linalg.inv(_sound(covariance[np.ix_(here, here)] + np.diag(variance[here])))
+        precision[np.ix_(here, here)] += own
+        pull[here] += own @ values[here]
+    mean = np.linalg.inv(_sound(precision))
     # A further day differs from the mean of these.
-    covariance: Floats = np.asarray(mean + changes, dtype=np.float64)
+    covariance = np.asarray(mean + np.diag(variance), dtype=np.float64)
     model = DynamicModel(
         robot or "arm",
         base.structure,
         base.names,
-        values,
+        mean @ pull,
         _sound(covariance),
         base,
         {"sessions": [s.path.name for s in sessions]},
         arm.healthy,
     )
-    noise = {side: np.mean([day.sigma[side] for day in days], axis=0) for side in days[0].sigma}
+    noise = {side: np.mean([day.sigma[side] for day in days], axis=0) for side in usual.sigma}
     return Reference(
         model,
         arm.compliance,
@@ -394,7 +407,18 @@ def _reference(
         arm.far_share,
         {side: delay_std([day.late[side] for day in days]) for side in _CHANNELS},
         habits=True,
+        masses=usual.masses,
+        gain_std=gain_std([day.gains for day in days]),
     )
+
+
+def _known(day: _Day, usual: _Day) -> tuple[Floats, Floats]:
+    """Values (p,) and covariance (p, p) of the base parameters of the usual day, NaN for those of another payload."""
+    pairs = np.array(shared(day.base, usual.base, day.masses, usual.masses))
+    values, covariance = np.full(len(usual.base), np.nan), np.full((len(usual.base),) * 2, np.nan)
+    values[pairs[:, 1]] = day.values[pairs[:, 0]]
+    covariance[np.ix_(pairs[:, 1], pairs[:, 1])] = day.covariance[np.ix_(pairs[:, 0], pairs[:, 0])]
+    return values, covariance
 
 
 def delay_std(late: Sequence[tuple[float, float]]) -> float:
@@ -408,6 +432,26 @@ def delay_std(late: Sequence[tuple[float, float]]) -> float:
     days = len(values) - 1
     variance = (USUAL_DAYS * DELAY_STD_S**2 + max(own, 0.0)) / (USUAL_DAYS + days)
     return float(np.sqrt(variance * (1.0 + 1.0 / len(values))))
+
+
+def gain_std(days: Sequence[Floats]) -> float:
+    """Standard deviation of the torque sensors' gains from day to day, from errors with standard deviations (2, n) of
+    each. All sensors of an arm have the same habits, and the usual one counts as some further changes.
+    """
+    table = np.array(days)
+    values, own = table[:, 0], table[:, 1] ** 2
+    known = np.isfinite(values) & (own < GAIN_STD**2)
+    count = known.sum(axis=0)
+    several = count > 1
+    if not several.any():
+        return GAIN_STD
+    values, own = (np.where(known, x, np.nan)[:, several] for x in (values, own))
+    changes = count[several] - 1
+    scatter = np.nansum((values - np.nanmean(values, axis=0)) ** 2, axis=0) - changes * np.nanmean(
+        own, axis=0
+    )
+    total = _USUAL_GAINS * GAIN_STD**2 + max(float(scatter.sum()), 0.0)
+    return float(np.sqrt(total / (_USUAL_GAINS + changes.sum())))
 
 
 def _sound(matrix: Floats) -> Floats:

@@ -18,15 +18,18 @@ from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
+from ident.diagnosis.selection import GAIN
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.wear import is_level, wear
-from ident.effects import EFFECTS
+from ident.effects import EFFECTS, SENSOR_GAIN, entry_of
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.data_quality import sample_loss
 
 # Least confidence of a finding.
 _HARDLY = 0.1
+# Least error of a sensor's gain in the models, in standard deviations.
+_CLEAR = 2.0
 
 
 def conclude(task: Task, state: State) -> Diagnosis:
@@ -72,7 +75,11 @@ def conclude(task: Task, state: State) -> Diagnosis:
     extended_rms = after.rms()
     entries = [_entry(f) for f in findings if f in shipped or f in state.timing]
     base_model, extended, changes = _models(
-        task, bench, baseline, (*entries, *(e for term in nameless for e in term.entries))
+        task,
+        bench,
+        baseline,
+        state.selection.nuisance,
+        (*entries, *(e for term in nameless for e in term.entries)),
     )
     fitted = {(term.side, term.joint) for term in nameless}
     left = [
@@ -121,7 +128,11 @@ def conclude(task: Task, state: State) -> Diagnosis:
 
 
 def _models(
-    task: Task, bench: DiagnosisBench, baseline: Baseline, effects: tuple[Mapping[str, Any], ...]
+    task: Task,
+    bench: DiagnosisBench,
+    baseline: Baseline,
+    nuisance: Mapping[str, tuple[float, float]],
+    effects: tuple[Mapping[str, Any], ...],
 ) -> tuple[DynamicModel, DynamicModel, dict[str, float]]:
     """Base model, extended model with the columns of the evidence, and the change of the base parameters in their
     standard deviations.
@@ -143,7 +154,7 @@ def _models(
         baseline.covariance,
         replace(nominal.base, structure=structure),
         provenance,
-        nominal.arm.healthy,
+        (*nominal.arm.healthy, *_gains(nuisance)),
     )
     values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]
     extended = replace(base, values=values, covariance=covariance, effects=(*base.effects, *effects))
@@ -152,6 +163,17 @@ def _models(
     order = np.argsort(-np.abs(shift))[:10]
     changes = {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0} if effects else {}
     return base, extended, changes
+
+
+def _gains(nuisance: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
+    """Entries of the tolerated errors of the torque sensors' gains beyond their own uncertainty: both models predict
+    what these sensors show."""
+    found = []
+    for name, (value, std) in nuisance.items():
+        what, _, joint = name.rpartition(" ")
+        if what == GAIN and abs(value) > _CLEAR * std:
+            found.append(entry_of(SENSOR_GAIN, [int(joint)], {"error": (value, std)}))
+    return found
 
 
 def _entry(finding: Finding) -> dict[str, Any]:

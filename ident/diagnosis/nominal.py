@@ -49,6 +49,8 @@ _RELAXATION_S = 2e-3
 _LEAST_MASS = 1e-3
 # A joint within this range carries no information on its friction, gears and cables.
 TRAVEL_RAD = 0.1
+# Usual standard deviation of a torque sensor's gain from day to day: within a per cent, evenly.
+GAIN_STD = 0.01 / np.sqrt(3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +64,9 @@ class NominalArm:
     presliding : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
     unknown.
     far, far_share : (n,) longer distance [rad] for a share of that friction, and the share.
-    couplings : pairs of joints with coupled drives. healthy : entries of the healthy arm's own effects
-    (`ident.effects`); their torque is part of the nominal one, so that a cause is a change against this arm.
+    gain_std : of the torque sensors' gains from day to day. couplings : pairs of joints with coupled drives.
+    healthy : entries of the healthy arm's own effects (`ident.effects`); their torque is part of the nominal one, so
+    that a cause is a change against this arm.
     """
 
     chain: Chain
@@ -76,6 +79,7 @@ class NominalArm:
     presliding: Floats | None = None
     far: Floats | None = None
     far_share: Floats | None = None
+    gain_std: float = GAIN_STD
     couplings: tuple[Coupling, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
 
@@ -249,6 +253,11 @@ class Nominal:
             loaded=recording.payload is not None or all(r.payload is None for r in self.recordings),
         )
 
+    @property
+    def masses(self) -> dict[str, float | None]:
+        """Announced mass [kg] of each payload."""
+        return {r.payload: r.payload_mass for r in self.recordings if r.payload is not None}
+
     # ---- rows ----
 
     @property
@@ -417,7 +426,9 @@ def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
 
 
 def _step(time: Floats) -> float:
-    return float(np.median(np.diff(time)))
+    """Usual distance [s] of stamps, from those around the middle of a long record."""
+    middle = len(time) // 2
+    return float(np.median(np.diff(time[max(middle - 500, 0) : middle + 500])))
 
 
 def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:

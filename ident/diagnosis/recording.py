@@ -16,7 +16,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure, Side
 from ident.rows.data_quality import Stuck, clipped_at, passed_band, stuck_at
 from ident.rows.prepare import PreparedSession, prepare
-from ident.rows.sessions import payload_name
+from ident.rows.sessions import payload_name, stated_mass
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session
 
@@ -49,8 +49,8 @@ class RecordStretch:
 class SessionRecord:
     """A session ready for rows.
 
-    number : in the order of the sessions' beginnings. payload : mounted, None for none.
-    period_s : of the excitation, or the duration without repetition; start_s : its beginning.
+    number : in the order of the sessions' beginnings. payload : mounted, None for none. payload_mass : as announced
+    [kg]. period_s : of the excitation, or the duration without repetition; start_s : its beginning.
     has_effort, has_motor : existing channels. test : held-out session.
     clipped : (n,) torque [Nm] at the limit of a joint's sensor, NaN without a visible limit. stuck : values reported
     repeatedly as motor torque without being measurements.
@@ -72,6 +72,7 @@ class SessionRecord:
     stuck: tuple[Stuck, ...]
     joint_band_hz: float | None = None
     motor_band_hz: float | None = None
+    payload_mass: float | None = None
 
     @property
     def repeats(self) -> bool:
@@ -126,6 +127,7 @@ def record(
         name=prepared.name,
         number=number,
         payload=payload_name(chosen),
+        payload_mass=stated_mass(chosen),
         stretches=stretches,
         start_s=float(first),
         period_s=float(spans[0][1] - spans[0][0]) * 1e-9 if spans else last - first,

@@ -18,7 +18,9 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.diagnosis.evidence import Floats
+from ident.diagnosis.nominal import GAIN_STD
 from ident.dynamics.base_set import BaseSet
+from ident.dynamics.parameters import PER_LINK
 from ident.effects import NAMELESS
 from ident.effects.nameless import KNOTS
 from ident.estimators.estimate import fisher_limit
@@ -39,6 +41,8 @@ _ELSE = 0.01
 _OFFSETS = ("offl", "offm")
 # Weight of the usual change beside that of this arm, in changes of a parameter.
 _USUAL_CHANGES = 2.0
+# Relative standard deviation of an announced mass.
+_WEIGHED = 0.02
 _ONE_IN = 0.01
 _AS_SETS = 4
 
@@ -52,7 +56,8 @@ class Reference:
     sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
     presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal.Arm`.
     delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
-    the changes from day to day.
+    the changes from day to day. masses : announced, of its payloads [kg].
+    gain_std : of the torque sensors' gains from day to day.
     """
 
     model: DynamicModel
@@ -68,6 +73,8 @@ class Reference:
     far_share: Floats | None = None
     delay_std_s: Mapping[str, float] = field(default_factory=dict)
     habits: bool = False
+    masses: Mapping[str, float | None] = field(default_factory=dict)
+    gain_std: float = GAIN_STD
 
     def __repr__(self) -> str:
         joints = self.model.structure.chain.joint_names
@@ -115,9 +122,22 @@ class Reference:
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
         side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
-        habits = bool(stored.get("habits", False))
+        habits, masses = bool(stored.get("habits", False)), dict(stored.get("masses", {}))
         return cls(
-            model, compliance, *delays, noise, null, sets, side, presliding, far, far_share, delay_std, habits
+            model,
+            compliance,
+            *delays,
+            noise,
+            null,
+            sets,
+            side,
+            presliding,
+            far,
+            far_share,
+            delay_std,
+            habits,
+            masses,
+            float(stored.get("gain_std", GAIN_STD)),
         )
 
     def stored(self) -> dict[str, Any]:
@@ -134,6 +154,8 @@ class Reference:
                 },
                 "sets": self.sets,
                 "habits": self.habits,
+                "masses": dict(self.masses),
+                "gain_std": self.gain_std,
                 "encoder": self.encoder,
                 "reach": _listed(self.presliding),
                 "far": _listed(self.far),
@@ -176,15 +198,20 @@ class Reference:
         more = np.diag(np.where(mine, share * model.values, 0.0) ** 2)
         return replace(self, model=replace(model, covariance=model.covariance + more))
 
-    def prior(self, base: BaseSet, *, wider: float = _WIDER) -> tuple[Floats, Floats] | None:
+    def prior(
+        self, base: BaseSet, masses: Mapping[str, float | None] | None = None, *, wider: float = _WIDER
+    ) -> tuple[Floats, Floats] | None:
         """Precision (p, p) and values (p,) of the base parameters shared with the reference.
 
-        wider : factor on their standard deviations. None for a reference without covariance or shared parameters.
+        masses : announced, of the payloads [kg]. Another payload than the reference's shares no parameter; its mass is
+        the announced one. wider : factor on their standard deviations. None for a reference without covariance or
+        shared parameters.
         """
+        masses = masses or {}
         own = self.model
         if own.covariance is None or own.base is None:
             return None
-        pairs = _same(own.base, base)
+        pairs = shared(own.base, base, self.masses, masses)
         mine = {int(p): k for k, p in enumerate(own.positions)}
         pairs = [(mine[a], b) for a, b in pairs if a in mine]
         if not pairs:
@@ -200,6 +227,9 @@ class Reference:
         precision[np.ix_(here, here)] = np.linalg.inv(covariance)
         mean = np.zeros(len(base))
         mean[here] = values
+        for k, mass in _announced(base, masses).items():
+            if k not in here:
+                precision[k, k], mean[k] = 1.0 / (_WEIGHED * mass) ** 2, mass
         return precision, mean
 
 
@@ -211,13 +241,15 @@ def habit(
 ) -> Floats:
     """Variance (p,) of healthy parameters from day to day around their mean.
 
-    days, covariances : parameters (p,) and covariance (p, p) of each day. torque_rms : of the rows by side, (n,) [Nm].
+    days, covariances : parameters (p,) and covariance (p, p) of each day, NaN for the parameters of another payload.
+    torque_rms : of the rows by side, (n,) [Nm].
     Joints of an arm have the same habits, so all parameters of a symbol share one relative variance: the scatter of the
     days beyond their own uncertainty, and the usual change as some further changes. Two days of a 7-joint arm are
     seven changes of its Coulomb friction.
     """
     values = np.array(days)
-    mean, own = values.mean(axis=0), np.mean([np.diag(c) for c in covariances], axis=0)
+    count = np.isfinite(values).sum(axis=0)
+    mean, own = np.nanmean(values, axis=0), np.nanmean([np.diag(c) for c in covariances], axis=0)
     symbols = [_symbol(name) for name in names]
     scale = np.array(
         [
@@ -234,8 +266,9 @@ def habit(
         mine = np.array([g == group for g in groups])
         # A parameter less certain than its usual change tells nothing of habits.
         telling = mine & (own < (usual * scale) ** 2) & (scale > 0.0)
-        changes = (len(values) - 1) * int(telling.sum())
-        scatter = np.sum((values[:, telling] - mean[telling]) ** 2, axis=0) - (len(values) - 1) * own[telling]
+        changes = int(np.sum(count[telling] - 1))
+        scatter = np.nansum((values[:, telling] - mean[telling]) ** 2, axis=0)
+        scatter = scatter - (count[telling] - 1) * own[telling]
         total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
         share = (_USUAL_CHANGES * usual[mine][0] ** 2 + total) / (_USUAL_CHANGES + changes)
         variance[mine] = share * scale[mine] ** 2
@@ -261,13 +294,47 @@ def _split(key: str) -> tuple[str, int]:
     return cause, int(joint) - 1
 
 
-def _same(a: BaseSet, b: BaseSet) -> list[tuple[int, int]]:
-    """Pairs of base parameters of two sets with the same sum of standard parameters."""
-    rows_a = [_combination(a, k) for k in range(len(a))]
-    rows_b = {_combination(b, k): k for k in range(len(b))}
+def shared(
+    a: BaseSet, b: BaseSet, masses_a: Mapping[str, float | None], masses_b: Mapping[str, float | None]
+) -> list[tuple[int, int]]:
+    """Pairs of base parameters of two sets with the same sum of standard parameters; those of a payload only if it
+    has the same name and no other announced mass [kg].
+    """
+    other = set()
+    for name, mass in masses_a.items():
+        now = masses_b.get(name)
+        if mass is not None and now is not None and not np.isclose(mass, now, rtol=1e-3):
+            other.add(name)
+    rows_a = [_combination(a, k, other) for k in range(len(a))]
+    rows_b = {_combination(b, k, set()): k for k in range(len(b))}
     return [(k, rows_b[row]) for k, row in enumerate(rows_a) if row in rows_b]
 
 
-def _combination(base: BaseSet, k: int) -> tuple[tuple[str, float], ...]:
-    names, row = base.structure.names, base.matrix[k]
-    return tuple((names[c], round(float(row[c]), 6)) for c in np.flatnonzero(np.abs(row) > 1e-9))
+def _combination(base: BaseSet, k: int, other: set[str]) -> tuple[tuple[str, float], ...]:
+    """Names and factors of a base parameter's sum, the payloads' by their names; `other` ones by no name in use."""
+    row = base.matrix[k]
+    return tuple(
+        (_with_payload(base, int(c), other), round(float(row[c]), 6))
+        for c in np.flatnonzero(np.abs(row) > 1e-9)
+    )
+
+
+def _with_payload(base: BaseSet, column: int, other: set[str]) -> str:
+    """Name of a column, of a payload's with that payload."""
+    structure, name = base.structure, base.structure.names[column]
+    payload = column // len(PER_LINK) - structure.chain.n
+    if not 0 <= payload < len(structure.payloads):
+        return name
+    title = structure.payloads[payload]
+    return f"{name.rstrip('0123456789')} of {title}{' before' if title in other else ''}"
+
+
+def _announced(base: BaseSet, masses: Mapping[str, float | None]) -> dict[int, float]:
+    """Announced mass [kg] by place of the base parameters that are the mass of a payload."""
+    found = {}
+    for k in range(len(base)):
+        terms = _combination(base, k, set())
+        for payload, mass in masses.items():
+            if mass and terms == ((f"M of {payload}", 1.0),):
+                found[k] = float(mass)
+    return found

@@ -18,7 +18,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import DELAYS, ELASTICITY, Shape
+from ident.effects import DELAYS, ELASTICITY, SENSOR_GAIN, Shape
 from ident.estimators.estimate import normal_tail
 
 log = logging.getLogger(__name__)
@@ -39,10 +39,15 @@ _LEAST_GAIN = 10.0
 _KNOWN_DELAY = 0.4
 # The same for a stiffness behind published motors.
 _KNOWN_COMPLIANCE = 0.4
+# Largest gain error of a torque sensor as one of other days, in their standard deviations.
+_HABITUAL = 3.0
 # Confidence in a sensor's error with a record of the joint torque only.
 _SHAPE_ALONE = 0.7
 # Confidence in one of two causes of the same torque in these motions.
 _EITHER = 0.5
+
+GAIN = "gain"
+"""Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
 
 Null = Mapping[tuple[str, int], float]
 """Upper limit of each candidate's gain in a healthy set."""
@@ -210,6 +215,11 @@ class _State:
                 if rows:
                     size = share * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
+        if len(nominal.rows) == 2 or ("joint" in nominal.rows and self.evidence.compared):
+            # Without motor torques or a reference a common gain of all sensors is a scale of all masses.
+            for joint in range(nominal.arm.chain.n):
+                rows = self.dictionary.rows(Candidate(SENSOR_GAIN, joint), Shape())
+                found.append((f"{GAIN} {joint + 1}", rows, 1.0, _HABITUAL * nominal.arm.gain_std))
         self._tolerances = found
         return found
 

@@ -44,7 +44,7 @@ def is_level(claim: Claim) -> bool:
 def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Finding]:
     """Findings of changed drives, beside the present columns of the evidence. after : held-out rows with them."""
     nominal, evidence = bench.nominal, bench.evidence
-    prior = reference.prior(nominal.base, wider=1.0)
+    prior = reference.prior(nominal.base, nominal.masses, wider=1.0)
     if prior is None or not reference.sets or "motor" not in nominal.rows:
         return []
     precision, healthy = prior

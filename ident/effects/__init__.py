@@ -39,6 +39,7 @@ __all__ = [
     "LOST_SAMPLES",
     "NAMELESS",
     "PRESLIDING",
+    "SENSOR_GAIN",
     "WEAR",
     "ZERO_OFFSET",
     "ArmMotion",
@@ -66,6 +67,7 @@ _ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 FRICTION_TEMPERATURE = drive.FrictionTemperature()
 PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
+SENSOR_GAIN = channel.SensorGain()
 ZERO_OFFSET = link.JointZeroOffset()
 LOST_SAMPLES = channel.LostSamples()
 DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
@@ -92,7 +94,7 @@ EFFECTS: dict[str, Effect] = {
         ZERO_OFFSET,
         link.EncoderEccentricity(),
         load.Contact(),
-        channel.SensorGain(),
+        SENSOR_GAIN,
         channel.SensorCrosstalk(),
         channel.SensorHysteresis(),
         channel.SensorSaturation(),

@@ -30,8 +30,7 @@ from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
-from ident.effects import entry_of
-from ident.effects.channel import SensorGain
+from ident.effects import SENSOR_GAIN, entry_of
 from ident.estimation.identify import (
     Identification,
     IdentificationSettings,
@@ -207,7 +206,7 @@ def choose(
     else:
         found = identify(sessions, chain, final, known=first.known)
     effects = tuple(
-        entry_of(SensorGain(), [chain.joint_names.index(joint) + 1], {"error": gain})
+        entry_of(SENSOR_GAIN, [chain.joint_names.index(joint) + 1], {"error": gain})
         for joint, gain in choice.gains.items()
     )
     return replace(found, settings=settled, choice=choice, effects=effects)

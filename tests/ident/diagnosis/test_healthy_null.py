@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis.commission import delay_std, with_far_presliding
-from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.commission import delay_std, gain_std, with_far_presliding
+from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import ModelStructure
+from ident.dynamics.structure import Condition, ModelStructure
 from ident.model import DynamicModel
 
 
@@ -112,3 +112,46 @@ def test_loosened_parameters_are_less_tied_and_no_others(chain: Chain) -> None:
     assert std[1][inertias] == pytest.approx(np.full(inertias.sum(), 1.5 * 0.1), rel=0.01)
     np.testing.assert_allclose(std[1][~inertias], std[0][~inertias])
     np.testing.assert_array_equal(loose[1], tied[1])
+
+
+def test_scatter_of_the_sensors_gains_is_learned_from_all_joints() -> None:
+    rng = np.random.default_rng(6)
+
+    def days(scatter: float) -> list[np.ndarray]:
+        return [np.stack([rng.normal(0.02, np.hypot(scatter, 1e-3), 7), np.full(7, 1e-3)]) for _ in range(6)]
+
+    assert gain_std(days(0.02)) == pytest.approx(0.02, rel=0.3)
+    assert gain_std(days(0.0)) < 0.4 * GAIN_STD
+    # One day, or values less certain than the usual change, say nothing of other days.
+    assert gain_std(days(0.02)[:1]) == GAIN_STD
+    assert gain_std([np.stack([np.full(7, 0.1 * k), np.full(7, 0.05)]) for k in range(3)]) == GAIN_STD
+
+
+def test_another_payload_shares_no_parameter_and_has_its_announced_mass(chain: Chain) -> None:
+    conditions = [Condition(), Condition("load")]
+    base = numeric_base(ModelStructure(chain, 2, ("load",)), conditions)
+    model = DynamicModel(
+        "arm", base.structure, base.names, np.full(len(base), 3.0), 1e-6 * np.eye(len(base)), base
+    )
+    healthy = replace(reference(model, {}, 8), masses={"load": 2.0})
+    other = numeric_base(ModelStructure(chain, 2, ("tool",)), [Condition(), Condition("tool")])
+    assert other.names == base.names
+    mine = np.array([name.rstrip("R").endswith(str(chain.n + 1)) for name in base.names])
+    mass = base.names.index(f"M{chain.n + 1}")
+
+    same = healthy.prior(base, {"load": 2.0})
+    another = healthy.prior(other, {"tool": 4.0})
+    heavier = healthy.prior(base, {"load": 4.0})
+    unknown = healthy.prior(other, {"tool": None})
+    assert same is not None
+    assert another is not None
+    assert heavier is not None
+    assert unknown is not None
+    assert np.all(np.diag(same[0]) > 0.0)
+    assert np.all(np.diag(same[0])[~mine] == np.diag(another[0])[~mine])
+    for precision, values in (another, heavier):
+        known = np.diag(precision)[mine] > 0.0
+        assert known.sum() == 1
+        assert values[mass] == 4.0
+        assert 1.0 / np.sqrt(precision[mass, mass]) == pytest.approx(0.08)
+    assert np.all(np.diag(unknown[0])[mine] == 0.0)
