@@ -494,7 +494,7 @@ def _schur(products: _Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats | No
     inner = own - cross @ projection
     size = np.diag(own).copy()
     # A column with less than this share beside the base carries no information of its own.
-    if np.any(size <= 0.0) or np.any(np.diag(inner) < 1e-7 * size):
+    if np.any(size <= 0.0) or np.any(np.diag(inner) < 1e-5 * size):
         return projection, None, np.zeros(len(own))
     inner = inner + ridge * np.diag(size)
     root = np.sqrt(np.diag(inner))
