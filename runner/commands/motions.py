@@ -7,13 +7,14 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from lwr_driver.configuration import CONFIGS
 from runner.terminal import PATH, StatusLine, json_option, to_json
 
-_EXPERIMENT = "experiments/default.yaml"
+_EXPERIMENT = str(CONFIGS / "experiments/default.yaml")
 
 
 @click.command("plan")
-@click.argument("file", default="plans/default.yaml")
+@click.argument("file", default=str(CONFIGS / "plans/default.yaml"))
 @click.option("--out", type=PATH, help="Plan file; default: NAME.plan.yaml here.")
 @click.option("--force", is_flag=True, help="Replace an existing plan file.")
 @json_option
