@@ -28,9 +28,9 @@ _noted: ContextVar[list[Reference] | None] = ContextVar("references", default=No
 
 @dataclass(frozen=True)
 class Reference:
-    """A file found by its name. beside : folder of the file naming it; None for the command line."""
+    """A file found by its name. beside : folder of the file naming it."""
 
-    beside: Path | None
+    beside: Path
     name: str
     path: Path
 
@@ -59,17 +59,17 @@ def noting() -> Iterator[list[Reference]]:
 
 
 def note(beside: Path | None, name: str, path: Path) -> None:
-    """A file was found."""
+    """A file was found; names from the command line, without `beside`, are not noted."""
     found = _noted.get()
-    if found is not None:
-        found.append(Reference(None if beside is None else beside.resolve(), name, path))
+    if found is not None and beside is not None:
+        found.append(Reference(beside.resolve(), name, path))
 
 
-def used(references: Sequence[Reference]) -> list[UsedFile]:
-    """The files behind references, each once, with their hashes and places of their copies."""
+def used(root: Path, references: Sequence[Reference]) -> list[UsedFile]:
+    """The file `root` and those behind references, each once, with their hashes and places of their copies."""
     folders: dict[Path, str] = {}
     files: dict[Path, UsedFile] = {}
-    for path in (reference.path for reference in references):
+    for path in (root.resolve(), *(reference.path for reference in references)):
         if path.parent not in folders:
             name = path.parent.name or "root"
             taken = sum(other == name or other.startswith(f"{name}-") for other in folders.values())
@@ -79,9 +79,9 @@ def used(references: Sequence[Reference]) -> list[UsedFile]:
     return list(files.values())
 
 
-def freeze(references: Sequence[Reference], target: Path) -> list[UsedFile]:
-    """Copy the files behind references into `target/files/` with their manifest; returns them."""
-    files = used(references)
+def freeze(root: Path, references: Sequence[Reference], target: Path) -> list[UsedFile]:
+    """Copy the file `root` and those behind references into `target/files/` with their manifest; returns them."""
+    files = used(root, references)
     by_path = {file.path: file.file for file in files}
     home = target / FOLDER
     for file in files:
@@ -92,11 +92,12 @@ def freeze(references: Sequence[Reference], target: Path) -> list[UsedFile]:
             raise ConfigurationError(f"{file.path} changed while it was read; start again")
     folders = {file.path.parent: file.file.partition("/")[0] for file in files}
     named = [
-        {"folder": folders.get(r.beside, "") if r.beside else "", "name": r.name, "file": by_path[r.path]}
-        for r in references
+        {"folder": folders.get(one.beside, ""), "name": one.name, "file": by_path[one.path]}
+        for one in references
     ]
     content = {
         "schema_version": 1,
+        "root": by_path[root.resolve()],
         "files": [{"path": str(f.path), "sha256": f.sha256, "file": f.file} for f in files],
         "references": [entry for index, entry in enumerate(named) if entry not in named[:index]],
         "made": {},
@@ -153,10 +154,7 @@ class Frozen:
     def root(self) -> Path:
         """The file named on the command line."""
         manifest = _read(self._manifest_path)
-        for entry in manifest["references"]:
-            if not entry["folder"]:
-                return _unchanged(self.folder / FOLDER, entry["file"], manifest)
-        raise ConfigurationError(f"{self._manifest_path}: names no experiment file; start a new experiment")
+        return _unchanged(self.folder / FOLDER, manifest["root"], manifest)
 
     def check(self) -> None:
         """Raise ConfigurationError if a frozen file changed."""
@@ -210,7 +208,7 @@ def _unchanged(home: Path, file: str, manifest: dict[str, Any]) -> Path:
 def _read(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        for key, kind in (("files", list), ("references", list), ("made", dict)):
+        for key, kind in (("root", str), ("files", list), ("references", list), ("made", dict)):
             if not isinstance(content[key], kind):
                 raise ValueError(f"`{key}` is no {kind.__name__}")
         for entry in (*content["files"], *content["references"]):

@@ -72,10 +72,14 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
     from runner.experiment_file import Experiment
+    from runner.files import examine, listed
     from runner.planning import Excitations, session_motion
     from runner.preflight import Preflight
 
     experiment = Experiment.load(file)
+    files = examine(experiment)
+    if not as_json:
+        click.echo(listed(files))
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     motions = Excitations.of(experiment, arm, cell)

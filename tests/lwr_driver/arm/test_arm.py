@@ -179,5 +179,7 @@ def test_another_arm_names_itself_and_has_limits_of_its_own(files):
 
 @pytest.mark.parametrize("size", ["0", "-0.1", "nan", "88"])
 def test_collision_shapes_have_sizes_of_a_body(files, size):
-    with pytest.raises(ConfigurationError, match="collision shape of link .*(outside 0.001 to 2 m|expected)"):
-        files(replace=(r'<cylinder radius="[^"]*"', f'<cylinder radius="{size}"'))
+    with pytest.raises(
+        ConfigurationError, match=r"collision shape of link .*(outside 0.001 to 2 m|expected)"
+    ):
+        files(replace=(r'(<collision>.*?radius=")[^"]*', rf"\g<1>{size}"))
