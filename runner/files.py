@@ -27,6 +27,7 @@ from runner.preflight import load_data
 
 COPY = "experiment.yaml"
 _LOCK = ".lock"
+_MCAP_END = b"\x89MCAP0\r\n"
 
 
 def examine(experiment: Experiment) -> list[UsedFile]:
@@ -144,11 +145,19 @@ def check_finished(experiment: Experiment, folder: Path) -> None:
         if name in payloads:
             payload = payloads[name]
             wanted["payload"] = "none" if payload is None else payload.name
-        if session.missing or end.get("exit_status") != "success":
+        samples = len(session.joint)
+        with path.open("rb") as stream:
+            stream.seek(-len(_MCAP_END), os.SEEK_END)
+            closed = stream.read() == _MCAP_END
+        if (
+            not closed
+            or end.get("exit_status") != "success"
+            or end.get("samples", str(samples)) != str(samples)
+        ):
             raise DataError(f"finished session {name}: {path} is not whole; {advice}")
-        if len(session.joint) < max(1, progress.rows(name)):
+        if samples < max(1, progress.rows(name)):
             raise DataError(
-                f"finished session {name}: {path} has {len(session.joint)} samples of {progress.rows(name)}; {advice}"
+                f"finished session {name}: {path} has {samples} samples of {progress.rows(name)}; {advice}"
             )
         for key, value in wanted.items():
             if str(metadata.get(key)) != value:

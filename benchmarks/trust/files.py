@@ -7,6 +7,7 @@ that cannot be, shapes without size, texts without end, broken YAML, references 
 from __future__ import annotations
 
 import copy
+import importlib
 import multiprocessing
 import os
 import signal
@@ -46,22 +47,39 @@ _WRONG: dict[str, list[tuple[str, list[Any]]]] = {
     "experiment": [
         ("name", ["", "../up", "a" * 300, 7, None]),
         (f"{_LOAD}.mass", [3340, -1, 0, _NAN, _INF, 10**400, "heavy"]),
-        (f"{_LOAD}.com", [[0, -66, 144], [0, -6.6, 14.4], [0.4, 0.4, 0.4], [_NAN, 0, 0], [0, 0], [1e9, 0, 0]]),
+        (
+            f"{_LOAD}.com",
+            [[0, -66, 144], [0, -6.6, 14.4], [0.4, 0.4, 0.4], [_NAN, 0, 0], [0, 0], [1e9, 0, 0]],
+        ),
         (
             f"{_LOAD}.inertia",
             [
-                [-0.01, 0, 0, 0.01, 0, 0.01], [0.01, 0, 0, 0.01, 0, 0.1], [0.01, 0.02, 0, 0.01, 0, 0.01],
-                [89, 0, 0, 71, 0, 21], [0.01, 0, 0, 0, 0, 0], [2.0, 0, 0, 2.0, 0, 2.0],
+                [-0.01, 0, 0, 0.01, 0, 0.01],
+                [0.01, 0, 0, 0.01, 0, 0.1],
+                [0.01, 0.02, 0, 0.01, 0, 0.01],
+                [89, 0, 0, 71, 0, 21],
+                [0.01, 0, 0, 0, 0, 0],
+                [2.0, 0, 0, 2.0, 0, 2.0],
             ],
         ),
         (f"{_LOAD}.name", ["none", "a/b", "", "x" * 5000, "a\x00b"]),
-        (f"{_LOAD}.shape", [
-            {**_SHAPE, "size_m": [0.0]}, {**_SHAPE, "size_m": [-0.1]}, {**_SHAPE, "size_m": [100]},
-            {**_SHAPE, "size_m": [0.1, 0.2]}, {**_SHAPE, "centre_m": [0, 0, 144]}, {**_SHAPE, "shape": "mesh"},
-        ]),
+        (
+            f"{_LOAD}.shape",
+            [
+                {**_SHAPE, "size_m": [0.0]},
+                {**_SHAPE, "size_m": [-0.1]},
+                {**_SHAPE, "size_m": [100]},
+                {**_SHAPE, "size_m": [0.1, 0.2]},
+                {**_SHAPE, "centre_m": [0, 0, 144]},
+                {**_SHAPE, "shape": "mesh"},
+            ],
+        ),
         ("sessions.0.name", ["s" * 300, "..", "loaded", 3]),
         ("sessions", [[], [{"name": f"s{k}"} for k in range(200)], "all"]),
-        ("moves.home", [[0, 28, 0, -74, 0, 45, 0], [0, 0.5, 0], [_NAN] * 7, [4.0] * 7, [0, 2.5, 0, 0, 0, 0, 0]]),
+        (
+            "moves.home",
+            [[0, 28, 0, -74, 0, 45, 0], [0, 0.5, 0], [_NAN] * 7, [4.0] * 7, [0, 2.5, 0, 0, 0, 0, 0]],
+        ),
         ("moves.settle_s", [1e6, 0, -1, _INF]),
         ("moves.brake_s", [1e6, -5, _HUGE]),
         ("moves.speed_scale", [20, 0, -0.2, 1.5, 1e-300]),
@@ -80,7 +98,10 @@ _WRONG: dict[str, list[tuple[str, list[Any]]]] = {
         ("diagnosis.sure", [80, 0.1]),
         ("replan.rounds", [-1, 10**6]),
         ("arm", ["nowhere.yaml", "../" * 400 + "x", {"a": 1}]),
-        ("emulator_settings", [{"fri.period_ms": 0}, {"robot.payload": "piano"}, {"nonsense": 1}, {"seed": -1}]),
+        (
+            "emulator_settings",
+            [{"fri.period_ms": 0}, {"robot.payload": "piano"}, {"nonsense": 1}, {"seed": -1}],
+        ),
         ("motor_torque.krl.reals", [[0, 1, 2, 3, 4, 5, 6], [1] * 7]),
     ],
     "arm": [
@@ -124,7 +145,10 @@ _WRONG: dict[str, list[tuple[str, list[Any]]]] = {
         ("fri.period_ms", [1000, 0]),
         ("fri.velocity", [[110] * 7, [0] * 7]),
         ("policy.window", [0, 10**12]),
-        ("faults", [[{"kind": "fire"}], [{"kind": "loss", "probability": 5}], [{"kind": "delay", "length": 10**12}]]),
+        (
+            "faults",
+            [[{"kind": "fire"}], [{"kind": "loss", "probability": 5}], [{"kind": "delay", "length": 10**12}]],
+        ),
         ("schedule", [[{"command": "dance"}], [{"command": "emergency_stop", "after_cycles": -1}]]),
         ("base", ["emulator.yaml", 7]),
     ],
@@ -244,9 +268,8 @@ def judge(kind: str, key: str, value: Any) -> tuple[list[str], float]:
 
 def campaign(ledger: Ledger, options: Any) -> None:
     """A line for each kind of file."""
-    import runner.commands.motions  # noqa: F401  before the forks
-    import runner.files  # noqa: F401
-    import sim_backend.rehearsal  # noqa: F401
+    for module in ("runner.commands.motions", "runner.files", "sim_backend.rehearsal"):
+        importlib.import_module(module)  # before the forks
 
     for number, (kind, key, value) in enumerate(CASES):
         if options.only is not None and number != options.only:
