@@ -198,10 +198,7 @@ def _changed(content: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
     place: Any = changed
     *path, last = key.split(".")
     for name in path:
-        if isinstance(place, list):
-            place = place[int(name)]
-        else:
-            place = place.setdefault(name, {})
+        place = place[int(name)] if isinstance(place, list) else place.setdefault(name, {})
     place[last] = value
     return changed
 
