@@ -21,6 +21,7 @@ OWN_PROGRAM = "lwr_identification"
 """The KRL program of this project."""
 
 JOINTS = 7
+_FILES = (("robot", "urdf"), ("robot", "parameters"), ("controller", "urdf"), ("", "limits"))
 
 _Number = TypeVar("_Number")
 Joints = tuple[_Number, _Number, _Number, _Number, _Number, _Number, _Number]
@@ -69,7 +70,7 @@ class RobotConfig:
     """
 
     urdf: FileName = "lwr4plus.urdf"
-    parameters: FileName = "table2.yaml"
+    parameters: FileName = "emulator/table2.yaml"
     payload: Name = "none"
     start_position: _Angles = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
     stiffness: _Stiffness = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
@@ -277,7 +278,17 @@ def _with_base(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         return content
     if not isinstance(base, str):
         raise ConfigurationError(f"{path}: `base` must be the name of a file, found {base!r}")
-    return _merge(_with_base(find(base, beside=path.parent), (*seen, path)), content)
+    below = find(base, beside=path.parent)
+    return _merge(_resolved(_with_base(below, (*seen, path)), below.parent), content)
+
+
+def _resolved(content: dict[str, Any], beside: Path) -> dict[str, Any]:
+    """The content of a base with its file names found beside the base itself."""
+    for section, key in _FILES:
+        place = content.get(section) if section else content
+        if isinstance(place, dict) and isinstance(place.get(key), str):
+            place[key] = str(find(place[key], beside=beside))
+    return content
 
 
 def _merge(below: dict[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,12 +14,14 @@ import signal
 import tempfile
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from benchmarks.trust.table import Ledger
+from runner.computer import git_commit
 
 __all__ = ["CASES", "campaign", "judge"]
 
@@ -35,9 +37,12 @@ _BASE: dict[str, dict[str, Any]] = {
         "name": "lab",
         "boxes": [{"name": "table", "size_m": [0.8, 1.2, 0.05], "centre_m": [0.9, 0.0, -0.3]}],
     },
-    "emulator": {"base": str(_CONFIGS / "emulator/default.yaml")},
+    "emulator": {"base": "emulator/default.yaml"},
     "plan": yaml.safe_load((_CONFIGS / "plans/default.plan.yaml").read_text()),
-    "problem": yaml.safe_load((_CONFIGS / "plans/default.yaml").read_text()),
+    "problem": {
+        **yaml.safe_load((_CONFIGS / "plans/default.yaml").read_text()),
+        "search": {"starts": 1, "hops": 0, "lanes": 1},
+    },
 }
 _LOAD = "sessions.1.payload"
 _SHAPE = {"shape": "sphere", "size_m": [0.1], "centre_m": [0.0, 0.0, 0.1]}
@@ -190,6 +195,7 @@ def _cases() -> Iterator[tuple[str, str, Any]]:
         yield "experiment", f"text {number}", text
 
 
+UNCHANGED = tuple((kind, "", None) for kind in _BASE)
 CASES: tuple[tuple[str, str, Any], ...] = tuple(_cases())
 
 
@@ -213,7 +219,7 @@ def _written(folder: Path, kind: str, key: str, value: Any) -> list[str]:
         experiment["excitation"] = {"plan": "plan.yaml"}
     else:
         experiment["excitation"] = {"period_s": 6.0, "harmonics": 3, "periods": 1}
-    if not isinstance(value, bytes):
+    if key and not isinstance(value, bytes):
         files[kind] = _changed(files[kind], key, value)
     for name, content in files.items():
         (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
@@ -235,7 +241,7 @@ def _command(arguments: list[str], out: Path) -> None:
 
 
 def judge(kind: str, key: str, value: Any) -> tuple[list[str], float]:
-    """What did not hold of a case, and its time [s]."""
+    """What did not hold of a case, and its time [s]. Without a key the files are right and have to pass."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         arguments = _written(folder, kind, key, value)
@@ -251,14 +257,20 @@ def judge(kind: str, key: str, value: Any) -> tuple[list[str], float]:
             process.join()
             return [f"not ended after {_PATIENCE_S:.0f} s"], took
         text = out.read_text(errors="replace")
+    if not key:
+        return [] if process.exitcode == 0 else [f"exit code {process.exitcode}: {text[-300:]}"], took
     bad = []
     if process.exitcode not in (2, 3):
         bad.append(f"exit code {process.exitcode}: {text[-300:]}")
     if "Traceback" in text:
         bad.append(f"traceback: {text[-300:]}")
-    if "Error: " not in text:
+    said = text.partition("Error: ")[2]
+    words = (*(part for part in key.split(".") if not part.isdigit()), str(value)[:12])
+    if not isinstance(value, bytes) and not any(word in said for word in words[-2:]):
+        bad.append(f"the error names neither key nor value: {said[:300]!r}")
+    if not said:
         bad.append("no error of ours")
-    if len(text.partition("Error: ")[2]) > 4000:
+    if len(said) > 4000:
         bad.append(f"a message of {len(text)} characters")
     return bad, took
 
@@ -268,13 +280,14 @@ def campaign(ledger: Ledger, options: Any) -> None:
     for module in ("runner.commands.motions", "runner.files", "sim_backend.rehearsal"):
         importlib.import_module(module)  # before the forks
 
-    for number, (kind, key, value) in enumerate(CASES):
+    for number, (kind, key, value) in enumerate((*UNCHANGED, *CASES)):
         if options.only is not None and number != options.only:
             continue
         if ledger.has("files", str(number)):
             continue
         bad, took = judge(kind, key, value)
-        line = ledger.line("files", kind)
+        line = ledger.line("files", kind if key else "unchanged")
+        line.figures |= {"commit": git_commit()[:9], "date": f"{datetime.now(UTC):%Y-%m-%d}"}
         line.count(bad, f"case {number}, {key} = {value!r:.60}")
         if bad:
             options.say(f"case {number}, {kind}, {key} = {value!r:.60}: {bad}")

@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ import yaml
 from benchmarks.trust.lab import descendants, gone
 from benchmarks.trust.table import Ledger
 from lwr_driver.session import read_session
+from runner.computer import git_commit
 
 __all__ = ["REFUSED", "campaign"]
 
@@ -263,6 +265,12 @@ def _two_at_once(template: Path, folder: Path) -> list[str]:
     return []
 
 
+def _counted(ledger: Ledger, line: str, bad: list[str], name: str) -> None:
+    entry = ledger.line("resume", line)
+    entry.figures |= {"commit": git_commit()[:9], "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    entry.count(bad, name)
+
+
 def campaign(ledger: Ledger, options: Any) -> None:
     """Aborts by the session they met, then the refusals."""
 
@@ -275,8 +283,8 @@ def campaign(ledger: Ledger, options: Any) -> None:
     todo = [n for n in range(options.runs or _RUNS) if not ledger.has("resume", str(n))]
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         for number, where, bad in pool.map(one, todo):
-            ledger.line("resume", f"abort in {where}" if where in _NAMES else f"abort {where}").count(
-                bad, f"run {number}"
+            _counted(
+                ledger, f"abort in {where}" if where in _NAMES else f"abort {where}", bad, f"run {number}"
             )
             for complaint in bad:
                 options.say(f"run {number}: {complaint}")
@@ -290,7 +298,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
             place = Path(name) / what.replace(" ", "_")
             place.mkdir()
             bad = _two_at_once(template, place) if change is None else _refused(template, place, change)
-            ledger.line("resume", "folder changed since" if change else what).count(bad, what)
+            _counted(ledger, "folder changed since" if change else what, bad, what)
             for complaint in bad:
                 options.say(f"{what}: {complaint}")
             ledger.finish("resume", what)

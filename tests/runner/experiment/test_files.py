@@ -102,9 +102,9 @@ def test_a_folder_of_an_earlier_version_is_not_gone_on_with(tmp_path: Path) -> N
 
 
 def test_a_folder_belongs_to_one_process_until_its_end(tmp_path: Path) -> None:
-    code = f"import time; from pathlib import Path; from runner.files import locked\nwith locked(Path({str(tmp_path)!r})):\n"
-    code += "    print('held', flush=True); time.sleep(60)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+    code = "import sys, time; from pathlib import Path; from runner.files import locked\n"
+    code += "with locked(Path(sys.argv[1])):\n    print('held', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
         with pytest.raises(RefusedError, match=f"in use by process {other.pid}"), locked(tmp_path):
@@ -149,7 +149,7 @@ def test_a_plan_with_reversed_joints_is_refused_on_resumption_too(file: Path) ->
     (folder / "plan.yaml").write_text(text)
     assert stored_plan(folder, "plan.yaml", arm()) is None
     Frozen(folder).keep("plan.yaml")
-    with pytest.raises(ConfigurationError, match="joints A2, A1, E1, .* are not those of"):
+    with pytest.raises(ConfigurationError, match=r"joints A2, A1, E1, .* are not those of"):
         stored_plan(folder, "plan.yaml", arm())
 
 

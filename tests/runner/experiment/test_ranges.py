@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from benchmarks.trust.files import CASES, judge
+from benchmarks.trust.files import CASES, UNCHANGED, judge
 from fri.quantities import metas
 from ident.excitation.plan import _Fourier, _PlanFile, _Points, _Spline
 from ident.excitation.problem import PlanProblem
@@ -62,6 +62,11 @@ def test_a_schema_is_made_from_the_same_declarations() -> None:
     schema = msgspec.json.schema(Cell)
     edge = schema["$defs"]["Box"]["properties"]["size_m"]["prefixItems"][0]
     assert (edge["minimum"], edge["maximum"], edge["unit"]) == (0.001, 20.0, "m")
+
+
+@pytest.mark.parametrize("case", [case for case in UNCHANGED if case[0] == "experiment"])
+def test_the_files_without_a_change_pass(case: tuple[str, str, None]) -> None:
+    assert judge(*case)[0] == []
 
 
 @pytest.mark.parametrize("number", range(5, len(CASES), 40))
