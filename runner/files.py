@@ -43,7 +43,7 @@ def gather(experiment: Experiment, rounds: int = 0) -> list[Reference]:
     beside = experiment.folder
     with noting() as found:
         arm = Arm.load(experiment.arm, beside=beside)
-        experiment.home(len(arm.joint_names))
+        _check_home(experiment, arm)
         Cell.load(experiment.cell, beside=beside)
         for payload in experiment.payloads().values():
             check_load(*load_data(arm, payload))
@@ -55,6 +55,17 @@ def gather(experiment: Experiment, rounds: int = 0) -> list[Reference]:
         if experiment.backend == "emulator":
             _examine_emulator(experiment)
     return found
+
+
+def _check_home(experiment: Experiment, arm: Arm) -> None:
+    """Raise ConfigurationError for a home position outside the limits of the arm."""
+    home = experiment.home(len(arm.joint_names))
+    for joint, q, low, high in zip(arm.joint_names, home, arm.q_low, arm.q_high, strict=True):
+        if not low <= q <= high:
+            raise ConfigurationError(
+                f"{experiment.source}: moves.home: {joint} {q:.4g} rad is outside {low:.4f} to {high:.4f} rad; choose "
+                "a position within the limits"
+            )
 
 
 def _examine_problem(experiment: Experiment, *, needed: bool) -> None:

@@ -77,7 +77,7 @@ def read_plan(path: Path, arm: Arm) -> ExcitationPlan:
     plan = ExcitationPlan.load(path)
     if plan.joint_names != arm.joint_names:
         raise ConfigurationError(
-            f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}, "
+            f"{path}: joint_names {', '.join(plan.joint_names)} are not those of {arm.name}, "
             f"{', '.join(arm.joint_names)}; plan the motion for this arm"
         )
     return plan

@@ -21,7 +21,9 @@ def rehearse(config: EmulatorConfig) -> None:
     except LwrError:
         raise
     except (ArithmeticError, ValueError, TypeError, LookupError, RuntimeError, OSError) as error:
+        plugins = [*config.robot.effects, *([config.robot.plant] if config.robot.plant else [])]
+        outside = f" or the outside classes {', '.join(plugin.type for plugin in plugins)}" if plugins else ""
         raise ConfigurationError(
             f"{config.source}: cannot be emulated: {type(error).__name__}: {error!s:.200}; compare it with "
-            "configs/emulator/default.yaml"
+            f"configs/emulator/default.yaml{outside and ', check' + outside.removeprefix(' or')}"
         ) from error

@@ -120,14 +120,13 @@ _WRONG: dict[str, list[tuple[str, list[Any]]]] = {
         ("position_margin_deg", [-1, 90]),
         ("lowest_resonance_hz", [0, -6, _INF]),
         ("urdf", ["nowhere.urdf", "arm.yaml", "a" * 3000]),
-        ("model", ["another arm"]),
         ("schema_version", [2]),
     ],
     "cell": [
         ("boxes.0.size_m", [[800, 1200, 50], [0, 1, 1], [-0.8, 1, 1], [1e300, 1, 1], [_NAN, 1, 1]]),
         ("boxes.0.centre_m", [[900, 0, 300], [_INF, 0, 0]]),
         ("boxes.0.rpy_deg", [[1e9, 0, 0]]),
-        ("boxes.0.name", ["b" * 3000, "link_3"]),
+        ("boxes.0.name", ["b" * 3000]),
         ("margin_m", [20, -0.1, _NAN]),
         ("ground_z_m", [500, _HUGE]),
         ("schema_version", ["one"]),
@@ -240,6 +239,14 @@ def _command(arguments: list[str], out: Path) -> None:
     main(arguments)
 
 
+def _words(key: str, value: Any) -> list[str]:
+    """What an error may name: the key, the value, or a key or value within it."""
+    inner = value if isinstance(value, dict) else value[0] if isinstance(value, list) and value else {}
+    parts = [str(word) for pair in inner.items() for word in pair] if isinstance(inner, dict) else []
+    own = [part for part in key.split(".") if not part.isdigit()][-1]
+    return [own, str(value)[:12], *(part.split(".")[-1] for part in parts)]
+
+
 def judge(kind: str, key: str, value: Any) -> tuple[list[str], float]:
     """What did not hold of a case, and its time [s]. Without a key the files are right and have to pass."""
     with tempfile.TemporaryDirectory() as name:
@@ -265,8 +272,7 @@ def judge(kind: str, key: str, value: Any) -> tuple[list[str], float]:
     if "Traceback" in text:
         bad.append(f"traceback: {text[-300:]}")
     said = text.partition("Error: ")[2]
-    words = (*(part for part in key.split(".") if not part.isdigit()), str(value)[:12])
-    if not isinstance(value, bytes) and not any(word in said for word in words[-2:]):
+    if not isinstance(value, bytes) and not any(word in said for word in _words(key, value)):
         bad.append(f"the error names neither key nor value: {said[:300]!r}")
     if not said:
         bad.append("no error of ours")

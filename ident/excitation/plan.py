@@ -104,7 +104,7 @@ class ExcitationPlan:
     def __post_init__(self) -> None:
         if len(self.joint_names) != self.motion.joints:
             raise ConfigurationError(
-                f"{len(self.joint_names)} joint names for a motion of {self.motion.joints} joints"
+                f"{len(self.joint_names)} joint_names for a motion of {self.motion.joints} joints"
             )
         if self.periods < 1:
             raise ConfigurationError(f"periods {self.periods} is below 1; at least one whole period is run")
@@ -188,7 +188,9 @@ class ExcitationPlan:
     def from_mapping(cls, content: Any, path: str) -> ExcitationPlan:
         """The plan of a file's content; ConfigurationError with path and fault otherwise."""
         if not isinstance(content, Mapping) or content.get("kind") != "excitation plan":
-            raise ConfigurationError(f"{path}: not an excitation plan of schema_version {_SCHEMA}")
+            raise ConfigurationError(
+                f"{path}: `kind` is not that of an excitation plan of schema_version {_SCHEMA}"
+            )
         keys = ("schema_version", "kind", "joint_names", "periods")
         head = parse(_PlanFile, {key: content[key] for key in keys if key in content}, path)
         try:

@@ -34,9 +34,11 @@ def check_load(mass: float, com: Sequence[float], inertia: Sequence[float]) -> N
     distance = math.hypot(*com)
     if distance > FARTHEST_M:
         mm = ", ".join(f"{value * 1e-3:g}" for value in com)
-        advice = f"it looks like mm, write [{mm}]" if distance * 1e-3 <= FARTHEST_M else "measure it again"
+        advice = (
+            f"it looks like mm, write [{mm}]" if 5.0 < distance <= 1e3 * FARTHEST_M else "measure it again"
+        )
         raise ConfigurationError(
-            f"centre of mass {distance:.4g} m from the flange, limit {FARTHEST_M:g} m; {advice}"
+            f"com: centre of mass {distance:.4g} m from the flange, limit {FARTHEST_M:g} m; {advice}"
         )
     if mass == 0.0 and any((*com, *inertia)):
         raise ConfigurationError(

@@ -149,7 +149,7 @@ def test_a_plan_with_reversed_joints_is_refused_on_resumption_too(file: Path) ->
     (folder / "plan.yaml").write_text(text)
     assert stored_plan(folder, "plan.yaml", arm()) is None
     Frozen(folder).keep("plan.yaml")
-    with pytest.raises(ConfigurationError, match=r"joints A2, A1, E1, .* are not those of"):
+    with pytest.raises(ConfigurationError, match=r"joint_names A2, A1, E1, .* are not those of"):
         stored_plan(folder, "plan.yaml", arm())
 
 
