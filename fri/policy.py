@@ -8,12 +8,18 @@ thresholds: every number of ``KrcPolicy`` is an assumption of this project, plau
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
 
 from fri.errors import ConfigurationError
 from fri.packets import JOINT_NAMES, JOINTS
+from fri.quantities import check, within
 from fri.states import Quality
+
+_Rate = Annotated[float, within(0.0, 1.0, "share")]
+_Factor = Annotated[float, within(0.0, 1000.0, above=True)]
+_Packets = Annotated[int, within(0, 100_000)]
 
 
 @dataclass(frozen=True)
@@ -57,59 +63,39 @@ class KrcPolicy:
         Rise time of this deceleration [s].
     """
 
-    window: int = 100
-    minimum_packets: int = 100
-    perfect_rate: float = 0.99
-    ok_rate: float = 0.95
-    bad_rate: float = 0.80
-    perfect_latency: float = 0.5
+    window: Annotated[int, within(2, 100_000)] = 100
+    minimum_packets: Annotated[int, within(1, 100_000)] = 100
+    perfect_rate: _Rate = 0.99
+    ok_rate: _Rate = 0.95
+    bad_rate: _Rate = 0.80
+    perfect_latency: _Factor = 0.5
     start_quality: Quality = Quality.OK
-    start_dwell: int = 100
+    start_dwell: _Packets = 100
     hold_quality: Quality = Quality.BAD
-    bridged_cycles: int = 3
+    bridged_cycles: _Packets = 3
     drop_on_malformed: bool = True
     drop_on_drives_off: bool = True
-    mirror_tolerance: float = 1e-3
-    limit_tolerance: float = 1e-6
-    t1_velocity_factor: float = 0.25
-    acceleration_factor: float | None = None
-    stop_acceleration_factor: float = 1.0
-    stop_jerk_time_s: float = 0.02
+    mirror_tolerance: Annotated[float, within(0.0, 1.0, "rad", above=True)] = 1e-3
+    limit_tolerance: Annotated[float, within(0.0, 1e-3, "rad", below=True)] = 1e-6
+    t1_velocity_factor: _Factor = 0.25
+    acceleration_factor: _Factor | None = None
+    stop_acceleration_factor: _Factor = 1.0
+    stop_jerk_time_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.02
 
     def __post_init__(self) -> None:
-        _require(self.window >= 2, "window", self.window, "at least 2 packets")
+        check(self)
         _require(
-            1 <= self.minimum_packets <= self.window,
+            self.minimum_packets <= self.window,
             "minimum_packets",
             self.minimum_packets,
             f"within 1..window ({self.window})",
         )
         _require(
-            0.0 <= self.bad_rate <= self.ok_rate <= self.perfect_rate <= 1.0,
+            self.bad_rate <= self.ok_rate <= self.perfect_rate,
             "bad_rate, ok_rate, perfect_rate",
             (self.bad_rate, self.ok_rate, self.perfect_rate),
             "ascending within 0..1",
         )
-        _require(self.start_dwell >= 0, "start_dwell", self.start_dwell, "0 packets or more")
-        _require(self.bridged_cycles >= 0, "bridged_cycles", self.bridged_cycles, "0 cycles or more")
-        for name in (
-            "perfect_latency",
-            "mirror_tolerance",
-            "t1_velocity_factor",
-            "stop_acceleration_factor",
-            "stop_jerk_time_s",
-        ):
-            _require(0.0 < getattr(self, name) < np.inf, name, getattr(self, name), "positive and finite")
-        _require(
-            0.0 <= self.limit_tolerance < 1e-3, "limit_tolerance", self.limit_tolerance, "within 0..1e-3 rad"
-        )
-        if self.acceleration_factor is not None:
-            _require(
-                self.acceleration_factor > 0.0,
-                "acceleration_factor",
-                self.acceleration_factor,
-                "positive or absent",
-            )
 
 
 @dataclass(frozen=True)

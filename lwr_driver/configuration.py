@@ -7,19 +7,24 @@ import difflib
 import math
 import os
 import re
+import reprlib
 import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
 
 from fri.errors import ConfigurationError
+from fri.quantities import LONGEST_LIST, LONGEST_TEXT, check_value, check_values, metas
+from lwr_driver.references import frozen_file, note
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 _LONGEST_SHOWN = 80
+_LONGEST_PATH = 1000
+_LARGEST_FILE = 50_000_000  # [bytes]
 
 T = TypeVar("T")
 
@@ -66,42 +71,62 @@ def as_path(value: Any, subject: str) -> Path:
 def find(name: str | Path, *, beside: Path | None = None) -> Path:
     """Path of the configuration file `name`.
 
-    Tried in order: the working directory, the folder `beside` of the file naming it, the project's
-    `configs/`. Raises ConfigurationError with the places tried.
+    beside : folder of the file naming it; the name is looked for there, then in the project's `configs/`, never in
+    the working directory. In the frozen files of an experiment only the files of its start are found.
+    None for a name from the command line: the working directory, then `configs/`.
+
+    Raises ConfigurationError with the places tried.
     """
     try:
         wanted = as_path(name, "configuration file").expanduser()
     except RuntimeError as error:
         raise ConfigurationError(f"file {_shown(name)!r} cannot be looked for: {error}") from error
-    folders = [Path.cwd(), *([] if beside is None else [beside]), CONFIGS]
+    frozen = None if beside is None else frozen_file(beside, str(name))
+    if frozen is not None:
+        return frozen
+    folders = [Path.cwd() if beside is None else beside, CONFIGS]
     places = [wanted] if wanted.is_absolute() else [folder / wanted for folder in folders]
     for place in places:
         try:
             if place.is_file():
-                return place.resolve()
+                found = place.resolve()
+                note(beside, str(name), found)
+                return found
         except OSError as error:
             raise ConfigurationError(
                 f"file {_shown(name)!r} cannot be looked for: {error.strerror}"
             ) from error
-    tried = ", ".join(str(place) for place in places)
-    raise ConfigurationError(f"file {str(name)!r} not found; tried {tried}")
+    tried = ", ".join(_shown(place, 4 * _LONGEST_SHOWN) for place in places)
+    raise ConfigurationError(f"file {_shown(name)!r} not found; tried {tried}")
 
 
-def _shown(name: str | Path) -> str:
+def _shown(name: str | Path, longest: int = _LONGEST_SHOWN) -> str:
     """The beginning of a long name, for a message."""
     text = str(name)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+    return text if len(text) <= longest else f"{text[:longest]}..."
+
+
+def read_text(path: Path) -> str:
+    """Text of a configuration file; ConfigurationError if it cannot be read or is far too large."""
+    try:
+        size = path.stat().st_size
+        if size > _LARGEST_FILE:
+            raise ConfigurationError(
+                f"{path}: {size / 1e6:.0f} MB, limit {_LARGEST_FILE / 1e6:.0f} MB; this is no configuration file"
+            )
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        if isinstance(error, ConfigurationError):
+            raise
+        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
 
 
 def read_yaml(path: Path) -> Any:
     """Parsed content of a YAML file (safe types only), with the position of a syntax error in the message."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
+    text = read_text(path)
     try:
         return yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
         raise ConfigurationError(f"{path}: not valid YAML: {error}") from error
 
 
@@ -117,18 +142,19 @@ def parse(cls: type[T], content: Any, where: str) -> T:
     """Build the dataclass `cls` from `content`; unknown or missing keys and wrong types are errors.
 
     Understood: nested dataclasses, `tuple[X, ...]`, fixed tuples, `dict[str, X]`, `X | None`, `Literal`,
-    bool, int, float, str and Path; numbers must be finite. `where` names the file, also in front of an error
+    bool, int, float, str and Path; numbers must be finite and within the range declared beside their key
+    (`lwr_driver.quantities`). `where` names the file, also in front of an error
     of the dataclass's own `__post_init__`.
     """
     if not isinstance(content, Mapping):
         raise ConfigurationError(f"{where}: expected a mapping of keys, found {_kind(content)}")
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls)) if field.init}
     for key in content:
         if key not in fields:
-            near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
+            near = difflib.get_close_matches(_shown(str(key)), fields, n=1, cutoff=0.5)
             advice = f"did you mean `{near[0]}`?" if near else f"known keys: {', '.join(fields)}"
-            raise ConfigurationError(f"{where}: unknown key `{key}`; {advice}")
+            raise ConfigurationError(f"{where}: unknown key `{_shown(str(key))}`; {advice}")
     values = {}
     for name, field in fields.items():
         if name in content:
@@ -142,20 +168,25 @@ def parse(cls: type[T], content: Any, where: str) -> T:
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
+    if typing.get_origin(hint) is Annotated:
+        inner, ranges = metas(hint)
+        converted = _convert(inner, value, where)
+        check_value(converted, ranges, where)
+        return converted
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value
     if origin in (typing.Union, types.UnionType):
         return _convert_union(arguments, value, where)
     if origin is typing.Literal:
-        if value not in arguments:
+        if not any(value is word or (type(value) is type(word) and value == word) for word in arguments):
             near = difflib.get_close_matches(
-                str(value).lower(), [str(word).lower() for word in arguments], n=1
+                _plain(value).lower(), [str(word).lower() for word in arguments], n=1
             )
             meant = next((word for word in arguments if [str(word).lower()] == near), None)
             hint = "" if meant is None else f"; did you mean `{meant}`?"
             raise ConfigurationError(
-                f"{where}: {value!r} is not one of {', '.join(map(str, arguments))}{hint}"
+                f"{where}: {_plain(value)!r} is not one of {', '.join(map(str, arguments))}{hint}"
             )
         return value
     if origin is tuple:
@@ -163,7 +194,10 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if origin is dict:
         if not isinstance(value, Mapping):
             raise ConfigurationError(f"{where}: expected a mapping, found {_kind(value)}")
-        return {str(key): _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
+        return {
+            str(key): _convert(arguments[1], item, f"{where}.{_shown(str(key))}")
+            for key, item in value.items()
+        }
     if dataclasses.is_dataclass(hint):
         return parse(typing.cast(type, hint), value, where)
     return _convert_scalar(hint, value, where)
@@ -187,20 +221,43 @@ def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[
     if not isinstance(value, (list, tuple)):
         raise ConfigurationError(f"{where}: expected a list, found {_kind(value)}")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
-        return tuple(_convert(arguments[0], item, f"{where}[{index}]") for index, item in enumerate(value))
+        if len(value) > LONGEST_LIST:
+            raise ConfigurationError(f"{where}: {len(value)} entries, limit {LONGEST_LIST}; shorten the list")
+        arguments = (arguments[0],) * len(value)
     if len(value) != len(arguments):
         raise ConfigurationError(f"{where}: expected {len(arguments)} entries, found {len(value)}")
-    return tuple(
-        _convert(hint, item, f"{where}[{index}]")
-        for index, (hint, item) in enumerate(zip(arguments, value, strict=True))
+    kinds = [metas(hint) for hint in arguments]
+    converted = tuple(
+        _convert(kind, item, f"{where}[{_label(item, index)}]")
+        for index, ((kind, _), item) in enumerate(zip(kinds, value, strict=True))
     )
+    for _, ranges in kinds[:1]:
+        check_values(converted, ranges, where)
+    for index, ((_, ranges), item) in enumerate(zip(kinds, converted, strict=True)):
+        check_value(item, ranges, f"{where}[{index}]")
+    return converted
+
+
+def _label(item: Any, index: int) -> str:
+    """The name of an entry of a list, or its index."""
+    name = item.get("name") if isinstance(item, Mapping) else None
+    return _shown(name) if isinstance(name, str) and name.isprintable() else str(index)
 
 
 def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if not math.isfinite(value):
-            raise ConfigurationError(f"{where}: {value} is not a finite number")
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            raise ConfigurationError(f"{where}: {_plain(value)} is not a finite number of usual size")
+        return number
+    longest = LONGEST_TEXT if hint is str else _LONGEST_PATH
+    if isinstance(value, str) and (len(value) > longest or "\0" in value):
+        raise ConfigurationError(
+            f"{where}: a text of {len(value)} characters, limit {longest}, without zero bytes; shorten it"
+        )
     if hint is Path and isinstance(value, str):
         return Path(value)
     if hint in (int, str, bool) and type(value) is hint:
@@ -212,11 +269,23 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
         bool: "true or false",
         Path: "a path",
     }
-    raise ConfigurationError(f"{where}: expected {expected.get(hint, hint)}, found {_kind(value)} {value!r}")
+    raise ConfigurationError(f"{where}: expected {expected.get(hint, hint)}, found {_found(value)}")
+
+
+def _plain(value: Any) -> str:
+    """A value of any size and depth in a message."""
+    if isinstance(value, str):
+        return _shown(value)
+    try:
+        return _shown(reprlib.repr(value))
+    except ValueError:  # a whole number too long to be written
+        return "a very long number"
 
 
 def _found(value: Any) -> str:
-    return f"{_kind(value)} {_shown(repr(value))}"
+    return (
+        f"{_kind(value)} {_plain(value)!r}" if isinstance(value, str) else f"{_kind(value)} {_plain(value)}"
+    )
 
 
 def _called(kind: type) -> str:

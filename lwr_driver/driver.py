@@ -32,6 +32,7 @@ from fri.errors import ConfigurationError, LwrError, NetworkError, OperatorError
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
+from lwr_driver.arm.load import check_load
 from lwr_driver.commander import BRAKE, HOLD
 from lwr_driver.configuration import as_path, expect
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
@@ -247,8 +248,9 @@ class Driver:
         mass : [kg]; com : centre of mass in the flange frame [m]
         inertia : JX JY JZ about it, along the axes of the flange frame [kg m2]
 
-        Raises ConfigurationError if the KRL program accepts none.
+        Raises ConfigurationError if the KRL program accepts none, or no payload can have them.
         """
+        check_load(mass, com, inertia)
         if not self.sets_load:
             raise ConfigurationError(
                 f"KRL program {self.link.handshake!r} takes no load data; enter them at the pendant, or use "

@@ -19,9 +19,11 @@ import numpy.typing as npt
 from fri.errors import DataError, LwrError, RefusedError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
+from lwr_driver.configuration import find
 from lwr_driver.driver import LOCK_STEP_EPOCH_NS, Driver, LinkState, MotionProgress, Outcome
 from lwr_driver.motion import Motion
 from lwr_driver.realtime import Rights
+from lwr_driver.references import Frozen
 from lwr_driver.session import read_session, session_metadata
 from lwr_driver.session.motor_torque import match_torques
 from lwr_driver.session.trace import import_trace
@@ -35,7 +37,7 @@ from runner.preflight import (
     check_link,
     check_payload,
     check_rights,
-    load_data,
+    set_load,
 )
 from runner.terminal import Interrupts, StatusLine
 
@@ -68,8 +70,19 @@ class ExperimentProgress:
         try:
             content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             origin = Path(content["origin"]) if content["origin"] else None
-            return cls(path, origin, dict(content["finished"]), dict(content["attempts"]))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            progress = cls(path, origin, dict(content["finished"]), dict(content["attempts"]))
+            for name, entry in progress.finished.items():
+                rest, _ = progress.rest(name, None), progress.rows(name)
+                if (
+                    rest.q.shape != rest.tau.shape
+                    or rest.q.ndim != 1
+                    or not np.isfinite([rest.q, rest.tau]).all()
+                ):
+                    raise ValueError(f"finished session {name!r} is {entry!r:.80}")
+            if not all(isinstance(uid, str) for uids in progress.attempts.values() for uid in uids):
+                raise ValueError("an attempt is no text")
+            return progress
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise DataError(
                 f"{path}: cannot be read: {error}; delete it to start the experiment anew"
             ) from error
@@ -102,9 +115,14 @@ class ExperimentProgress:
         self._save()
         return earlier[-1], parent
 
-    def finish(self, session: str, rest: Rest) -> None:
-        """Mark a session as finished."""
-        self.finished[session] = {"q": rest.q.tolist(), "tau": rest.tau.tolist()}
+    def rows(self, session: str) -> int:
+        """Number of samples in the log of a finished session, 0 if unknown."""
+        entry = self.finished[session].get("rows", [0])
+        return int(entry[0])
+
+    def finish(self, session: str, rest: Rest, rows: int = 0) -> None:
+        """Mark a session as finished, with the number of samples in its log."""
+        self.finished[session] = {"q": rest.q.tolist(), "tau": rest.tau.tolist(), "rows": [rows]}
         self._save()
 
     def _save(self) -> None:
@@ -209,12 +227,13 @@ class Run:
         self.experiment, self.folder, self.bench, self.excite = experiment, folder, bench, excite
         self._progress = ExperimentProgress.load(folder)
         self._mounted: Payload | None = None
+        self._asked = False  # whether this process has had a payload mounted
         self._rest: Rest | None = None
 
     def followed_by(self, experiment: Experiment, excite: Callable[[SessionPlan, float], Motion]) -> Run:
         """A run of further sessions, from the present state of the arm and its payload."""
         run = Run(experiment, self.folder, self.bench, excite)
-        run._mounted, run._rest = self._mounted, self._rest
+        run._mounted, run._asked, run._rest = self._mounted, self._asked, self._rest
         return run
 
     def sessions(self) -> list[Record]:
@@ -270,7 +289,7 @@ class Run:
             bench.status.say(warning)
         if outcome.status == "success":
             self._rest = self._at_rest(plan.payload)
-            self._progress.finish(plan.name, self._rest)
+            self._progress.finish(plan.name, self._rest, recorded.samples)
         return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error, warnings)
 
     def _still_loaded(self, plan: SessionPlan, before: Rest, outcome: Outcome) -> Outcome:
@@ -318,16 +337,19 @@ class Run:
         return motion, preflight
 
     def _swap(self, plan: SessionPlan) -> None:
-        """Have the payload of the session mounted, and check it by the torques at rest."""
+        """Have the payload of the session mounted, and check it by the torques at rest.
+
+        What hung on the flange in an earlier run is no knowledge: the first session of every run asks.
+        """
         bench, before = self.bench, self._rest
-        if plan.payload != self._mounted or before is None:
+        if not self._asked or plan.payload != self._mounted or before is None:
             load = plan.payload
             name = "none" if load is None else f"{load.name}, {load.mass:g} kg"
             bench.status.say(f"payload for session {plan.name}: {name}")
             bench.operator.swap(self._mounted, plan.payload)
             if bench.driver.sets_load:
-                bench.driver.set_load(*load_data(bench.arm, plan.payload))
-            self._mounted = plan.payload
+                bench.status.say(set_load(bench.driver, bench.arm, plan.payload))
+            self._mounted, self._asked = plan.payload, True
         if before is None:
             return
         after = self._at_rest(plan.payload)
@@ -389,6 +411,13 @@ class Run:
             utc_start=epoch.isoformat() if experiment.lock_step else None,
         )
 
+    def _named_files(self) -> dict[str, bytes]:
+        """Arm and cell file, and the manifest of all files, for the log."""
+        experiment, frozen = self.experiment, Frozen(self.folder)
+        named = {"arm.yaml": experiment.arm, "cell.yaml": experiment.cell}
+        files = {key: find(name, beside=experiment.folder).read_bytes() for key, name in named.items()}
+        return files | ({"files.json": frozen.manifest} if frozen.there else {})
+
     def _attachments(self, motion: Motion, preflight: Preflight) -> dict[str, bytes]:
         buffer, time = io.BytesIO(), np.arange(len(motion)) * motion.period_s
         qd = np.gradient(motion.q, motion.period_s, axis=0)
@@ -396,6 +425,7 @@ class Run:
         np.savez_compressed(buffer, time=time, q=motion.q, qd=qd, qdd=qdd)
         return {
             "experiment.yaml": self.experiment.text.encode(),
+            **self._named_files(),
             "robot.urdf": self.bench.arm.urdf.encode(),
             "plan.npz": buffer.getvalue(),
             "preflight.json": preflight.to_json(),

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,20 @@ import pinocchio as pin
 
 from fri.errors import ConfigurationError
 from fri.handshake import find_handshake
+from fri.quantities import FileName, Name, Share, check, entries, within
 from lwr_driver.arm.cell import PayloadShape
-from lwr_driver.configuration import find, parse, read_mapping
+from lwr_driver.arm.load import check_load
+from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
+from lwr_driver.extent import LONGEST_EXCITATION_S, Harmonics, Period, Periods
 from lwr_driver.session.motor_torque import KrlMotorTorque
 
-DEFAULT = "experiments/default.yaml"
+DEFAULT = CONFIGS / "experiments/default.yaml"
+
+Mass = Annotated[float, within(0.0, 14.0, "kg", above=True, note="twice the rated payload")]
+_Place = Annotated[float, within(-0.5, 0.5, "m")]
+_Moment = Annotated[float, within(-5.0, 5.0, "kg m²")]
+_Angle = Annotated[float, within(-3.0, 3.0, "rad")]
+_Frequency = Annotated[float, within(0.1, 500.0, "Hz")]
 
 
 def _require(condition: object, message: str) -> None:
@@ -39,17 +48,22 @@ class Payload:
     shape : outer shape for the collision check; None omits the payload there.
     """
 
-    name: str
-    mass: float
-    com: tuple[float, float, float]
-    inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    name: Name
+    mass: Mass
+    com: tuple[_Place, _Place, _Place]
+    inertia: tuple[_Moment, _Moment, _Moment, _Moment, _Moment, _Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     shape: PayloadShape | None = None
 
     def __post_init__(self) -> None:
         plain = self.name and "/" not in self.name and not self.name.startswith(".")
         _require(plain, f"payload name {self.name!r}: use a plain word, it becomes part of names")
         _require(self.name != "none", "payload name 'none' means the empty flange; leave the key out instead")
-        _require(0 < self.mass <= 50, f"payload {self.name}: mass {self.mass} kg is outside 0 to 50 kg")
+        _require(self.name.isprintable(), f"payload name {self.name!r}: use letters that can be printed")
+        try:
+            check(self)
+            check_load(self.mass, self.com, self.inertia)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"payload {self.name}: {error}") from error
 
     def body(self) -> pin.Inertia:
         """The payload as a rigid body in the frame of link 7."""
@@ -66,7 +80,7 @@ class SessionPlan:
     validation : held-out session with another motion.
     """
 
-    name: str
+    name: Name
     payload: Payload | None = None
     validation: bool = False
 
@@ -80,20 +94,21 @@ class SessionPlan:
 class Excitation:
     """The exciting motion, equation (9): periodic, at rest at both ends of each period."""
 
-    period_s: float = 20.0
-    harmonics: int = 5
-    periods: int = 2
-    speed_scale: float = 1.0
-    plan: str | None = None
-    seed: int = 1
+    period_s: Period = 20.0
+    harmonics: Harmonics = 5
+    periods: Periods = 2
+    speed_scale: Share = 1.0
+    plan: FileName | None = None
+    seed: Annotated[int, within(0, 2**32 - 2)] = 1
 
     def __post_init__(self) -> None:
-        _require(self.period_s > 0, f"period_s {self.period_s} s is not positive")
-        _require(self.harmonics >= 2, f"harmonics {self.harmonics} is below 2; rest at both ends needs two")
+        check(self)
+        duration = self.periods * self.period_s
         _require(
-            self.periods >= 1, f"periods {self.periods} is below 1; at least one whole period is recorded"
+            self.plan is not None or duration <= LONGEST_EXCITATION_S,
+            f"{self.periods} periods of {self.period_s:g} s last {duration:g} s, limit {LONGEST_EXCITATION_S:g} s; "
+            "lower `periods` or `period_s`",
         )
-        _require(0 < self.speed_scale <= 1, f"speed_scale {self.speed_scale} is outside 0 to 1")
         _require(
             self.plan is None or self.speed_scale == 1,
             f"excitation.speed_scale {self.speed_scale} does not apply to the motion of excitation.plan "
@@ -105,34 +120,30 @@ class Excitation:
 class Moves:
     """Approach and return: resting position `home` [rad] and speed."""
 
-    home: tuple[float, ...] = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
-    speed_scale: float = 0.2
-    settle_s: float = 1.0
-    brake_s: float = 0.5
-    clearance_m: float = 0.03
-    max_start_distance_rad: float = 3.0
+    home: tuple[_Angle, ...] = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
+    speed_scale: Annotated[float, within(0.01, 1.0, "share")] = 0.2
+    settle_s: Annotated[float, within(0.5, 60.0, "s", note="the arm must come to rest")] = 1.0
+    brake_s: Annotated[float, within(0.0, 60.0, "s")] = 0.5
+    clearance_m: Annotated[float, within(0.0, 0.5, "m")] = 0.03
+    max_start_distance_rad: Annotated[float, within(0.01, 6.0, "rad")] = 3.0
 
     def __post_init__(self) -> None:
-        _require(0 < self.speed_scale <= 1, f"speed_scale {self.speed_scale} is outside 0 to 1")
-        _require(
-            self.settle_s >= 0.5, f"settle_s {self.settle_s} s is below 0.5 s; the arm must come to rest"
-        )
-        _require(self.clearance_m >= 0, f"clearance_m {self.clearance_m} m is negative")
+        check(self)
 
 
 @dataclass(frozen=True)
 class Link:
     """The FRI connection: this PC's address, the controller's, and the handshake of its KRL program."""
 
-    address: str = "127.0.0.1"
-    port: int = 49938
-    controller: str | None = None
-    handshake: str = "lwr_identification"
-    quality_s: float = 1.0
+    address: Annotated[str, entries(1, 253)] = "127.0.0.1"
+    port: Annotated[int, within(0, 65535)] = 49938
+    controller: Annotated[str, entries(1, 253)] | None = None
+    handshake: Name = "lwr_identification"
+    quality_s: Annotated[float, within(0.01, 60.0, "s")] = 1.0
 
     def __post_init__(self) -> None:
+        check(self)
         find_handshake(self.handshake)
-        _require(0 <= self.port <= 65535, f"port {self.port} is outside 0 to 65535")
 
 
 @dataclass(frozen=True)
@@ -153,9 +164,12 @@ class Identification:
     """Model, estimator and filters of the estimate."""
 
     model: Literal[1, 2, 3] = 2
-    estimator: str = "wls"
-    cutoff_hz: float | None = None
-    decimate_hz: float | None = None
+    estimator: Name = "wls"
+    cutoff_hz: _Frequency | None = None
+    decimate_hz: _Frequency | None = None
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -167,11 +181,12 @@ class DiagnosisPlan:
     """
 
     run: bool = True
-    reference: str | None = None
-    sure: float = 0.8  # ident.diagnosis.statements.SURE, not imported here: commands would start slower
+    reference: FileName | None = None
+    # ident.diagnosis.statements.SURE, not imported here: commands would start slower
+    sure: Annotated[float, within(0.5, 1.0, "share", below=True, note="0.8 is usual")] = 0.8
 
     def __post_init__(self) -> None:
-        _require(0.5 <= self.sure < 1.0, f"sure {self.sure} is outside 0.5 to 1; 0.8 is usual")
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -182,11 +197,11 @@ class Replan:
     from the experiment.
     """
 
-    rounds: int = 0
-    problem: str = "plans/replan.yaml"
+    rounds: Annotated[int, within(0, 20)] = 0
+    problem: FileName = "plans/replan.yaml"
 
     def __post_init__(self) -> None:
-        _require(self.rounds >= 0, f"replan.rounds {self.rounds} is negative")
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -196,14 +211,14 @@ class Experiment:
     sealed : whether an effect is hidden in the emulated arm; its true parameters then stay out of the results.
     """
 
-    name: str
-    arm: str = "lwr4plus.yaml"
-    cell: str = "cell.yaml"
+    name: Name
+    arm: FileName = "lwr4plus.yaml"
+    cell: FileName = "cell.yaml"
     backend: Literal["emulator", "fri"] = "emulator"
-    emulator: str = "emulator/default.yaml"
+    emulator: FileName = "emulator/default.yaml"
     emulator_settings: dict[str, Any] = field(default_factory=dict)
     lock_step: bool = True
-    serial: str = ""
+    serial: Annotated[str, entries(0, 64)] = ""
     link: Link = field(default_factory=Link)
     motor_torque: MotorTorque = field(default_factory=MotorTorque)
     excitation: Excitation = field(default_factory=Excitation)
@@ -211,16 +226,16 @@ class Experiment:
     identification: Identification = field(default_factory=Identification)
     diagnosis: DiagnosisPlan = field(default_factory=DiagnosisPlan)
     replan: Replan = field(default_factory=Replan)
-    sessions: tuple[SessionPlan, ...] = (SessionPlan("unloaded"),)
+    sessions: Annotated[tuple[SessionPlan, ...], entries(1, 100)] = (SessionPlan("unloaded"),)
     source: Path = field(default=Path(), init=False)
     folder: Path = field(default=Path(), init=False)
     text: str = field(default="", init=False, repr=False)
     sealed: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
+        check(self)
         _require_word(self.name, f"name {self.name!r}: letters, digits, - and _ only, it names a folder")
         names = [session.name for session in self.sessions]
-        _require(names, "sessions is empty; list at least one motion")
         for name in names:
             count = names.count(name)
             _require(count == 1, f"session name {name!r} is used {count} times; names must differ")
@@ -246,7 +261,7 @@ class Experiment:
         path = find(name)
         experiment = parse(cls, read_mapping(path), str(path))
         folder = path.parent if beside is None else beside
-        vars(experiment).update(source=path, folder=folder, text=path.read_text(encoding="utf-8"))
+        vars(experiment).update(source=path, folder=folder, text=read_text(path))
         return experiment
 
     def changed(self, *, sealed: bool | None = None, **values: Any) -> Experiment:

@@ -38,7 +38,8 @@ class Person:
             work = f"Take the payload {mounted.name!r} off" if mounted else "Leave the flange empty"
             load = "set the load data on the controller to the empty flange"
         else:
-            work = f"Mount the payload {wanted.name!r}, {wanted.mass:g} kg"
+            verb = "Make sure that this is mounted: the payload" if wanted == mounted else "Mount the payload"
+            work = f"{verb} {wanted.name!r}, {wanted.mass:g} kg"
             x, y, z = (1000 * value for value in wanted.com)
             load = (
                 f"enter its load data on the controller: {wanted.mass:g} kg, centre of mass "

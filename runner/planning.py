@@ -18,6 +18,7 @@ from lwr_driver.arm.cell import Cell
 from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.configuration import find
 from lwr_driver.motion import Motion, move_to
+from lwr_driver.references import Frozen
 from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.preflight import (
     Item,
@@ -51,9 +52,8 @@ class Excitations:
         """The motions stored in `folder`, the results of the experiment; missing ones are planned now."""
 
         def motion(name: str, make: Callable[[Experiment, Arm, Cell], ExcitationPlan]) -> ExcitationPlan:
-            if folder is not None and (folder / name).is_file():
-                return ExcitationPlan.load(folder / name)
-            return make(experiment, arm, cell)
+            stored = None if folder is None else stored_plan(folder, name, arm)
+            return make(experiment, arm, cell) if stored is None else stored
 
         validated = any(session.validation for session in experiment.sessions)
         unseen = motion(VALIDATION_PLAN, _plan_unseen) if validated else None
@@ -62,14 +62,45 @@ class Excitations:
     def save(self, folder: Path) -> None:
         """Write missing plan files into the folder of the results."""
         for name, plan in ((PLAN, self.exciting), (VALIDATION_PLAN, self.unseen)):
-            if plan is not None and not (folder / name).is_file():
-                plan.save(folder / name)
+            if plan is not None:
+                store_plan(folder, name, plan)
 
     def rows(self, session: SessionPlan, period_s: float) -> Motion:
         """The motion of a session for a controller's period [s], with one phase per period of the motion."""
         if session.validation and self.unseen is not None:
             return excitation_rows(self.unseen, 1)(period_s)
         return excitation_rows(self.exciting, self.periods)(period_s)
+
+
+def read_plan(path: Path, arm: Arm) -> ExcitationPlan:
+    """A plan file for the joints of the arm; ConfigurationError otherwise."""
+    plan = ExcitationPlan.load(path)
+    if plan.joint_names != arm.joint_names:
+        raise ConfigurationError(
+            f"{path}: joint_names {', '.join(plan.joint_names)} are not those of {arm.name}, "
+            f"{', '.join(arm.joint_names)}; plan the motion for this arm"
+        )
+    return plan
+
+
+def stored_plan(folder: Path, name: str, arm: Arm) -> ExcitationPlan | None:
+    """The plan made by an earlier run into the folder of the results; None without one.
+
+    Raises ConfigurationError if it changed since, or is of another arm.
+    """
+    frozen = Frozen(folder)
+    there = frozen.kept(name) if frozen.there else (folder / name).is_file()
+    return read_plan(folder / name, arm) if there else None
+
+
+def store_plan(folder: Path, name: str, plan: ExcitationPlan) -> None:
+    """Write a plan into the folder of the results, unless it is there, and note its hash."""
+    frozen = Frozen(folder)
+    if frozen.kept(name) if frozen.there else (folder / name).is_file():
+        return
+    plan.save(folder / name)
+    if frozen.there:
+        frozen.keep(name)
 
 
 def checker(arm: Arm, cell: Cell, payload: Payload | None) -> CollisionChecker:
@@ -85,13 +116,7 @@ def plan_excitation(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationP
     """
     settings = experiment.excitation
     if settings.plan is not None:
-        plan = ExcitationPlan.load(find(settings.plan, beside=experiment.folder))
-        if plan.joint_names != arm.joint_names:
-            raise ConfigurationError(
-                f"{settings.plan}: joints {', '.join(plan.joint_names)} are not those of {arm.name}, "
-                f"{', '.join(arm.joint_names)}; plan the motion for this arm"
-            )
-        return plan
+        return read_plan(find(settings.plan, beside=experiment.folder), arm)
     return _simple(experiment, arm, cell, settings.seed, settings.periods)
 
 

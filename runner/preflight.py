@@ -21,9 +21,11 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
-from fri.errors import RefusedError
+from fri.errors import RefusedError, RobotError
+from fri.handshake import IdentificationHandshake, find_handshake
 from lwr_driver.arm import Arm
 from lwr_driver.arm.collision import CollisionChecker
+from lwr_driver.driver import Driver
 from lwr_driver.link import LinkState
 from lwr_driver.motion import Motion, extremes
 from lwr_driver.realtime import Rights
@@ -39,6 +41,8 @@ _BYTES_PER_CYCLE = 600.0
 _TORQUE_SHARE = 0.8
 _GRAVITY_SHARE = 0.3
 _GRAVITY_FLOOR = 0.03
+_LOAD_SETTLES_S = 0.2
+_LOAD_SHARE, _LOAD_FLOOR = 0.15, 0.01
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,68 @@ def load_data(arm: Arm, payload: Payload | None) -> tuple[float, Triple, Triple]
     x, y, z = flange.actInv(np.asarray(payload.com)).tolist()
     xx, yy, zz = np.diag(flange.rotation.T @ payload.body().inertia @ flange.rotation).tolist()
     return payload.mass, (x, y, z), (xx, yy, zz)
+
+
+def set_load(driver: Driver, arm: Arm, payload: Payload | None) -> str:
+    """Send the load data of a payload, and check them by the gravity torques of the controller; returns the result.
+
+    Raises ConfigurationError before anything is sent for load data that no payload can have, and RobotError if the
+    gravity torques in the packets do not change as they must.
+    """
+    mass, com, inertia = load_data(arm, payload)
+    before = driver.last_rows(1)[-1]["msr"].copy()
+    driver.set_load(mass, com, inertia)
+    handshake = find_handshake(driver.link.handshake)
+    if not isinstance(handshake, IdentificationHandshake) or not np.any(before["gravity"]):
+        return "load data sent; the controller reports no gravity torques, so they are not checked further"
+    driver.monitor(max(10, round(_LOAD_SETTLES_S / driver.state().period_s)))
+    after = driver.last_rows(1)[-1]["msr"]
+    old = handshake.load(before)
+    return check_gravity_change(
+        arm,
+        np.asarray(after["msr_jnt_pos"], dtype=np.float64),
+        (np.asarray(before["gravity"], dtype=np.float64), np.asarray(after["gravity"], dtype=np.float64)),
+        ((float(old[0]), 1e-3 * old[1:4]), (mass, np.asarray(com))),
+    )
+
+
+def check_gravity_change(
+    arm: Arm,
+    q: Vector,
+    gravity: tuple[Vector, Vector],
+    loads: tuple[tuple[float, Vector], tuple[float, Vector]],
+) -> str:
+    """The change of the controller's gravity torques by new load data against the nominal one, in a sentence.
+
+    q : (n,) [rad], at rest. gravity : (n,) [Nm] in the packets before and after. loads : mass [kg] and centre of mass
+    in the flange frame [m] before and after. The sign of the torques in the packet is that of the arm's own gravity.
+    Raises RobotError with joint, value and limit.
+    """
+    before, after = (gravity_of_load(arm, q, *load) for load in loads)
+    sign = 1.0 if float(gravity[0] @ before) >= 0.0 else -1.0
+    expected, found = after - before, sign * (gravity[1] - gravity[0])
+    allowed = _LOAD_SHARE * np.abs(expected) + _LOAD_FLOOR * arm.tau_max
+    excess = np.abs(found - expected) / allowed
+    joint = int(np.argmax(excess))
+    if excess[joint] > 1.0:
+        raise RobotError(
+            f"load data of {loads[1][0]:g} kg: gravity torque of {arm.joint_names[joint]} in the controller changed by "
+            f"{found[joint]:+.2f} Nm, expected {expected[joint]:+.2f} ± {allowed[joint]:.2f} Nm. They are not "
+            "in force as sent; check the KRL program and the tool at the pendant, nothing moved"
+        )
+    largest = int(np.argmax(np.abs(expected)))
+    return (
+        f"load data in force: the controller's gravity torque of {arm.joint_names[largest]} changed by "
+        f"{found[largest]:+.2f} Nm, expected {expected[largest]:+.2f} Nm"
+    )
+
+
+def gravity_of_load(arm: Arm, q: Vector, mass: float, com: Vector) -> Vector:
+    """Gravity torque of the nominal arm with a mass [kg] at com in the flange frame, (3,) [m]; (n,) [Nm]."""
+    model = pin.buildModelFromXML(arm.urdf)
+    place = model.frames[model.getFrameId("flange")].placement
+    model.appendBodyToJoint(model.njoints - 1, pin.Inertia(mass, np.asarray(com), np.zeros((3, 3))), place)
+    return np.asarray(pin.computeGeneralizedGravity(model, model.createData(), q))
 
 
 @dataclass(frozen=True)

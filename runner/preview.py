@@ -21,6 +21,7 @@ from lwr_driver.arm.cell import Cell
 from lwr_driver.arm.collision import Clearance, CollisionChecker
 from lwr_driver.configuration import find, read_mapping
 from lwr_driver.motion import Motion
+from lwr_driver.references import Frozen
 from runner.experiment import ExperimentProgress
 from runner.experiment_file import Experiment, Payload
 from runner.live import phase_at
@@ -118,8 +119,10 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     folder = Path(file)
     results = folder if folder.is_dir() else None
     if results is not None:
-        path = folder / "experiment.yaml"
-        experiment = Experiment.load(path.resolve(), beside=ExperimentProgress.load(folder).origin)
+        frozen = Frozen(folder.resolve())
+        path = frozen.root() if frozen.there else (folder / "experiment.yaml").resolve()
+        beside = path.parent if frozen.there else ExperimentProgress.load(folder).origin
+        experiment = Experiment.load(path, beside=beside)
     else:
         path = find(file)
         if read_mapping(path).get("kind") == "excitation plan":

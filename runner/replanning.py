@@ -28,7 +28,7 @@ from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from runner.experiment import Record, Run
 from runner.experiment_file import Experiment, Payload, SessionPlan
-from runner.planning import excitation_rows
+from runner.planning import excitation_rows, store_plan, stored_plan
 from runner.preflight import check_start
 from runner.results import estimate, named_model, summarise, unseen_sessions, write_results
 from runner.terminal import StatusLine
@@ -83,9 +83,10 @@ class Rounds:
 
     def _motion(self, number: int, records: Sequence[Record]) -> ExcitationPlan:
         """The motion of a round, read from the folder, or planned now and stored there."""
-        path = self.folder / PLAN.format(number)
-        if path.is_file():
-            return ExcitationPlan.load(path)
+        name = PLAN.format(number)
+        stored = stored_plan(self.folder, name, self.arm)
+        if stored is not None:
+            return stored
         status = self.status
         status.show(f"estimate before round {number}", 0.0, "")
         found = estimate(self.experiment, self.arm, records)
@@ -97,7 +98,7 @@ class Rounds:
         hint = "Ctrl-C ends the search and keeps the best motion so far"
         status.show(f"planning round {number}", 0.0, hint)
         motion = planned_near_home(self.experiment, self.arm, problem, lambda now: show_search(status, now))
-        motion.save(path)
+        store_plan(self.folder, name, motion)
         status.clear()
         essential = found.estimate if found.essential is None else found.essential.estimate
         before = float(np.median(essential.rsd_percent))

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -188,7 +188,8 @@ def write_results(
     summary["link"] = {**_earlier_link(folder, summary), **summary["link"]}
     report = _report(experiment, summary, found)
     if found is not None:
-        write_model(named_model(found.model, arm.name), folder / "model.yaml")
+        files = {file["path"]: file["sha256"] for file in summary.get("files", ())}
+        write_model(named_model(found.model, arm.name, files), folder / "model.yaml")
     (folder / "report.txt").write_text(report, encoding="utf-8")
     write_json(folder / "summary.json", summary)
     return report
@@ -206,9 +207,13 @@ def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     return {name: link[name] for name in names if name in kept and name in link}
 
 
-def named_model(model: DynamicModel, robot: str) -> DynamicModel:
-    """The identified model with the name of the robot, and this software in its provenance."""
-    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, "software": software()})
+def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None = None) -> DynamicModel:
+    """The identified model with the name of the robot, and this software in its provenance.
+
+    files : SHA-256 of the files of the experiment by path, for the provenance.
+    """
+    origin = {"software": software()} | ({"files": dict(files)} if files else {})
+    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, **origin})
 
 
 def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
@@ -257,16 +262,14 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
 _ANNOUNCED = ("payload", "payload_mass")
 
 
-def new_folder(folder: Path) -> None:
-    """Make an empty folder for results. ConfigurationError if this is impossible."""
+def new_folder(folder: Path, advice: str = "choose another --results") -> None:
+    """Make an empty folder for results. ConfigurationError, with the advice, if this is impossible."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigurationError(f"{folder} is not an empty folder; choose another --results")
+        raise ConfigurationError(f"{folder} is not empty, or no folder; {advice}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigurationError(
-            f"{folder} cannot be made: {error.strerror}; choose another --results"
-        ) from error
+        raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; {advice}") from error
 
 
 def write_log_results(

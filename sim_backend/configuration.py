@@ -5,48 +5,49 @@ A file may name another one under `base`; its keys then replace those of the bas
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from fri.errors import ConfigurationError
 from fri.handshake import HANDSHAKES
 from fri.krl import KrlProgram, Machinery
 from fri.policy import KrcPolicy
-from lwr_driver.configuration import find, parse, read_mapping
+from fri.quantities import FileName, Name, Version, check, entries, within
+from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
 
 OWN_PROGRAM = "lwr_identification"
 """The KRL program of this project."""
 
 JOINTS = 7
-Joints = tuple[float, float, float, float, float, float, float]
+_FILES = (("robot", "urdf"), ("robot", "parameters"), ("controller", "urdf"), ("", "limits"))
 
+_Number = TypeVar("_Number")
+Joints = tuple[_Number, _Number, _Number, _Number, _Number, _Number, _Number]
+"""Seven numbers, one for each joint."""
 
-def _numbers(owner: object, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
-    for name in names:
-        value = getattr(owner, name)
-        for number in value if isinstance(value, tuple) else (value,):
-            yield name, number
-
-
-def _non_negative(owner: object, *names: str) -> None:
-    for name, number in _numbers(owner, names):
-        if number < 0.0:
-            raise ConfigurationError(f"{name} {number} is negative")
-
-
-def _positive(owner: object, *names: str) -> None:
-    for name, number in _numbers(owner, names):
-        if number <= 0.0:
-            raise ConfigurationError(f"{name} {number} must be above zero")
+_Angles = Joints[Annotated[float, within(-6.3, 6.3, "rad")]]
+_Stiffness = Joints[Annotated[float, within(10.0, 1e7, "Nm/rad")]]
+_Gains = Joints[Annotated[float, within(0.0, 1e6)]]
+_Torques = Joints[Annotated[float, within(0.0, 1e4, "Nm")]]
+_Offsets = Joints[Annotated[float, within(-1e3, 1e3, "Nm")]]
+_MotorLimits = Joints[Annotated[float, within(1.0, 1e4, "Nm")]]
+_Resolution = Joints[Annotated[float, within(0.0, 0.1, "rad")]]
+_Speeds = Joints[Annotated[float, within(0.05, 50.0, "rad/s")]]
+_Accelerations = Joints[Annotated[float, within(0.5, 5000.0, "rad/s²")]]
+_Cutoff = Annotated[float, within(0.01, 10_000.0, "Hz")]
+_Delay = Annotated[int, within(0, 10_000, "ms")]
+_Index = Annotated[int, within(1, 16)]
+_Metres = Annotated[float, within(-0.5, 0.5, "m")]
+_Moment = Annotated[float, within(-5.0, 5.0, "kg m²")]
 
 
 @dataclass(frozen=True)
 class Plugin:
     """A class from outside, `package.module:Class`, and its keyword arguments."""
 
-    type: str
+    type: Annotated[str, entries(3, 200)]
     options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -68,20 +69,16 @@ class RobotConfig:
     `sim_backend.plant.Plant`); the `effects` act on its sensors only
     """
 
-    urdf: str = "lwr4plus.urdf"
-    parameters: str = "table2.yaml"
-    payload: str = "none"
-    start_position: Joints = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
-    stiffness: Joints = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
-    damping: Joints = (15.0, 15.0, 10.0, 10.0, 3.0, 1.0, 0.5)
-    brake_torque: Joints = (300.0, 300.0, 200.0, 200.0, 150.0, 80.0, 80.0)
-    substeps: int = 4
-    effects: tuple[Plugin, ...] = ()
+    urdf: FileName = "lwr4plus.urdf"
+    parameters: FileName = "emulator/table2.yaml"
+    payload: Name = "none"
+    start_position: _Angles = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
+    stiffness: _Stiffness = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
+    damping: _Gains = (15.0, 15.0, 10.0, 10.0, 3.0, 1.0, 0.5)
+    brake_torque: _Torques = (300.0, 300.0, 200.0, 200.0, 150.0, 80.0, 80.0)
+    substeps: Annotated[int, within(1, 200)] = 4
+    effects: Annotated[tuple[Plugin, ...], entries(0, 100)] = ()
     plant: Plugin | None = None
-
-    def __post_init__(self) -> None:
-        _positive(self, "stiffness", "substeps")
-        _non_negative(self, "damping", "brake_torque")
 
 
 @dataclass(frozen=True)
@@ -90,12 +87,12 @@ class LoadData:
     [kg m^2].
     """
 
-    mass: float = 0.0
-    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    mass: Annotated[float, within(0.0, 50.0, "kg")] = 0.0
+    com: tuple[_Metres, _Metres, _Metres] = (0.0, 0.0, 0.0)
+    inertia: tuple[_Moment, _Moment, _Moment, _Moment, _Moment, _Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _non_negative(self, "mass")
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -113,26 +110,21 @@ class ControllerConfig:
     settle_s : time under control before the first packet
     """
 
-    urdf: str = "lwr4plus.urdf"
+    urdf: FileName = "lwr4plus.urdf"
     load: LoadData = field(default_factory=LoadData)
-    stiffness: Joints = (10e3, 10e3, 10e3, 10e3, 10e3, 7.5e3, 7.5e3)
-    position_gain: Joints = (9e3, 9e3, 6e3, 6e3, 3e3, 2e3, 2e3)
-    velocity_gain: Joints = (250.0, 250.0, 160.0, 160.0, 60.0, 40.0, 40.0)
-    torque_gain: Joints = (0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5)
-    viscous: Joints = (15.0, 17.0, 7.1, 10.5, 4.9, 3.3, 1.8)
-    coulomb: Joints = (13.5, 15.0, 7.9, 9.0, 5.0, 4.0, 3.75)
-    coulomb_speed: float = 0.01
-    torque_limit: Joints = (200.0, 200.0, 120.0, 120.0, 100.0, 50.0, 50.0)
-    velocity_cutoff_hz: float = 150.0
-    command_cutoff_hz: float = 40.0
-    model_period_ms: int = 20
-    external_cutoff_hz: float = 10.0
-    settle_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        _positive(self, "stiffness", "torque_limit", "coulomb_speed", "velocity_cutoff_hz")
-        _positive(self, "command_cutoff_hz", "model_period_ms", "external_cutoff_hz")
-        _non_negative(self, "position_gain", "velocity_gain", "torque_gain", "viscous", "coulomb", "settle_s")
+    stiffness: _Stiffness = (10e3, 10e3, 10e3, 10e3, 10e3, 7.5e3, 7.5e3)
+    position_gain: _Gains = (9e3, 9e3, 6e3, 6e3, 3e3, 2e3, 2e3)
+    velocity_gain: _Gains = (250.0, 250.0, 160.0, 160.0, 60.0, 40.0, 40.0)
+    torque_gain: _Gains = (0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5)
+    viscous: _Gains = (15.0, 17.0, 7.1, 10.5, 4.9, 3.3, 1.8)
+    coulomb: _Torques = (13.5, 15.0, 7.9, 9.0, 5.0, 4.0, 3.75)
+    coulomb_speed: Annotated[float, within(1e-6, 10.0, "rad/s")] = 0.01
+    torque_limit: _MotorLimits = (200.0, 200.0, 120.0, 120.0, 100.0, 50.0, 50.0)
+    velocity_cutoff_hz: _Cutoff = 150.0
+    command_cutoff_hz: _Cutoff = 40.0
+    model_period_ms: Annotated[int, within(1, 10_000, "ms")] = 20
+    external_cutoff_hz: _Cutoff = 10.0
+    settle_s: Annotated[float, within(0.0, 60.0, "s")] = 1.0
 
 
 @dataclass(frozen=True)
@@ -143,18 +135,15 @@ class SensorConfig:
     """
 
     position_sensor: Literal["link", "motor"] = "link"
-    position_resolution: Joints = (6e-6,) * 7
-    position_noise: Joints = (0.0,) * 7
-    motor_position_resolution: Joints = (1e-6,) * 7
-    joint_torque_noise: Joints = (0.39, 0.39, 0.23, 0.23, 0.23, 0.086, 0.086)
-    joint_torque_offset: Joints = (0.0,) * 7
-    joint_torque_resolution: Joints = (0.02, 0.02, 0.01, 0.01, 0.01, 0.005, 0.005)
-    motor_torque_noise: Joints = (0.5, 0.5, 0.3, 0.3, 0.2, 0.1, 0.1)
-    motor_torque_resolution: Joints = (0.05, 0.05, 0.03, 0.03, 0.02, 0.01, 0.01)
-    temperature: float = 35.0
-
-    def __post_init__(self) -> None:
-        _non_negative(self, *(f.name for f in fields(self) if f.name.endswith(("_resolution", "_noise"))))
+    position_resolution: _Resolution = (6e-6,) * 7
+    position_noise: _Resolution = (0.0,) * 7
+    motor_position_resolution: _Resolution = (1e-6,) * 7
+    joint_torque_noise: _Torques = (0.39, 0.39, 0.23, 0.23, 0.23, 0.086, 0.086)
+    joint_torque_offset: _Offsets = (0.0,) * 7
+    joint_torque_resolution: _Torques = (0.02, 0.02, 0.01, 0.01, 0.01, 0.005, 0.005)
+    motor_torque_noise: _Torques = (0.5, 0.5, 0.3, 0.3, 0.2, 0.1, 0.1)
+    motor_torque_resolution: _Torques = (0.05, 0.05, 0.03, 0.03, 0.02, 0.01, 0.01)
+    temperature: Annotated[float, within(-50.0, 200.0, "°C")] = 35.0
 
 
 @dataclass(frozen=True)
@@ -167,17 +156,12 @@ class KrlRealsConfig:
     """
 
     enabled: bool = True
-    reals: tuple[int, int, int, int, int, int, int] = (1, 2, 3, 4, 5, 6, 7)
-    counter_int: int = 1
-    tick_ms: int = 12
-    delay_ms: int = 0
+    reals: tuple[_Index, _Index, _Index, _Index, _Index, _Index, _Index] = (1, 2, 3, 4, 5, 6, 7)
+    counter_int: _Index = 1
+    tick_ms: Annotated[int, within(1, 1000, "ms")] = 12
+    delay_ms: _Delay = 0
 
     def __post_init__(self) -> None:
-        _positive(self, "tick_ms")
-        _non_negative(self, "delay_ms")
-        for index in (*self.reals, self.counter_int):
-            if not 1 <= index <= 16:
-                raise ConfigurationError(f"KRL variable index {index} is outside 1 to 16")
         if len(set(self.reals)) != len(self.reals):
             raise ConfigurationError(f"reals {list(self.reals)} names a variable twice")
 
@@ -191,14 +175,10 @@ class TraceConfig:
     longest_s : older samples are dropped
     """
 
-    clock_offset: float = 812.4375
-    clock_rate_error: float = 1.5e-5
-    delay_ms: int = 0
-    longest_s: float = 900.0
-
-    def __post_init__(self) -> None:
-        _non_negative(self, "delay_ms")
-        _positive(self, "longest_s")
+    clock_offset: Annotated[float, within(-1e9, 1e9, "s")] = 812.4375
+    clock_rate_error: Annotated[float, within(-0.1, 0.1)] = 1.5e-5
+    delay_ms: _Delay = 0
+    longest_s: Annotated[float, within(1.0, 3600.0, "s")] = 900.0
 
 
 @dataclass(frozen=True)
@@ -213,22 +193,21 @@ class FriConfig:
 
     program: Literal["lwr_identification", "stanford", "ros_control", "rcprg"] = "stanford"
     autostart: bool = True
-    period_ms: int = 1
-    local_host: str = "127.0.0.1"
-    local_port: int = 0
-    position_min: Joints = (-2.9671, -2.0944, -2.9671, -2.0944, -2.9671, -2.0944, -2.9671)
-    position_max: Joints = (2.9671, 2.0944, 2.9671, 2.0944, 2.9671, 2.0944, 2.9671)
-    velocity: Joints = (2.0944, 2.0944, 2.7925, 2.7925, 4.3633, 3.8397, 3.8397)
-    acceleration: Joints = (20.94, 20.94, 27.93, 27.93, 43.63, 76.79, 76.79)
-    uptime_s: float = 3600.0
-    answer_delay_s: float = 1e-4
-    patience_s: float = 10.0
+    period_ms: Annotated[int, within(1, 100, "ms")] = 1
+    local_host: Annotated[str, entries(1, 253)] = "127.0.0.1"
+    local_port: Annotated[int, within(0, 65535)] = 0
+    position_min: _Angles = (-2.9671, -2.0944, -2.9671, -2.0944, -2.9671, -2.0944, -2.9671)
+    position_max: _Angles = (2.9671, 2.0944, 2.9671, 2.0944, 2.9671, 2.0944, 2.9671)
+    velocity: _Speeds = (2.0944, 2.0944, 2.7925, 2.7925, 4.3633, 3.8397, 3.8397)
+    acceleration: _Accelerations = (20.94, 20.94, 27.93, 27.93, 43.63, 76.79, 76.79)
+    uptime_s: Annotated[float, within(0.0, 1e8, "s")] = 3600.0
+    answer_delay_s: Annotated[float, within(0.0, 1.0, "s")] = 1e-4
+    patience_s: Annotated[float, within(0.001, 3600.0, "s")] = 10.0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.period_ms <= 100:
-            raise ConfigurationError(f"period_ms {self.period_ms} is outside 1 to 100")
-        _positive(self, "velocity", "acceleration", "patience_s")
-        _non_negative(self, "answer_delay_s", "uptime_s")
+        for low, high in zip(self.position_min, self.position_max, strict=True):
+            if not low < high:
+                raise ConfigurationError(f"position_min {low} is not below position_max {high}")
 
 
 @dataclass(frozen=True)
@@ -239,8 +218,8 @@ class EmulatorConfig:
     faults : faults on the wire from the start. schedule : the operator's actions without request
     """
 
-    schema_version: int = 1
-    seed: int = 1
+    schema_version: Version = 1
+    seed: Annotated[int, within(0, 2**63)] = 1
     robot: RobotConfig = field(default_factory=RobotConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)
@@ -248,18 +227,10 @@ class EmulatorConfig:
     trace: TraceConfig = field(default_factory=TraceConfig)
     fri: FriConfig = field(default_factory=FriConfig)
     policy: KrcPolicy = field(default_factory=KrcPolicy)
-    limits: str = "lwr4plus.yaml"
-    faults: tuple[dict[str, Any], ...] = ()
-    schedule: tuple[dict[str, Any], ...] = ()
+    limits: FileName = "lwr4plus.yaml"
+    faults: Annotated[tuple[dict[str, Any], ...], entries(0, 1000)] = ()
+    schedule: Annotated[tuple[dict[str, Any], ...], entries(0, 1000)] = ()
     source: Path = field(default=Path(), init=False)
-
-    def __post_init__(self) -> None:
-        if self.schema_version != 1:
-            raise ConfigurationError(
-                f"schema_version {self.schema_version} is unknown; this software reads 1"
-            )
-        if self.seed < 0:
-            raise ConfigurationError(f"seed {self.seed} is negative")
 
     def beside(self, name: str) -> Path:
         """Path of the file `name` of this configuration."""
@@ -275,14 +246,14 @@ def krl_program(
     """
     if name not in HANDSHAKES:
         raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(HANDSHAKES)}")
-    text = find(f"krl/{name}.src")
-    data = text.with_suffix(".dat").read_text(encoding="utf-8")
+    text = CONFIGS / f"krl/{name}.src"
+    data = read_text(text.with_suffix(".dat"))
     values = {"LWR_CYCLE": period_ms, **settings}
-    return KrlProgram(text.read_text(encoding="utf-8"), data, values, machinery, name)
+    return KrlProgram(read_text(text), data, values, machinery, name)
 
 
 def load_configuration(
-    name: str | Path = "emulator/default.yaml", overrides: Mapping[str, Any] | None = None
+    name: str | Path = CONFIGS / "emulator/default.yaml", overrides: Mapping[str, Any] | None = None
 ) -> EmulatorConfig:
     """Read and check an emulator configuration.
 
@@ -307,7 +278,17 @@ def _with_base(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         return content
     if not isinstance(base, str):
         raise ConfigurationError(f"{path}: `base` must be the name of a file, found {base!r}")
-    return _merge(_with_base(find(base, beside=path.parent), (*seen, path)), content)
+    below = find(base, beside=path.parent)
+    return _merge(_resolved(_with_base(below, (*seen, path)), below.parent), content)
+
+
+def _resolved(content: dict[str, Any], beside: Path) -> dict[str, Any]:
+    """The content of a base with its file names found beside the base itself."""
+    for section, key in _FILES:
+        place = content.get(section) if section else content
+        if isinstance(place, dict) and isinstance(place.get(key), str):
+            place[key] = str(find(place[key], beside=beside))
+    return content
 
 
 def _merge(below: dict[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,11 +11,11 @@ import heapq
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from fri.errors import ConfigurationError
+from fri.quantities import check, entries, within
 
 Kind = Literal["loss", "burst", "delay", "jitter", "duplicate", "reorder", "truncate", "corrupt", "foreign"]
 
@@ -35,20 +35,15 @@ class WireFault:
 
     kind: Kind
     direction: Literal["to_pc", "to_krc", "both"] = "both"
-    probability: float = 1.0
-    cycles: int | None = None
-    length: int = 3
-    bits: int = 1
-    host: str = "127.0.0.2"
+    probability: Annotated[float, within(0.0, 1.0, "share")] = 1.0
+    cycles: Annotated[int, within(1, 10**9)] | None = None
+    length: Annotated[int, within(1, 100_000)] = 3
+    bits: Annotated[int, within(1, 10_000)] = 1
+    host: Annotated[str, entries(1, 253)] = "127.0.0.2"
     imitate: bool = True
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.probability <= 1.0:
-            raise ConfigurationError(f"probability {self.probability} is outside 0 to 1")
-        if self.length < 1 or self.bits < 1:
-            raise ConfigurationError(f"length {self.length} and bits {self.bits} must be at least 1")
-        if self.cycles is not None and self.cycles < 1:
-            raise ConfigurationError(f"cycles {self.cycles} must be at least 1; leave it out for no end")
+        check(self)
 
 
 class Parcel(NamedTuple):

@@ -11,11 +11,12 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from fri.errors import ConfigurationError, LwrError, RobotError
+from fri.quantities import Name, check, within
 from fri.states import EventKind, Quality, State
 from lwr_driver.configuration import parse
 from sim_backend.cabinet import Cabinet
@@ -40,21 +41,17 @@ class ScheduleEntry:
     after_cycles : delay in FRI cycles
     """
 
-    command: str
+    command: Name
     when: Moment = "now"
-    after_cycles: int = 0
-    occurrence: int = 1
+    after_cycles: Annotated[int, within(0, 10**9)] = 0
+    occurrence: Annotated[int, within(1, 10**6)] = 1
     arguments: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check(self)
         if self.command not in COMMANDS:
             raise ConfigurationError(f"command {self.command!r} is unknown; known: {', '.join(COMMANDS)}")
         _check_arguments(self.command, self.arguments)
-        if self.after_cycles < 0 or self.occurrence < 1:
-            raise ConfigurationError(
-                f"after_cycles {self.after_cycles} must be at least 0, "
-                f"occurrence {self.occurrence} at least 1"
-            )
 
 
 class _Pending:

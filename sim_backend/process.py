@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from fri.errors import ConfigurationError, LwrError, NetworkError, RobotError
-from lwr_driver.configuration import find
+from lwr_driver.configuration import CONFIGS, find
 from lwr_driver.realtime import undisturbed
 from sim_backend.pendant import Pendant
 
@@ -45,7 +45,7 @@ class Emulator:
 
     def __init__(
         self,
-        config: str | Path = "emulator/default.yaml",
+        config: str | Path = CONFIGS / "emulator/default.yaml",
         *,
         lock_step: bool = True,
         fri_host: str = "127.0.0.1",

@@ -29,6 +29,8 @@ SECTIONS = {
     "computer": "faults of this computer: kill -9, disk, clock, starvation, Ctrl-C",
     "network": "what is bound, who is answered, what is said",
     "realtime": "reply latency beside a minimal C client, at 1, 2, 5 and 10 ms",
+    "files": "crafted files: an error with advice, never a traceback or an hour of work",
+    "resume": "aborts at random instants, each finished by --resume; folders that changed since",
     "input": "mangled packets, logs, files: an error of ours or a correct result",
     "physics": "the emulated arm against theory",
     "clients": "other people's FRI clients on the emulator",

@@ -14,10 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from fri.errors import ConfigurationError
+from fri.quantities import within
 from ident.excitation.arm_model import (
     ArmEstimate,
     Mechanism,
@@ -81,8 +83,8 @@ class Workspace:
     (for the LWR4+ 0.31 m above the base plate). None switches a bound off.
     """
 
-    radius_m: float | None = 0.3
-    height_m: float | None = -0.2
+    radius_m: Annotated[float, within(0.0, 5.0, "m")] | None = 0.3
+    height_m: Annotated[float, within(-5.0, 5.0, "m")] | None = -0.2
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import yaml
 
 from fri.errors import ConfigurationError, DataError
+from fri.quantities import Name, Version, entries, within
 from ident.excitation.check import Check, Margin
 from ident.excitation.motions import (
     Array,
@@ -23,10 +24,61 @@ from ident.excitation.motions import (
     SplineMotion,
 )
 from ident.model.model_file import write_checked
-from lwr_driver.configuration import read_mapping
+from lwr_driver.configuration import parse, read_mapping
+from lwr_driver.extent import LONGEST_EXCITATION_S, Periods
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
+
+_Duration = Annotated[float, within(0.01, LONGEST_EXCITATION_S, "s")]
+_Angle = Annotated[float, within(-20.0, 20.0, "rad")]
+_Angles = Annotated[tuple[_Angle, ...], entries(1, 200)]
+_Table = Annotated[tuple[_Angles, ...], entries(1, 100)]
+_Limit = Annotated[float, within(0.0, 1e6, above=True)]
+_Limits = Annotated[tuple[_Limit, ...], entries(1, 100)]
+
+
+@dataclass(frozen=True)
+class _Fourier:
+    """A Fourier series in a plan file."""
+
+    type: Literal["fourier"]
+    period_s: _Duration
+    bias: _Angles
+    a: _Table
+    b: _Table
+    harmonics: Annotated[int, within(1, 200)] = 1
+
+
+@dataclass(frozen=True)
+class _Spline:
+    """A B-spline in a plan file."""
+
+    type: Literal["bspline"]
+    duration_s: _Duration
+    points: _Table
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Postures in a plan file."""
+
+    type: Literal["point to point"]
+    postures: Annotated[tuple[_Angles, ...], entries(2, 10_000)]
+    v_max: _Limits
+    a_max: _Limits
+    j_max: _Limits
+    dwell_s: Annotated[float, within(0.0, 600.0, "s")]
+
+
+@dataclass(frozen=True)
+class _PlanFile:
+    """The keys of a plan file that decide the motion; the rest is a record of its planning."""
+
+    schema_version: Version
+    kind: Literal["excitation plan"]
+    joint_names: Annotated[tuple[Name, ...], entries(1, 100)]
+    periods: Periods
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +104,7 @@ class ExcitationPlan:
     def __post_init__(self) -> None:
         if len(self.joint_names) != self.motion.joints:
             raise ConfigurationError(
-                f"{len(self.joint_names)} joint names for a motion of {self.motion.joints} joints"
+                f"{len(self.joint_names)} joint_names for a motion of {self.motion.joints} joints"
             )
         if self.periods < 1:
             raise ConfigurationError(f"periods {self.periods} is below 1; at least one whole period is run")
@@ -135,23 +187,31 @@ class ExcitationPlan:
     @classmethod
     def from_mapping(cls, content: Any, path: str) -> ExcitationPlan:
         """The plan of a file's content; ConfigurationError with path and fault otherwise."""
+        if not isinstance(content, Mapping) or content.get("kind") != "excitation plan":
+            raise ConfigurationError(
+                f"{path}: `kind` is not that of an excitation plan of schema_version {_SCHEMA}"
+            )
+        keys = ("schema_version", "kind", "joint_names", "periods")
+        head = parse(_PlanFile, {key: content[key] for key in keys if key in content}, path)
         try:
-            if content["schema_version"] != _SCHEMA or content["kind"] != "excitation plan":
-                raise ConfigurationError("not an excitation plan of schema_version 1")
-            margins = tuple(_margin_from_mapping(entry) for entry in content.get("margins", []))
-            return cls(
-                motion=_motion_from_mapping(content["motion"]),
-                joint_names=tuple(str(name) for name in content["joint_names"]),
-                periods=int(content["periods"]),
+            plan = cls(
+                motion=_motion_from_mapping(content.get("motion"), f"{path}: `motion`"),
+                joint_names=head.joint_names,
+                periods=head.periods,
                 objectives=content.get("objectives", {}),
                 rsd_percent=content.get("rsd_percent", {}),
-                check=Check(margins),
+                check=Check(tuple(_margin_from_mapping(entry) for entry in content.get("margins", []))),
                 provenance=content.get("provenance", {}),
             )
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{path}: {error}") from error
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"{path}: not a readable excitation plan: {error!r}") from error
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            reason = str(error) if isinstance(error, ConfigurationError) else f"not readable: {error!r:.200}"
+            raise ConfigurationError(reason if reason.startswith(path) else f"{path}: {reason}") from error
+        if not plan.duration_s <= LONGEST_EXCITATION_S:
+            raise ConfigurationError(
+                f"{path}: {plan.periods} periods of {plan.period_s:g} s last {plan.duration_s:g} s, limit "
+                f"{LONGEST_EXCITATION_S:g} s; lower `periods`"
+            )
+        return plan
 
 
 def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
@@ -169,18 +229,25 @@ def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
     raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
 
 
-def _motion_from_mapping(content: Any) -> ParametricMotion:
-    def arrays(*keys: str) -> list[Array]:
-        return [np.array(content[key], dtype=np.float64) for key in keys]
+def _motion_from_mapping(content: Any, where: str) -> ParametricMotion:
+    forms = {"fourier": _Fourier, "bspline": _Spline, "point to point": _Points}
+    kind = content.get("type") if isinstance(content, Mapping) else None
+    if not isinstance(kind, str) or kind not in forms:
+        raise ConfigurationError(f"{where}: motion type {kind!r:.40} is unknown; known: {', '.join(forms)}")
+    form: Any = parse(forms[kind], content, where)
 
-    if content["type"] == "fourier":
-        return FourierSeries(float(content["period_s"]), *arrays("bias", "a", "b"))
-    if content["type"] == "bspline":
-        return SplineMotion(float(content["duration_s"]), *arrays("points"))
-    if content["type"] == "point to point":
-        postures, v_max, a_max, j_max = arrays("postures", "v_max", "a_max", "j_max")
-        return PointToPoint(postures, v_max, a_max, j_max, float(content["dwell_s"]))
-    raise ConfigurationError(f"motion type {content['type']!r} is unknown")
+    def arrays(*keys: str) -> list[Array]:
+        rows = [getattr(form, key) for key in keys]
+        if any(len({len(row) for row in table}) > 1 for table in rows if isinstance(table[0], tuple)):
+            raise ConfigurationError(f"{where}: rows of different lengths; give one number per column")
+        return [np.array(table, dtype=np.float64) for table in rows]
+
+    if isinstance(form, _Fourier):
+        return FourierSeries(form.period_s, *arrays("bias", "a", "b"))
+    if isinstance(form, _Spline):
+        return SplineMotion(form.duration_s, *arrays("points"))
+    postures, v_max, a_max, j_max = arrays("postures", "v_max", "a_max", "j_max")
+    return PointToPoint(postures, v_max, a_max, j_max, form.dwell_s)
 
 
 def _margin_to_mapping(margin: Margin) -> dict[str, Any]:

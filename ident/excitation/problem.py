@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from fri.errors import ConfigurationError
+from fri.quantities import FileName, Name, Share, Version, entries, within
 from ident.excitation.check import Workspace
 from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
+from lwr_driver.extent import LONGEST_EXCITATION_S, Harmonics, Period, Periods
+
+_Bound = Annotated[float, within(0.0, 1e12, above=True)]
+_Noise = Annotated[float, within(1e-6, 1000.0, "Nm")]
+_Joint = Annotated[int, within(1, 100)]
 
 
 @dataclass(frozen=True)
@@ -21,16 +27,18 @@ class MotionForm:
     """
 
     type: Literal["fourier", "bspline"] = "fourier"
-    period_s: float = 20.0
-    harmonics: int = 5
-    control_points: int = 12
-    periods: int = 1
+    period_s: Period = 20.0
+    harmonics: Harmonics = 5
+    control_points: Annotated[int, within(1, 60)] = 12
+    periods: Periods = 1
 
     def __post_init__(self) -> None:
-        if not self.period_s > 0:
-            raise ConfigurationError(f"period_s {self.period_s} s is not positive")
-        if self.periods < 1:
-            raise ConfigurationError(f"periods {self.periods} is below 1")
+        duration = self.periods * self.period_s
+        if not 0.0 < duration <= LONGEST_EXCITATION_S or self.periods < 1:
+            raise ConfigurationError(
+                f"{self.periods} periods of {self.period_s:g} s last {duration:g} s, above 0 to "
+                f"{LONGEST_EXCITATION_S:g} s are planned; lower `periods` or `period_s`"
+            )
 
 
 @dataclass(frozen=True)
@@ -44,13 +52,13 @@ class Knowledge:
     samples : independent samples in each session, for the predicted deviations
     """
 
-    file: str = "emulator/table2.yaml"
-    payload: str | None = "paper_load"
-    relative_uncertainty: float = 0.1
-    coverage: float = 3.0
-    noise_motor: tuple[float, ...] = ()
-    noise_joint: tuple[float, ...] = ()
-    samples: float = 100.0
+    file: FileName = "emulator/table2.yaml"
+    payload: Name | None = "paper_load"
+    relative_uncertainty: Annotated[float, within(0.0, 10.0)] = 0.1
+    coverage: Annotated[float, within(0.0, 20.0)] = 3.0
+    noise_motor: tuple[_Noise, ...] = ()
+    noise_joint: tuple[_Noise, ...] = ()
+    samples: Annotated[float, within(1.0, 1e6)] = 100.0
 
 
 @dataclass(frozen=True)
@@ -69,12 +77,12 @@ class Objective:
         "mean_rsd"
     )
     scaling: Literal["none", "columns", "parameters"] = "none"
-    condition_at_most: float | None = None
-    mean_rsd_at_most: float | None = None
-    worst_rsd_at_most: float | None = None
-    goal_condition: float | None = None
-    goal_wrist: float = 0.9
-    wrist: tuple[int, ...] = (6, 7)
+    condition_at_most: _Bound | None = None
+    mean_rsd_at_most: _Bound | None = None
+    worst_rsd_at_most: _Bound | None = None
+    goal_condition: _Bound | None = None
+    goal_wrist: Annotated[float, within(0.0, 100.0, above=True)] = 0.9
+    wrist: Annotated[tuple[_Joint, ...], entries(1, 100)] = (6, 7)
 
 
 @dataclass(frozen=True)
@@ -85,8 +93,8 @@ class Prior:
     session : a session log, including its payload
     """
 
-    plan: str | None = None
-    session: str | None = None
+    plan: FileName | None = None
+    session: FileName | None = None
     sessions: tuple[Literal["unloaded", "loaded"], ...] = ("unloaded", "loaded")
 
     def __post_init__(self) -> None:
@@ -102,12 +110,12 @@ class Search:
     jobs : processes, through joblib with its configured backend (loky, dask, ray)
     """
 
-    seed: int = 1
-    starts: int = 8
-    hops: int = 120
-    lanes: int = 4
-    jobs: int = 1
-    time_limit_s: float | None = None
+    seed: Annotated[int, within(0, 2**32 - 1000)] = 1
+    starts: Annotated[int, within(1, 100)] = 8
+    hops: Annotated[int, within(0, 5000)] = 120
+    lanes: Annotated[int, within(1, 100)] = 4
+    jobs: Annotated[int, within(-1, 1024)] = 1
+    time_limit_s: Annotated[float, within(0.1, 86400.0, "s")] | None = None
 
     def __post_init__(self) -> None:
         if self.starts < 1 or self.hops < 0 or self.lanes < 1:
@@ -127,21 +135,21 @@ class PlanProblem:
     clearance_m : distance to keep; None: the cell's own margin. speed_scale : share of the velocity limits
     """
 
-    name: str
-    schema_version: int = 1
-    arm: str = "lwr4plus.yaml"
-    cell: str = "cell.yaml"
+    name: Name
+    schema_version: Version = 1
+    arm: FileName = "lwr4plus.yaml"
+    cell: FileName = "cell.yaml"
     payload_shape: PayloadShape | None = None
     motion: MotionForm = field(default_factory=MotionForm)
     knowledge: Knowledge = field(default_factory=Knowledge)
-    parameters: str | tuple[str, ...] = "base"
-    sessions: tuple[Literal["unloaded", "loaded"], ...] = ("unloaded", "loaded")
+    parameters: str | tuple[Name, ...] = "base"
+    sessions: Annotated[tuple[Literal["unloaded", "loaded"], ...], entries(1, 100)] = ("unloaded", "loaded")
     model: Literal[1, 2, 3] = 2
     objective: Objective = field(default_factory=Objective)
     workspace: Workspace = field(default_factory=Workspace)
-    clearance_m: float | None = None
-    speed_scale: float = 1.0
-    prior: tuple[Prior, ...] = ()
+    clearance_m: Annotated[float, within(0.0, 0.5, "m")] | None = None
+    speed_scale: Share = 1.0
+    prior: Annotated[tuple[Prior, ...], entries(0, 100)] = ()
     search: Search = field(default_factory=Search)
     source: Path | None = None
 
@@ -161,10 +169,6 @@ class PlanProblem:
         )
 
     def __post_init__(self) -> None:
-        if self.schema_version != 1:
-            raise ConfigurationError(
-                f"schema_version {self.schema_version} is unknown; this software reads 1"
-            )
         if not self.sessions:
             raise ConfigurationError("sessions is empty; list `unloaded`, `loaded` or both")
         if "loaded" in self.sessions and self.knowledge.payload is None:

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from fri.errors import ConfigurationError
-from lwr_driver.configuration import find, parse, read_mapping
+from fri.quantities import Name, Version, check, entries, within
+from lwr_driver.configuration import CONFIGS, find, parse, read_mapping
 
-Triple = tuple[float, float, float]
+_Place = Annotated[float, within(-20.0, 20.0, "m")]
+_Edge = Annotated[float, within(0.001, 20.0, "m")]
+_Near = Annotated[float, within(-1.0, 1.0, "m")]
+_Size = Annotated[float, within(0.001, 1.0, "m")]
+_Angle = Annotated[float, within(-360.0, 360.0, "deg")]
+Angles = tuple[_Angle, _Angle, _Angle]
 
 
 @dataclass(frozen=True)
 class Box:
     """A box: full edge lengths [m], centre [m] and roll, pitch, yaw [deg] in `base_link`."""
 
-    name: str
-    size_m: Triple
-    centre_m: Triple
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    name: Name
+    size_m: tuple[_Edge, _Edge, _Edge]
+    centre_m: tuple[_Place, _Place, _Place]
+    rpy_deg: Angles = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if min(self.size_m) <= 0.0:
-            raise ConfigurationError(
-                f"box {self.name}: size_m {self.size_m} must be above zero in each direction"
-            )
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,14 @@ class PayloadShape:
     """
 
     shape: Literal["sphere", "cylinder", "box"]
-    size_m: tuple[float, ...]
-    centre_m: Triple
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    size_m: tuple[_Size, ...]
+    centre_m: tuple[_Near, _Near, _Near]
+    rpy_deg: Angles = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        check(self)
         wanted = {"sphere": 1, "cylinder": 2, "box": 3}[self.shape]
-        if len(self.size_m) != wanted or min(self.size_m) <= 0.0:
+        if len(self.size_m) != wanted:
             raise ConfigurationError(
                 f"payload shape {self.shape} needs {wanted} size(s) above zero, found {list(self.size_m)}"
             )
@@ -56,25 +60,20 @@ class Cell:
     margin_m : least distance of every motion [m]
     """
 
-    schema_version: int = 1
-    name: str = "cell"
-    ground_z_m: float | None = 0.0
-    margin_m: float = 0.02
-    boxes: tuple[Box, ...] = ()
+    schema_version: Version = 1
+    name: Name = "cell"
+    ground_z_m: Annotated[float, within(-5.0, 5.0, "m")] | None = 0.0
+    margin_m: Annotated[float, within(0.0, 0.5, "m")] = 0.02
+    boxes: Annotated[tuple[Box, ...], entries(0, 500)] = ()
 
     def __post_init__(self) -> None:
-        if self.schema_version != 1:
-            raise ConfigurationError(
-                f"schema_version {self.schema_version} is unknown; this software reads 1"
-            )
-        if not 0.0 <= self.margin_m <= 0.5:
-            raise ConfigurationError(f"margin_m {self.margin_m} is not within 0 to 0.5")
+        check(self)
         names = [box.name for box in self.boxes]
         if len(set(names)) != len(names):
             raise ConfigurationError(f"box names {names} are not unique")
 
     @classmethod
-    def load(cls, name: str | Path = "cell.yaml", *, beside: Path | None = None) -> Cell:
+    def load(cls, name: str | Path = CONFIGS / "cell.yaml", *, beside: Path | None = None) -> Cell:
         """Read a cell file; ConfigurationError names file, key and remedy."""
         path = find(name, beside=beside)
         return parse(cls, read_mapping(path), str(path))

@@ -61,10 +61,16 @@ class CollisionChecker:
         expect(arm, Arm, "arm of a collision check", "give `Arm.load()`")
         expect(cell, Cell, "cell of a collision check", "give `Cell.load()`")
         self.arm, self.cell, self.payload = arm, cell, payload
-        self._model = pin.buildModelFromXML(arm.urdf)
+        try:
+            self._model = pin.buildModelFromXML(arm.urdf)
+        except (ValueError, RuntimeError) as error:
+            raise ConfigurationError(f"{arm.urdf_path}: cannot be read as a URDF: {error}") from error
         if self._model.nq != JOINTS:
             raise ConfigurationError(f"{arm.urdf_path}: {self._model.nq} moving joints; the arm has {JOINTS}")
-        geometry = pin.buildGeomFromUrdfString(self._model, arm.urdf, pin.GeometryType.COLLISION)
+        try:
+            geometry = pin.buildGeomFromUrdfString(self._model, arm.urdf, pin.GeometryType.COLLISION)
+        except (ValueError, RuntimeError) as error:
+            raise ConfigurationError(f"{arm.urdf_path}: collision shapes cannot be read: {error}") from error
         wanted = len(ElementTree.fromstring(arm.urdf).findall("link/collision"))
         if geometry.ngeoms == 0 or geometry.ngeoms != wanted:
             raise ConfigurationError(

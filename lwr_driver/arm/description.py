@@ -8,32 +8,39 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
-from lwr_driver.configuration import find, parse, read_mapping
+from fri.quantities import FileName, Name, Version, check, suspected, within
+from lwr_driver.arm.ceilings import JOINT_NAMES, LWR4PLUS, MODEL
+from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
 
 JOINTS = 7
 
 Vector = NDArray[np.float64]
 
 
+_Angle = Annotated[float, within(-360.0, 360.0, "deg")]
+_LEAST_RANGE_DEG = 10.0
+
+
 @dataclass(frozen=True)
 class _JointEntry:
     """One joint of the arm file. Limits are magnitudes; `position_deg` is (lower, upper)."""
 
-    name: str
-    position_deg: tuple[float, float]
-    velocity_deg_s: float
-    acceleration_rad_s2: float
-    jerk_rad_s3: float
-    torque_nm: float
-    gear_ratio: float
-    stiffness_nm_rad: float
+    name: Name
+    position_deg: tuple[_Angle, _Angle]
+    velocity_deg_s: Annotated[float, within(5.0, 720.0, "deg/s")]
+    acceleration_rad_s2: Annotated[float, within(0.1, 100.0, "rad/s²")]
+    jerk_rad_s3: Annotated[float, within(1.0, 10000.0, "rad/s³")]
+    torque_nm: Annotated[float, within(1.0, 1000.0, "Nm")]
+    gear_ratio: Annotated[float, within(1.0, 1000.0)]
+    stiffness_nm_rad: Annotated[float, within(100.0, 1e6, "Nm/rad")]
 
     def __post_init__(self) -> None:
         lower, upper = self.position_deg
@@ -41,35 +48,30 @@ class _JointEntry:
             raise ConfigurationError(
                 f"joint {self.name}: position_deg {lower} to {upper} is no range; the lower end comes first"
             )
-        for field, value in vars(self).items():
-            if field not in ("name", "position_deg") and not value > 0.0:
-                raise ConfigurationError(f"joint {self.name}: {field} is {value}; it must be above zero")
+        if upper - lower < _LEAST_RANGE_DEG:
+            advice = suspected([lower, upper], "deg", lambda angle: abs(angle) <= 360.0)
+            raise ConfigurationError(
+                f"joint {self.name}: position_deg {lower:g} to {upper:g} deg is less than {_LEAST_RANGE_DEG:g} deg; "
+                f"{advice or 'give both ends'}"
+            )
 
 
 @dataclass(frozen=True)
 class _ArmFile:
     """The arm file as written; units are in the key names."""
 
-    schema_version: int
-    name: str
-    urdf: Path
-    position_margin_deg: float
-    lowest_resonance_hz: float
+    schema_version: Version
+    name: Name
+    urdf: FileName
+    position_margin_deg: Annotated[float, within(0.0, 20.0, "deg")]
+    lowest_resonance_hz: Annotated[float, within(0.1, 1000.0, "Hz")]
     joints: tuple[_JointEntry, ...]
+    model: Name = MODEL
 
     def __post_init__(self) -> None:
-        if self.schema_version != 1:
-            raise ConfigurationError(
-                f"schema_version {self.schema_version} is unknown; this software reads 1"
-            )
+        check(self)
         if len(self.joints) != JOINTS:
             raise ConfigurationError(f"{len(self.joints)} joints listed; the LWR4+ has {JOINTS}")
-        if not 0.0 <= self.position_margin_deg <= 20.0:
-            raise ConfigurationError(f"position_margin_deg {self.position_margin_deg} is not within 0 to 20")
-        if not 0.0 < self.lowest_resonance_hz < 1000.0:
-            raise ConfigurationError(
-                f"lowest_resonance_hz {self.lowest_resonance_hz} is not within 0 to 1000"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +124,8 @@ class Arm:
     v_max, a_max, j_max : limits of every command [rad/s], [rad/s²], [rad/s³]
     tau_max : joint torque limits [Nm]; gear_ratio : motor turns per joint turn
     stiffness : joint stiffness [Nm/rad]; resonance_hz : lowest structural resonance [Hz]
+    model : what the arm is; the limits of the LWR4+ (`ceilings`) hold for it whatever its file says, and for every arm
+    with its joint names. Raises ConfigurationError beyond them.
     """
 
     name: str
@@ -138,6 +142,11 @@ class Arm:
     resonance_hz: float
     urdf: str
     urdf_path: Path
+    model: str = MODEL
+
+    def __post_init__(self) -> None:
+        if self.model == MODEL or self.joint_names == JOINT_NAMES:
+            _enforce_ceilings(self)
 
     def __repr__(self) -> str:
         rows = (
@@ -168,25 +177,24 @@ class Arm:
         return ArmLimits(self.q_low, self.q_high, self.v_max, self.a_max, self.j_max)
 
     @classmethod
-    def load(cls, name: str | Path = "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
+    def load(cls, name: str | Path = CONFIGS / "lwr4plus.yaml", *, beside: Path | None = None) -> Arm:
         """Read and check an arm file and its URDF.
 
-        Raises ConfigurationError if a limit is not sane, the joint names differ from the URDF's chain, a
-        link's inertia is impossible, or the URDF has no collision geometry.
+        beside : folder of the file naming it, see `configuration.find`.
+
+        Raises ConfigurationError if a limit is not sane or beyond those of the LWR4+, the joint names differ from
+        the URDF's chain, a link's inertia or collision shape is impossible, or the URDF has no collision geometry.
         """
         path = find(name, beside=beside)
         content = parse(_ArmFile, read_mapping(path), str(path))
         urdf_path = find(content.urdf, beside=path.parent)
-        try:
-            urdf = urdf_path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigurationError(f"{urdf_path}: cannot be read: {error}") from error
+        urdf = read_text(urdf_path)
         joints = content.joints
         position = np.radians([joint.position_deg for joint in joints])
         margin = float(np.radians(content.position_margin_deg))
         if np.any(position[:, 1] - position[:, 0] <= 2.0 * margin):
             raise ConfigurationError(f"{path}: position_margin_deg leaves no range; lower it")
-        arm = cls(
+        values: dict[str, Any] = dict(  # noqa: C408
             name=content.name,
             joint_names=tuple(joint.name for joint in joints),
             q_min=_fixed(position[:, 0]),
@@ -201,9 +209,43 @@ class Arm:
             resonance_hz=content.lowest_resonance_hz,
             urdf=urdf,
             urdf_path=urdf_path,
+            model=content.model,
         )
+        try:
+            arm = cls(**values)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{path}: {error}") from error
         _check_urdf(arm, str(urdf_path))
         return arm
+
+
+def _usual(limit: float, value: float) -> bool:
+    """Whether a value is a likely one below a limit."""
+    return 0.05 * limit < value <= limit * (1.0 + 1e-6)
+
+
+def _enforce_ceilings(arm: Arm) -> None:
+    """Raise ConfigurationError for a limit beyond what the LWR4+ can stand."""
+    if arm.joint_names != JOINT_NAMES:
+        raise ConfigurationError(
+            f"joints {' '.join(arm.joint_names)} are not those of {MODEL}, {' '.join(JOINT_NAMES)}; for another arm "
+            "name it in `model` and give its own limits"
+        )
+    given = {
+        "position_deg": ("deg", np.degrees(np.maximum(np.abs(arm.q_min), np.abs(arm.q_max)))),
+        "velocity_deg_s": ("deg/s", np.degrees(arm.v_max)),
+        "acceleration_rad_s2": ("rad/s²", arm.a_max),
+        "jerk_rad_s3": ("rad/s³", arm.j_max),
+        "torque_nm": ("Nm", arm.tau_max),
+    }
+    for key, (unit, values) in given.items():
+        for joint, value, limit in zip(arm.joint_names, values.tolist(), LWR4PLUS[key], strict=True):
+            if not 0.0 < value <= limit * (1.0 + 1e-6):
+                advice = suspected(value, unit, partial(_usual, limit))
+                raise ConfigurationError(
+                    f"joint {joint}: {key} {value:g} {unit} is beyond {limit:g} {unit}, which the {MODEL} can stand; "
+                    f"{advice or 'an arm file may only narrow its limits'}"
+                )
 
 
 def link_inertias(urdf: str, where: str = "URDF") -> dict[str, LinkInertia]:
@@ -266,6 +308,13 @@ def _check_urdf(arm: Arm, where: str) -> None:
             raise ConfigurationError(
                 f"{where}: link {inertia.link}: {defect}; no rigid body has this inertia"
             )
+    for joint in root.findall("joint"):
+        place = f"{where}: joint {joint.get('name')}"
+        _origin(joint, place)
+        axis = joint.find("axis")
+        if axis is not None and not np.any(_numbers(axis.get("xyz", "1 0 0"), 3, f"{place}: axis")):
+            raise ConfigurationError(f"{place} has an axis of length zero")
+    _check_shapes(root, where)
     if not root.findall("link/collision"):
         raise ConfigurationError(
             f"{where}: no link has collision geometry, so every collision check would pass; add primitive "
@@ -273,12 +322,40 @@ def _check_urdf(arm: Arm, where: str) -> None:
         )
 
 
+_SHAPES = {
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "box": ("size",),
+}
+
+
+def _check_shapes(root: Any, where: str) -> None:
+    """Raise ConfigurationError for a collision shape that is no primitive of a size between 1 mm and 2 m."""
+    for link in root.findall("link"):
+        for collision in link.findall("collision"):
+            place = f"{where}: collision shape of link {link.get('name')}"
+            _origin(collision, place)
+            shapes = list(collision.find("geometry") if collision.find("geometry") is not None else ())
+            if len(shapes) != 1 or shapes[0].tag not in _SHAPES:
+                found = ", ".join(str(shape.tag) for shape in shapes) or "none"
+                raise ConfigurationError(f"{place}: found {found}; use one {', '.join(_SHAPES)}")
+            for key in _SHAPES[shapes[0].tag]:
+                sizes = _numbers(shapes[0].get(key, ""), 3 if key == "size" else 1, f"{place}: {key}")
+                if not (np.all(sizes >= 0.001) and np.all(sizes <= 2.0)):
+                    mm = np.all(sizes * 1e-3 >= 0.001) and np.all(sizes * 1e-3 <= 2.0)
+                    advice = "it looks like mm; a URDF is in m" if mm else "give a size above zero"
+                    raise ConfigurationError(
+                        f"{place}: {key} {' '.join(f'{size:g}' for size in sizes)} m is outside 0.001 to 2 m; {advice}"
+                    )
+
+
 def _root(urdf: str, where: str) -> Any:
     if "<!DOCTYPE" in urdf or "<!ENTITY" in urdf:
         raise ConfigurationError(f"{where}: document type declarations are not read; remove them")
     try:
         return ElementTree.fromstring(urdf)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
         raise ConfigurationError(f"{where}: not valid XML: {error}") from error
 
 

@@ -10,14 +10,18 @@ up to the KRL loop and unknown here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from fri.quantities import check, entries, within
 from lwr_driver.session.session import JointColumns
 
-_SLOTS = 16
+_Slot = Annotated[int, within(1, 16, note="KRL variables are numbered from 1")]
+_Scale = Annotated[float, within(-1e6, 1e6, "Nm")]
+_Sign = Annotated[int, within(-1, 1)]
 _LONGEST_STEP = 1000
 _FOLLOWS = 0.9
 _CLEARLY = 4.0
@@ -39,13 +43,14 @@ class KrlMotorTorque:
     counter_modulus : the counter runs from 0 to this minus one
     """
 
-    reals: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
-    scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    sign: tuple[int, ...] = (1, 1, 1, 1, 1, 1, 1)
-    counter_int: int = 1
-    counter_modulus: int = 2**31
+    reals: Annotated[tuple[_Slot, ...], entries(1, 16)] = (1, 2, 3, 4, 5, 6, 7)
+    scale: tuple[_Scale, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    sign: tuple[_Sign, ...] = (1, 1, 1, 1, 1, 1, 1)
+    counter_int: _Slot = 1
+    counter_modulus: Annotated[int, within(2, 2**32)] = 2**31
 
     def __post_init__(self) -> None:
+        check(self)
         if not self.reals or len(set(self.reals)) != len(self.reals):
             raise ConfigurationError(f"`reals` {self.reals} must name a different variable for each joint")
         if not (len(self.reals) == len(self.scale) == len(self.sign)):
@@ -53,16 +58,10 @@ class KrlMotorTorque:
                 f"`reals`, `scale` and `sign` have {len(self.reals)}, {len(self.scale)} and {len(self.sign)} "
                 "entries; each needs one for each joint"
             )
-        for name, slots in (("reals", self.reals), ("counter_int", (self.counter_int,))):
-            for slot in slots:
-                if not 1 <= slot <= _SLOTS:
-                    raise ConfigurationError(f"`{name}` has {slot}; KRL variables are numbered 1 to {_SLOTS}")
         if any(sign not in (1, -1) for sign in self.sign):
             raise ConfigurationError(f"`sign` {self.sign} must be 1 or -1 for each joint")
         if any(not np.isfinite(scale) or scale == 0.0 for scale in self.scale):
             raise ConfigurationError(f"`scale` {self.scale} must be finite and not zero for each joint")
-        if not 2 <= self.counter_modulus <= 2**32:
-            raise ConfigurationError(f"`counter_modulus` {self.counter_modulus} is not within 2 to {2**32}")
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,7 @@ def command(
     from ident.import_log import read_recording
     from runner.diagnosis import arm_data, chain_of, known_arm
     from runner.experiment_file import DEFAULT, Experiment
+    from runner.files import locked
 
     if sessions and file is not None:
         raise ConfigurationError(
@@ -87,6 +88,8 @@ def command(
     else:
         experiment = Experiment.load(file if file is not None else DEFAULT)
         folder, count = out.with_name(f"{out.stem}_sessions"), sets or _RECORDED_SETS
+        folder.mkdir(parents=True, exist_ok=True)
+        click.get_current_context().with_resource(locked(folder))
         paths = record_sets(experiment, folder, count, assume_yes=yes, allow_non_realtime=allow_non_realtime)
     parts = [[read_recording(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
@@ -111,24 +114,42 @@ def record_sets(
 
     Finished sessions are not run again. Raises OperatorError for an abort, RobotError or the error of a failure.
     """
-    from fri.errors import OperatorError, RobotError
+    from fri.errors import ConfigurationError, OperatorError, RobotError
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
+    from lwr_driver.references import Frozen
     from runner.experiment import ExperimentProgress, Run
+    from runner.files import begin, check_finished, gather, go_on, listed
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
     from runner.terminal import StatusLine
 
+    frozen = Frozen(folder.resolve())
+    remarks: list[str] = []
+    if frozen.there:
+        given = experiment.text
+        experiment, remarks = go_on(folder.resolve())
+        if experiment.text != given:
+            raise ConfigurationError(
+                f"{folder} was recorded with another experiment file; choose another --out"
+            )
+    else:
+        references = gather(experiment)
+        folder.mkdir(parents=True, exist_ok=True)
+        experiment = begin(experiment, references, folder.resolve())
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     status = StatusLine()
-    motions = Excitations.of(experiment, arm, cell)
+    status.say("\n".join([listed(frozen.files()), *remarks]))
+    motions = Excitations.of(experiment, arm, cell, folder)
+    motions.save(folder)
     found = []
     for number in range(sets):
         place = folder / f"set_{number + 1}"
         place.mkdir(parents=True, exist_ok=True)
         if not (place / "progress.json").is_file():
             ExperimentProgress.create(place, experiment.folder)
+        check_finished(_of_set(experiment, number), place)
         status.say(f"set {number + 1} of {sets}")
         one = _of_set(experiment, number)
         laboratory = Laboratory(

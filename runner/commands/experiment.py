@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -15,17 +14,17 @@ import click
 from fri.errors import ConfigurationError, DataError, LwrError, OperatorError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
+from lwr_driver.references import Frozen
 from runner.diagnosis.after_run import conclude_run
-from runner.experiment import Bench, ExperimentProgress, Record, Run
+from runner.experiment import Bench, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
+from runner.files import begin, gather, go_on, listed, locked
 from runner.hiding.effect import HiddenEffect, emulated_arm, with_effect
 from runner.laboratory import Laboratory
-from runner.planning import PLAN, Excitations
+from runner.planning import Excitations
 from runner.replanning import Rounds, rounds_begun
-from runner.results import estimate, summarise, write_results
+from runner.results import estimate, new_folder, summarise, write_results
 from runner.terminal import PATH, StatusLine, json_option, to_json
-
-COPY = "experiment.yaml"
 
 
 @click.command("experiment")
@@ -98,12 +97,11 @@ def command(
             raise ConfigurationError("--reveal shows a finished run; leave FILE, --out, --resume and --hide")
         _reveal(Path(reveal) if reveal else None, as_json)
         return
-    experiment, folder = _begin(file, out, resume, hide)
+    status = StatusLine()
+    experiment, folder = _begin(file, out, resume, hide, replan or 0, status)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
-    status = StatusLine()
-    if not (folder / PLAN).is_file():
-        status.show("planning the excitation", 0.0, "")
+    status.show("planning the excitation", 0.0, "")
     motions = Excitations.of(experiment, arm, cell, folder)
     status.clear()
     motions.save(folder)
@@ -116,6 +114,7 @@ def command(
     done = all(record.status == "success" for record in records)
     found = estimate(experiment, arm, records) if done else None
     summary = summarise(experiment, records, found)
+    summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
     text = write_results(folder, experiment, arm, summary, found)
     if done and experiment.diagnosis.run and not no_diagnosis:
         status.show("diagnosis", 0.0, "")
@@ -181,34 +180,32 @@ def _reveal(folder: Path | None, as_json: bool) -> None:
 
 
 def _begin(
-    file: str | None, out: Path | None, resume: Path | None, hide: int | None = None
+    file: str | None, out: Path | None, resume: Path | None, hide: int | None, rounds: int, status: StatusLine
 ) -> tuple[Experiment, Path]:
+    """The experiment of frozen files and its folder, held until the end of the command."""
+    context = click.get_current_context()
     if resume is not None:
         if file is not None or out is not None or hide is not None:
             raise ConfigurationError(
                 "--resume takes its experiment file, folder and hidden effect from FOLDER; leave FILE, --out and "
                 "--hide"
             )
-        if not (resume / COPY).is_file():
-            raise ConfigurationError(f"{resume} holds no {COPY}; name the folder of an aborted experiment")
-        return Experiment.load(
-            (resume / COPY).resolve(), beside=ExperimentProgress.load(resume).origin
-        ), resume
+        if not resume.is_dir():
+            raise ConfigurationError(f"{resume} is no folder; name the folder of an aborted experiment")
+        context.with_resource(locked(resume))
+        experiment, remarks = go_on(resume.resolve(), rounds=rounds)
+        status.say("\n".join([listed(Frozen(resume).files()), *remarks]))
+        return experiment, resume
     experiment = Experiment.load(file if file is not None else DEFAULT)
     if hide is not None:
         emulated_arm(experiment)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out if out is not None else Path("experiments") / f"{experiment.name}-{stamp}"
-    if folder.exists() and any(folder.iterdir()):
-        raise ConfigurationError(f"{folder} is not empty; choose another --out, or go on there with --resume")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(experiment.source, folder / COPY)
-        ExperimentProgress.create(folder, experiment.folder)
-    except OSError as error:
-        raise ConfigurationError(
-            f"{folder} cannot be written: {error.strerror}; choose another --out"
-        ) from error
+    references = gather(experiment, rounds)
+    new_folder(folder, "choose another --out, or go on there with --resume")
+    context.with_resource(locked(folder))
+    experiment = begin(experiment, references, folder.resolve())
+    status.say(listed(Frozen(folder).files()))
     return experiment, folder
 
 

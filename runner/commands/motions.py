@@ -7,13 +7,14 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from lwr_driver.configuration import CONFIGS
 from runner.terminal import PATH, StatusLine, json_option, to_json
 
-_EXPERIMENT = "experiments/default.yaml"
+_EXPERIMENT = str(CONFIGS / "experiments/default.yaml")
 
 
 @click.command("plan")
-@click.argument("file", default="plans/default.yaml")
+@click.argument("file", default=str(CONFIGS / "plans/default.yaml"))
 @click.option("--out", type=PATH, help="Plan file; default: NAME.plan.yaml here.")
 @click.option("--force", is_flag=True, help="Replace an existing plan file.")
 @json_option
@@ -71,10 +72,14 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
     from runner.experiment_file import Experiment
+    from runner.files import examine, listed
     from runner.planning import Excitations, session_motion
     from runner.preflight import Preflight
 
     experiment = Experiment.load(file)
+    files = examine(experiment)
+    if not as_json:
+        click.echo(listed(files))
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     motions = Excitations.of(experiment, arm, cell)

@@ -10,11 +10,12 @@ import click
 from click.shell_completion import get_completion_class
 
 from fri.errors import ConfigurationError, LwrError
+from lwr_driver.configuration import CONFIGS
 from runner.terminal import StatusLine, json_option, to_json
 
 
 @click.command("doctor")
-@click.argument("file", default="experiments/default.yaml")
+@click.argument("file", default=str(CONFIGS / "experiments/default.yaml"))
 @click.option("--link", is_flag=True, help="Test the link too: answer the controller in monitor mode.")
 @click.option(
     "--seconds", default=10.0, show_default=True, type=click.FloatRange(0.5), help="Length of the test."
@@ -104,7 +105,7 @@ def _is_error(record: logging.LogRecord) -> bool:
 
 
 @click.command("emulator")
-@click.argument("config", default="emulator/default.yaml")
+@click.argument("config", default=str(CONFIGS / "emulator/default.yaml"))
 @click.option("--fri-host", default="127.0.0.1", show_default=True, help="Address of the commanding PC.")
 @click.option("--fri-port", default=49938, show_default=True, type=click.IntRange(1, 65535), help="Its port.")
 @click.option(

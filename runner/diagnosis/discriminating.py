@@ -25,6 +25,7 @@ from ident.excitation.motions import ParametricMotion
 from ident.model import DynamicModel
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
+from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import JointColumns, Phase, Session
 from runner.diagnosis.motions import chirp, poses, reversal_ladder, slow_sweep
 from runner.experiment_file import Experiment, Payload, SessionPlan
@@ -131,7 +132,8 @@ def offers_after_logs(diagnosis: Diagnosis, experiment: Experiment | None) -> tu
     if experiment is None or not any(finding.alternatives for finding in diagnosis.claims):
         return ()
     try:
-        arm, cell = Arm.load(experiment.arm), Cell.load(experiment.cell)
+        arm = Arm.load(experiment.arm, beside=CONFIGS)
+        cell = Cell.load(experiment.cell, beside=CONFIGS)
         return offers(diagnosis, experiment, arm, cell, plan_excitation(experiment, arm, cell))
     except LwrError as error:
         log.info("no discriminating experiment: %s", error)

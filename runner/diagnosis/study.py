@@ -47,8 +47,6 @@ DETAILS = "details.json"
 EXTENDED = "model_extended.yaml"
 TEXT = "diagnosis.txt"
 
-_DEFAULT_ARM = "lwr4plus.yaml"
-
 
 @dataclass(frozen=True, eq=False)
 class Material:
@@ -279,7 +277,7 @@ def known_arm(name: str | None, chain: Chain) -> Arm | None:
     """The arm file called `name`; without a name the default one, if its joints are those of the chain."""
     if name is not None:
         return Arm.load(name)
-    arm = Arm.load(_DEFAULT_ARM)
+    arm = Arm.load()
     return arm if arm.joint_names == chain.joint_names else None
 
 

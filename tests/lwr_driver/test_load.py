@@ -25,8 +25,11 @@ def test_load_data_reach_the_controller_and_too_heavy_ones_do_not() -> None:
         assert load["mass"] == pytest.approx(3.34)
         assert load["com"] == pytest.approx([0.0, -0.066, 0.144], abs=1e-6)
         assert load["inertia"] == pytest.approx([0.01, 0.0, 0.0, 0.02, 0.0, 0.03])
-        with pytest.raises(RobotError, match=r"waited .* for load data of 20 kg in force; .*LWR_LOAD_MAX"):
-            driver.set_load(20.0, timeout_s=1.0)
+        with pytest.raises(ConfigurationError, match=r"mass 20 kg is outside 0 to 14 kg"):
+            driver.set_load(20.0)
+        with pytest.raises(ConfigurationError, match=r"looks like mm, write \[0, -0.066, 0.144\]"):
+            driver.set_load(3.34, (0.0, -66.0, 144.0))
+        assert emulator.status()["load"]["mass"] == pytest.approx(3.34)
         driver.set_load(*load_data(arm(), None))
         assert emulator.status()["load"]["mass"] == 0.0
         driver.wait_quality()

@@ -207,10 +207,10 @@ def test_jacobian_rows_end_with_z_y_x_rotations_and_pose_is_row_major():
         ("robot.stifness", [1.0], "stiffness"),
         ("krl_reals.reals", [1, 1, 2, 3, 4, 5, 6], "twice"),
         ("krl_reals.counter_int", 17, "outside 1 to 16"),
-        ("sensors.joint_torque_noise", [-1, 0, 0, 0, 0, 0, 0], "negative"),
+        ("sensors.joint_torque_noise", [-1, 0, 0, 0, 0, 0, 0], r"-1.0 Nm is outside 0 to"),
         ("robot.effects", [{"type": "nowhere"}], "package.module:Class"),
         ("robot.effects", [{"type": "nowhere.at:All"}], "cannot be imported"),
-        ("seed", -1, "negative"),
+        ("seed", -1, "-1 is outside 0 to"),
     ],
 )
 def test_wrong_configurations_say_what_is_wrong(key, value, message):

@@ -61,7 +61,7 @@ def test_plan_file_round_trip_is_exact(plan: ExcitationPlan, tmp_path: Path) -> 
 def test_broken_plan_file_says_what_is_wrong(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     path.write_text("schema_version: 1\nkind: excitation plan\nperiods: 1\n")
-    with pytest.raises(ConfigurationError, match=r"plan\.yaml: not a readable excitation plan"):
+    with pytest.raises(ConfigurationError, match=r"plan\.yaml: key `joint_names` is missing"):
         ExcitationPlan.load(path)
 
 

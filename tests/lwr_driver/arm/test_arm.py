@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -56,17 +57,26 @@ def test_file_with_changes_is_read(files):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c["joints"][2].update(velocity_deg_s=0.0), "E1: velocity_deg_s is 0.0"),
-        (lambda c: c["joints"][2].update(jerk_rad_s3=-1.0), "E1: jerk_rad_s3"),
+        (
+            lambda c: c["joints"][2].update(velocity_deg_s=0.0),
+            r"\[E1\]: `velocity_deg_s`: 0.0 deg/s is outside 5 to 720",
+        ),
+        (lambda c: c["joints"][2].update(jerk_rad_s3=-1.0), r"\[E1\]: `jerk_rad_s3`"),
         (lambda c: c["joints"][0].update(position_deg=[170, -170]), "A1: position_deg"),
-        (lambda c: c["joints"][0].update(position_deg=[-175, 175]), "A1 may move .* narrow"),
+        (
+            lambda c: c["joints"][0].update(position_deg=[-175, 175]),
+            "A1: position_deg 175 deg is beyond 170 deg, .* narrow",
+        ),
         (lambda c: c["joints"].pop(), "6 joints listed"),
-        (lambda c: c["joints"].reverse(), "kinematic order"),
+        (lambda c: c["joints"].reverse(), "joints A6 .* are not those of KUKA LWR4"),
         (lambda c: c.update(position_margin_deg=21.0), "position_margin_deg"),
-        (lambda c: c.update(schema_version=2), "schema_version 2"),
+        (lambda c: c.update(schema_version=2), "`schema_version`: 2 is outside 1 .this software reads 1"),
         (lambda c: c.update(urdf="missing.urdf"), "missing.urdf"),
         (lambda c: c.update(resonance=3), "unknown key"),
-        (lambda c: c["joints"][1].update(position_deg=[-1, 1]), "leaves no range"),
+        (
+            lambda c: c["joints"][1].update(position_deg=[-1, 1]),
+            "less than 10 deg; it looks like rad; .*-57.3, 57.3",
+        ),
     ],
 )
 def test_limits_that_are_not_sane_are_refused(files, change, message):
@@ -113,3 +123,63 @@ def test_inertia_is_turned_by_its_origin():
 def test_thin_rod_is_a_body_and_a_thinner_one_is_not():
     assert LinkInertia("rod", 1.0, np.zeros(3), np.diag([1e-9, 1.0, 1.0])).defect() is None
     assert "break" in (LinkInertia("rod", 1.0, np.zeros(3), np.diag([1e-9, 1.0, 1.1])).defect() or "")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda c: c["joints"][0].update(acceleration_rad_s2=60.0),
+            "A1: acceleration_rad_s2 60 rad/s² is beyond 8",
+        ),
+        (
+            lambda c: c["joints"][0].update(acceleration_rad_s2=458.0),
+            "looks like deg/s²; write it in rad/s²: 7.99",
+        ),
+        (lambda c: c["joints"][3].update(jerk_rad_s3=5729.0), "looks like deg/s³; write it in rad/s³: 99.99"),
+        (lambda c: c["joints"][1].update(velocity_deg_s=187.0), "A2: velocity_deg_s 187 deg/s is beyond 110"),
+        (lambda c: c["joints"][1].update(velocity_deg_s=1.92), "looks like rad/s; write it in deg/s: 110"),
+        (lambda c: c["joints"][6].update(torque_nm=100.0), "A6: torque_nm 100 Nm is beyond 38 Nm"),
+        (
+            lambda c: c.update(
+                model="big arm", joints=[{**c["joints"][0], "jerk_rad_s3": 900.0}, *c["joints"][1:]]
+            ),
+            "jerk",
+        ),
+    ],
+)
+def test_a_file_cannot_widen_what_the_arm_can_stand(files, change, message):
+    with pytest.raises(ConfigurationError, match=message):
+        files(change)
+
+
+def test_neither_can_a_changed_description():
+    with pytest.raises(ConfigurationError, match="beyond 8 rad/s²"):
+        dataclasses.replace(arm(), a_max=2.0 * arm().a_max)
+    narrow = dataclasses.replace(arm(), a_max=0.5 * arm().a_max)
+    assert np.all(narrow.a_max == 4.0)
+
+
+def test_another_arm_names_itself_and_has_limits_of_its_own(files):
+    names = [f"iiwa_{number}" for number in range(1, 8)]
+    urdf = (CONFIGS / "lwr4plus.urdf").read_text()
+
+    def change(content):
+        content.update(name="lab 3", model="KUKA iiwa 14")
+        for joint, name in zip(content["joints"], names, strict=True):
+            joint.update(name=name, torque_nm=320.0)
+
+    with pytest.raises(ConfigurationError, match="moving joints are A1"):
+        files(change)
+    for old, new in zip(arm().joint_names, names, strict=True):
+        urdf = urdf.replace(f'<joint name="{old}"', f'<joint name="{new}"')
+    other = files(change, replace=(".*", urdf))
+    assert np.all(other.tau_max == 320.0)
+
+
+@pytest.mark.parametrize("size", ["0", "-0.1", "nan", "88"])
+def test_collision_shapes_have_sizes_of_a_body(files, size):
+    with pytest.raises(
+        ConfigurationError, match=r"collision shape of link .*(outside 0.001 to 2 m|expected)"
+    ):
+        files(replace=(r'(<collision>.*?radius=")[^"]*', rf"\g<1>{size}"))

@@ -13,8 +13,9 @@ import numpy as np
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
-from lwr_driver.driver import Outcome
+from lwr_driver.driver import LinkSettings, Outcome
 from lwr_driver.motion import Motion, move_to
+from lwr_driver.ring import ROW
 from runner.experiment import Bench, Run
 from runner.experiment_file import Experiment, MotorTorque, Moves, Payload, SessionPlan
 from runner.preflight import gravity_torque
@@ -39,6 +40,7 @@ class Stand:
         self.calls: list[tuple[Any, ...]] = []
         self.sets_load = True
         self.rights = None
+        self.link = LinkSettings()
         self.quality, self.error = "OK", 0
         self.sign = np.ones(7)
         self.outcome = ("success", "", None)
@@ -86,6 +88,9 @@ class Stand:
     def set_load(self, *load: Any) -> None:
         self.calls.append(("set_load", *load))
 
+    def last_rows(self, count: int) -> np.ndarray:
+        return np.zeros(count, ROW)
+
     def enter_command(self) -> None:
         self.calls.append(("enter_command",))
         self.at_command()
@@ -116,7 +121,7 @@ class Stand:
 
     def end_record(self, status: str, reason: str) -> SimpleNamespace:
         self.calls.append(("end_record", status, reason))
-        return SimpleNamespace(error=self.write_error)
+        return SimpleNamespace(error=self.write_error, samples=0)
 
     # -- person and onlooker ---------------------------------------------------------------------------------
 

@@ -82,7 +82,15 @@ def test_log_keeps_the_contract(finished: Finished) -> None:
     names = [phase.name for phase in session.phases]
     order = ["move_to_start", "settle", "period 1", "brake", "return"]
     assert [name for name in names if name in order] == order
-    assert set(session.attachments) == {"experiment.yaml", "robot.urdf", "plan.npz", "preflight.json"}
+    assert set(session.attachments) == {
+        "experiment.yaml",
+        "arm.yaml",
+        "cell.yaml",
+        "files.json",
+        "robot.urdf",
+        "plan.npz",
+        "preflight.json",
+    }
     assert session.motor is not None
     spans = session.spans("period")
     assert len(spans) == 1
@@ -136,8 +144,6 @@ def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) 
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["exit_status"] == "fail"
     before = (folder / "unloaded.mcap").read_bytes()
-    kept = folder / "experiment.yaml"
-    kept.write_text(experiment_file(tmp_path).read_text())
     resumed = run("experiment", "--resume", str(folder), "--yes")
     assert resumed.code == 0, resumed.text
     assert (folder / "unloaded.mcap").read_bytes() == before

@@ -300,11 +300,11 @@ def test_a_finished_session_without_its_log_is_repeated(stand: Stand, tmp_path: 
     assert "execute" in stand.names()
 
 
-def test_a_resumption_knows_the_mounted_payload(stand: Stand, tmp_path: Path) -> None:
+def test_a_resumption_asks_for_the_payload_and_weighs_it(stand: Stand, tmp_path: Path) -> None:
     run_of(stand, tmp_path, LOADED).sessions()
     stand.calls.clear()
     run_of(stand, tmp_path, LOADED, AGAIN).sessions()
-    assert stand.of("swap") == []
+    assert stand.of("swap") == [(LOAD, LOAD)]
     stand.calls.clear()
     run_of(stand, tmp_path, LOADED, AGAIN, BARE).sessions()
     assert stand.of("swap") == [(LOAD, None)]
@@ -313,10 +313,10 @@ def test_a_resumption_knows_the_mounted_payload(stand: Stand, tmp_path: Path) ->
 def test_a_resumption_weighs_the_payload_against_the_last_session(stand: Stand, tmp_path: Path) -> None:
     run_of(stand, tmp_path, LOADED).sessions()
     stand.flange = None
+    stand.careless = True
     with pytest.raises(RefusedError, match="payload 'paper_load' announced"):
         run_of(stand, tmp_path, LOADED, AGAIN).sessions()
     other = Payload("other", 1.0, (0.0, 0.0, 0.1))
-    stand.careless = True
     with pytest.raises(RefusedError, match="payload 'other' announced"):
         run_of(stand, tmp_path, LOADED, SessionPlan("next", other)).sessions()
 
