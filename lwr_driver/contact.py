@@ -185,7 +185,8 @@ class ContactWatch:
         """
         now, last, change, odd = self._now, self._last, self._change, self._odd
         now[:JOINTS], now[JOINTS : 2 * JOINTS], now[2 * JOINTS :] = q, tau, estimate
-        if not self._known or cycles > _MOST_CYCLES:
+        if not self._known or not 0 < cycles <= _MOST_CYCLES:
+            cycles = 1
             last[:] = now
             self._filter[0], self._filter[1] = now[: 2 * JOINTS], 0.0
             self._step[:] = 0.0
