@@ -40,6 +40,8 @@ _CUTOFF_HZ, _DAMPING = 40.0, 0.8
 _LARGEST_ANGLE = 1.2  # of the cutoff frequency, per cycle [rad]
 _SETTLING = 5.0  # time constants of F after a beginning
 _MOST_CYCLES = 10  # after a longer gap F begins anew
+_BEYOND_FLANGE_M = 0.05
+_LEAST_KG = 0.1  # smaller differences of the gravity torque are no payload
 # Jumps between two packets, believed only if the next packet confirms them.
 _JUMP_RAD, _JUMP_SHARE = 5e-3, 0.5
 
@@ -119,8 +121,8 @@ class ContactWatch:
     external : own estimate of the external torque (7,) [Nm], positive if it drives the joint forward; zero if unknown
     allowed : its limit at present (7,) [Nm]
 
-    The payload is known from `carry`; otherwise its weight is taken from the packet's gravity torque, the controller's
-    load data. A channel of joint torques all exactly zero since the beginning is none: then only the controller's
+    The payload is known from `carry`. Otherwise its weight is taken from the packet's gravity torque, the controller's
+    load data, and the inertia that belongs to this weight from `weigh`. A channel of joint torques all exactly zero since the beginning is none: then only the controller's
     estimate counts.
     """
 
@@ -132,6 +134,9 @@ class ContactWatch:
         self._model.loadFromString(expected.dynamics)
         self._data = self._model.createData()
         self._bare = self._model.inertias[JOINTS].copy()
+        named = self._model.existFrame("flange")
+        frame = self._model.frames[self._model.getFrameId("flange")] if named else None
+        self._flange = pin.SE3.Identity() if frame is None else frame.placement.copy()
         self._carried = False
         rows = np.array([expected.viscous, expected.coulomb, expected.offset])
         self._viscous, self._coulomb, self._offset = rows
@@ -167,9 +172,28 @@ class ContactWatch:
         """Expect a payload: mass [kg], centre of mass in the flange frame [m], JX JY JZ about it [kg m2]."""
         pin, model = self._pin, self._model
         body = pin.Inertia(mass, com, np.diag(inertia))
-        place = model.frames[model.getFrameId("flange")].placement if model.existFrame("flange") else None
-        model.inertias[JOINTS] = self._bare + (body if place is None else place.act(body))
+        model.inertias[JOINTS] = self._bare + self._flange.act(body)
         self._carried = True
+
+    def weigh(self, q: NDArray[np.float32], gravity: NDArray[np.float32]) -> None:
+        """Mass and centre of mass from the controller's gravity torque (7,) [Nm] at rest in q, unless `carry` told.
+
+        What this pose does not show of the centre of mass is taken for `_BEYOND_FLANGE_M` out of the flange.
+        """
+        if self._carried or not gravity.any():
+            return
+        pin, model, zero = self._pin, self._model, np.zeros(JOINTS)
+        model.inertias[JOINTS] = self._bare
+        load = gravity - pin.computeGeneralizedGravity(model, self._data, q.astype(np.float64))
+        columns = pin.computeJointTorqueRegressor(model, self._data, q.astype(np.float64), zero, zero)
+        columns = columns[:, 10 * (JOINTS - 1) :][:, :4]
+        usual = self._flange.act(np.array([0.0, 0.0, _BEYOND_FLANGE_M]))
+        # For the mass, and for the deviation of the first moment from that of the usual place.
+        columns[:, 0] += columns[:, 1:] @ usual
+        mass, *moment = np.linalg.lstsq(columns, load, rcond=0.01)[0]
+        if mass > _LEAST_KG:
+            body = pin.Inertia(mass, usual + np.array(moment) / mass, np.zeros((3, 3)))
+            model.inertias[JOINTS] = self._bare + body
 
     def update(
         self,
