@@ -122,8 +122,8 @@ class ContactWatch:
     allowed : its limit at present (7,) [Nm]
 
     The payload is known from `carry`. Otherwise its weight is taken from the packet's gravity torque, the controller's
-    load data, and the inertia that belongs to this weight from `weigh`. A channel of joint torques all exactly zero since the beginning is none: then only the controller's
-    estimate counts.
+    load data, and the inertia that belongs to this weight from `weigh`. A channel of joint torques all exactly zero
+    since the beginning is none: then only the controller's estimate counts.
     """
 
     def __init__(self, expected: ExpectedArm, settings: ContactSettings, tau_max: Floats) -> None:

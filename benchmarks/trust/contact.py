@@ -286,7 +286,9 @@ def healthy(period_ms: int, seed: int, ring: Ring, *, loaded: bool = True) -> Ru
     return run
 
 
+@cache
 def _stamp() -> dict[str, str]:
+    """Commit and date at the beginning."""
     commit = git_commit()
     return {"commit": commit[:7] + commit[40:], "date": datetime.now(UTC).date().isoformat()}
 
@@ -326,6 +328,7 @@ def _pieces(options: Any) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
 
 def campaign(ledger: Ledger, options: Any) -> None:
     """Lines of the pushes by joint, of an obstacle, and of healthy runs."""
+    _stamp()
     with shared_ring() as ring:
         for what, plan in _pieces(options):
             if not plan or ledger.has("contact", what):
