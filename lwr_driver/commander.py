@@ -263,14 +263,14 @@ class Commander:
         self._origin = None
         self.mode = Mode.STOP
 
-    def touch(self, what: str) -> None:
+    def touch(self, what: str, advice: str) -> None:
         """Something touches the arm: stop a motion, and begin none before `allow`.
 
         At rest the arm goes back to its place before the contact if it is still pressed from there.
         """
         if self.mode not in (Mode.HOLD, Mode.MOTION, Mode.STOP):
             return
-        reason = f"{what} {self.place()}"
+        reason = f"{what} {self.place()}; {advice}"
         moving, before = self.mode is Mode.MOTION, round(_BEFORE_CONTACT_S / self._period)
         if moving:
             origin = self._plan[max(self.index - before, 0)].copy()

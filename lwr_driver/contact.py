@@ -109,6 +109,13 @@ class Contact(NamedTuple):
         name = joint_names[self.joint]
         return f"{name} {self.quantity} {self.value:.1f} Nm exceeds {self.limit:.1f} Nm"
 
+    @property
+    def advice(self) -> str:
+        """The remedy."""
+        if self.quantity == _QUANTITIES[0]:
+            return "free the arm, or slow the motion down"
+        return "free the arm; if nothing touches it, check its payload, load data and torque sensors"
+
 
 _QUANTITIES = ("joint torque", "external torque by the controller's estimate", "external torque by the model")
 
@@ -151,6 +158,7 @@ class ContactWatch:
         self._filter, self._next = np.zeros((3, 2 * JOINTS)), np.zeros((2, 2 * JOINTS))
         self._excess = np.full((3, JOINTS), -np.inf)
         self._known = False
+        self._open = np.ones(JOINTS)  # share of the friction of uncertain sign
         self._doubted = False
         self._alive = False
         self._settling = 0
@@ -165,6 +173,8 @@ class ContactWatch:
         inverse = np.linalg.inv(np.eye(2) - half * rates)
         forced = half * np.array([[0.0], [self._square]])
         self._advance = inverse @ np.hstack([np.eye(2) + half * rates, forced])
+        self._lag = 2.0 * _DAMPING / cutoff
+        self._closing = np.exp(-0.5 * cutoff * period_s)
         self._settled = int(np.ceil(_SETTLING / (cutoff * period_s)))
         self._known = False
 
@@ -264,7 +274,10 @@ class ContactWatch:
         if self._friction:
             sign = np.clip(qd / _SIGN_SPEED, -1.0, 1.0)
             expected = expected + self._viscous * qd + self._coulomb * sign + self._offset
-            np.add(self._threshold, self._coulomb * (1.0 - np.abs(sign)), out=self.allowed)
+            # A change of sign passes the low-pass gradually.
+            turns = qd * (qd + self._lag * qdd) <= 0.0
+            self._open = np.maximum(np.where(turns, 1.0, 1.0 - np.abs(sign)), self._closing * self._open)
+            np.add(self._threshold, self._coulomb * self._open, out=self.allowed)
         np.subtract(expected, tau, out=self.external)
 
     def _contact(self) -> Contact:

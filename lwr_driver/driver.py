@@ -164,7 +164,8 @@ class Driver:
                 cpu=link.cpu,
             )
             expected = ExpectedArm.nominal(self.arm) if self._expected is None else self._expected
-            watch = (expected, self.contact, self.arm.tau_max)
+            limits = ContactSettings(self.contact.torque_share, self.contact.external_nm)
+            watch = (expected, limits, self.arm.tau_max)
             self._loop = LoopProcess(settings, self.arm.limits, self._control, self._ring, scheduling, watch)
             self.rights = self._loop.rights
             for shortage in (*self.rights.missing, *self.rights.advice):

@@ -403,7 +403,7 @@ class Loop:
         self._bad = self._bad + elapsed if quality < Quality.OK else 0
         if touched is not None:
             what = f"contact: {touched.describe(self._settings.joint_names)}"
-            self._alarm = partial(commander.touch, what)
+            self._alarm = partial(commander.touch, what, touched.advice)
         elif (
             self._alarm is None
             and commander.mode is Mode.MOTION
@@ -415,7 +415,8 @@ class Loop:
                 f"{commander.place()}"
             )
             self._alarm = partial(commander.stop, Result.NETWORK, reason)
-        if self._alarm is not None and not (sent and commander.mode is Mode.MOTION):
+        moves = commander.mode is Mode.MOTION or (self._job is Job.MOTION and not self._begun)
+        if self._alarm is not None and not (sent and moves):
             self._alarm()
             self._alarm = None
 

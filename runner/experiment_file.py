@@ -17,6 +17,7 @@ from fri.handshake import find_handshake
 from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session.motor_torque import KrlMotorTorque
+from runner.contact import ContactPlan
 
 DEFAULT = "experiments/default.yaml"
 
@@ -208,6 +209,7 @@ class Experiment:
     motor_torque: MotorTorque = field(default_factory=MotorTorque)
     excitation: Excitation = field(default_factory=Excitation)
     moves: Moves = field(default_factory=Moves)
+    contact: ContactPlan = field(default_factory=ContactPlan)
     identification: Identification = field(default_factory=Identification)
     diagnosis: DiagnosisPlan = field(default_factory=DiagnosisPlan)
     replan: Replan = field(default_factory=Replan)
