@@ -235,7 +235,7 @@ class ContactWatch:
             np.multiply(self._step, cycles, out=change)
             np.add(last, change, out=now)
         np.divide(change[:JOINTS], cycles, out=self._step[:JOINTS])
-        self._alive = self._alive or bool(tau.any())
+        self._alive = self._alive or bool(now[JOINTS : 2 * JOINTS].any())
         self._low_pass(cycles)
         self._settling = max(self._settling - cycles, 0)
         self._estimate(gravity)
