@@ -19,8 +19,8 @@ from lwr_driver.control import Control, Mode, Result, Text, Word
 from lwr_driver.guard import Guard, Retreat, Stop, Violation
 from lwr_driver.ring import NO_PHASE
 
-HOLD, BRAKE, RETREAT = 0, 1, 2
-"""Phase numbers given by the loop itself: holding, stopping before the end of a motion, going back from a contact."""
+HOLD, BRAKE, CONTACT, RETREAT = 0, 1, 2, 3
+"""Phase numbers given by the loop itself: holding; stopping before the end of a motion, or at a contact; going back."""
 
 # A retreat ends where the arm was commanded so long before the contact was noticed.
 _BEFORE_CONTACT_S = 0.05
@@ -333,7 +333,7 @@ class Commander:
             if self._retreat.under_way:
                 self.phase = RETREAT
                 return self._retreat.advance(self._since_sent).astype(np.float32)
-            self.phase = BRAKE
+            self.phase = BRAKE if self._origin is None else CONTACT
             return self._stop.advance(self._since_sent).astype(np.float32)
         self.phase = HOLD
         return self._hold.astype(np.float32)

@@ -32,7 +32,7 @@ from fri.errors import ConfigurationError, LwrError, NetworkError, OperatorError
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
-from lwr_driver.commander import BRAKE, HOLD, RETREAT
+from lwr_driver.commander import BRAKE, CONTACT, HOLD, RETREAT
 from lwr_driver.configuration import as_path, expect
 from lwr_driver.contact import ContactSettings, ExpectedArm
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
@@ -82,7 +82,7 @@ _ERRORS: Mapping[Result, type[LwrError]] = {
     Result.NETWORK: NetworkError,
     Result.GUARD: RefusedError,
 }
-_PHASES = {HOLD: "hold", BRAKE: "brake", RETREAT: "retreat"}
+_PHASES = {HOLD: "hold", BRAKE: "brake", CONTACT: "contact", RETREAT: "retreat"}
 _POOR = (Quality.UNACCEPTABLE.name, Quality.BAD.name)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fri.states import EventKind, Quality, State
-from lwr_driver.commander import BRAKE, RETREAT
+from lwr_driver.commander import CONTACT, RETREAT
 from lwr_driver.contact import Contact
 from lwr_driver.control import Job, Mode, Result, Text, Word
 from lwr_driver.motion import Motion, move_to
@@ -352,6 +352,6 @@ def test_phases_tell_stop_and_retreat_apart(rig):
         phases.append(r.loop._commander.phase)
         if r.done:
             break
-    assert phases[0] == BRAKE
+    assert phases[0] == CONTACT
     assert RETREAT in phases
     assert phases == sorted(phases[:-1]) + phases[-1:]
