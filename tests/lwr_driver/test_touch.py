@@ -8,7 +8,7 @@ import pytest
 from fri.states import EventKind, Quality, State
 from lwr_driver.commander import CONTACT, RETREAT
 from lwr_driver.contact import Contact
-from lwr_driver.control import Job, Mode, Result, Text, Word
+from lwr_driver.control import Mode, Result, Text, Word
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import Ring
 from tests.lwr_driver.driver_rig import Rig, arm
