@@ -16,11 +16,16 @@ from numpy.typing import NDArray
 
 from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.control import Control, Mode, Result, Text, Word
-from lwr_driver.guard import Guard, Stop, Violation
+from lwr_driver.guard import Guard, Retreat, Stop, Violation
 from lwr_driver.ring import NO_PHASE
 
-HOLD, BRAKE = 0, 1
-"""Phase numbers given by the loop itself: holding, and stopping before the end of a motion."""
+HOLD, BRAKE, CONTACT, RETREAT = 0, 1, 2, 3
+"""Phase numbers given by the loop itself: holding; stopping before the end of a motion, or at a contact; going back."""
+
+# A retreat ends where the arm was commanded so long before the contact was noticed.
+_BEFORE_CONTACT_S = 0.05
+# An arm at rest is pressed by more than this share of the limit of the external torque.
+_PRESSED = 0.5
 
 # New values foreseen in a cycle: one is used up, and it must not take long.
 _MORE = 3
@@ -78,6 +83,8 @@ class Commander:
     mode : kind of answer; index : row of the motion, -1 outside one; phase : number of the phase
     target : last value sent (7,) float32, NaN before the first
     ended : result and reason of the motion, (NONE, "") before its end
+    barred : why no motion may begin before `allow`: a fallback or a contact; empty if one may
+    external, allowed : external torque and its limit (7,) [Nm], as the watch has them; zero without one
     """
 
     def __init__(
@@ -90,8 +97,12 @@ class Commander:
         self.target = np.full(JOINTS, np.nan, dtype=np.float32)
         self.ended: tuple[Result, str] = (Result.NONE, "")
         self._period = 0.0
+        self.barred = ""
+        self.external, self.allowed = np.zeros(JOINTS), np.zeros(JOINTS)
         self._guard: Guard
         self._stop: Stop
+        self._retreat: Retreat
+        self._origin: NDArray[np.float64] | None = None  # goal of a retreat from the contact
         self._since_sent = 0  # cycles since `target` was sent
         self._sent = 0  # values, altogether
         self._ahead: _Ahead | None = None
@@ -108,6 +119,7 @@ class Commander:
         self.target = np.full(JOINTS, np.nan, dtype=np.float32)
         self._guard = Guard(self._limits, period_s)
         self._stop = Stop(self._limits, period_s)
+        self._retreat = Retreat(self._limits, period_s)
 
     @property
     def moving(self) -> bool:
@@ -128,7 +140,6 @@ class Commander:
         self._guard.scale_velocity(safety_limits)
         self.index, self.phase = -1, HOLD
         self._control.tracking[:] = 0.0
-        self._control.write_text(Text.LEFT, "")
         self.mode = Mode.HOLD
         if step is not None and moves and self.follows(setpoint):
             self._since_sent = 1
@@ -187,7 +198,7 @@ class Commander:
             room = self._tracking_limit
             most = max(1, min(most, self._base + self._rows - sequence))
         elif self.mode is Mode.HOLD:
-            begins = rows > 0 and self._begins_here()
+            begins = rows > 0 and not self.barred and self._begins_here()
             most = 1 if begins else most
         else:
             self._ahead = None
@@ -214,6 +225,8 @@ class Commander:
         self.ended = (Result.NONE, "")
         if self.mode is not Mode.HOLD:
             self.ended = (Result.REFUSED, f"a motion cannot begin {self.place()}")
+        elif self.barred:
+            self.ended = (Result.REFUSED, f"no motion before `enter_command`: {self.barred}")
         elif not self._begins_here():
             self.ended = (Result.REFUSED, "the motion does not begin at the commanded position")
         else:
@@ -237,15 +250,43 @@ class Commander:
 
     def stop(self, result: Result, reason: str) -> None:
         """Begin a stop within the limits; `ended` is (`result`, `reason`) once the arm holds."""
-        if self.mode not in (Mode.MOTION, Mode.HOLD):
-            return
-        self._pending = (result, reason)
+        if self.mode in (Mode.MOTION, Mode.HOLD):
+            self._pending = (result, reason)
+            self._brake()
+
+    def _brake(self) -> None:
         try:
             self._stop.begin(*self._past)
         except ValueError as error:
-            self.fall_silent(result, f"{reason}; {error}")
+            self.fall_silent(self._pending[0], f"{self._pending[1]}; {error}")
             return
+        self._origin = None
         self.mode = Mode.STOP
+
+    def touch(self, what: str, advice: str) -> None:
+        """Something touches the arm: stop a motion, and begin none before `allow`.
+
+        At rest the arm goes back to its place before the contact if it is still pressed from there.
+        """
+        if self.mode not in (Mode.HOLD, Mode.MOTION, Mode.STOP):
+            return
+        reason = f"{what} {self.place()}; {advice}"
+        moving, before = self.mode is Mode.MOTION, round(_BEFORE_CONTACT_S / self._period)
+        if moving:
+            origin = self._plan[max(self.index - before, 0)].copy()
+            self.stop(Result.ROBOT, reason)
+            self._origin = origin
+        if self.barred:
+            return
+        self.barred = reason
+        self._control.write_text(Text.LEFT, reason)
+        if self.mode is Mode.STOP and not moving:
+            self._pending = (self._pending[0], f"{self._pending[1]}; then {reason}")
+
+    def allow(self) -> None:
+        """Motions may begin again."""
+        self.barred = ""
+        self._control.write_text(Text.LEFT, "")
 
     def lose(self, result: Result, reason: str) -> None:
         """Return to the mirror when the controller no longer follows; a motion ends for good."""
@@ -257,6 +298,7 @@ class Commander:
             self.ended = (result, reason)
         elif self.mode is Mode.STOP:
             self.ended = (self._pending[0], f"{self._pending[1]}; then {reason}")
+        self.barred = reason
         self._control.write_text(Text.LEFT, reason)
         self.mode, self.index, self.phase = Mode.MIRROR, -1, NO_PHASE
 
@@ -288,7 +330,10 @@ class Commander:
             return self._plan[self.index].astype(np.float32)
         self.index = -1
         if self.mode is Mode.STOP:
-            self.phase = BRAKE
+            if self._retreat.under_way:
+                self.phase = RETREAT
+                return self._retreat.advance(self._since_sent).astype(np.float32)
+            self.phase = BRAKE if self._origin is None else CONTACT
             return self._stop.advance(self._since_sent).astype(np.float32)
         self.phase = HOLD
         return self._hold.astype(np.float32)
@@ -302,14 +347,43 @@ class Commander:
             if self.index == self._rows - 1:
                 self._end(Result.DONE, "")
         elif self.mode is Mode.STOP:
-            past[:] = self._stop.advance(0)
-            if self._stop.finished:
-                self._end(*self._pending)
+            self._commit_stop()
         else:
             past[:] = self._hold
         self.target = target
         self._since_sent = 0
         self._sent += 1
+
+    def _commit_stop(self) -> None:
+        past, stop, retreat = self._past, self._stop, self._retreat
+        if retreat.under_way:
+            for back in range(3):
+                past[back] = retreat.row(back)
+            if retreat.arrived:
+                retreat.end()
+                self._end(*self._pending)
+            elif np.any((np.abs(self.external) > self.allowed) & (self.external * retreat.way < 0.0)):
+                # Something is in the way back.
+                retreat.end()
+                self._brake()
+            return
+        past[:] = stop.advance(0)
+        if not stop.finished:
+            return
+        origin, self._origin = self._origin, None
+        if origin is not None and self._pressed(origin - past[0]):
+            self._pending = (
+                self._pending[0],
+                f"{self._pending[1]}; still pressed at rest, the arm went back",
+            )
+            retreat.begin(past[0], origin)
+            if retreat.under_way:
+                return
+        self._end(*self._pending)
+
+    def _pressed(self, way: NDArray[np.float64]) -> bool:
+        """Whether the arm at rest is pressed in the direction `way` (7,)."""
+        return bool(np.any((np.abs(self.external) > _PRESSED * self.allowed) & (self.external * way > 0.0)))
 
     def _end(self, result: Result, reason: str) -> None:
         """End a motion or a stop: the arm holds."""

@@ -99,13 +99,15 @@ class Word(IntEnum):
     NOTES = 31  # count of notes; the last is in the text NOTE
     SUSPECT = 32
     ROW = 33  # last row sent of a motion, -1 if none since its request
+    # written by the driver
+    LOAD = 40  # count of payloads put into `load`
 
 
 class Text(IntEnum):
     """Places of the shared texts, all written by the loop."""
 
     REASON = 0  # of the last result
-    LEFT = 1  # why command mode was left
+    LEFT = 1  # why command mode was left, or why no motion may begin in it
     NOTE = 2  # the last rare event of the link
 
 
@@ -118,6 +120,7 @@ class Control:
     measured : (6, 7) float64: mean q, std q, mean tau, std tau, mean external tau, mean command
     tracking : (7,) worst tracking error since command mode began [rad]
     latency : histogram of the reply latency in bins of `BIN_NS`
+    load : (7,) expected payload: mass [kg], centre of mass [m], inertia [kg m2], see `ContactWatch.carry`
     """
 
     def __init__(self, descriptor: int, plan_rows: int) -> None:
@@ -128,6 +131,7 @@ class Control:
         self.tracking = self._take((JOINTS,), "<f8")
         self.measured = self._take((6, JOINTS), "<f8")
         self.latency = self._take((_BINS,), "<i8")
+        self.load = self._take((7,), "<f8")
         self._texts = self._take((len(Text), _TEXT_BYTES), "u1")
         self.phase_rows = self._take((_PHASES,), "<i8")
         self.phase_ids = self._take((_PHASES,), "<i8")
@@ -227,6 +231,7 @@ def _size(plan_rows: int) -> int:
         JOINTS * 8,
         6 * JOINTS * 8,
         _BINS * 8,
+        7 * 8,
         len(Text) * _TEXT_BYTES,
         _PHASES * 8,
         _PHASES * 8,

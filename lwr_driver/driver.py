@@ -33,8 +33,9 @@ from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
 from lwr_driver.arm.load import check_load
-from lwr_driver.commander import BRAKE, HOLD
+from lwr_driver.commander import BRAKE, CONTACT, HOLD, RETREAT
 from lwr_driver.configuration import as_path, expect
+from lwr_driver.contact import ContactSettings, ExpectedArm
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
 from lwr_driver.link import (
     LinkSettings,
@@ -82,7 +83,8 @@ _ERRORS: Mapping[Result, type[LwrError]] = {
     Result.NETWORK: NetworkError,
     Result.GUARD: RefusedError,
 }
-_PHASES = {HOLD: "hold", BRAKE: "brake"}
+_PHASES = {HOLD: "hold", BRAKE: "brake", CONTACT: "contact", RETREAT: "retreat"}
+_POOR = (Quality.UNACCEPTABLE.name, Quality.BAD.name)
 
 
 class Driver:
@@ -92,6 +94,7 @@ class Driver:
     link : settings of the connection
     notify : called with a Waiting about twice a second while a step waits
     motor_torque : places of the motor torques in the KRL variables; None records none
+    contact : limits of torque and contact; expected : the arm of the own estimate, None for the nominal one
 
     A waiting step raises OperatorError after `request_stop` or `drop_link`, NetworkError if the link or a
     process is gone, RobotError if the controller does not follow a request. Errors carry the last cycles as
@@ -105,10 +108,14 @@ class Driver:
         *,
         notify: Callable[[Waiting], None] | None = None,
         motor_torque: KrlMotorTorque | None = None,
+        contact: ContactSettings | None = None,
+        expected: ExpectedArm | None = None,
     ) -> None:
         expect(arm, Arm, "arm of the driver", "give `Arm.load()`")
         expect(link, LinkSettings, "link of the driver", 'give `LinkSettings(address="192.168.0.100")`')
         self.arm, self.link, self.motor_torque = arm, link, motor_torque
+        self.contact = ContactSettings() if contact is None else contact
+        self._expected = expected
         self.rights: Rights | None = None
         self._notify = notify
         self._control: Control | None = None
@@ -157,7 +164,10 @@ class Driver:
                 priority=link.priority,
                 cpu=link.cpu,
             )
-            self._loop = LoopProcess(settings, self.arm.limits, self._control, self._ring, scheduling)
+            expected = ExpectedArm.nominal(self.arm) if self._expected is None else self._expected
+            limits = ContactSettings(self.contact.torque_share, self.contact.external_nm)
+            watch = (expected, limits, self.arm.tau_max)
+            self._loop = LoopProcess(settings, self.arm.limits, self._control, self._ring, scheduling, watch)
             self.rights = self._loop.rights
             for shortage in (*self.rights.missing, *self.rights.advice):
                 log.warning("%s", shortage)
@@ -263,6 +273,21 @@ class Driver:
         self._wait(Job.LOAD, f"load data of {mass:g} kg in force", advise_load, timeout_s)
         return self.state()
 
+    def expect_load(
+        self,
+        mass: float,
+        com: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        inertia: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Expect this payload in the own estimate of the external torque, at the latest when the arm rests next.
+
+        Arguments as of `set_load`. Without a call the weight of the payload is taken from the controller's gravity
+        torque, its load data; the inertia is then unknown.
+        """
+        control = self._need(self._control)
+        control.load[:] = (mass, *com, *inertia)
+        control.words[Word.LOAD] += 1
+
     def enter_command(self, *, timeout_s: float = 120.0) -> LinkState:
         """Ask the KRL program to start commanding; wait for command mode, drives on and no error.
 
@@ -300,7 +325,7 @@ class Driver:
         names = dict(zip(control.phase_ids.tolist(), (name for _, name in motion.phases), strict=False))
         trouble: LwrError | None = None
         following = time.monotonic()
-        watch = _Watch(self)
+        watch, poor = _Watch(self), False
         try:
             while not self._need(self._control).done:
                 time.sleep(_POLL_S)
@@ -310,6 +335,8 @@ class Driver:
                 following = time.monotonic() + _PROGRESS_S
                 if trouble is None:
                     trouble = self._recorder_trouble()
+                if not poor and (poor := self.state().quality in _POOR):
+                    log.warning("the controller rates the link %s in command mode", self.state().quality)
                 if progress is not None:
                     row = max(int(control.words[Word.ROW]), 0)
                     phase = self._phase_name(names)
@@ -471,10 +498,13 @@ class Driver:
             raise self._with_rows(OperatorError(f"stop requested while waiting for {awaited}"))
 
     def _check_executable(self, motion: Motion, state: LinkState) -> None:
-        if state.mode != "hold":
-            left = f" {state.left}" if state.left else ""
+        if state.mode != "hold" or state.left:
+            left = f" {state.left}." if state.left else ""
+            where = "not in command mode" if state.mode != "hold" else "no motion yet"
+            raise self._with_rows(RobotError(f"{where} ({state.summary}).{left} Call `enter_command` first"))
+        if state.quality in _POOR:
             raise self._with_rows(
-                RobotError(f"not in command mode ({state.summary}).{left} Call `enter_command` first")
+                NetworkError(f"the controller rates the link {state.quality}; `wait_quality` before a motion")
             )
         if abs(motion.period_s - state.period_s) > 1e-9:
             raise ConfigurationError(

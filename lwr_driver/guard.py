@@ -42,6 +42,9 @@ from lwr_driver.arm import JOINTS, ArmLimits
 # Half the spacing of float32 numbers between 2 and 4 rad; joint positions of the arm are below 3 rad.
 ROUNDING = 2.0**-23
 
+RETREAT_SPEED = 0.25
+"""Of a joint on the way back from a contact [rad/s]; some 0.2 m/s at the flange."""
+
 _UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³"}
 _SLACK = 1e-9
 
@@ -205,6 +208,60 @@ class Stop:
     @property
     def finished(self) -> bool:
         """Whether the commanded position rests."""
+        return self._cycle >= self._cycles
+
+
+class Retreat:
+    """A straight jerk-limited move in joint space from rest to rest, slow, for the way back from a contact.
+
+    limits : of velocity, acceleration and jerk; period_s : time of one cycle [s]
+
+    way : from the beginning to the end (7,) [rad]
+    """
+
+    def __init__(self, limits: ArmLimits, period_s: float) -> None:
+        self._period = period_s
+        self._otg = Ruckig(JOINTS, period_s)
+        self._trajectory = Trajectory(JOINTS)
+        move = InputParameter(JOINTS)
+        move.synchronization = Synchronization.Phase
+        move.max_velocity = np.minimum(limits.v_max, RETREAT_SPEED).tolist()
+        move.max_acceleration = limits.a_max.tolist()
+        move.max_jerk = limits.j_max.tolist()
+        self._move = move
+        self.way = np.zeros(JOINTS)
+        self._cycle = self._cycles = 0
+
+    def begin(self, start: Rows, goal: Rows) -> None:
+        """Plan the way from `start` to `goal`, (7,) [rad]; without a way nothing begins."""
+        self._move.current_position = start.tolist()
+        self._move.target_position = goal.tolist()
+        self.way = goal - start
+        self._cycle = self._cycles = 0
+        if int(self._otg.calculate(self._move, self._trajectory)) >= 0:
+            self._cycles = int(np.ceil(self._trajectory.duration / self._period - 1e-9))
+
+    def advance(self, cycles: int) -> Rows:
+        """Row `cycles` cycles further on, (7,) [rad]."""
+        self._cycle = min(self._cycle + cycles, self._cycles)
+        return self.row(0)
+
+    def row(self, back: int) -> Rows:
+        """Row `back` cycles ago, (7,) [rad]."""
+        return np.array(self._trajectory.at_time(max(self._cycle - back, 0) * self._period)[0])
+
+    def end(self) -> None:
+        """Give the way up or close it."""
+        self._cycle = self._cycles = 0
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a way has begun and not been closed."""
+        return self._cycles > 0
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the goal has been commanded."""
         return self._cycle >= self._cycles
 
 

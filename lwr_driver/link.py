@@ -104,7 +104,8 @@ class LinkState:
     setpoint : the controller's own set point, command plus FRI offset [rad]; motions begin there
     tracking_error : largest distance of q from the answer before, in this command mode [rad]
     latency_s : quantiles 0.5, 0.99, 0.999 and 1 of the time from packet to answer in the loop [s]
-    left : reason of the last end of command mode, empty in command mode or before the first
+    left : why no motion may begin before `enter_command`: the last end of command mode, or a contact in it; empty
+        if one may
     received to restarts : counters of the link; late : answers not yet seen by the controller at its next
         packet; overruns : rows lost to a slow recorder
     """

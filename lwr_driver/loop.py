@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.commander import Commander
+from lwr_driver.contact import Contact, ContactWatch
 from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
 from lwr_driver.ring import ROW, Ring
 
@@ -41,6 +44,8 @@ _OVERDUE_S = 0.15e-3
 _LEAVE_ALONE = (Job.NONE, Job.MOTION, Job.CYCLES)
 _REMIND_S = 1.0  # silence in lock step before a reminder to the other side
 _STILL_RAD = 1e-5  # largest step per cycle of a set point at rest
+# A motion ends after so many packets of quality UNACCEPTABLE in command mode, or so long below OK.
+_UNACCEPTABLE_PACKETS, _BAD_S = 3, 1.0
 # Counters of the link in a reason, with their words.
 _REPORTED = (
     ("lost", "lost"),
@@ -111,14 +116,20 @@ class Loop:
     Usable in any process: `cycle` handles one packet, `run` goes on until the request to quit.
 
     control : the shared memory; ring : rows for the recorder, None keeps none
+    watch : of torque and contact, None watches nothing
     turnaround : waits actively for the next packet, with its answer and those to the following packets ready;
         it costs up to 1.35 ms of a processor in each cycle, 0.55 ms at 1 kHz; None to sleep instead
     """
 
     def __init__(
-        self, settings: LoopSettings, limits: ArmLimits, control: Control, ring: Ring | None = None
+        self,
+        settings: LoopSettings,
+        limits: ArmLimits,
+        control: Control,
+        ring: Ring | None = None,
+        watch: ContactWatch | None = None,
     ) -> None:
-        self._settings, self._control, self._ring = settings, control, ring
+        self._settings, self._control, self._ring, self._watch = settings, control, ring, watch
         self.turnaround: Turnaround | None = None
         self._ready_in = Mode.MIRROR  # mode of the prepared answers
         self._handshake = find_handshake(settings.handshake)
@@ -128,6 +139,12 @@ class Loop:
         msr = self.remote.msr
         self._krl, self._offset = msr["cmd_jnt_pos"], msr["cmd_jnt_pos_fri_offset"]
         self._q = msr["msr_jnt_pos"]
+        self._torques = msr["msr_jnt_trq"], msr["est_ext_jnt_trq"], msr["gravity"]
+        if watch is not None:
+            self._commander.external, self._commander.allowed = watch.external, watch.allowed
+        self._loads = 0  # payloads taken from the driver
+        self._alarm: Callable[[], None] | None = None  # ends a motion with the next packet
+        self._unacceptable, self._bad = 0, 0  # packets of such quality on end, cycles below OK
         self._sample_time = self._period = 0.0
         self._silence_s, self._silence_cycles = settings.link_timeout_s, 0
         self._sequence = -1
@@ -227,7 +244,7 @@ class Loop:
     def _look_out(self, turnaround: Turnaround, timeout_s: float) -> bool:
         """Wait for a packet with the answer ready; False if none came. A new request is taken at once."""
         remote = self.remote
-        again = not turnaround.next(more=self._commander.mode is self._ready_in)
+        again = not turnaround.next(more=self._commander.mode is self._ready_in and self._alarm is None)
         while again:
             self._make_ready(turnaround)
             due = remote.received_ns * 1e-9 + self._period - time.monotonic()
@@ -251,6 +268,7 @@ class Loop:
             or counter is None
             or remote.controller is None
             or (stops and (begins or commander.mode is Mode.MOTION))
+            or (self._alarm is not None and commander.mode is Mode.MOTION)
         ):
             return
         # Other jobs may write to the KRL program with any answer. In lock step no packet waits.
@@ -328,6 +346,7 @@ class Loop:
             self._set_period(remote.sample_time_s)
         if not sent:
             self._take_request()
+        touched = self._feel(elapsed)
         misses = int(remote.msr["miss_counter"])
         if misses != self._misses:
             self._misses, self._missed_at = misses, sequence
@@ -344,11 +363,15 @@ class Loop:
             if step is None or (step.any() and not self._may_stop(setpoint, elapsed)):
                 self._held_back = True
                 return None
-            self._let_brake = 0
+            self._let_brake = self._unacceptable = self._bad = 0
+            self._alarm = None
+            if self._watch is not None:
+                self._watch.weigh(self._q, self._torques[2])
             self._misses_before = misses
             self._counted_before = remote.counters()
             return commander.enter(setpoint, float(remote.msr["safety_limits"]), step)
         commander.watch(elapsed, setpoint, self._q)
+        self._react(touched, elapsed, sent)
         if self._job is Job.MOTION and not self._begun:
             self._begun = True
             commander.begin(self._a, sequence)
@@ -358,6 +381,44 @@ class Loop:
             elif self._job is not Job.MOTION:
                 commander.stop(Result.ABORTED, f"stopped by the driver {commander.place()}")
         return commander.command(sequence)
+
+    def _feel(self, elapsed: int) -> Contact | None:
+        """Torque or contact beyond its limit in this packet."""
+        watch = self._watch
+        if watch is None:
+            return None
+        loads = int(self._words[Word.LOAD])
+        if loads != self._loads and not self._commander.moving:
+            self._loads, load = loads, self._control.load
+            watch.carry(float(load[0]), load[1:4], load[4:])
+        return watch.update(elapsed, self._q, *self._torques)
+
+    def _react(self, touched: Contact | None, elapsed: int, sent: bool) -> None:
+        """In command mode, end a motion after a contact, or after a link rated bad for too long.
+
+        A motion with its answer already sent ends with the next packet.
+        """
+        commander, quality = self._commander, self.remote.quality
+        self._unacceptable = self._unacceptable + 1 if quality == Quality.UNACCEPTABLE else 0
+        self._bad = self._bad + elapsed if quality < Quality.OK else 0
+        if touched is not None:
+            what = f"contact: {touched.describe(self._settings.joint_names)}"
+            self._alarm = partial(commander.touch, what, touched.advice)
+        elif (
+            self._alarm is None
+            and commander.mode is Mode.MOTION
+            and (self._unacceptable >= _UNACCEPTABLE_PACKETS or self._bad * self._period >= _BAD_S)
+        ):
+            reason = (
+                f"the controller rates the link {Quality(quality).name} in command mode, "
+                f"{self._bad * self._period:.3f} s below OK, {self._misses - self._misses_before} answers missed "
+                f"{commander.place()}"
+            )
+            self._alarm = partial(commander.stop, Result.NETWORK, reason)
+        moves = commander.mode is Mode.MOTION or (self._job is Job.MOTION and not self._begun)
+        if self._alarm is not None and not (sent and moves):
+            self._alarm()
+            self._alarm = None
 
     def _step(self) -> NDArray[np.float64] | None:
         """Step of the controller's set point per cycle (7,) [rad], zero at rest; None if unknown.
@@ -401,6 +462,8 @@ class Loop:
         self._silence_cycles = round(self._silence_s / self._period)
         self._fastest = self._limits.v_max * self._period
         self._commander.set_period(self._period)
+        if self._watch is not None:
+            self._watch.set_period(self._period)
 
     def _leave(self) -> None:
         """End command mode, with the reason, if the controller no longer follows."""
@@ -505,6 +568,8 @@ class Loop:
             else:
                 handshake.request_stop(remote.command, remote.msr)
             done = commander.mode is Mode.HOLD and handshake.started(remote.msr)
+            if done:
+                commander.allow()
         elif job is Job.LEAVE:
             handshake.request_stop(remote.command, remote.msr)
             done = remote.state != State.CMD and handshake.stopped(remote.msr)

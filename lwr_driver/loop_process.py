@@ -1,7 +1,7 @@
 """The FRI loop in a process of its own: the handle that starts and ends it, and its entry.
 
-The process is a fresh interpreter. It imports numpy, ruckig and `fri` only, and with real-time rights the
-compiled `lwr_driver.turnaround`. It inherits the shared memory and a pipe, and writes one line to the pipe:
+The process is a fresh interpreter. It imports numpy, ruckig, pinocchio and `fri` only, and with real-time rights
+the compiled `lwr_driver.turnaround`. It inherits the shared memory and a pipe, and writes one line to the pipe:
 ready, or the reason why not. It ignores Ctrl-C, and ends when its parent is gone.
 """
 
@@ -23,10 +23,12 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, LwrError, NetworkError
 from lwr_driver import realtime
 from lwr_driver.arm import ArmLimits
+from lwr_driver.contact import ContactSettings, ContactWatch, ExpectedArm
 from lwr_driver.control import Control, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.realtime import Rights, Shortage
@@ -57,17 +59,25 @@ class LoopProcess:
     Raises NetworkError if the address cannot be bound or required rights are missing, ConfigurationError if
     the process cannot be started.
 
+    watch : the expected arm, the limits of torque and contact, and the torque limits of the joints (7,) [Nm]
     rights : rights of the process; port : its UDP port; pid : its process id
     """
 
     def __init__(
-        self, settings: LoopSettings, limits: ArmLimits, control: Control, ring: Ring, scheduling: Scheduling
+        self,
+        settings: LoopSettings,
+        limits: ArmLimits,
+        control: Control,
+        ring: Ring,
+        scheduling: Scheduling,
+        watch: tuple[ExpectedArm, ContactSettings, NDArray[np.float64]],
     ) -> None:
         self._control = control
         order = {
             "settings": asdict(settings),
             "limits": {name: np.asarray(value).tolist() for name, value in asdict(limits).items()},
             "scheduling": asdict(scheduling),
+            "watch": [asdict(watch[0]), asdict(watch[1]), watch[2].tolist()],
             "control": [control.descriptor, control.plan_rows],
             "ring": ring.name,
             "parent": os.getpid(),
@@ -163,7 +173,9 @@ def main(arguments: Sequence[str]) -> None:
         settings["joint_names"] = tuple(settings["joint_names"])
         limits = ArmLimits(**{name: np.array(value) for name, value in order["limits"].items()})
         control = Control(*order["control"])
-        loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]))
+        expected, contact, tau_max = order["watch"]
+        watch = ContactWatch(ExpectedArm(**expected), ContactSettings(**contact), np.array(tau_max))
+        loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]), watch)
         rights = _become_real_time(loop, control, scheduling) if scheduling.apply else Rights()
         if scheduling.required:
             rights.enforce()

@@ -258,6 +258,7 @@ class Run:
         bench, driver = self.bench, self.bench.driver
         driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
         self._swap(plan)
+        driver.expect_load(*load_data(bench.arm, plan.payload))
         here = self._at_rest(plan.payload)
         motion, preflight = self._prepare(plan, here)
         start = driver.state()

@@ -20,6 +20,7 @@ from lwr_driver.arm.load import check_load
 from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
 from lwr_driver.extent import LONGEST_EXCITATION_S, Harmonics, Period, Periods
 from lwr_driver.session.motor_torque import KrlMotorTorque
+from runner.contact import ContactPlan
 
 DEFAULT = CONFIGS / "experiments/default.yaml"
 
@@ -223,6 +224,7 @@ class Experiment:
     motor_torque: MotorTorque = field(default_factory=MotorTorque)
     excitation: Excitation = field(default_factory=Excitation)
     moves: Moves = field(default_factory=Moves)
+    contact: ContactPlan = field(default_factory=ContactPlan)
     identification: Identification = field(default_factory=Identification)
     diagnosis: DiagnosisPlan = field(default_factory=DiagnosisPlan)
     replan: Replan = field(default_factory=Replan)

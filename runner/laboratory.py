@@ -13,6 +13,7 @@ from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.driver import Driver, LinkSettings, Waiting
+from runner.contact import expected_arm
 from runner.experiment import Bench, Operator
 from runner.experiment_file import Experiment, Payload
 from runner.terminal import StatusLine
@@ -152,7 +153,15 @@ class Laboratory:
             operator = EmulatedOperator(emulator.pendant, frozenset(known), enters_load=enters_load)
         torque = experiment.motor_torque
         krl = torque.krl if torque.source == "krl_reals" else None
-        driver = Driver(arm, self._link(port), notify=self._notify, motor_torque=krl)
+        contact, expected = experiment.contact, expected_arm(experiment.contact, arm, experiment.folder)
+        driver = Driver(
+            arm,
+            self._link(port),
+            notify=self._notify,
+            motor_torque=krl,
+            contact=contact,
+            expected=expected,
+        )
         stack.enter_context(driver)
         driver.connect()
         return Bench(arm, cell, driver, operator, self.status)

@@ -25,6 +25,7 @@ from benchmarks.trust.table import Ledger
 SECTIONS = {
     "wire": "faults on the wire, alone and mixed, in every phase",
     "reaction": "from a fault to the safe reaction, in cycles",
+    "contact": "pushes on each joint and an obstacle: stopped in time, and no alarm without them",
     "robot": "faults of the robot: emergency stop, drives, modes, quality, temperature, payload, people",
     "computer": "faults of this computer: kill -9, disk, clock, starvation, Ctrl-C",
     "network": "what is bound, who is answered, what is said",

@@ -29,7 +29,11 @@ _FAULTS: dict[str, tuple[str, dict[str, Any], str | None]] = {
     "drive error": ("drive_fault", {"joint": 3}, "drives"),
     "drive warning (temperature)": ("drive_fault", {"joint": 3, "error": False}, None),
     "program cancelled": ("stop_program", {}, "no packet|in lock step"),
-    "arm held by force": ("push", {"torque": [0.0, 600.0, 0.0, 0.0, 0.0, 0.0, 0.0]}, "is .* rad from"),
+    "arm held by force": (
+        "push",
+        {"torque": [0.0, 600.0, 0.0, 0.0, 0.0, 0.0, 0.0]},
+        "contact: A2 .* Nm exceeds",
+    ),
     "controller restarts": ("restart", {"silent_cycles": 60}, "started again|left command|drives|lost"),
 }
 _LINES = {

@@ -99,7 +99,7 @@ class Clock:
         self.now_ns += round(seconds * 1e9)
 
 
-class _TimedTurnaround(Turnaround):
+class TimedTurnaround(Turnaround):
     """The loop's answers ahead, at the time of the stand."""
 
     def __init__(self, loop: Loop, control: Control, clock: Clock) -> None:
@@ -162,7 +162,7 @@ class Stand:
         ring.start_writing()
         self.settings = LoopSettings("127.0.0.1", 0, None, lock_step, program, 0.1, 0.2, arm.joint_names)
         self.loop = Loop(self.settings, arm.limits, self.control, ring)
-        self.ahead = _TimedTurnaround(self.loop, self.control, self.clock) if ahead else None
+        self.ahead = TimedTurnaround(self.loop, self.control, self.clock) if ahead else None
         self.loop.turnaround = self.ahead
         self.end = ControllerEnd(self.loop.remote.address)
         self.monitor = CommandMonitor(arm, period_ms * 1e-3)

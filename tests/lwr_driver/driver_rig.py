@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,7 @@ class Rig:
         ring: Ring | None = None,
         policy: dict[str, object] | None = None,
         tracking_limit_rad: float = 0.2,
+        watch: Any = None,
     ) -> None:
         self.arm = arm()
         self.period_ms, self.period_s = period_ms, period_ms * 1e-3
@@ -103,7 +105,7 @@ class Rig:
         self.settings = LoopSettings(
             "127.0.0.1", 0, None, lock_step, program, 0.1, tracking_limit_rad, self.arm.joint_names
         )
-        self.loop = Loop(self.settings, self.arm.limits, self.control, ring)
+        self.loop = Loop(self.settings, self.arm.limits, self.control, ring, watch)
         self.end = ControllerEnd(self.loop.remote.address)
         self.arrived = Arrived()
         self.sent_by_loop: list[NDArray[np.float64]] = []

@@ -1,0 +1,287 @@
+"""Torque and contact, watched in every cycle.
+
+Compared with limits, joint by joint: the measured joint torque, the controller's estimate of the external torque, and
+the driver's own. The own estimate is the torque by which the joint torque sensors miss the model of the arm
+with its payload,
+
+    tau_ext = F[M(q) qdd + c(q, qd) + g(q) + Fv qd + Fc sign(qd) + off] - F[tau],
+
+with positions and torques through one second-order low-pass F, of which velocity and acceleration are states
+(bilinear transform). Equal delays cancel, and the link's own acceleration is seen as well: a push shows before
+it has passed the elastic joint. It follows the measured arm, whatever is commanded.
+
+The limit is a threshold, plus the uncertainty of the friction: its sign below `_SIGN_SPEED`, and its size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from lwr_driver.arm import JOINTS, Arm
+
+Joints = tuple[float, float, float, float, float, float, float]
+Floats = NDArray[np.float64]
+
+EXTERNAL_NM: Joints = (15.0, 15.0, 8.0, 8.0, 8.0, 3.5, 3.5)
+"""Highest thresholds of the external torque [Nm], about a twelfth of the joints' limits."""
+
+TORQUE_SHARE = 0.9
+"""Highest share of a joint's torque limit."""
+
+# Link-side friction of the nominal arm, unknown and below this share of the torque limit.
+_FRICTION_SHARE = 0.01
+_SIGN_SPEED = 0.02  # of a joint: below it the sign of its friction is uncertain [rad/s]
+_CUTOFF_HZ, _DAMPING = 40.0, 0.8
+_LARGEST_ANGLE = 1.2  # of the cutoff frequency, per cycle [rad]
+_SETTLING = 5.0  # time constants of F after a beginning
+_MOST_CYCLES = 10  # after a longer gap F begins anew
+_BEYOND_FLANGE_M = 0.05
+_LEAST_KG = 0.1  # smaller differences of the gravity torque are no payload
+# Jumps between two packets, believed only if the next packet confirms them.
+_JUMP_RAD, _JUMP_SHARE = 5e-3, 0.5
+
+
+@dataclass(frozen=True)
+class ContactSettings:
+    """Limits of torque and contact; they can be lowered, not raised.
+
+    torque_share : largest joint torque, as a share of the joint's limit
+    external_nm : thresholds of the external torque [Nm], by the controller's estimate and by the model
+    """
+
+    torque_share: float = TORQUE_SHARE
+    external_nm: Joints = EXTERNAL_NM
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.torque_share <= TORQUE_SHARE:
+            raise ConfigurationError(
+                f"torque_share {self.torque_share} is outside 0 to {TORQUE_SHARE}; it can only be lowered"
+            )
+        if len(self.external_nm) != JOINTS:
+            raise ConfigurationError(f"external_nm has {len(self.external_nm)} entries, the arm {JOINTS}")
+        for joint, (value, most) in enumerate(zip(self.external_nm, EXTERNAL_NM, strict=True), start=1):
+            if not 0.0 < value <= most:
+                raise ConfigurationError(
+                    f"external_nm of joint {joint} is {value} Nm, outside 0 to {most:g} Nm; it can only be lowered"
+                )
+
+
+@dataclass(frozen=True)
+class ExpectedArm:
+    """The arm without payload as the own estimate expects it; (7,) each.
+
+    dynamics : rigid bodies, a pinocchio model as text
+    viscous [Nm s/rad], coulomb [Nm], offset [Nm] : friction at the joint torque sensor
+    uncertainty : of friction and offset [Nm]
+    """
+
+    dynamics: str
+    viscous: tuple[float, ...]
+    coulomb: tuple[float, ...]
+    offset: tuple[float, ...]
+    uncertainty: tuple[float, ...]
+
+    @classmethod
+    def nominal(cls, arm: Arm) -> ExpectedArm:
+        """Bodies of the URDF, friction unknown."""
+        import pinocchio as pin
+
+        zero = (0.0,) * JOINTS
+        uncertainty = tuple((_FRICTION_SHARE * arm.tau_max).tolist())
+        return cls(pin.buildModelFromXML(arm.urdf).saveToString(), zero, zero, zero, uncertainty)
+
+
+class Contact(NamedTuple):
+    """A limit exceeded: quantity, joint from 0, size and limit [Nm]."""
+
+    quantity: str
+    joint: int
+    value: float
+    limit: float
+
+    def describe(self, joint_names: tuple[str, ...]) -> str:
+        """The message with subject, value and limit."""
+        name = joint_names[self.joint]
+        return f"{name} {self.quantity} {self.value:.1f} Nm exceeds {self.limit:.1f} Nm"
+
+    @property
+    def advice(self) -> str:
+        """The remedy."""
+        if self.quantity == _QUANTITIES[0]:
+            return "free the arm, or slow the motion down"
+        return "free the arm; if nothing touches it, check its payload, load data and torque sensors"
+
+
+_QUANTITIES = ("joint torque", "external torque by the controller's estimate", "external torque by the model")
+
+
+class ContactWatch:
+    """Compares each packet with the limits.
+
+    expected : the arm; settings : its limits; tau_max : torque limits of the joints (7,) [Nm]
+
+    external : own estimate of the external torque (7,) [Nm], positive if it drives the joint forward; zero if unknown
+    allowed : its limit at present (7,) [Nm]
+
+    The payload is known from `carry`. Otherwise its weight is taken from the packet's gravity torque, the controller's
+    load data, and the inertia that belongs to this weight from `weigh`. A channel of joint torques all exactly zero
+    since the beginning is none: then only the controller's estimate counts.
+    """
+
+    def __init__(self, expected: ExpectedArm, settings: ContactSettings, tau_max: Floats) -> None:
+        import pinocchio as pin
+
+        self._pin = pin
+        self._model = pin.Model()
+        self._model.loadFromString(expected.dynamics)
+        self._data = self._model.createData()
+        self._bare = self._model.inertias[JOINTS].copy()
+        named = self._model.existFrame("flange")
+        frame = self._model.frames[self._model.getFrameId("flange")] if named else None
+        self._flange = pin.SE3.Identity() if frame is None else frame.placement.copy()
+        self._carried = False
+        rows = np.array([expected.viscous, expected.coulomb, expected.offset])
+        self._viscous, self._coulomb, self._offset = rows
+        self._friction = bool(rows.any())
+        self._most = settings.torque_share * tau_max
+        self._threshold = np.array(settings.external_nm) + np.array(expected.uncertainty)
+        self.external = np.zeros(JOINTS)
+        self.allowed = self._threshold.copy()
+        self._jump = np.concatenate([np.full(JOINTS, _JUMP_RAD), *[_JUMP_SHARE * tau_max] * 2])
+        self._now, self._last, self._step, self._change, self._odd = (np.zeros(3 * JOINTS) for _ in range(5))
+        # Position and velocity of the low-pass, and its input.
+        self._filter, self._next = np.zeros((3, 2 * JOINTS)), np.zeros((2, 2 * JOINTS))
+        self._excess = np.full((3, JOINTS), -np.inf)
+        self._known = False
+        self._open = np.ones(JOINTS)  # share of the friction of uncertain sign
+        self._doubted = False
+        self._alive = False
+        self._settling = 0
+        self.set_period(1e-3)
+
+    def set_period(self, period_s: float) -> None:
+        """Begin with packets of this period [s]."""
+        cutoff = min(2.0 * np.pi * _CUTOFF_HZ, _LARGEST_ANGLE / period_s)
+        self._square, self._double = cutoff**2, 2.0 * _DAMPING * cutoff
+        rates = np.array([[0.0, 1.0], [-self._square, -self._double]])
+        half = 0.5 * period_s
+        inverse = np.linalg.inv(np.eye(2) - half * rates)
+        forced = half * np.array([[0.0], [self._square]])
+        self._advance = inverse @ np.hstack([np.eye(2) + half * rates, forced])
+        self._lag = 2.0 * _DAMPING / cutoff
+        self._closing = np.exp(-0.5 * cutoff * period_s)
+        self._settled = int(np.ceil(_SETTLING / (cutoff * period_s)))
+        self._known = False
+
+    def carry(self, mass: float, com: Floats, inertia: Floats) -> None:
+        """Expect a payload: mass [kg], centre of mass in the flange frame [m], JX JY JZ about it [kg m2]."""
+        pin, model = self._pin, self._model
+        body = pin.Inertia(mass, com, np.diag(inertia))
+        model.inertias[JOINTS] = self._bare + self._flange.act(body)
+        self._carried = True
+
+    def weigh(self, q: NDArray[np.float32], gravity: NDArray[np.float32]) -> None:
+        """Mass and centre of mass from the controller's gravity torque (7,) [Nm] at rest in q, unless `carry` told.
+
+        What this pose does not show of the centre of mass is taken for `_BEYOND_FLANGE_M` out of the flange.
+        """
+        if self._carried or not gravity.any():
+            return
+        pin, model, zero = self._pin, self._model, np.zeros(JOINTS)
+        model.inertias[JOINTS] = self._bare
+        load = gravity - pin.computeGeneralizedGravity(model, self._data, q.astype(np.float64))
+        columns = pin.computeJointTorqueRegressor(model, self._data, q.astype(np.float64), zero, zero)
+        columns = columns[:, 10 * (JOINTS - 1) :][:, :4]
+        usual = self._flange.act(np.array([0.0, 0.0, _BEYOND_FLANGE_M]))
+        # For the mass, and for the deviation of the first moment from that of the usual place.
+        columns[:, 0] += columns[:, 1:] @ usual
+        mass, *moment = np.linalg.lstsq(columns, load, rcond=0.01)[0]
+        if mass > _LEAST_KG:
+            body = pin.Inertia(mass, usual + np.array(moment) / mass, np.zeros((3, 3)))
+            model.inertias[JOINTS] = self._bare + body
+
+    def update(
+        self,
+        cycles: int,
+        q: NDArray[np.float32],
+        tau: NDArray[np.float32],
+        estimate: NDArray[np.float32],
+        gravity: NDArray[np.float32],
+    ) -> Contact | None:
+        """Take in a packet, `cycles` after the last one; the limit exceeded, if any.
+
+        q [rad], tau [Nm] : measured. estimate, gravity : the controller's external and gravity torques [Nm]; (7,) each
+        """
+        now, last, change, odd = self._now, self._last, self._change, self._odd
+        now[:JOINTS], now[JOINTS : 2 * JOINTS], now[2 * JOINTS :] = q, tau, estimate
+        if not self._known or not 0 < cycles <= _MOST_CYCLES:
+            cycles = 1
+            last[:] = now
+            self._filter[0], self._filter[1] = now[: 2 * JOINTS], 0.0
+            self._step[:] = 0.0
+            self._settling, self._known = self._settled, True
+        np.subtract(now, last, out=change)
+        np.multiply(self._step, -cycles, out=odd)
+        odd += change
+        np.abs(odd, out=odd)
+        # A flipped bit in one packet is no contact.
+        self._doubted = not self._doubted and bool((odd > self._jump).any())
+        if self._doubted:
+            np.multiply(self._step, cycles, out=change)
+            np.add(last, change, out=now)
+        np.divide(change[:JOINTS], cycles, out=self._step[:JOINTS])
+        self._alive = self._alive or bool(now[JOINTS : 2 * JOINTS].any())
+        self._low_pass(cycles)
+        self._settling = max(self._settling - cycles, 0)
+        self._estimate(gravity)
+        self._last, self._now = now, last
+        excess = self._excess
+        np.abs(now[JOINTS:].reshape(2, JOINTS), out=excess[:2])
+        excess[0] -= self._most
+        excess[1] -= self.allowed
+        np.abs(self.external, out=excess[2])
+        excess[2] -= self.allowed
+        # Also false for NaN.
+        return None if excess.max() <= 0.0 else self._contact()
+
+    def _low_pass(self, cycles: int) -> None:
+        """Advance F from the last packet to this one, with straight lines between them."""
+        memory, ends = self._filter, 2 * JOINTS
+        for part in range(cycles):
+            np.multiply(self._change[:ends], (2 * part + 1) / cycles, out=memory[2])
+            memory[2] += self._last[:ends]
+            memory[2] += self._last[:ends]
+            np.dot(self._advance, memory, out=self._next)
+            memory[:2] = self._next
+
+    def _estimate(self, gravity: NDArray[np.float32]) -> None:
+        """The own estimate, from the state of the low-pass."""
+        if self._settling or not self._alive:
+            self.external[:] = 0.0
+            return
+        pin, model, data = self._pin, self._model, self._data
+        q, tau = self._filter[0, :JOINTS], self._filter[0, JOINTS:]
+        qd = self._filter[1, :JOINTS]
+        qdd = self._square * (self._now[:JOINTS] - q) - self._double * qd
+        expected = pin.rnea(model, data, q, qd, qdd)
+        if not self._carried and gravity.any():
+            expected = expected + gravity - pin.computeGeneralizedGravity(model, data, q)
+        if self._friction:
+            sign = np.clip(qd / _SIGN_SPEED, -1.0, 1.0)
+            expected = expected + self._viscous * qd + self._coulomb * sign + self._offset
+            # A change of sign passes the low-pass gradually.
+            turns = qd * (qd + self._lag * qdd) <= 0.0
+            self._open = np.maximum(np.where(turns, 1.0, 1.0 - np.abs(sign)), self._closing * self._open)
+            np.add(self._threshold, self._coulomb * self._open, out=self.allowed)
+        np.subtract(expected, tau, out=self.external)
+
+    def _contact(self) -> Contact:
+        excess = np.where(np.isnan(self._excess), np.inf, self._excess)
+        kind, joint = divmod(int(np.argmax(excess)), JOINTS)
+        limit = float((self._most if kind == 0 else self.allowed)[joint])
+        return Contact(_QUANTITIES[kind], joint, float(self._excess[kind, joint]) + limit, limit)

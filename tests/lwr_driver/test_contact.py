@@ -1,0 +1,220 @@
+"""The watch of torque and contact: its estimate of the external torque, and its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from fri.errors import ConfigurationError
+from lwr_driver.contact import EXTERNAL_NM, Contact, ContactSettings, ContactWatch, ExpectedArm
+from tests.lwr_driver.driver_rig import arm
+
+Floats = NDArray[np.float64]
+HOME = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
+LOAD = pin.Inertia(3.34, np.array([0.0, -0.066, 0.066]), np.diag([0.02, 0.02, 0.01]))
+NOTHING = np.zeros(7, np.float32)
+
+
+def model(load: pin.Inertia | None = None) -> pin.Model:
+    links = pin.buildModelFromXML(arm().urdf)
+    if load is not None:
+        flange = links.frames[links.getFrameId("flange")].placement
+        links.appendBodyToJoint(7, load, flange)
+    return links
+
+
+def watch(settings: ContactSettings | None = None, period_s: float = 1e-3) -> ContactWatch:
+    made = ContactWatch(ExpectedArm.nominal(arm()), settings or ContactSettings(), arm().tau_max)
+    made.set_period(period_s)
+    return made
+
+
+def swing(period_s: float, seconds: float = 1.5) -> tuple[Floats, Floats, Floats]:
+    """A quick motion of all joints about home."""
+    time = np.arange(0.0, seconds, period_s)[:, None]
+    rate = 2.0 * np.pi * np.array([0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3])
+    # The cosine is at rest in the beginning.
+    size = 0.2
+    return (
+        HOME + size * (1.0 - np.cos(rate * time)),
+        size * rate * np.sin(rate * time),
+        size * rate**2 * np.cos(rate * time),
+    )
+
+
+def torques(links: pin.Model, q: Floats, qd: Floats, qdd: Floats) -> Floats:
+    data = links.createData()
+    return np.array([pin.rnea(links, data, *row) for row in zip(q, qd, qdd, strict=True)])
+
+
+def follow(
+    made: ContactWatch, q: Floats, tau: Floats, estimate: Floats | None = None, gravity: Floats | None = None
+) -> tuple[list[Contact | None], Floats]:
+    """What the watch says in each cycle, and its estimate."""
+    found, external = [], []
+    for row in range(len(q)):
+        other = NOTHING if estimate is None else estimate[row].astype(np.float32)
+        weight = NOTHING if gravity is None else gravity[row].astype(np.float32)
+        found.append(made.update(1, q[row].astype(np.float32), tau[row].astype(np.float32), other, weight))
+        external.append(made.external.copy())
+    return found, np.array(external)
+
+
+@pytest.mark.parametrize("period_s", [1e-3, 5e-3, 10e-3])
+def test_free_motion_shows_no_external_torque(period_s):
+    q, qd, qdd = swing(period_s)
+    found, external = follow(watch(period_s=period_s), q, torques(model(), q, qd, qdd))
+    assert found == [None] * len(q)
+    assert np.abs(external).max() < 2.0
+
+
+@pytest.mark.parametrize("period_s", [1e-3, 5e-3])
+@pytest.mark.parametrize(("joint", "torque"), [(1, 30.0), (5, -8.0)])
+def test_a_push_is_found_within_15_ms_with_its_size_and_sign(period_s, joint, torque):
+    q, qd, qdd = swing(period_s)
+    tau = torques(model(), q, qd, qdd)
+    first = round(1.0 / period_s)
+    tau[first:, joint] -= torque
+    found, external = follow(watch(period_s=period_s), q, tau)
+    told = next(row for row, contact in enumerate(found) if contact is not None)
+    assert 0 <= told - first <= round(15e-3 / period_s)
+    contact = found[told]
+    assert contact is not None
+    assert (contact.joint, contact.quantity) == (joint, "external torque by the model")
+    assert contact.value > contact.limit
+    assert external[-1, joint] == pytest.approx(torque, abs=1.0)
+
+
+def test_the_payload_belongs_to_the_arm_once_it_is_known():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(LOAD), q, qd, qdd)
+    assert any(follow(watch(), q, tau)[0])
+    told = watch()
+    told.carry(LOAD.mass, LOAD.lever, np.diag(LOAD.inertia))
+    found, external = follow(told, q, tau)
+    assert not any(found)
+    assert np.abs(external).max() < 2.5
+
+
+def test_an_untold_payload_follows_from_the_controllers_gravity_torque():
+    q, qd, qdd = swing(1e-3)
+    gravity = torques(model(LOAD), q, 0.0 * qd, 0.0 * qdd)
+    made = watch()
+    made.weigh(q[0].astype(np.float32), gravity[0].astype(np.float32))
+    found, external = follow(made, q, torques(model(LOAD), q, qd, qdd), gravity=gravity)
+    assert not any(found)
+    assert np.abs(external).max() < 4.0
+
+
+def test_known_friction_is_no_contact_and_its_sign_at_rest_is_left_open():
+    q, qd, qdd = swing(1e-3)
+    coulomb, viscous = np.full(7, 3.0), np.full(7, 2.0)
+    tau = torques(model(), q, qd, qdd) + coulomb * np.sign(qd) + viscous * qd + 1.0
+    nominal = ExpectedArm.nominal(arm())
+    known = ExpectedArm(nominal.dynamics, tuple(viscous), tuple(coulomb), (1.0,) * 7, (0.5,) * 7)
+    made = ContactWatch(known, ContactSettings(external_nm=(1.5,) * 7), arm().tau_max)
+    found, external = follow(made, q, tau)
+    assert not any(found)
+    assert np.abs(external[500:]).max() < 4.0
+    made.update(1, *(np.zeros(7, np.float32) for _ in range(4)))
+    assert np.all(made.allowed >= 2.0 - 1e-9)
+    assert any(
+        follow(ContactWatch(nominal, ContactSettings(external_nm=(1.5,) * 7), arm().tau_max), q, tau)[0]
+    )
+
+
+def test_the_controllers_estimate_counts_by_itself():
+    q = np.tile(HOME, (100, 1))
+    tau = torques(model(), q, 0.0 * q, 0.0 * q)
+    estimate = np.zeros_like(q)
+    # As it grows: a jump of one packet is not believed.
+    estimate[50:, 4] = -np.minimum(np.arange(50), 30.0)
+    found, _ = follow(watch(), q, tau, estimate)
+    assert found[58] is None
+    assert found[60] is not None
+    assert (
+        found[60]
+        .describe(arm().joint_names)
+        .startswith("A4 external torque by the controller's estimate 10.0 Nm exceeds 9.0 Nm")
+    )
+
+
+def test_joint_torque_near_its_limit_is_told_without_any_torque_before():
+    made = watch()
+    q = np.tile(HOME, (50, 1))
+    tau = np.zeros_like(q)
+    tau[20:, 1] = -400.0
+    found, _ = follow(made, q, tau)
+    # The second packet confirms the jump.
+    assert found[20] is None
+    assert found[21] == Contact("joint torque", 1, 400.0, pytest.approx(0.9 * 176.0))
+
+
+def test_torque_channel_without_a_value_is_no_contact():
+    q, _, _ = swing(1e-3)
+    found, external = follow(watch(), q, 0.0 * q)
+    assert not any(found)
+    assert not external.any()
+
+
+def test_a_flipped_bit_in_one_packet_is_no_contact():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(), q, qd, qdd)
+    q[700, 3] += 0.5
+    tau[900, 1] = 900.0
+    found, external = follow(watch(), q, tau)
+    assert not any(found)
+    assert np.abs(external).max() < 3.0
+
+
+def test_lost_packets_are_bridged():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(), q, qd, qdd)
+    made, last = watch(), 0
+    for row in range(len(q)):
+        if row % 7 in (3, 4, 5):
+            continue
+        contact = made.update(
+            row - last if row else 1, q[row].astype(np.float32), tau[row].astype(np.float32), NOTHING, NOTHING
+        )
+        assert contact is None
+        last = row
+        assert np.abs(made.external).max() < 3.0
+
+
+def test_an_estimate_that_is_no_number_is_a_contact():
+    q = np.tile(HOME, (60, 1))
+    tau = torques(model(), q, 0.0 * q, 0.0 * q)
+    estimate = np.zeros_like(q)
+    estimate[50:, 2] = np.nan
+    found, _ = follow(watch(), q, tau, estimate)
+    assert found[49] is None
+    assert found[-1] is not None
+    assert found[-1].joint == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"torque_share": 0.95}, "torque_share 0.95 .* can only be lowered"),
+        ({"torque_share": 0.0}, "torque_share 0.0"),
+        ({"torque_share": float("nan")}, "torque_share nan"),
+        ({"external_nm": (16.0, *EXTERNAL_NM[1:])}, "joint 1 is 16.0 Nm, outside 0 to 15 Nm; .* lowered"),
+        ({"external_nm": (*EXTERNAL_NM[:6], -1.0)}, "joint 7 is -1.0 Nm"),
+        ({"external_nm": (1.0,) * 6}, "has 6 entries"),
+    ],
+)
+def test_limits_can_only_be_lowered(settings, words):
+    with pytest.raises(ConfigurationError, match=words):
+        ContactSettings(**settings)
+
+
+def test_a_lowered_threshold_finds_a_smaller_push():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(), q, qd, qdd)
+    tau[800:, 0] += 9.0
+    assert not any(follow(watch(), q, tau)[0])
+    found, _ = follow(watch(ContactSettings(external_nm=(6.0, *EXTERNAL_NM[1:]))), q, tau)
+    assert any(contact is not None and contact.joint == 0 for contact in found)
