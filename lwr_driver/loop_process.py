@@ -18,12 +18,12 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
+from fri import interpreter
 from fri.errors import ConfigurationError, LwrError, NetworkError
 from lwr_driver import realtime
 from lwr_driver.arm import ArmLimits
@@ -32,7 +32,6 @@ from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.realtime import Rights, Shortage
 from lwr_driver.ring import Ring
 
-_ROOT = Path(__file__).resolve().parents[1]
 _BOOT = "import sys; from lwr_driver.loop_process import main; main(sys.argv[1:])"
 _START_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = 3.0
@@ -69,19 +68,18 @@ class LoopProcess:
             "limits": {name: np.asarray(value).tolist() for name, value in asdict(limits).items()},
             "scheduling": asdict(scheduling),
             "control": [control.descriptor, control.plan_rows],
-            "ring": ring.name,
+            "ring": ring.inherited,
             "parent": os.getpid(),
         }
-        places = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _BOOT, json.dumps(order)],
-                pass_fds=(control.descriptor,),
+                interpreter.command("-c", _BOOT, json.dumps(order)),
+                pass_fds=(control.descriptor, ring.descriptor),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(places), "OPENBLAS_NUM_THREADS": "1"},
+                env=interpreter.environment(),
                 start_new_session=True,
             )
         except OSError as error:
@@ -121,6 +119,9 @@ class LoopProcess:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_END_TIMEOUT_S)
         if self._process.poll() is None:
+            # Its end at real-time priority would stop another driver on its processor.
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(self.pid, os.SCHED_OTHER, os.sched_param(0))
             self._process.kill()
             self._process.wait()
         if self._process.stdout is not None:
@@ -168,6 +169,7 @@ def main(arguments: Sequence[str]) -> None:
         if scheduling.required:
             rights.enforce()
     except LwrError as error:
+        realtime.give_back()
         _say({"error": str(error), "kind": type(error).__name__})
         return
 
@@ -176,7 +178,10 @@ def main(arguments: Sequence[str]) -> None:
 
     signal.signal(signal.SIGTERM, end)
     _say({"port": loop.remote.address[1], **asdict(rights)})
-    loop.run(order["parent"])
+    try:
+        loop.run(order["parent"])
+    finally:
+        realtime.give_back()
 
 
 def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> Rights:
