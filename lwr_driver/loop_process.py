@@ -29,6 +29,7 @@ from lwr_driver import realtime
 from lwr_driver.arm import ArmLimits
 from lwr_driver.control import Control, Word
 from lwr_driver.loop import Loop, LoopSettings
+from lwr_driver.pace import Pace
 from lwr_driver.realtime import Rights, Shortage
 from lwr_driver.ring import Ring
 
@@ -164,7 +165,10 @@ def main(arguments: Sequence[str]) -> None:
         settings["joint_names"] = tuple(settings["joint_names"])
         limits = ArmLimits(**{name: np.array(value) for name, value in order["limits"].items()})
         control = Control(*order["control"])
-        loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]))
+        loop_settings = LoopSettings(**settings)
+        loop = Loop(loop_settings, limits, control, Ring.attach(order["ring"]))
+        if not loop_settings.lock_step:
+            loop.pace = Pace()
         rights = _become_real_time(loop, control, scheduling) if scheduling.apply else Rights()
         if scheduling.required:
             rights.enforce()
