@@ -20,6 +20,7 @@ from runner.experiment import Bench, ExperimentProgress, Record, Run
 from runner.experiment_file import DEFAULT, Experiment
 from runner.hiding.effect import HiddenEffect, emulated_arm, with_effect
 from runner.laboratory import Laboratory
+from runner.output import OUTPUT_FOLDER
 from runner.planning import PLAN, Excitations
 from runner.replanning import Rounds, rounds_begun
 from runner.results import estimate, summarise, write_results
@@ -30,7 +31,7 @@ COPY = "experiment.yaml"
 
 @click.command("experiment")
 @click.argument("file", required=False)
-@click.option("--out", type=PATH, help="Folder of the results; default: experiments/NAME-STAMP.")
+@click.option("--out", type=OUTPUT_FOLDER, help="Folder of the results; default: experiments/NAME-STAMP.")
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
 @click.option("--resume", type=PATH, metavar="FOLDER", help="Continue the aborted experiment in FOLDER.")
 @click.option(
