@@ -22,6 +22,10 @@ log = logging.getLogger(__name__)
 
 VERBS = {
     "doctor": "examine this computer, the link and the controller",
+    "record": "log what the controller sends, nothing is commanded",
+    "hold": "enter command mode, hold the pose, leave it",
+    "jog": "move one joint by some degrees",
+    "home": "move to the home position",
     "experiment": "the whole chain: plan, drive, log, swap the payload, estimate",
     "plan": "an optimal exciting motion within all limits",
     "check": "every check of an experiment file, without motion",
@@ -43,6 +47,7 @@ VERBS = {
 }
 FAMILIES = {
     "setup": ("doctor", "emulator", "completion"),
+    "steps": ("record", "hold", "jog", "home"),
     "motions": ("plan", "check", "preview"),
     "models": ("validate", "compare", "payload", "export"),
     "logs": ("report", "info", "recover", "attach", "import"),
