@@ -202,7 +202,7 @@ class Loop:
             return False
         counted = remote.sequence - self._sequence if self._sequence >= 0 else 1
         elapsed = self._passed(counted, sent)
-        target = self._decide(counted, elapsed, sent)
+        target = self._decide(elapsed, sent)
         self._sequence = remote.sequence
         answered = self._commander.mode is not Mode.SILENT and not self._held_back
         if answered:
@@ -325,10 +325,10 @@ class Loop:
 
     # -- what to answer --------------------------------------------------------------------------------------
 
-    def _decide(self, counted: int, elapsed: int, sent: bool) -> NDArray[np.float32] | None:
+    def _decide(self, elapsed: int, sent: bool) -> NDArray[np.float32] | None:
         """The position to send, or None for the mirror, or for no answer at all if it is held back.
 
-        counted, elapsed : cycles since the last packet by its counter, and as they passed, see `_passed`
+        elapsed : cycles since the last packet, 0 for one ahead of its time, see `_passed`
         sent : the answer has left already; new requests are for the next packet
 
         In command mode the mirror of a moving set point would stop the arm at once. Without an answer the
@@ -353,8 +353,8 @@ class Loop:
             # The restart has cleared the request to start; it is made anew.
             self._begun = self._begun and self._job is not Job.START
             self._lose("the controller was started again")
-        elif counted > self._silence_cycles:
-            self._lose(f"{counted - 1} packets in a row were lost")
+        elif elapsed > self._silence_cycles:
+            self._lose(f"{elapsed - 1} packets in a row were lost")
         other_cycle = remote.sample_time_s != self._sample_time
         self._doubted = (other_cycle or not ready) and self._doubtful()
         if self._doubted:

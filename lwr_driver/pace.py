@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import ceil, floor
 
 # Clocks may differ by this share; the reference follows the packets so fast [cycles per cycle].
-_SLEW = 0.02
+_SLEW = 0.002
 # A packet may come so early: share of a cycle, and time [s].
 _EARLY_SHARE, _EARLY_S = 0.75, 0.5e-3
 # Held-back packets weigh 1, others take off so much; beyond the limit the sender is too fast.

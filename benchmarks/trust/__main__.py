@@ -24,11 +24,13 @@ from benchmarks.trust.table import Ledger
 
 SECTIONS = {
     "wire": "faults on the wire, alone and mixed, in every phase",
+    "clocks": "counters and clocks that disagree, in lock step and real time",
     "reaction": "from a fault to the safe reaction, in cycles",
     "robot": "faults of the robot: emergency stop, drives, modes, quality, temperature, payload, people",
     "computer": "faults of this computer: kill -9, disk, clock, starvation, Ctrl-C",
     "network": "what is bound, who is answered, what is said",
     "realtime": "reply latency beside a minimal C client, at 1, 2, 5 and 10 ms",
+    "drivers": "two drivers on one computer: starts and ends beside a running motion",
     "input": "mangled packets, logs, files: an error of ours or a correct result",
     "physics": "the emulated arm against theory",
     "clients": "other people's FRI clients on the emulator",
