@@ -39,27 +39,11 @@ speed_option = click.option(
 )
 
 
-class _Signed(click.Command):
-    """A command with an argument that may be negative, such as -5."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Tell negative numbers from options."""
-        number = next((k for k, text in enumerate(args) if text.startswith("-") and _is_number(text)), None)
-        if number is None or "--" in args[:number]:
-            return super().parse_args(ctx, args)
-        # Options first, then all arguments behind the mark that ends the options.
-        before, after = args[:number], args[number + 1 :]
-        options = [k for k, text in enumerate(after) if text.startswith("-") and not _is_number(text)]
-        split = options[0] if options else len(after)
-        return super().parse_args(ctx, [*after[split:], "--", *before, args[number], *after[:split]])
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+def _no_option(context: click.Context, parameter: click.Parameter, value: str) -> str:
+    """Refuse an unknown option taken for an argument, for `jog` takes negative numbers."""
+    if value.startswith("-"):
+        raise click.NoSuchOption(value, ctx=context)
+    return value
 
 
 @dataclass(frozen=True)
@@ -210,10 +194,10 @@ def hold_command(
     _tell(order, _run(order, lambda steps, path: steps.hold(path, seconds)))
 
 
-@click.command("jog", cls=_Signed)
-@click.argument("joint")
+@click.command("jog", context_settings={"ignore_unknown_options": True})
+@click.argument("joint", callback=_no_option)
 @click.argument("degrees", type=float)
-@click.argument("file", default=_EXPERIMENT)
+@click.argument("file", default=_EXPERIMENT, callback=_no_option)
 @speed_option
 @payload_option
 @out_option
