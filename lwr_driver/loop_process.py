@@ -190,9 +190,11 @@ def main(arguments: Sequence[str]) -> None:
 
 def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> Rights:
     """Take the granted rights; with all of them and a processor of its own, the loop waits actively."""
-    turnaround, advice = None, []
-    if realtime.assess(scheduling.priority).ok:
-        # Before the rights: the compiler needs much time, and all its memory would be locked.
+    processor, shared = realtime.reserve(scheduling.cpu)
+    turnaround, advice = None, [] if shared is None else [shared]
+    if processor is not None and realtime.assess(scheduling.priority).ok:
+        # Before the rights: the compiler needs much time, and all its memory would be locked. It takes some
+        # 500 MB, freed by the kernel at the priority of the process if that is killed.
         try:
             from lwr_driver.turnaround import Turnaround
 
@@ -200,7 +202,7 @@ def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> R
         except Exception as error:  # the loop works without a compiler
             remedy = f"answers take longer; see that numba works and may write its cache ({error})"
             advice.append(Shortage("the code that answers at once cannot be compiled", remedy))
-    rights = realtime.set_up(scheduling.priority, scheduling.cpu)
+    rights = realtime.set_up(scheduling.priority, processor)
     if rights.ok and rights.processor is not None:
         loop.turnaround = turnaround
     return replace(rights, advice=(*rights.advice, *advice))

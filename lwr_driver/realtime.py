@@ -93,11 +93,31 @@ def assess(priority: int = 80) -> Rights:
     return Rights(tuple(missing), tuple(advice))
 
 
+def reserve(processor: int | None = None) -> tuple[int | None, Shortage | None]:
+    """Take a processor until `give_back`: as asked, else one without a driver. And advice if there is none.
+
+    Isolated ones come first, then the last one down to the second: interrupts prefer the first, and the recorder and
+    everything else need one. None if all are taken. The kernel forgets a reservation with its process.
+    """
+    if processor is not None:
+        if _claim(processor):
+            return processor, None
+        remedy = "name another one in `cpu`, or None to have a free one found"
+        return processor, Shortage(f"processor {processor} has a driver already", remedy)
+    allowed = sorted(os.sched_getaffinity(0), reverse=True)
+    if len(allowed) < 2:
+        return None, None
+    for candidate in (*_isolated(), *allowed[:-1]):
+        if _claim(candidate):
+            return candidate, None
+    remedy = "answers take longer; use a computer with more processors than drivers"
+    return None, Shortage(f"of {len(allowed)} processors each has a driver but the first", remedy)
+
+
 def set_up(priority: int = 80, processor: int | None = None) -> Rights:
     """Make this process a real-time one as far as allowed; returns its rights.
 
-    priority : of SCHED_FIFO, 1 to 99
-    processor : to bind to; None for a free one, isolated ones first, then from the last one down
+    priority : of SCHED_FIFO, 1 to 99; processor : to bind to, of `reserve`; None for the first, which no driver has
 
     Everything that takes long comes before SCHED_FIFO: a collection of garbage at this priority would stop other
     drivers on the same processor for some 50 ms.
@@ -106,16 +126,6 @@ def set_up(priority: int = 80, processor: int | None = None) -> Rights:
     gc.collect()
     gc.freeze()
     gc.disable()
-    chosen, shared = _choose(processor)
-    if shared:
-        advice.append(shared)
-    if chosen is not None:
-        try:
-            os.sched_setaffinity(0, {chosen})
-        except OSError as error:
-            remedy = f"choose one of {sorted(os.sched_getaffinity(0))} ({error.strerror})"
-            missing.append(Shortage(f"no operation on processor {chosen}", remedy))
-            chosen = None
     _prefault()
     library = ctypes.CDLL(None, use_errno=True)
     if library.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
@@ -124,11 +134,22 @@ def set_up(priority: int = 80, processor: int | None = None) -> Rights:
         descriptor = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
         os.write(descriptor, b"\0\0\0\0")
         _awake.append(descriptor)
+    if processor is not None:
+        try:
+            os.sched_setaffinity(0, {processor})
+        except OSError as error:
+            remedy = f"choose one of {sorted(os.sched_getaffinity(0))} ({error.strerror})"
+            missing.append(Shortage(f"no operation on processor {processor}", remedy))
+            processor = None
+    else:
+        # Away from the other drivers; even the end of a killed process takes some 10 ms at its priority.
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError:
         missing.append(_no_priority(priority, resource.getrlimit(resource.RLIMIT_RTPRIO)[0]))
-    return Rights(tuple(missing), tuple(advice), chosen)
+    return Rights(tuple(missing), tuple(advice), processor)
 
 
 def give_back() -> None:
@@ -187,27 +208,6 @@ def _capabilities() -> int:
 
 def _processors() -> int:
     return len(os.sched_getaffinity(0))
-
-
-def _choose(processor: int | None) -> tuple[int | None, Shortage | None]:
-    """The processor to bind to, and advice if another driver has it: as asked, else a free one.
-
-    Isolated ones come first, then the last one, since interrupts prefer the first. None if all are taken: at equal
-    priority the kernel finds the time on any of them.
-    """
-    if processor is not None:
-        if _claim(processor):
-            return processor, None
-        remedy = "name another one in `cpu`, or None to have a free one found"
-        return processor, Shortage(f"processor {processor} has a driver already", remedy)
-    allowed = sorted(os.sched_getaffinity(0), reverse=True)
-    if len(allowed) < 2:
-        return None, None
-    for candidate in (*_isolated(), *allowed):
-        if _claim(candidate):
-            return candidate, None
-    remedy = "answers take longer; use one driver for each processor at most"
-    return None, Shortage(f"each of the {len(allowed)} processors has a driver already", remedy)
 
 
 def _isolated() -> list[int]:

@@ -169,6 +169,11 @@ def _send(ports: list[int], period_ms: int, results: Connection) -> None:
         def commanding(self) -> bool:
             return True
 
+        @property
+        def awaited(self) -> bool:
+            # The sender must not take its whole processor while the second driver starts there.
+            return False
+
     kinds = iter((made, _Second))
     reply_latency._Link = lambda *arguments: next(kinds)(*arguments)  # type: ignore[assignment, misc]
     send(ports, period_ms, results)

@@ -114,25 +114,25 @@ def alone(monkeypatch):
 
 
 def test_drivers_on_one_computer_share_out_the_processors(alone):
-    assert [realtime._choose(None)[0] for _ in range(4)] == [3, 2, 1, 0]
-    processor, advice = realtime._choose(None)
+    assert [realtime.reserve()[0] for _ in range(3)] == [3, 2, 1]
+    processor, advice = realtime.reserve()
     assert processor is None
-    assert "each of the 4 processors has a driver already" in str(advice)
+    assert "of 4 processors each has a driver but the first" in str(advice)
 
 
 def test_isolated_processors_are_taken_first_and_one_given_back_is_taken_again(alone, monkeypatch):
     monkeypatch.setattr(realtime, "_isolated", lambda: [1, 2])
-    assert [realtime._choose(None)[0] for _ in range(3)] == [1, 2, 3]
+    assert [realtime.reserve()[0] for _ in range(3)] == [1, 2, 3]
     realtime._claims.pop(0).close()
-    assert realtime._choose(None)[0] == 1
+    assert realtime.reserve()[0] == 1
 
 
 def test_a_named_processor_is_taken_and_a_driver_already_there_is_told(alone):
-    assert realtime._choose(2) == (2, None)
-    processor, advice = realtime._choose(2)
+    assert realtime.reserve(2) == (2, None)
+    processor, advice = realtime.reserve(2)
     assert processor == 2
     assert "processor 2 has a driver already" in str(advice)
-    assert realtime._choose(None)[0] == 3
+    assert realtime.reserve()[0] == 3
 
 
 def test_nothing_long_happens_at_real_time_priority(alone, monkeypatch):
@@ -145,7 +145,7 @@ def test_nothing_long_happens_at_real_time_priority(alone, monkeypatch):
     monkeypatch.setattr(realtime.os, "sched_setscheduler", lambda pid, kind, _: order.append(kind))
     monkeypatch.setattr(realtime.os, "open", lambda *_: os.dup(0))
     monkeypatch.setattr(realtime.os, "write", lambda *_: 4)
-    assert realtime.set_up().processor == 3
+    assert realtime.set_up(80, realtime.reserve()[0]).processor == 3
     assert order == ["collect", "freeze", "disable", "prefault", "lock", os.SCHED_FIFO]
     realtime.give_back()
     assert order[-2:] == [os.SCHED_OTHER, "unlock"]
