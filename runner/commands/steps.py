@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _EXPERIMENT = "experiments/default.yaml"
 _FOLDER = Path("steps")
 _SPEED = 0.1
+_SILENCE_S = 60.0
+"""A recording survives so much silence: another KRL program is selected meanwhile."""
 
 out_option = click.option("--out", type=OUTPUT_FILE, help="Session log; default: steps/NAME-STAMP.mcap.")
 payload_option = click.option(
@@ -76,6 +78,8 @@ def _run(order: _Order, work: Callable[[Steps, Path], Step]) -> Step:
             raise OperatorError(f"{order.name} was not confirmed; nothing moved")
     path.parent.mkdir(parents=True, exist_ok=True)
     laboratory = Laboratory(experiment, allow_non_realtime=order.allow_non_realtime, status=status)
+    if order.name == "record":
+        laboratory = Laboratory(experiment, allow_non_realtime=True, status=status, silence_s=_SILENCE_S)
     with laboratory as bench:
         return work(Steps(experiment, bench, payload), path)
 
@@ -134,7 +138,7 @@ def record_command(
     lwr-run record my_lab.yaml --seconds 10
     lwr-run record my_lab.yaml --out guided.mcap --poses poses.yaml
     """
-    order = _Order("record", file, out, allow_non_realtime=True, as_json=as_json)
+    order = _Order("record", file, out, as_json=as_json)
     if poses is not None and poses.exists():
         raise ConfigurationError(f"{poses} exists; choose another --poses")
     step = _run(order, lambda steps, path: steps.record(path, seconds))

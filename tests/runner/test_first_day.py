@@ -90,7 +90,9 @@ def day(tmp_path: Path) -> Iterator[Day]:
         try:
             said = process.stdout.readline()
             while not said.rstrip().endswith("}"):
-                said += process.stdout.readline()
+                line = process.stdout.readline()
+                assert line, f"the emulator said {said!r} and ended"
+                said += line
             with Pendant(json.loads(said)["pendant_port"]) as pendant:
                 yield Day(tmp_path, pendant, steps)
         finally:
