@@ -61,7 +61,8 @@ class _Moving:
         self._thread = threading.Thread(target=self._move)
 
     def __enter__(self) -> _Moving:
-        self._driver.connect(timeout_s=60.0)
+        # A busy computer may take long to start the sender.
+        self._driver.connect(timeout_s=300.0)
         rights = self._driver.rights
         self.processor = None if rights is None else rights.processor
         self._thread.start()

@@ -6,6 +6,7 @@ answered on standard input, the pendant's part comes over its port.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 import yaml
 
+from benchmarks.trust.lab import descendants
 from ident.model.model_file import read_model
 from lwr_driver.realtime import assess
 from lwr_driver.session import read_session
@@ -93,10 +95,18 @@ def day(tmp_path: Path) -> Iterator[Day]:
                 line = process.stdout.readline()
                 assert line, f"the emulator said {said!r} and ended"
                 said += line
+            in_real_time(process.pid)
             with Pendant(json.loads(said)["pendant_port"]) as pendant:
                 yield Day(tmp_path, pendant, steps)
         finally:
             process.terminate()
+
+
+def in_real_time(pid: int) -> None:
+    """Give the emulated controller the priority that a real one has, where this is allowed."""
+    for child in descendants(pid):
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(child, os.SCHED_FIFO, os.sched_param(60))
 
 
 def test_there_are_ten_steps_each_with_something_to_see() -> None:
