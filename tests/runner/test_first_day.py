@@ -153,7 +153,7 @@ def test_the_first_day_goes_as_the_document_says(day: Day) -> None:
         assert float(found[1]) == pytest.approx(float(degrees), abs=0.3)
     for line in day.steps[8]:
         assert "moved to home" in day.do(line)
-    np.testing.assert_allclose(pendant.status()["position"], home, atol=5e-3)
+    np.testing.assert_allclose(pendant.status()["setpoint"], home, atol=2e-3)
 
     assert "FAIL" not in "".join(day.do(line) for line in day.steps[9])
     assert (folder / "preview.html").is_file()
