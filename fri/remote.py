@@ -42,6 +42,9 @@ _JNT_POS = slice(CMD_OFFSETS["jnt_pos"], CMD_OFFSETS["jnt_pos"] + 4 * JOINTS)
 _PORT_GRACE_S = 0.1
 # Number of foreign hosts named in events; further ones are counted only.
 _NAMED_FOREIGN = 16
+# Packets without an irregularity before the next one is told again.
+_QUIET_PACKETS = 1000
+_LONGEST_DRAIN_S = 0.05
 # Time for clearing away worthless datagrams, even with a timeout of zero.
 _SHORTEST_FLOOD_S = 0.005
 
@@ -53,6 +56,7 @@ class LinkEventKind(Enum):
     FOREIGN = "foreign"
     PORT_CHANGED = "port changed"
     RESTARTED = "restarted"
+    AHEAD = "ahead of time"
 
 
 class LinkEvent(NamedTuple):
@@ -105,9 +109,9 @@ class RemoteEnd:
     malformed_by : dict of Fault to int
         Malformed datagrams by reason.
     received, answered, lost, repeated, reordered, suspect, malformed, foreign, restarts, port_changes,
-    unreflected, send_errors : int
+    unreflected, send_errors, ahead : int
         Counters. `lost` includes late packets (`reordered`); `unreflected` counts answers not yet seen by the
-        controller in its next packet.
+        controller in its next packet; `ahead` counts cycles that took no time, see ``tell_ahead``.
 
     Raises
     ------
@@ -186,6 +190,8 @@ class RemoteEnd:
         self.port_changes = 0
         self.unreflected = 0
         self.send_errors = 0
+        self.ahead = 0
+        self._ahead_at = -_QUIET_PACKETS - 1
 
     @property
     def lost(self) -> int:
@@ -227,6 +233,7 @@ class RemoteEnd:
             "port_changes": self.port_changes,
             "unreflected": self.unreflected,
             "send_errors": self.send_errors,
+            "ahead": self.ahead,
         }
 
     @property
@@ -292,6 +299,24 @@ class RemoteEnd:
             if remaining <= 0.0:
                 return None
             flags = self._set_timeout(remaining if timeout_s > 0.0 else 0.0)
+
+    def drain(self) -> int:
+        """Drop all waiting datagrams, for they are stale; returns their number."""
+        dropped, deadline = 0, monotonic() + _LONGEST_DRAIN_S
+        try:
+            while monotonic() < deadline:
+                self._socket.recv_into(self._msr.buffer, 0, socket.MSG_DONTWAIT)
+                dropped += 1
+        except OSError:
+            pass
+        return dropped
+
+    def tell_ahead(self, cycles: int, text: str) -> None:
+        """Count `cycles` of the sender that took no time; `text` is told when an irregularity begins."""
+        if self.sequence - self._ahead_at > _QUIET_PACKETS:
+            self._event(LinkEventKind.AHEAD, text)
+        self._ahead_at = self.sequence
+        self.ahead += cycles
 
     def pending(self) -> bool:
         """Whether another datagram is waiting; the present packet is stale then."""

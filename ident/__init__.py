@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import fri  # noqa: F401 - finds a place for compiled code
+
 if TYPE_CHECKING:
     from ident.diagnosis import commission, diagnose
     from ident.dynamics import Chain

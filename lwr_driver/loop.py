@@ -27,6 +27,7 @@ from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.commander import Commander
 from lwr_driver.contact import Contact, ContactWatch
 from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
+from lwr_driver.pace import Pace, Stamps
 from lwr_driver.ring import ROW, Ring
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ _REPORTED = (
     ("suspect", "held back"),
     ("malformed", "malformed"),
     ("foreign", "foreign"),
+    ("ahead", "ahead of their time by the sender's fault"),
 )
 _COUNTED = ("lost", "repeated", "reordered", "suspect", "malformed", "foreign", "restarts", "unreflected")
 _COUNTERS = tuple((Word[name.upper()], name) for name in (*_COUNTED, "answered", "received"))
@@ -119,6 +121,8 @@ class Loop:
     watch : of torque and contact, None watches nothing
     turnaround : waits actively for the next packet, with its answer and those to the following packets ready;
         it costs up to 1.35 ms of a processor in each cycle, 0.55 ms at 1 kHz; None to sleep instead
+    pace : keeps rows from passing faster than this computer's clock; None where packets have no such clock, as in
+        lock step
     """
 
     def __init__(
@@ -131,6 +135,7 @@ class Loop:
     ) -> None:
         self._settings, self._control, self._ring, self._watch = settings, control, ring, watch
         self.turnaround: Turnaround | None = None
+        self.pace: Pace | None = None
         self._ready_in = Mode.MIRROR  # mode of the prepared answers
         self._handshake = find_handshake(settings.handshake)
         self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
@@ -147,7 +152,8 @@ class Loop:
         self._unacceptable, self._bad = 0, 0  # packets of such quality on end, cycles below OK
         self._sample_time = self._period = 0.0
         self._silence_s, self._silence_cycles = settings.link_timeout_s, 0
-        self._sequence = -1
+        self._sequence = self._count = -1  # of packets, and of the cycles they took
+        self._stamps = Stamps()
         unknown = np.full(JOINTS, np.nan, dtype=np.float32)
         self._past_setpoints = [(unknown, 1)] * 3  # newest first, and the cycles to the one before
         self._limits, self._fastest = limits, limits.v_max
@@ -181,6 +187,9 @@ class Loop:
         """Serve packets and requests until `QUIT` is set or the parent is gone; stops a motion first."""
         parent = os.getppid() if parent is None else parent
         commander = self._commander
+        if not self._settings.lock_step:
+            # Packets that came while this process was being set up.
+            self.remote.drain()
         if self._ring is not None:
             self._ring.start_writing()
         try:
@@ -208,8 +217,9 @@ class Loop:
                 self._disagree()
             self._no_packet()
             return False
-        elapsed = remote.sequence - self._sequence if self._sequence >= 0 else 1
-        target = self._decide(remote.sequence, elapsed, sent)
+        counted = remote.sequence - self._sequence if self._sequence >= 0 else 1
+        elapsed = self._passed(counted, sent)
+        target = self._decide(elapsed, sent)
         self._sequence = remote.sequence
         answered = self._commander.mode is not Mode.SILENT and not self._held_back
         if answered:
@@ -218,8 +228,22 @@ class Loop:
             self._disagree()
         self._answered = answered or sent
         self._write_row(self._answered, turnaround.sent_ns if turnaround is not None and sent else None)
-        self._advance_job(elapsed)
+        self._advance_job(max(elapsed, 1))
         return True
+
+    def _passed(self, counted: int, sent: bool) -> int:
+        """How many of the `counted` cycles have passed by the clocks; 0 for a packet ahead of its time."""
+        remote, pace = self.remote, self.pace
+        passed = self._stamps.feed(counted, remote.timestamp_s, remote.sample_time_s)
+        if pace is not None:
+            passed = pace.feed(counted, remote.received_ns, answered=sent)
+        if passed < counted and not sent and self._commander.mode is not Mode.MIRROR:
+            whose = f"this computer's clock: {pace}" if pace is not None else "its own time stamp"
+            remote.tell_ahead(
+                counted - passed, f"the controller's counter runs ahead of {whose}; the sender is at fault"
+            )
+        self._count = self._count + passed if self._sequence >= 0 else remote.sequence
+        return passed
 
     def _up_to_date(self) -> bool:
         """Whether every answered packet has been processed."""
@@ -274,7 +298,7 @@ class Loop:
         # Other jobs may write to the KRL program with any answer. In lock step no packet waits.
         several = self._job in _LEAVE_ALONE and not self._settings.lock_step
         most = turnaround.most if several else 1
-        foreseen = commander.foresee(self._sequence + 1, self._a if begins else 0, most)
+        foreseen = commander.foresee(self._count + 1, self._a if begins else 0, most)
         if foreseen is None:
             return
         ready = len(foreseen.values)
@@ -283,7 +307,15 @@ class Loop:
                 foreseen.values[ahead], turnaround.slot(counter + ahead, foreseen.values[ahead]), ahead
             )
         self._ready_in = commander.mode
-        turnaround.arm(remote.controller, counter, ready, self._sample_time, commander.target, foreseen.room)
+        turnaround.arm(
+            remote.controller,
+            counter,
+            ready,
+            self._sample_time,
+            commander.target,
+            foreseen.room,
+            *((self.pace.due_ns, self.pace.period_ns) if self.pace is not None else ()),
+        )
 
     def _disagree(self) -> None:
         """Fall silent after an answer sent against the loop's decision; this cannot happen."""
@@ -311,9 +343,10 @@ class Loop:
 
     # -- what to answer --------------------------------------------------------------------------------------
 
-    def _decide(self, sequence: int, elapsed: int, sent: bool) -> NDArray[np.float32] | None:
+    def _decide(self, elapsed: int, sent: bool) -> NDArray[np.float32] | None:
         """The position to send, or None for the mirror, or for no answer at all if it is held back.
 
+        elapsed : cycles since the last packet, 0 for one ahead of its time, see `_passed`
         sent : the answer has left already; new requests are for the next packet
 
         In command mode the mirror of a moving set point would stop the arm at once. Without an answer the
@@ -330,9 +363,11 @@ class Loop:
         )
         setpoint = self._krl + self._offset
         past = self._past_setpoints
+        early, elapsed = elapsed == 0, max(elapsed, 1)
         past[2], past[1], past[0] = past[1], past[0], (setpoint, elapsed)
         if remote.restarts != self._restarts:
             self._restarts = remote.restarts
+            self._reset_pace()
             # The restart has cleared the request to start; it is made anew.
             self._begun = self._begun and self._job is not Job.START
             self._lose("the controller was started again")
@@ -349,7 +384,7 @@ class Loop:
         touched = self._feel(elapsed)
         misses = int(remote.msr["miss_counter"])
         if misses != self._misses:
-            self._misses, self._missed_at = misses, sequence
+            self._misses, self._missed_at = misses, remote.sequence
         if commander.mode is Mode.SILENT:
             return None
         if not ready:
@@ -370,17 +405,27 @@ class Loop:
             self._misses_before = misses
             self._counted_before = remote.counters()
             return commander.enter(setpoint, float(remote.msr["safety_limits"]), step)
+        if early and (commander.moving or self._job is Job.MOTION):
+            # Without an answer a controller that is too fast brakes by itself; no row is due yet.
+            self._held_back = True
+            self._react(touched, elapsed, sent)
+            if commander.mode is Mode.MOTION and self.pace is not None and self.pace.too_fast:
+                commander.stop(
+                    Result.NETWORK,
+                    f"the controller's packets run ahead of time {commander.place()}: {self.pace}; see its friOpen",
+                )
+            return None
         commander.watch(elapsed, setpoint, self._q)
         self._react(touched, elapsed, sent)
         if self._job is Job.MOTION and not self._begun:
             self._begun = True
-            commander.begin(self._a, sequence)
+            commander.begin(self._a, self._count)
         if commander.mode is Mode.MOTION and not sent:
             if int(self._words[Word.STOP]) != self._b:
                 commander.stop(Result.ABORTED, f"stop requested {commander.place()}")
             elif self._job is not Job.MOTION:
                 commander.stop(Result.ABORTED, f"stopped by the driver {commander.place()}")
-        return commander.command(sequence)
+        return commander.command(self._count)
 
     def _feel(self, elapsed: int) -> Contact | None:
         """Torque or contact beyond its limit in this packet."""
@@ -464,6 +509,11 @@ class Loop:
         self._commander.set_period(self._period)
         if self._watch is not None:
             self._watch.set_period(self._period)
+        self._reset_pace()
+
+    def _reset_pace(self) -> None:
+        if self.pace is not None and self._period > 0.0:
+            self.pace.reset(self._period, self._silence_cycles)
 
     def _leave(self) -> None:
         """End command mode, with the reason, if the controller no longer follows."""

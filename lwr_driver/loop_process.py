@@ -18,23 +18,23 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fri import interpreter
 from fri.errors import ConfigurationError, LwrError, NetworkError
 from lwr_driver import realtime
 from lwr_driver.arm import ArmLimits
 from lwr_driver.contact import ContactSettings, ContactWatch, ExpectedArm
 from lwr_driver.control import Control, Word
 from lwr_driver.loop import Loop, LoopSettings
+from lwr_driver.pace import Pace
 from lwr_driver.realtime import Rights, Shortage
 from lwr_driver.ring import Ring
 
-_ROOT = Path(__file__).resolve().parents[1]
 _BOOT = "import sys; from lwr_driver.loop_process import main; main(sys.argv[1:])"
 _START_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = 3.0
@@ -79,19 +79,18 @@ class LoopProcess:
             "scheduling": asdict(scheduling),
             "watch": [asdict(watch[0]), asdict(watch[1]), watch[2].tolist()],
             "control": [control.descriptor, control.plan_rows],
-            "ring": ring.name,
+            "ring": ring.inherited,
             "parent": os.getpid(),
         }
-        places = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _BOOT, json.dumps(order)],
-                pass_fds=(control.descriptor,),
+                interpreter.command("-c", _BOOT, json.dumps(order)),
+                pass_fds=(control.descriptor, ring.descriptor),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(places), "OPENBLAS_NUM_THREADS": "1"},
+                env=interpreter.environment(),
                 start_new_session=True,
             )
         except OSError as error:
@@ -131,6 +130,9 @@ class LoopProcess:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_END_TIMEOUT_S)
         if self._process.poll() is None:
+            # Its end at real-time priority would stop another driver on its processor.
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(self.pid, os.SCHED_OTHER, os.sched_param(0))
             self._process.kill()
             self._process.wait()
         if self._process.stdout is not None:
@@ -175,11 +177,15 @@ def main(arguments: Sequence[str]) -> None:
         control = Control(*order["control"])
         expected, contact, tau_max = order["watch"]
         watch = ContactWatch(ExpectedArm(**expected), ContactSettings(**contact), np.array(tau_max))
-        loop = Loop(LoopSettings(**settings), limits, control, Ring.attach(order["ring"]), watch)
+        loop_settings = LoopSettings(**settings)
+        loop = Loop(loop_settings, limits, control, Ring.attach(order["ring"]), watch)
+        if not loop_settings.lock_step:
+            loop.pace = Pace()
         rights = _become_real_time(loop, control, scheduling) if scheduling.apply else Rights()
         if scheduling.required:
             rights.enforce()
     except LwrError as error:
+        realtime.give_back()
         _say({"error": str(error), "kind": type(error).__name__})
         return
 
@@ -188,14 +194,19 @@ def main(arguments: Sequence[str]) -> None:
 
     signal.signal(signal.SIGTERM, end)
     _say({"port": loop.remote.address[1], **asdict(rights)})
-    loop.run(order["parent"])
+    try:
+        loop.run(order["parent"])
+    finally:
+        realtime.give_back()
 
 
 def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> Rights:
     """Take the granted rights; with all of them and a processor of its own, the loop waits actively."""
-    turnaround, advice = None, []
-    if realtime.assess(scheduling.priority).ok:
-        # Before the rights: the compiler needs much time, and all its memory would be locked.
+    processor, shared = realtime.reserve(scheduling.cpu)
+    turnaround, advice = None, [] if shared is None else [shared]
+    if processor is not None and realtime.assess(scheduling.priority).ok:
+        # Before the rights: the compiler needs much time, and all its memory would be locked. It takes some
+        # 500 MB, freed by the kernel at the priority of the process if that is killed.
         try:
             from lwr_driver.turnaround import Turnaround
 
@@ -203,7 +214,7 @@ def _become_real_time(loop: Loop, control: Control, scheduling: Scheduling) -> R
         except Exception as error:  # the loop works without a compiler
             remedy = f"answers take longer; see that numba works and may write its cache ({error})"
             advice.append(Shortage("the code that answers at once cannot be compiled", remedy))
-    rights = realtime.set_up(scheduling.priority, scheduling.cpu)
+    rights = realtime.set_up(scheduling.priority, processor)
     if rights.ok and rights.processor is not None:
         loop.turnaround = turnaround
     return replace(rights, advice=(*rights.advice, *advice))

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import gc
 import os
 import platform
 import resource
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Iterator
@@ -29,8 +31,11 @@ _PREFAULT_BYTES = 16 * 2**20
 _LIMITS_FILE = "/etc/security/limits.d/realtime.conf"
 _LOCK_BYTES = 768 * 2**20  # a loop with the compiler loaded takes some 500 MiB
 
-# Held open for the life of the process: closing it lets the processor sleep deeply again.
+# Held open until `give_back`: closing it lets the processor sleep deeply again.
 _awake: list[int] = []
+# A bound name of a socket marks a processor as taken; the kernel forgets it with its process, however that ends.
+_claims: list[socket.socket] = []
+_CLAIM = "\0lwr_driver.processor.{}"
 
 
 @dataclass(frozen=True)
@@ -88,20 +93,39 @@ def assess(priority: int = 80) -> Rights:
     return Rights(tuple(missing), tuple(advice))
 
 
+def reserve(processor: int | None = None) -> tuple[int | None, Shortage | None]:
+    """Take a processor until `give_back`: as asked, else one without a driver. And advice if there is none.
+
+    Isolated ones come first, then the last one down to the second: interrupts prefer the first, and the recorder and
+    everything else need one. None if all are taken. The kernel forgets a reservation with its process.
+    """
+    if processor is not None:
+        if _claim(processor):
+            return processor, None
+        remedy = "name another one in `cpu`, or None to have a free one found"
+        return processor, Shortage(f"processor {processor} has a driver already", remedy)
+    allowed = sorted(os.sched_getaffinity(0), reverse=True)
+    if len(allowed) < 2:
+        return None, None
+    for candidate in (*_isolated(), *allowed[:-1]):
+        if _claim(candidate):
+            return candidate, None
+    remedy = "answers take longer; use a computer with more processors than drivers"
+    return None, Shortage(f"of {len(allowed)} processors each has a driver but the first", remedy)
+
+
 def set_up(priority: int = 80, processor: int | None = None) -> Rights:
     """Make this process a real-time one as far as allowed; returns its rights.
 
-    priority : of SCHED_FIFO, 1 to 99; processor : to bind to, None for an isolated one, else the last
+    priority : of SCHED_FIFO, 1 to 99; processor : to bind to, of `reserve`; None for the first, which no driver has
+
+    Everything that takes long comes before SCHED_FIFO: a collection of garbage at this priority would stop other
+    drivers on the same processor for some 50 ms.
     """
     missing, advice = [], _kernel_advice()
-    chosen = _choose(processor)
-    if chosen is not None:
-        try:
-            os.sched_setaffinity(0, {chosen})
-        except OSError as error:
-            remedy = f"choose one of {sorted(os.sched_getaffinity(0))} ({error.strerror})"
-            missing.append(Shortage(f"no operation on processor {chosen}", remedy))
-            chosen = None
+    gc.collect()
+    gc.freeze()
+    gc.disable()
     _prefault()
     library = ctypes.CDLL(None, use_errno=True)
     if library.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
@@ -110,14 +134,36 @@ def set_up(priority: int = 80, processor: int | None = None) -> Rights:
         descriptor = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
         os.write(descriptor, b"\0\0\0\0")
         _awake.append(descriptor)
+    if processor is not None:
+        try:
+            os.sched_setaffinity(0, {processor})
+        except OSError as error:
+            remedy = f"choose one of {sorted(os.sched_getaffinity(0))} ({error.strerror})"
+            missing.append(Shortage(f"no operation on processor {processor}", remedy))
+            processor = None
+    else:
+        # Away from the other drivers; even the end of a killed process takes some 10 ms at its priority.
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError:
         missing.append(_no_priority(priority, resource.getrlimit(resource.RLIMIT_RTPRIO)[0]))
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    return Rights(tuple(missing), tuple(advice), chosen)
+    return Rights(tuple(missing), tuple(advice), processor)
+
+
+def give_back() -> None:
+    """End real-time operation: ordinary scheduling, memory unlocked, processor free for another driver.
+
+    Before the end of the process, for the kernel frees its memory at its priority.
+    """
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    ctypes.CDLL(None).munlockall()
+    while _awake:
+        os.close(_awake.pop())
+    while _claims:
+        _claims.pop().close()
 
 
 def _no_priority(priority: int, ceiling: int) -> Shortage:
@@ -164,16 +210,27 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _choose(processor: int | None) -> int | None:
-    """The processor to bind to: as asked, an isolated one, or the last (interrupts prefer the first)."""
-    if processor is not None:
-        return processor
+def _isolated() -> list[int]:
+    """Processors kept free of other programs by the kernel's `isolcpus`."""
+    found: list[int] = []
     with contextlib.suppress(OSError, ValueError):
-        isolated = Path("/sys/devices/system/cpu/isolated").read_text().strip()
-        if isolated:
-            return int(isolated.replace("-", ",").split(",")[0])
-    allowed = sorted(os.sched_getaffinity(0))
-    return allowed[-1] if len(allowed) > 1 else None
+        for part in Path("/sys/devices/system/cpu/isolated").read_text().strip().split(","):
+            first, _, last = part.partition("-")
+            found += range(int(first), int(last or first) + 1)
+    return found
+
+
+def _claim(processor: int) -> bool:
+    """Take a processor for this process; False if another driver has it."""
+    mark = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        mark.bind(_CLAIM.format(processor))
+    except OSError as error:
+        mark.close()
+        # Without names of this kind nothing can be shared out.
+        return error.errno != errno.EADDRINUSE
+    _claims.append(mark)
+    return True
 
 
 def _prefault() -> None:

@@ -12,7 +12,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from fri import interpreter
 from fri.errors import ConfigurationError, DataError, LwrError
 from lwr_driver.ring import Ring
 from lwr_driver.session.recording import Recorded, Recording, SessionRequest, utc_offset_ns
@@ -31,7 +31,6 @@ _BUSY_ROWS = 1000
 _START_TIMEOUT_S = 60.0
 _REPLY_TIMEOUT_S = 60.0
 _NICE = 5
-_ROOT = Path(__file__).resolve().parents[1]
 _BOOT = "import sys; from lwr_driver.recorder import main; main(sys.argv[1:])"
 
 
@@ -76,14 +75,13 @@ class Recorder:
         self._reply_timeout_s = _REPLY_TIMEOUT_S
         mine, theirs = Pipe(duplex=True)
         self._connection = mine
-        places = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         timeout = "none" if heartbeat_timeout_s is None else repr(float(heartbeat_timeout_s))
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _BOOT, str(theirs.fileno()), ring.name, timeout, str(nice)],
-                pass_fds=(theirs.fileno(),),
+                interpreter.command("-c", _BOOT, str(theirs.fileno()), ring.inherited, timeout, str(nice)),
+                pass_fds=(theirs.fileno(), ring.descriptor),
                 stdin=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(places)},
+                env=interpreter.environment(),
                 start_new_session=True,
             )
         except OSError as error:

@@ -4,17 +4,17 @@ The loop fills `Ring.row` and calls `publish`: it copies the row into its slot, 
 never waits, allocates or calls the system. If the ring is full, the new row is dropped and counted, so a
 reader never sees a half overwritten row. The reader takes rows with `take` and frees them with `release`.
 
+The memory has no name of its own (`memfd_create`): it is gone with its last process, also after `kill -9`.
+
 Each counter is an aligned 8-byte word in a cache line of its own, written by one side only. The order "row
 first, head second" is kept by the total store order of x86-64, the architecture of the controller PCs.
 """
 
 from __future__ import annotations
 
+import mmap
 import os
-import sys
-import threading
 import time
-from multiprocessing import resource_tracker, shared_memory
 from typing import Any
 
 import numpy as np
@@ -51,25 +51,24 @@ _MAGIC_AT, _CAPACITY_AT, _ITEM_AT = 0, 1, 2
 _LINES = 6  # the head line, then one for each counter
 _HEADER_BYTES = _LINES * _LINE * 8
 
-_attach_lock = threading.Lock()
-
 
 class Ring:
-    """A ring of `ROW`s in shared memory, made by `create` and opened in the other process by `attach`.
+    """A ring of `ROW`s in shared memory, made by `create` and opened in another process by `attach`.
 
-    The creating process calls `unlink` when both sides are done; `close` only drops this process's view.
+    name : place of the memory for `attach`, valid as long as the creating process holds it
+    descriptor : file descriptor, for child processes; they attach to `inherited`
+
+    The creating process calls `unlink` when it is done; `close` only drops this process's view.
     """
 
-    def __init__(self, memory: shared_memory.SharedMemory, *, owner: bool) -> None:
-        self._memory = memory
+    def __init__(self, descriptor: int, size: int, name: str, *, owner: bool) -> None:
+        self.descriptor, self.name = descriptor, name
         self._owner = owner
-        buffer: Any = memory.buf
-        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=buffer)
+        memory: Any = mmap.mmap(descriptor, size)
+        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=memory)
         if int(words[_MAGIC_AT]) != _MAGIC or int(words[_ITEM_AT]) != ROW.itemsize:
-            del words
-            memory.close()
             raise ConfigurationError(
-                f"shared memory {memory.name!r} is not a ring of {ROW.itemsize}-byte rows; "
+                f"shared memory {name!r} is not a ring of {ROW.itemsize}-byte rows; "
                 "both processes must run the same version"
             )
         self.capacity = int(words[_CAPACITY_AT])
@@ -77,8 +76,8 @@ class Ring:
         self._head, self._tail, self._beat, self._overruns, self._writer = (
             words[line * _LINE : line * _LINE + 1] for line in range(1, _LINES)
         )
-        self._rows = np.ndarray((self.capacity,), dtype=ROW, buffer=buffer, offset=_HEADER_BYTES)
-        self._bytes: memoryview = buffer[_HEADER_BYTES : _HEADER_BYTES + self.capacity * ROW.itemsize]
+        self._rows = np.ndarray((self.capacity,), dtype=ROW, buffer=memory, offset=_HEADER_BYTES)
+        self._bytes = memoryview(memory)[_HEADER_BYTES : _HEADER_BYTES + self.capacity * ROW.itemsize]
         self._published = int(self._head[0])
         self.row: NDArray[Any] = np.zeros(1, dtype=ROW)
         self.row["phase"] = NO_PHASE
@@ -91,38 +90,45 @@ class Ring:
         if capacity < 2:
             raise ConfigurationError(f"ring of {capacity} rows; it needs 2 at least")
         size = _HEADER_BYTES + capacity * ROW.itemsize
+        descriptor = -1
         try:
-            memory = shared_memory.SharedMemory(create=True, size=size)
+            descriptor = os.memfd_create("lwr_ring", os.MFD_CLOEXEC)
+            # Unlike a mere length this has every page, or fails here and not later in the loop.
+            os.posix_fallocate(descriptor, 0, size)
+            words = np.zeros(_LINES * _LINE, np.int64)
+            words[_MAGIC_AT], words[_CAPACITY_AT], words[_ITEM_AT] = _MAGIC, capacity, ROW.itemsize
+            os.pwrite(descriptor, words.tobytes(), 0)
+            return cls(descriptor, size, f"/proc/{os.getpid()}/fd/{descriptor}", owner=True)
         except OSError as error:
+            if descriptor >= 0:
+                os.close(descriptor)
             raise ConfigurationError(
-                f"shared memory of {size / 1e6:.1f} MB cannot be had: {error}; free some of /dev/shm"
+                f"shared memory of {size / 1e6:.1f} MB cannot be had: {error}; end other programs"
             ) from error
-        buffer: Any = memory.buf
-        np.frombuffer(buffer, dtype=np.uint8, count=size)[:] = 0
-        words = np.ndarray((_LINES * _LINE,), dtype=np.int64, buffer=buffer)
-        words[_MAGIC_AT], words[_CAPACITY_AT], words[_ITEM_AT] = _MAGIC, capacity, ROW.itemsize
-        del words
-        return cls(memory, owner=True)
 
     @classmethod
     def attach(cls, name: str) -> Ring:
-        """The ring created by another process under `name`."""
+        """The ring of another process, by its `name` there or by `inherited` in a child process."""
+        descriptor = -1
         try:
-            memory = _attach(name)
+            descriptor = os.open(name, os.O_RDWR | os.O_CLOEXEC)
+            size = os.fstat(descriptor).st_size
+            if size < _HEADER_BYTES:
+                raise ConfigurationError(f"shared memory {name!r} of {size} bytes is no ring")
+            return cls(descriptor, size, name, owner=False)
         except (OSError, ValueError) as error:
+            if descriptor >= 0:
+                os.close(descriptor)
+            if isinstance(error, ConfigurationError):
+                raise
             raise ConfigurationError(
                 f"shared memory {name!r} cannot be opened: {error}; its creator must still run"
             ) from error
-        if memory.size < _HEADER_BYTES:
-            size = memory.size
-            memory.close()
-            raise ConfigurationError(f"shared memory {name!r} of {size} bytes is no ring")
-        return cls(memory, owner=False)
 
     @property
-    def name(self) -> str:
-        """Name of the memory, for `attach`."""
-        return self._memory.name
+    def inherited(self) -> str:
+        """Name for a child process that inherits `descriptor`; needs no rights to look into this process."""
+        return f"/proc/self/fd/{self.descriptor}"
 
     # -- the side of the loop --------------------------------------------------------------------------------
 
@@ -215,46 +221,32 @@ class Ring:
         return int(self._writer[0])
 
     def close(self) -> None:
-        """Drop this process's view of the ring."""
+        """Drop this process's view of the ring; of the creator the memory stays until `unlink`."""
         if self._words.size == 0:
             return
         none = np.zeros(0, dtype=np.int64)
         self._words = self._head = self._tail = self._beat = self._overruns = self._writer = none
         self._rows = np.zeros(0, dtype=ROW)
         self._bytes.release()
-        self._memory.close()
+        if not self._owner:
+            self._give_back()
 
     def unlink(self) -> None:
-        """Close, and give the memory back to the system once the other process closes too."""
+        """Close, and give the memory back to the system once the other processes close too."""
         self.close()
-        if self._owner:
-            self._owner = False
-            self._memory.unlink()
+        self._give_back()
+
+    def _give_back(self) -> None:
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
 
     def __del__(self) -> None:
-        # Else the shared memory complains at exit about remaining views.
         if hasattr(self, "_bytes"):
-            self.close()
+            self.unlink()
 
     def __enter__(self) -> Ring:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._owner:
-            self.unlink()
-        else:
-            self.close()
-
-
-def _attach(name: str) -> shared_memory.SharedMemory:
-    if sys.version_info >= (3, 13):
-        return shared_memory.SharedMemory(name=name, track=False)
-    # Before 3.13 attaching registers the memory with this process's resource tracker; at its end the tracker
-    # would remove memory still in use by the creator.
-    with _attach_lock:
-        register = resource_tracker.register
-        resource_tracker.register = lambda *_: None
-        try:
-            return shared_memory.SharedMemory(name=name)
-        finally:
-            resource_tracker.register = register
+        self.unlink()

@@ -150,7 +150,7 @@ def _answer(descriptor: Any, answer: Any, controller: Any, found: Any, scratch: 
 @njit(
     "UniTuple(int64, 2)(int64, uint8[:, ::1], uint16[:, ::1], float32[:, ::1], int64[:, ::1], int64[::1],"
     "uint8[:, ::1], float32[:, ::1], int64, int64, float32, float32[::1], float32, int64[::1], int64[::1],"
-    "int64[::1], int64[:, ::1], int64[::1], int64, int64, int64, int64)",
+    "int64[::1], int64[:, ::1], int64[::1], int64, int64, int64, int64, int64, int64)",
     cache=True,
 )
 def _turn(
@@ -176,6 +176,8 @@ def _turn(
     awake: Any,
     asleep: Any,
     patience: Any,
+    due: Any,
+    period: Any,
 ) -> Any:
     """Wait, and answer regular packets; see `Turnaround.wait`. Returns the status and the number of datagrams.
 
@@ -184,7 +186,8 @@ def _turn(
 
     ends : sockaddr_in of the senders; answers, targets : by counter modulo their number, `ready` of them from
     `sequence` on; sent : value sent before them; found : length, instants of arrival and of the answer [ns] of
-    each datagram; scratch : pollfd, time, length of an address; awake, asleep, patience : from now [ns]
+    each datagram; scratch : pollfd, time, length of an address; awake, asleep, patience : from now [ns]; due : no
+    answer to a packet before, nor to later ones before a `period` more each [ns]
     """
     time = scratch[1:3]
     start = _now(time)
@@ -214,6 +217,7 @@ def _turn(
         if not (
             answers[slot, 2] + 256 * answers[slot, 3] == counter
             and found[place, 0] == MSR_SIZE
+            and found[place, 1] >= due + place * period
             and ends[place, 0] == controller[0]
             and _regular(shorts[place], floats[place], counter, sample_time, last, room)
             and not _asked(words, seen, watched)
@@ -250,6 +254,7 @@ class Turnaround:
         self._last = np.zeros(JOINTS, np.float32)
         self._ready, self._sequence, self._sample_time, self._room = 0, 0, 0.0, 0.0
         self._place, self._taken = 0, 0
+        self._due = self._period = 0
         # Indexed by counter modulo `most`.
         self._answers = np.zeros((self.most, CMD_SIZE), np.uint8)
         self._targets = np.zeros((self.most, JOINTS), np.float32)
@@ -275,11 +280,14 @@ class Turnaround:
         sample_time_s: float,
         last: NDArray[np.float32],
         room: float,
+        due_ns: int = 0,
+        period_ns: int = 0,
     ) -> None:
         """Declare the answers ready for `ready` packets from `controller`, with counters from `sequence` on.
 
         sample_time_s : required in the packets; last : value sent last (7,) [rad]; room : largest distance of
-        measured position and set point from the value sent before [rad]
+        measured position and set point from the value sent before [rad]; due_ns, period_ns : earliest arrival of
+        the first packet, and between packets; an earlier one is left to the loop
         """
         host, port = controller
         family = socket.AF_INET.to_bytes(2, "little")
@@ -289,6 +297,7 @@ class Turnaround:
         self._last[:] = last
         # As float32, never wider.
         self._room = float(np.nextafter(np.float32(room), np.float32(0.0)))
+        self._due, self._period = due_ns, period_ns
         self._ready = ready
 
     def wait(self, awake_ns: int, asleep_ns: int, patience_ns: int) -> bool:
@@ -325,6 +334,8 @@ class Turnaround:
             awake_ns,
             asleep_ns,
             patience_ns,
+            self._due,
+            self._period,
         )
         return bool(status == _ASKED)
 

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import logging
 import os
 import sys
-from typing import Any
+import traceback
+from pathlib import Path
+from typing import Any, NoReturn
 
 import click
 
-from fri.errors import LwrError, OperatorError
+from fri.errors import FileError, LwrError, OperatorError
 
 # Before the import of numpy: for small matrices a second BLAS thread costs time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+log = logging.getLogger(__name__)
+
 VERBS = {
     "doctor": "examine this computer, the link and the controller",
+    "record": "log what the controller sends, nothing is commanded",
+    "hold": "enter command mode, hold the pose, leave it",
+    "jog": "move one joint by some degrees",
+    "home": "move to the home position",
     "experiment": "the whole chain: plan, drive, log, swap the payload, estimate",
     "plan": "an optimal exciting motion within all limits",
     "check": "every check of an experiment file, without motion",
@@ -38,6 +47,7 @@ VERBS = {
 }
 FAMILIES = {
     "setup": ("doctor", "emulator", "completion"),
+    "steps": ("record", "hold", "jog", "home"),
     "motions": ("plan", "check", "preview"),
     "models": ("validate", "compare", "payload", "export"),
     "logs": ("report", "info", "recover", "attach", "import"),
@@ -73,15 +83,36 @@ class Verbs(click.Group):
             formatter.write_dl(list(VERBS.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; an `LwrError` becomes one message and an exit code."""
+        """Run the command; every error becomes one message and an exit code."""
         try:
             return super().invoke(ctx)
         except LwrError as error:
-            click.secho(f"{type(error).__name__}: {error}", fg="red", err=True)
-            ctx.exit(error.exit_code)
+            _complain(ctx, error)
         except (KeyboardInterrupt, click.Abort):
             click.echo("aborted", err=True)
             ctx.exit(OperatorError.exit_code)
+        except (click.ClickException, click.exceptions.Exit, BrokenPipeError):
+            raise
+        except OSError as error:
+            _complain(ctx, FileError.of(error))
+        except MemoryError:
+            _complain(ctx, FileError.of(OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), "memory"))
+        except Exception as error:
+            log.debug("internal error", exc_info=True)
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            _complain(
+                ctx,
+                LwrError(
+                    f"internal error, {type(error).__name__}: {error} ({Path(place.filename).name}, line "
+                    f"{place.lineno}). Please report it with what `lwr-run -vv` prints"
+                ),
+            )
+
+
+def _complain(ctx: click.Context, error: LwrError) -> NoReturn:
+    click.secho(f"{type(error).__name__}: {error}", fg="red", err=True)
+    log.debug("raised here", exc_info=error)
+    ctx.exit(error.exit_code)
 
 
 @click.group(cls=Verbs, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})

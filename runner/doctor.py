@@ -348,6 +348,7 @@ def judge_link(patient: Patient, link: LinkTest) -> list[ComputerFinding]:
         _replies(link),
         _in_time(link),
         _quality(link),
+        *_round_trip(link),
         *_robot(link.end),
         *_program(patient, link),
     ]
@@ -407,6 +408,23 @@ def _in_time(link: LinkTest) -> ComputerFinding:
     limit = f"{100 * _GOOD_SHARE:g} %"
     share = link.in_time
     return graded("answered in time", value, limit, (share < _POOR_SHARE, poor), (share < _GOOD_SHARE, weak))
+
+
+def _round_trip(link: LinkTest) -> list[ComputerFinding]:
+    """The way there and back by the controller's own clock, if it measures one: stale answers are late by it."""
+    end = link.end
+    if not end.controller_latency_s > 0.0:
+        return []
+    cycle = 1000.0 * end.period_s
+    value = f"latency {1000 * end.controller_latency_s:.2f} ms, jitter {1000 * end.jitter_s:.2f} ms"
+    stale = (
+        "the controller gets answers to old packets: stop the KRL program and start it again after the PC; see reply, "
+        "and take away switches on the way"
+    )
+    slow = "the answers come late in the cycle; see reply, or take a longer cycle"
+    slower = max(end.controller_latency_s, end.jitter_s) > 0.5 * end.period_s
+    cases = (end.controller_latency_s > end.period_s, stale), (slower, slow)
+    return [graded("round trip", value, f"below {0.5 * cycle:g} ms, at most {cycle:g} ms", *cases)]
 
 
 def _quality(link: LinkTest) -> ComputerFinding:

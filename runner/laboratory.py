@@ -102,6 +102,7 @@ class Laboratory:
 
     assume_yes : confirm all questions to the operator.
     allow_non_realtime : command a real arm without real-time rights; the emulator needs none.
+    silence_s : without a packet for so long the link is lost [s].
     """
 
     def __init__(
@@ -111,8 +112,10 @@ class Laboratory:
         assume_yes: bool = False,
         allow_non_realtime: bool = False,
         status: StatusLine | None = None,
+        silence_s: float = LinkSettings.link_timeout_s,
     ) -> None:
         self.experiment = experiment
+        self._silence_s = silence_s
         self.status = status if status is not None else StatusLine()
         self.emulator: EmulatorProcess | None = None
         self._assume_yes = assume_yes
@@ -176,6 +179,7 @@ class Laboratory:
             lock_step=emulated and self.experiment.lock_step,
             handshake=link.handshake,
             realtime="allow" if emulated or self._allow_non_realtime else "require",
+            link_timeout_s=self._silence_s,
             # On a busy computer the emulator may pause for long; in lock step a pause is harmless.
             lock_step_patience_s=60.0,
         )

@@ -23,7 +23,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import ConfigurationError
+from fri import interpreter
+from fri.errors import ConfigurationError, LwrError
 from fri.states import Quality, State
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell, PayloadShape
@@ -40,7 +41,6 @@ _NICE = 10
 _START_S = 60.0
 _STOP_S = 5.0
 _MOST_ROWS = 1024
-_ROOT = Path(__file__).resolve().parents[1]
 _COLOURS = ("#000000", "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7")
 
 
@@ -55,24 +55,29 @@ class LiveView:
             from runner.report.interactive import INSTALL
 
             raise ConfigurationError(f"--live: {INSTALL}")
+        # Opened here: other processes of this user may not be allowed to look into this one.
+        with Ring.attach(ring_name) as ring:
+            self._process = self._start(experiment, ring, port)
+        self.url = self._first_line()
+
+    def _start(self, experiment: Experiment, ring: Ring, port: int) -> subprocess.Popen[str]:
         settings = {
-            "ring": ring_name,
+            "ring": ring.inherited,
             "port": port,
             "arm": experiment.arm,
             "cell": experiment.cell,
             "beside": str(experiment.folder),
         }
-        places = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "runner.live", json.dumps(settings)],
+        return subprocess.Popen(
+            interpreter.command("-m", "runner.live", json.dumps(settings)),
+            pass_fds=(ring.descriptor,),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(places), "OPENBLAS_NUM_THREADS": "1"},
+            env=interpreter.environment(),
             start_new_session=True,
         )
-        self.url = self._first_line()
 
     def begin(self, session: str, payload: Payload | None, motion: Motion) -> None:
         """Announce a session's motion: payload, phases and duration."""
@@ -118,15 +123,14 @@ class LiveView:
         assert stream is not None
         threading.Thread(target=lambda: lines.put(stream.readline()), daemon=True).start()
         try:
-            url = lines.get(timeout=_START_S).strip()
-        except queue.Empty:
-            url = ""
-        if not url:
+            said = json.loads(lines.get(timeout=_START_S))
+        except (queue.Empty, ValueError):
+            said = {}
+        if "url" not in said:
             self.close()
-            raise ConfigurationError(
-                "the live view did not start; leave out --live, or choose another --live-port"
-            )
-        return url
+            reason = said.get("error", "the live view did not start")
+            raise ConfigurationError(f"--live: {reason}; leave out --live, or choose another --live-port")
+        return str(said["url"])
 
 
 class Sample:
@@ -268,13 +272,17 @@ def main(arguments: list[str], commands: IO[str], answers: IO[str]) -> None:
     from runner.scene import start_server, stop_server
 
     beside = Path(settings["beside"])
-    arm, cell = Arm.load(settings["arm"], beside=beside), Cell.load(settings["cell"], beside=beside)
-    server = start_server(int(settings["port"]))
+    try:
+        arm, cell = Arm.load(settings["arm"], beside=beside), Cell.load(settings["cell"], beside=beside)
+        server = start_server(int(settings["port"]))
+    except (LwrError, OSError) as error:
+        print(json.dumps({"error": str(error)}), file=answers, flush=True)
+        return
     page = Dashboard(server, arm, cell)
     announced: queue.Queue[str | None] = queue.Queue()
     threading.Thread(target=lambda: _read(commands, announced), daemon=True).start()
-    answers.write(f"http://127.0.0.1:{server.get_port()}\n")
-    answers.flush()
+    url = f"http://127.0.0.1:{server.get_port()}"
+    print(json.dumps({"url": url}), file=answers, flush=True)
     seen = 0
     try:
         with Ring.attach(settings["ring"]) as ring:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import fri  # noqa: F401 - finds a place for compiled code
+
 if TYPE_CHECKING:
     from sim_backend.process import Emulator
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import signal
 import sys
 from typing import Any
@@ -95,4 +96,6 @@ def _overrides(settings: tuple[str, ...], period_ms: float | None, seed: int | N
 
 
 if __name__ == "__main__":
+    # Last, so that a file of the working folder adds effects of a lab but replaces no module.
+    sys.path.append(os.getcwd())
     main()

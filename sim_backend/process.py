@@ -7,7 +7,6 @@ import logging
 import os
 import select
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from numbers import Real
 from pathlib import Path
 from typing import IO, Any
 
+from fri import interpreter
 from fri.errors import ConfigurationError, LwrError, NetworkError, RobotError
 from lwr_driver.configuration import CONFIGS, find
 from lwr_driver.realtime import undisturbed
@@ -139,9 +139,7 @@ class Emulator:
         if self.running:
             return self
         command = [
-            sys.executable,
-            "-m",
-            "sim_backend",
+            *interpreter.command("-m", "sim_backend"),
             str(self.config),
             "--lock-step" if self.lock_step else "--real-time",
             f"--fri-host={self.fri_host}",
@@ -153,7 +151,11 @@ class Emulator:
         ]
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env=interpreter.environment(),
         )
         try:
             self.pendant_port = self._announced()

@@ -24,6 +24,7 @@ from benchmarks.trust.table import Ledger
 
 SECTIONS = {
     "wire": "faults on the wire, alone and mixed, in every phase",
+    "clocks": "counters and clocks that disagree, in lock step and real time",
     "reaction": "from a fault to the safe reaction, in cycles",
     "contact": "pushes on each joint and an obstacle: stopped in time, and no alarm without them",
     "robot": "faults of the robot: emergency stop, drives, modes, quality, temperature, payload, people",
@@ -32,6 +33,7 @@ SECTIONS = {
     "realtime": "reply latency beside a minimal C client, at 1, 2, 5 and 10 ms",
     "files": "crafted files: an error with advice, never a traceback or an hour of work",
     "resume": "aborts at random instants, each finished by --resume; folders that changed since",
+    "drivers": "two drivers on one computer: starts and ends beside a running motion",
     "input": "mangled packets, logs, files: an error of ours or a correct result",
     "physics": "the emulated arm against theory",
     "clients": "other people's FRI clients on the emulator",
@@ -60,7 +62,7 @@ class Options:
 @click.option("--seconds", type=float, help="Duration of soak and of each real-time measurement.")
 @click.option("--periods-ms", default="1,2,5,10", show_default=True, help="FRI cycles of `realtime`.")
 @click.option("--only", type=int, help="One run of `wire` by its number.")
-@click.option("--lines", default="", help="Pattern: only such lines of `computer` and `realtime`.")
+@click.option("--lines", default="", help="Pattern: only such lines of `computer`, `drivers`, `realtime`.")
 @click.option("--anew", is_flag=True, help="Forget what the file holds of these sections.")
 @click.option("--join", multiple=True, type=click.Path(path_type=Path, exists=True), help="For `table`.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("trust.json"), show_default=True)

@@ -65,7 +65,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
                 usage[part].append(_usage(pid))
             ledger.save()
         virtual_s = float(lab.emulator.status()["time_s"])
-        ring = Path("/dev/shm") / lab.driver.ring_name.lstrip("/")
+        ring = Path(lab.driver.ring_name)
         lab.close()
         left = [f"process {pid}" for pid in gone([pid for part, pid in pids.items() if part != "runner"])]
         left += [f"shared memory {ring}"] if ring.exists() else []

@@ -31,6 +31,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion, check_motion, move_to
+from lwr_driver.pace import Pace
 from lwr_driver.ring import Ring
 from lwr_driver.session import session_metadata
 from lwr_driver.session.recording import Recorded, Recording, SessionRequest
@@ -111,6 +112,15 @@ class TimedTurnaround(Turnaround):
         """The first packet of a cycle comes while the loop looks out for it, any other one while it is busy."""
         return super().next(more=more and self.meanwhile)
 
+    def arm(self, *arguments: Any, due_ns: int = 0, period_ns: int = 0) -> None:
+        """Answers ready for the packets that are due at the time of the stand."""
+        controller, sequence, ready, *more = arguments
+        if len(more) > 3:
+            *more, due_ns, period_ns = more
+        if period_ns:
+            ready = min(ready, max(0, (self._clock.now_ns - due_ns) // period_ns + 1))
+        super().arm(controller, sequence, ready, *more)
+
     @property
     def received_ns(self) -> int:
         """When the datagram came."""
@@ -164,6 +174,7 @@ class Stand:
         self.loop = Loop(self.settings, arm.limits, self.control, ring)
         self.ahead = TimedTurnaround(self.loop, self.control, self.clock) if ahead else None
         self.loop.turnaround = self.ahead
+        self.loop.pace = None if lock_step else Pace()
         self.end = ControllerEnd(self.loop.remote.address)
         self.monitor = CommandMonitor(arm, period_ms * 1e-3)
         self.path = folder / "run.mcap"
@@ -183,6 +194,7 @@ class Stand:
         )
         self.closed: Recorded | None = None
         self.cycle_number = 0
+        self.pace = 1.0  # true length of a cycle, as a share of the one in the header
         self.packets = 0
         self.silent = 0
         self.hurry = 0
@@ -257,7 +269,7 @@ class Stand:
             self.slow -= 1
             self.clock.now_ns += self.delay_ns
             self._serve()
-        self.clock.now_ns += self.period_ms * 1_000_000
+        self.clock.now_ns += round(self.period_ms * 1e6 * self.pace)
         if session.state is State.OFF:
             self._serve()
             positions = session.close_cycle().positions

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from runner.output import OUTPUT_FILE
 from runner.terminal import coupling_option, gear_ratio_option, json_option, to_json
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ _FIRST_SEED = 1001
     type=click.IntRange(1),
     help="Number of sets: to record (default 3), or in SESSIONS, set after set (default 1).",
 )
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Model file of the healthy arm.")
+@click.option("--out", required=True, type=OUTPUT_FILE, help="Model file of the healthy arm.")
 @click.option("--arm", help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.")
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."

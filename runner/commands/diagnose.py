@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from runner.output import OUTPUT_FOLDER
 from runner.terminal import GroupedCommand, coupling_option, gear_ratio_option, json_option
 
 _GROUPS = {
@@ -30,7 +31,7 @@ _GROUPS = {
 @click.option(
     "--reference", type=click.Path(path_type=Path), help="Model of `lwr-run commission`, arm healthy."
 )
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder of the results.")
+@click.option("--out", required=True, type=OUTPUT_FOLDER, help="Folder of the results.")
 @click.option("--arm", help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.")
 @click.option(
     "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."

@@ -21,6 +21,7 @@ from runner.experiment_file import DEFAULT, Experiment
 from runner.files import begin, gather, go_on, listed, locked
 from runner.hiding.effect import HiddenEffect, emulated_arm, with_effect
 from runner.laboratory import Laboratory
+from runner.output import OUTPUT_FOLDER
 from runner.planning import Excitations
 from runner.replanning import Rounds, rounds_begun
 from runner.results import estimate, new_folder, summarise, write_results
@@ -29,7 +30,7 @@ from runner.terminal import PATH, StatusLine, json_option, to_json
 
 @click.command("experiment")
 @click.argument("file", required=False)
-@click.option("--out", type=PATH, help="Folder of the results; default: experiments/NAME-STAMP.")
+@click.option("--out", type=OUTPUT_FOLDER, help="Folder of the results; default: experiments/NAME-STAMP.")
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
 @click.option("--resume", type=PATH, metavar="FOLDER", help="Continue the aborted experiment in FOLDER.")
 @click.option(

@@ -18,6 +18,7 @@ from ident.estimators import ESTIMATORS
 from ident.model.model_file import write_model
 from runner.diagnosis import known_arm
 from runner.estimation import IdentifySettings, announced, couplings, recorded_couplings
+from runner.output import OUTPUT_FILE, OUTPUT_FOLDER
 from runner.recordings import GUESSED, guess_options, read_recordings
 from runner.results import named_model, new_folder, write_log_results
 from runner.terminal import GroupedCommand, json_option, to_json
@@ -89,10 +90,10 @@ _GROUPS = {
     metavar="FILE",
     help="YAML file of filters, covariance and more; see docs/identify_settings.md.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Model file to write, e.g. model.yaml.")
+@click.option("--out", type=OUTPUT_FILE, help="Model file to write, e.g. model.yaml.")
 @click.option(
     "--results",
-    type=click.Path(path_type=Path),
+    type=OUTPUT_FOLDER,
     metavar="FOLDER",
     help="Folder for summary.json, model.yaml and report.html, as of an experiment.",
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, check_file, check_folder
 from runner.terminal import PATH, json_option, to_json
 
 
@@ -27,7 +28,7 @@ def info_command(session: Path, as_json: bool) -> None:
 
 @click.command("recover")
 @click.argument("session", type=PATH)
-@click.option("--out", type=PATH, help="Recovered file; default: SESSION.recovered.mcap.")
+@click.option("--out", type=OUTPUT_FILE, help="Recovered file; default: SESSION.recovered.mcap.")
 @json_option
 def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
     """Repair the SESSION log of a killed recorder, as a new file.
@@ -39,7 +40,7 @@ def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
     """
     from lwr_driver.session import recover
 
-    target = out if out is not None else session.with_suffix(".recovered.mcap")
+    target = out if out is not None else check_file(session.with_suffix(".recovered.mcap"))
     done = recover(session, target)
     click.echo(to_json(done) if as_json else str(done))
 
@@ -47,7 +48,7 @@ def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
 @click.command("attach")
 @click.argument("session", type=PATH)
 @click.argument("trace", type=PATH)
-@click.option("--out", type=PATH, help="New file; default: replace SESSION in one step.")
+@click.option("--out", type=OUTPUT_FILE, help="New file; default: replace SESSION in one step.")
 @click.option(
     "--tolerance-ms", type=click.FloatRange(min=0.0, min_open=True), help="Largest accepted timing error."
 )
@@ -68,6 +69,8 @@ def attach_command(
     """
     from lwr_driver.session.trace import import_trace
 
+    if out is None:
+        check_file(session)
     tolerance = None if tolerance_ms is None else tolerance_ms / 1000.0
     done = import_trace(session, trace, out, tolerance_s=tolerance)
     click.echo(to_json(done) if as_json else str(done))
@@ -85,7 +88,7 @@ def _rows(context: click.Context, parameter: click.Parameter, value: str | None)
 @click.command("import")
 @click.argument("mapping")
 @click.argument("source", type=PATH)
-@click.argument("output", type=PATH)
+@click.argument("output", type=OUTPUT_FILE)
 @click.option("--rows", callback=_rows, metavar="A:B", help="Rows A to B-1 only, counted from 0.")
 @click.option("--payload", help="Name of the payload; `none`: the bare arm.")
 @click.option("--payload-mass", type=float, metavar="KG", help="Weighed mass of the payload.")
@@ -141,7 +144,10 @@ def import_command(
 @click.command("report")
 @click.argument("folder", type=PATH)
 @click.option(
-    "--svg", type=PATH, metavar="FOLDER", help="Write the figures as SVG files to this folder instead."
+    "--svg",
+    type=OUTPUT_FOLDER,
+    metavar="FOLDER",
+    help="Write the figures as SVG files to this folder instead.",
 )
 @click.option(
     "--columns",
@@ -171,6 +177,7 @@ def report_command(folder: Path, svg: Path | None, columns: int, width: int, as_
         from runner.report.page import write_report
         from runner.report.verdicts import headline, verdicts
 
+        check_folder(folder)
         page = write_report(folder)
         lines = verdicts(ResultFolder.load(folder))
         level, sentence = headline(lines)

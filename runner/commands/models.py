@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from fri.errors import ConfigurationError
+from runner.output import OUTPUT_FILE
 from runner.terminal import PATH, json_option, to_json
 
 
@@ -114,7 +115,7 @@ def compare_command(first: Path, second: Path, as_json: bool, level: float) -> N
 @click.argument("model", type=PATH)
 @click.argument("sessions", nargs=-1, required=True, type=PATH)
 @click.option("--free-offsets", is_flag=True, help="Estimate the torque offsets anew.")
-@click.option("--out", type=PATH, metavar="FILE", help="Model file to write, with the payload.")
+@click.option("--out", type=OUTPUT_FILE, metavar="FILE", help="Model file to write, with the payload.")
 @json_option
 def payload_command(
     model: Path, sessions: tuple[Path, ...], free_offsets: bool, out: Path | None, as_json: bool
@@ -144,7 +145,7 @@ def payload_command(
 
 @click.command("export")
 @click.argument("model", type=PATH)
-@click.argument("outputs", nargs=-1, required=True, type=PATH)
+@click.argument("outputs", nargs=-1, required=True, type=OUTPUT_FILE)
 @click.option("--payload", help="Payload of the model to mount; default: the bare arm.")
 @click.option("--name", default="arm", show_default=True, help="Name in the file; prefix of the C functions.")
 @click.option("--force", is_flag=True, help="Replace existing files.")

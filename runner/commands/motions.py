@@ -8,6 +8,7 @@ import click
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
+from runner.output import OUTPUT_FILE, check_file
 from runner.terminal import PATH, StatusLine, json_option, to_json
 
 _EXPERIMENT = str(CONFIGS / "experiments/default.yaml")
@@ -15,7 +16,7 @@ _EXPERIMENT = str(CONFIGS / "experiments/default.yaml")
 
 @click.command("plan")
 @click.argument("file", default=str(CONFIGS / "plans/default.yaml"))
-@click.option("--out", type=PATH, help="Plan file; default: NAME.plan.yaml here.")
+@click.option("--out", type=OUTPUT_FILE, help="Plan file; default: NAME.plan.yaml here.")
 @click.option("--force", is_flag=True, help="Replace an existing plan file.")
 @json_option
 def plan_command(file: str, out: Path | None, force: bool, as_json: bool) -> None:
@@ -35,7 +36,7 @@ def plan_command(file: str, out: Path | None, force: bool, as_json: bool) -> Non
     from runner.replanning import show_search
 
     problem = PlanProblem.load(file)
-    target = out if out is not None else Path(f"{problem.name}.plan.yaml")
+    target = out if out is not None else check_file(Path(f"{problem.name}.plan.yaml"))
     if target.exists() and not force:
         raise ConfigurationError(f"{target} exists; choose another --out, or replace it with --force")
     status = StatusLine()
@@ -119,6 +120,8 @@ def preview_command(
     """
     from runner.preview import planned_motion, preview_html, serve
 
+    if not serving:
+        check_file(out)
     planned = planned_motion(file, session=session)
 
     def tell(place: str) -> None:

@@ -100,3 +100,65 @@ def test_rights_read_well():
     rights = Rights((Shortage("no a", "do b"),), (), None)
     with pytest.raises(NetworkError, match="no a: do b"):
         rights.enforce()
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """A computer of four processors without other drivers; what is claimed is given back."""
+    monkeypatch.setattr(realtime, "_CLAIM", f"\0test.{os.getpid()}.{{}}")
+    monkeypatch.setattr(realtime, "_isolated", list)
+    monkeypatch.setattr(realtime.os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
+    yield
+    while realtime._claims:
+        realtime._claims.pop().close()
+
+
+def test_drivers_on_one_computer_share_out_the_processors(alone):
+    assert [realtime.reserve()[0] for _ in range(3)] == [3, 2, 1]
+    processor, advice = realtime.reserve()
+    assert processor is None
+    assert "of 4 processors each has a driver but the first" in str(advice)
+
+
+def test_isolated_processors_are_taken_first_and_one_given_back_is_taken_again(alone, monkeypatch):
+    monkeypatch.setattr(realtime, "_isolated", lambda: [1, 2])
+    assert [realtime.reserve()[0] for _ in range(3)] == [1, 2, 3]
+    realtime._claims.pop(0).close()
+    assert realtime.reserve()[0] == 1
+
+
+def test_a_named_processor_is_taken_and_a_driver_already_there_is_told(alone):
+    assert realtime.reserve(2) == (2, None)
+    processor, advice = realtime.reserve(2)
+    assert processor == 2
+    assert "processor 2 has a driver already" in str(advice)
+    assert realtime.reserve()[0] == 3
+
+
+def test_nothing_long_happens_at_real_time_priority(alone, monkeypatch):
+    order = []
+    for name in ("collect", "freeze", "disable"):
+        monkeypatch.setattr(realtime.gc, name, lambda name=name: order.append(name))
+    monkeypatch.setattr(realtime, "_prefault", lambda: order.append("prefault"))
+    monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: Library(order))
+    monkeypatch.setattr(realtime.os, "sched_setaffinity", lambda *_: None)
+    monkeypatch.setattr(realtime.os, "sched_setscheduler", lambda pid, kind, _: order.append(kind))
+    monkeypatch.setattr(realtime.os, "open", lambda *_: os.dup(0))
+    monkeypatch.setattr(realtime.os, "write", lambda *_: 4)
+    assert realtime.set_up(80, realtime.reserve()[0]).processor == 3
+    assert order == ["collect", "freeze", "disable", "prefault", "lock", os.SCHED_FIFO]
+    realtime.give_back()
+    assert order[-2:] == [os.SCHED_OTHER, "unlock"]
+    assert not realtime._claims
+
+
+class Library:
+    def __init__(self, order):
+        self.order = order
+
+    def mlockall(self, flags):
+        self.order.append("lock")
+        return 0
+
+    def munlockall(self):
+        self.order.append("unlock")

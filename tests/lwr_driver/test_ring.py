@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -129,7 +128,7 @@ def test_a_process_that_attaches_does_not_take_the_ring_with_it():
 
 def test_nothing_is_left_behind():
     ring = Ring.create(4)
-    place = Path("/dev/shm") / ring.name
+    place = Path(ring.name)
     assert place.exists()
     ring.unlink()
     ring.unlink()
@@ -138,17 +137,27 @@ def test_nothing_is_left_behind():
         Ring.attach(ring.name)
 
 
-def test_other_shared_memory_is_refused():
-    from multiprocessing.shared_memory import SharedMemory
+def test_other_memory_is_refused(tmp_path):
+    other = tmp_path / "other"
+    other.write_bytes(bytes(8192))
+    with pytest.raises(ConfigurationError, match="is not a ring"):
+        Ring.attach(str(other))
 
-    memory = SharedMemory(create=True, size=8192)
-    try:
-        np.frombuffer(memory.buf, dtype=np.uint8)[:] = 0
-        with pytest.raises(ConfigurationError, match="is not a ring"):
-            Ring.attach(memory.name)
-    finally:
-        memory.close()
-        memory.unlink()
+
+def test_a_killed_creator_leaves_nothing_and_takes_nothing_from_those_who_attached():
+    code = (
+        "import os, sys, time; from lwr_driver.ring import Ring; ring = Ring.create(4); "
+        "ring.row['sequence'] = 9; ring.publish(); print(ring.name, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as creator:
+        name = creator.stdout.readline().strip()
+        before = set(os.listdir("/dev/shm"))
+        with Ring.attach(name) as mine:
+            creator.kill()
+            creator.wait()
+            assert mine.take()["sequence"].tolist() == [9]
+        assert not Path(name).exists()
+        assert not set(os.listdir("/dev/shm")) - before
 
 
 def test_ring_of_one_row_is_refused():

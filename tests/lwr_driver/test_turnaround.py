@@ -355,6 +355,7 @@ class Granted:
     @pytest.fixture(autouse=True)
     def granted(self, monkeypatch):
         monkeypatch.setattr(realtime, "assess", lambda priority: Rights())
+        monkeypatch.setattr(realtime, "reserve", lambda cpu: (1, None))
         monkeypatch.setattr(realtime, "set_up", lambda priority, cpu: Rights(processor=1))
 
 
@@ -365,6 +366,16 @@ class TestRights(Granted):
         assert rig.loop.turnaround is not None
         assert rights == Rights(processor=1)
         rig.enter()
+        rig.close()
+
+    def test_without_a_processor_of_its_own_the_loop_sleeps_until_a_packet_comes(self, monkeypatch):
+        taken = realtime.Shortage("each processor has a driver already", "use one for each")
+        monkeypatch.setattr(realtime, "reserve", lambda cpu: (None, taken))
+        monkeypatch.setattr(realtime, "set_up", lambda priority, cpu: Rights(processor=cpu))
+        rig = Rig(lock_step=False)
+        rights = loop_process._become_real_time(rig.loop, rig.control, Scheduling(True, True))
+        assert rig.loop.turnaround is None
+        assert rights.advice == (taken,)
         rig.close()
 
     def test_without_a_compiler_the_loop_says_so_and_goes_on(self, monkeypatch):

@@ -61,6 +61,25 @@ def link_test(counts: dict[int, int] | None = None, fresh: int = 833, **end: Any
     return LinkTest(10.0, state(), state(**({"received": 2000} | end)), worst, edges, histogram, msr, fresh)
 
 
+@pytest.mark.parametrize(
+    ("latency_s", "jitter_s", "verdict"),
+    [(0.0004, 0.0001, "ok"), (0.003, 0.0, "advice"), (0.001, 0.004, "advice"), (0.327, 0.0, "fail")],
+)
+def test_a_round_trip_longer_than_the_cycle_is_no_link(
+    latency_s: float, jitter_s: float, verdict: str
+) -> None:
+    link = link_test(controller_latency_s=latency_s, jitter_s=jitter_s)
+    found = by_subject(judge_link(PATIENT, link))["round trip"]
+    assert found.verdict == verdict
+    assert f"latency {1000 * latency_s:.2f} ms" in found.value
+    assert found.limit == "below 2.5 ms, at most 5 ms"
+    assert ("old packets" in found.advice) == (verdict == "fail")
+
+
+def test_a_controller_that_measures_no_round_trip_is_not_judged_by_it() -> None:
+    assert "round trip" not in by_subject(judge_link(PATIENT, link_test()))
+
+
 @pytest.mark.slow
 def test_the_emulator_is_found_and_tested(tmp_path: Path) -> None:
     code, text = doctor("--link", "--seconds", "0.5", "--period-ms", "20", "--json")

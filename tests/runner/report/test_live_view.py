@@ -197,3 +197,14 @@ def test_driver_and_commands_are_there_without_the_extra() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == "fine"
+
+
+def test_a_port_in_use_is_told(ring: Ring) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(
+            ConfigurationError, match=f"--live: port {port} of 127.0.0.1 is in use.*--live-port"
+        ):
+            LiveView(Experiment.load(), ring.name, port=port)

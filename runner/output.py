@@ -1,0 +1,73 @@
+"""Places of results, tried before the work begins: a wrong path costs no measurement."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fri.errors import FileError
+
+_BLOCK = bytes(4096)
+
+
+def check_file(path: Path) -> Path:
+    """Try whether a file can be written at `path`, which stays as it is. Raises FileError with advice."""
+    _try(path.parent, path)
+    if path.is_dir():
+        raise _refusal(errno.EISDIR, path)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise _refusal(errno.EACCES, path)
+    return path
+
+
+def check_folder(path: Path) -> Path:
+    """Try whether files can be written to the folder `path`, existing or to be made. Raises FileError."""
+    place = path
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    _try(place, path)
+    return path
+
+
+def _try(folder: Path, wanted: Path) -> None:
+    try:
+        # The folder may be there and the name still be too long.
+        with contextlib.suppress(FileNotFoundError):
+            wanted.lstat()
+        with tempfile.TemporaryFile(dir=folder) as trial:
+            trial.write(_BLOCK)
+            trial.flush()
+    except OSError as error:
+        raise FileError.of(error, f"{wanted} cannot be written") from error
+
+
+def _refusal(number: int, path: Path) -> FileError:
+    return FileError.of(OSError(number, os.strerror(number)), f"{path} cannot be written")
+
+
+class OutputFile(click.Path):
+    """A file to be written, tried as the command line is read."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path, after `check_file`."""
+        return check_file(Path(value))
+
+
+class OutputFolder(OutputFile):
+    """A folder to be filled, tried as the command line is read."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path, after `check_folder`."""
+        return check_folder(Path(value))
+
+
+OUTPUT_FILE, OUTPUT_FOLDER = OutputFile(), OutputFolder()

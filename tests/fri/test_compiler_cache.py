@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fri import compiler_cache
+
+
+@pytest.fixture
+def sealed(monkeypatch, tmp_path):
+    """A computer on which only the given folders can be written; returns the environment's cache folder."""
+
+    def seal(*writable: Path) -> str | None:
+        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+        monkeypatch.setenv("HOME", str(tmp_path / "home"))
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setattr(compiler_cache.tempfile, "gettempdir", lambda: str(tmp_path))
+        allowed = tuple(map(str, writable))
+        monkeypatch.setattr(compiler_cache, "_writable", lambda folder: str(folder).startswith(allowed))
+        compiler_cache.provide()
+        return os.environ.get("NUMBA_CACHE_DIR")
+
+    yield seal
+    os.environ.pop("NUMBA_CACHE_DIR", None)
+
+
+def test_a_writable_installation_or_home_needs_no_other_place(sealed, tmp_path):
+    assert sealed("/") is None
+    assert sealed(tmp_path / "home") is None
+
+
+def test_without_both_a_private_temporary_place_serves(sealed, tmp_path):
+    place = tmp_path / f"lwr-run-{os.getuid()}"
+    assert sealed(place) == str(place)
+    assert place.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_place_that_others_can_write_is_not_trusted(sealed, tmp_path):
+    place = tmp_path / f"lwr-run-{os.getuid()}"
+    place.mkdir()
+    place.chmod(0o777)
+    assert sealed(place) is None
+
+
+def test_a_named_place_that_cannot_be_written_is_replaced(sealed, tmp_path, monkeypatch):
+    place = tmp_path / f"lwr-run-{os.getuid()}"
+    delenv = monkeypatch.delenv
+    monkeypatch.setattr(
+        monkeypatch, "delenv", lambda name, **_: None if "NUMBA" in name else delenv(name, **_)
+    )
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/nowhere")
+    assert sealed(place) == str(place)
