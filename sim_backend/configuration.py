@@ -11,13 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fri.errors import ConfigurationError
-from fri.handshake import HANDSHAKES
-from fri.krl import KrlProgram, Machinery
 from fri.policy import KrcPolicy
 from lwr_driver.configuration import find, parse, read_mapping
-
-OWN_PROGRAM = "lwr_identification"
-"""The KRL program of this project."""
 
 JOINTS = 7
 Joints = tuple[float, float, float, float, float, float, float]
@@ -56,35 +51,6 @@ class Plugin:
 
 
 @dataclass(frozen=True)
-class RobotConfig:
-    """The true arm.
-
-    urdf : kinematics. parameters : file with the standard parameters and the named payloads, or an identified
-    `model.yaml` together with its effects
-    stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
-    substeps : steps of the joint dynamics within 1 ms
-    effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
-    plant : other physics altogether, called with `model, drive, random, **options` (see
-    `sim_backend.plant.Plant`); the `effects` act on its sensors only
-    """
-
-    urdf: str = "lwr4plus.urdf"
-    parameters: str = "table2.yaml"
-    payload: str = "none"
-    start_position: Joints = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
-    stiffness: Joints = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
-    damping: Joints = (15.0, 15.0, 10.0, 10.0, 3.0, 1.0, 0.5)
-    brake_torque: Joints = (300.0, 300.0, 200.0, 200.0, 150.0, 80.0, 80.0)
-    substeps: int = 4
-    effects: tuple[Plugin, ...] = ()
-    plant: Plugin | None = None
-
-    def __post_init__(self) -> None:
-        _positive(self, "stiffness", "substeps")
-        _non_negative(self, "damping", "brake_torque")
-
-
-@dataclass(frozen=True)
 class LoadData:
     """Load data in the controller: mass [kg], centre of mass in the frame of link 7 [m], inertia about it
     [kg m^2].
@@ -99,14 +65,52 @@ class LoadData:
 
 
 @dataclass(frozen=True)
+class RobotConfig:
+    """The true arm.
+
+    urdf : kinematics. parameters : file with the standard parameters and the named payloads, or an identified
+    `model.yaml` together with its effects
+    payload : on the flange at the start, by its name in `payloads` or `parameters`. payloads : more of them by name
+    gravity : acceleration of gravity in the axes of the base [m/s^2]; (0, 0, 9.81) for an arm at the ceiling
+    stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
+    substeps : steps of the joint dynamics within 1 ms
+    effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
+    plant : other physics altogether, called with `model, drive, random, **options` (see
+    `sim_backend.plant.Plant`); the `effects` act on its sensors only
+    """
+
+    urdf: str = "lwr4plus.urdf"
+    parameters: str = "table2.yaml"
+    payload: str = "none"
+    payloads: dict[str, LoadData] = field(default_factory=dict)
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    start_position: Joints = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
+    stiffness: Joints = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
+    damping: Joints = (15.0, 15.0, 10.0, 10.0, 3.0, 1.0, 0.5)
+    brake_torque: Joints = (300.0, 300.0, 200.0, 200.0, 150.0, 80.0, 80.0)
+    substeps: int = 4
+    effects: tuple[Plugin, ...] = ()
+    plant: Plugin | None = None
+
+    def __post_init__(self) -> None:
+        _positive(self, "stiffness", "substeps")
+        _non_negative(self, "damping", "brake_torque")
+        if "none" in self.payloads:
+            raise ConfigurationError("payloads has an entry `none`, the name of the empty flange; name it otherwise")
+
+
+@dataclass(frozen=True)
 class ControllerConfig:
     """The joint position controller and its model of the arm.
 
     urdf : the controller's model of the arm, CAD-like; its inertias differ from the truth
-    load : load data at the start. stiffness : the controller's value of the joint stiffness [Nm/rad]
+    load : load data at the start. gravity : `$GRAVITATION`, the opposite of `robot.gravity` if the controller knows
+    the mounting [m/s^2]. stiffness : the controller's value of the joint stiffness [Nm/rad]
     position_gain [Nm/rad], velocity_gain [Nm s/rad], torque_gain [-] : feedback of motor position and
     velocity and of the joint torque. viscous [Nm s/rad], coulomb [Nm] : friction compensation by the commanded
     velocity, linear below coulomb_speed [rad/s]. torque_limit [Nm] of the motors, referred to the joint
+    impedance_torque_gain [-] : torque feedback under joint impedance and gravity compensation; motor_inertia
+    [kg m^2] : the controller's value, for the damping of the springs. free_damping [Nm s/rad] : of gravity compensation
     velocity_cutoff_hz : filter on the motor velocity; command_cutoff_hz : filter on the commanded velocity
     model_period_ms : period of the Jacobian and the mass matrix in the packet
     external_cutoff_hz : filter of the estimated external torque
@@ -115,6 +119,7 @@ class ControllerConfig:
 
     urdf: str = "lwr4plus.urdf"
     load: LoadData = field(default_factory=LoadData)
+    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
     stiffness: Joints = (10e3, 10e3, 10e3, 10e3, 10e3, 7.5e3, 7.5e3)
     position_gain: Joints = (9e3, 9e3, 6e3, 6e3, 3e3, 2e3, 2e3)
     velocity_gain: Joints = (250.0, 250.0, 160.0, 160.0, 60.0, 40.0, 40.0)
@@ -123,6 +128,9 @@ class ControllerConfig:
     coulomb: Joints = (13.5, 15.0, 7.9, 9.0, 5.0, 4.0, 3.75)
     coulomb_speed: float = 0.01
     torque_limit: Joints = (200.0, 200.0, 120.0, 120.0, 100.0, 50.0, 50.0)
+    impedance_torque_gain: float = 4.0
+    motor_inertia: Joints = (3.0, 2.5, 2.0, 2.0, 0.8, 0.4, 0.4)
+    free_damping: Joints = (4.0, 4.0, 3.0, 3.0, 1.0, 0.5, 0.5)
     velocity_cutoff_hz: float = 150.0
     command_cutoff_hz: float = 40.0
     model_period_ms: int = 20
@@ -132,6 +140,7 @@ class ControllerConfig:
     def __post_init__(self) -> None:
         _positive(self, "stiffness", "torque_limit", "coulomb_speed", "velocity_cutoff_hz")
         _positive(self, "command_cutoff_hz", "model_period_ms", "external_cutoff_hz")
+        _non_negative(self, "impedance_torque_gain", "motor_inertia", "free_damping")
         _non_negative(self, "position_gain", "velocity_gain", "torque_gain", "viscous", "coulomb", "settle_s")
 
 
@@ -205,14 +214,17 @@ class TraceConfig:
 class FriConfig:
     """The link: `friSetup` and `friOpen`, the KRL program, and the controller's limits.
 
-    program : KRL program by its name in configs/krl. autostart : it runs from the beginning
+    program : KRL program by its name in configs/krl, or a `.src` file of the laboratory. autostart : it runs from the
+    beginning. mode : operating mode at the beginning
     velocity [rad/s], acceleration [rad/s^2] : limits; beyond them the controller drops the session
     answer_delay_s : age of an undisturbed answer in lock step
     patience_s : in lock step and command mode, wall time before an answer counts as missing
+    leave_s : in lock step, wall time without an answer before the client counts as gone; at once if its port is closed
     """
 
-    program: Literal["lwr_identification", "stanford", "ros_control", "rcprg"] = "stanford"
+    program: str = "stanford"
     autostart: bool = True
+    mode: Literal["T1", "T2", "AUT", "EXT"] = "EXT"
     period_ms: int = 1
     local_host: str = "127.0.0.1"
     local_port: int = 0
@@ -223,12 +235,33 @@ class FriConfig:
     uptime_s: float = 3600.0
     answer_delay_s: float = 1e-4
     patience_s: float = 10.0
+    leave_s: float = 300.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.period_ms <= 100:
             raise ConfigurationError(f"period_ms {self.period_ms} is outside 1 to 100")
-        _positive(self, "velocity", "acceleration", "patience_s")
+        _positive(self, "velocity", "acceleration", "patience_s", "leave_s")
         _non_negative(self, "answer_delay_s", "uptime_s")
+
+
+@dataclass(frozen=True)
+class KrlConfig:
+    """The KRL interpreter; no document of KUKA gives its speed.
+
+    statement_ms : time of a statement [ms]. halt_s : time until somebody presses start after HALT [s]
+    currents : whether `$CURR_ACT` exists. variables : values for variables of the program's data list
+    """
+
+    statement_ms: float = 0.1
+    halt_s: float = 1.0
+    currents: bool = True
+    variables: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _non_negative(self, "statement_ms", "halt_s")
+        for name, value in self.variables.items():
+            if not isinstance(value, (bool, int, float, str)):
+                raise ConfigurationError(f"variables: {name} is {value!r}; give a number, a truth value or a text")
 
 
 @dataclass(frozen=True)
@@ -247,6 +280,7 @@ class EmulatorConfig:
     krl_reals: KrlRealsConfig = field(default_factory=KrlRealsConfig)
     trace: TraceConfig = field(default_factory=TraceConfig)
     fri: FriConfig = field(default_factory=FriConfig)
+    krl: KrlConfig = field(default_factory=KrlConfig)
     policy: KrcPolicy = field(default_factory=KrcPolicy)
     limits: str = "lwr4plus.yaml"
     faults: tuple[dict[str, Any], ...] = ()
@@ -264,21 +298,6 @@ class EmulatorConfig:
     def beside(self, name: str) -> Path:
         """Path of the file `name` of this configuration."""
         return find(name, beside=self.source.parent)
-
-
-def krl_program(
-    name: str, period_ms: int, machinery: Machinery | None = None, **settings: float
-) -> KrlProgram:
-    """Program `name` of configs/krl, ready to start with an FRI cycle of `period_ms`.
-
-    machinery : motor currents and load data, None leaves both at zero; settings : values for its data list
-    """
-    if name not in HANDSHAKES:
-        raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(HANDSHAKES)}")
-    text = find(f"krl/{name}.src")
-    data = text.with_suffix(".dat").read_text(encoding="utf-8")
-    values = {"LWR_CYCLE": period_ms, **settings}
-    return KrlProgram(text.read_text(encoding="utf-8"), data, values, machinery, name)
 
 
 def load_configuration(
