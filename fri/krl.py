@@ -79,7 +79,11 @@ class _Motion:
     def position(self, now_ms: float) -> np.ndarray:
         """Setpoint (7,) [rad]."""
         s = min(1.0, max(0.0, (now_ms - self.begin_ms) / self.duration_ms))
-        return self.goal if s == 1.0 else self.start + s**3 * (10 - 15 * s + 6 * s * s) * (self.goal - self.start)
+        return (
+            self.goal
+            if s == 1.0
+            else self.start + s**3 * (10 - 15 * s + 6 * s * s) * (self.goal - self.start)
+        )
 
 
 class _Frame:
@@ -210,7 +214,9 @@ class KrlProgram:
 
     def _pause(self, until_ms: float) -> Generator[float, None, None]:
         if self._nested:
-            raise RobotError("a function that waits is called within an expression; assign its result to a variable")
+            raise RobotError(
+                "a function that waits is called within an expression; assign its result to a variable"
+            )
         yield until_ms
 
     def _enter(self, title: str, arguments: list[Any]) -> Flow:
@@ -285,7 +291,9 @@ class KrlProgram:
             if milliseconds > 0.0:
                 yield from self._pause(self._tick(milliseconds))
         elif isinstance(statement, tree.Halt):
-            self.machinery.say(f"{self.name}, line {statement.line}: HALT; start is pressed in {self._halt_s:g} s")
+            self.machinery.say(
+                f"{self.name}, line {statement.line}: HALT; start is pressed in {self._halt_s:g} s"
+            )
             yield from self._pause(self._tick(1000.0 * self._halt_s))
         elif isinstance(statement, tree.Move):
             yield from self._move(statement)
@@ -324,12 +332,13 @@ class KrlProgram:
             yield from self._spend()
             passes = passes + 1 if clock == self._clock else 0
             if passes > _LONGEST_RUN:
-                raise ConfigurationError(f"{self.name}, line {statement.line}: the loop never waits")
+                self._line = statement.line
+                raise RobotError("the loop never waits")
 
     def _move(self, statement: tree.Move) -> Generator[float, None, None]:
         """Move KRL's setpoint to the goal; to the place of the arm, once the arm stands."""
         session = self._need()
-        while session.ramping or not self.machinery.powered:
+        while session.ramping:
             yield from self._pause(self._tick())
         here = isinstance(statement.goal, tree.Name) and statement.goal.name in HERE
         if here:
@@ -345,8 +354,12 @@ class KrlProgram:
         target = positions(goal, session.krl_setpoint, relative=statement.relative)
         outside = (target < session.limits.q_min - 1e-6) | (target > session.limits.q_max + 1e-6)
         if outside.any():
-            raise RobotError(f"software limit: the goal {np.degrees(target).round(2).tolist()} deg is out of reach")
+            raise RobotError(
+                f"software limit: the goal {np.degrees(target).round(2).tolist()} deg is out of reach"
+            )
         while True:
+            while session.ramping or not self.machinery.powered:
+                yield from self._pause(self._tick())
             if session.state is not State.CMD:
                 session.resync()
             share = _SPEED_SHARE * max(1.0, float(self._system.read("$OV_PRO", ()))) / 100.0
@@ -355,8 +368,6 @@ class KrlProgram:
                 yield from self._pause(self._tick())
             if session.state is State.CMD or np.array_equal(session.krl_setpoint, target.astype(np.float32)):
                 return
-            while session.ramping or not self.machinery.powered:
-                yield from self._pause(self._tick())
 
     # Values
 

@@ -88,7 +88,9 @@ class Check:
         elif call.name in FUNCTIONS:
             low, high = FUNCTIONS[call.name]
         elif call.name in self._external:
-            self._remark(call.line, f"{call.name} of another module is passed over; put its .src beside the program")
+            self._remark(
+                call.line, f"{call.name} of another module is passed over; put its .src beside the program"
+            )
             low, high = 0, len(call.arguments)
         else:
             raise self._error(call.line, f"there is no function {call.name}")
@@ -102,11 +104,15 @@ class Check:
         title, fields = split(name.name)
         declared = self._known.get(title)
         if declared is not None:
-            self._fields(STRUCTURES.get(declared.kind) if not declared.size else None, fields, name.name, line)
+            self._fields(
+                STRUCTURES.get(declared.kind) if not declared.size else None, fields, name.name, line
+            )
         elif title not in self._parameters:
             template = System.template(title)
             if template is None and title.startswith("$") and not title.startswith("$FRI"):
-                self._remark(line, f"the emulated controller does not have {title}; it is a plain variable here")
+                self._remark(
+                    line, f"the emulated controller does not have {title}; it is a plain variable here"
+                )
             elif template is None:
                 raise self._error(line, f"there is no variable {title}")
             self._fields(template, fields, name.name, line)

@@ -81,7 +81,11 @@ def parse_source(text: str, data: str = "", name: str = "KRL program") -> Source
     if not subprograms:
         raise ConfigurationError(f"{name}: holds no DEF")
     return Source(
-        next(iter(subprograms)), subprograms, declarations, tuple(elements), frozenset(external - set(subprograms))
+        next(iter(subprograms)),
+        subprograms,
+        declarations,
+        tuple(elements),
+        frozenset(external - set(subprograms)),
     )
 
 

@@ -45,6 +45,11 @@ class KrcPolicy:
         normal.
     mirror_tolerance : float
         Largest distance [rad] of the first command, and of any command with the drives off, from the mirror.
+    soft_mirror_tolerance : float
+        The same [rad] for the first command of joint impedance control: published clients begin at the measured
+        position, where the spring sags.
+    largest_stiffness, largest_damping : float
+        Bounds of commanded joint stiffness [Nm/rad] and damping ratio.
     limit_tolerance : float
         Allowance on position and step limits for the rounding of float32 [rad].
     t1_velocity_factor : float
@@ -70,6 +75,9 @@ class KrcPolicy:
     drop_on_malformed: bool = True
     drop_on_drives_off: bool = True
     mirror_tolerance: float = 1e-3
+    soft_mirror_tolerance: float = 0.1
+    largest_stiffness: float = 5000.0
+    largest_damping: float = 1.0
     limit_tolerance: float = 1e-6
     t1_velocity_factor: float = 0.25
     acceleration_factor: float | None = None
@@ -95,6 +103,9 @@ class KrcPolicy:
         for name in (
             "perfect_latency",
             "mirror_tolerance",
+            "soft_mirror_tolerance",
+            "largest_stiffness",
+            "largest_damping",
             "t1_velocity_factor",
             "stop_acceleration_factor",
             "stop_jerk_time_s",

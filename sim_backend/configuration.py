@@ -5,10 +5,12 @@ A file may name another one under `base`; its keys then replace those of the bas
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
+
+import yaml
 
 from fri.errors import ConfigurationError
 from fri.policy import KrcPolicy
@@ -96,7 +98,9 @@ class RobotConfig:
         _positive(self, "stiffness", "substeps")
         _non_negative(self, "damping", "brake_torque")
         if "none" in self.payloads:
-            raise ConfigurationError("payloads has an entry `none`, the name of the empty flange; name it otherwise")
+            raise ConfigurationError(
+                "payloads has an entry `none`, the name of the empty flange; name it otherwise"
+            )
 
 
 @dataclass(frozen=True)
@@ -261,7 +265,9 @@ class KrlConfig:
         _non_negative(self, "statement_ms", "halt_s")
         for name, value in self.variables.items():
             if not isinstance(value, (bool, int, float, str)):
-                raise ConfigurationError(f"variables: {name} is {value!r}; give a number, a truth value or a text")
+                raise ConfigurationError(
+                    f"variables: {name} is {value!r}; give a number, a truth value or a text"
+                )
 
 
 @dataclass(frozen=True)
@@ -315,6 +321,20 @@ def load_configuration(
     config = parse(EmulatorConfig, content, str(path))
     object.__setattr__(config, "source", path)
     return config
+
+
+def read_settings(settings: Iterable[str]) -> dict[str, Any]:
+    """Texts `KEY=VALUE` of a command line as overrides; the values are YAML."""
+    found: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise ConfigurationError(f"--set {setting!r} is not of the form KEY=VALUE")
+        try:
+            found[key] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigurationError(f"--set {setting!r}: the value is not valid YAML") from error
+    return found
 
 
 def _with_base(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:

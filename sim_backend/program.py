@@ -50,7 +50,14 @@ def krl_program(
         if path.suffix.lower() == ".src" and path != text and path.stem.upper() in called
     }
     program = KrlProgram(
-        source, data, settings, machinery, text.stem, statement_ms=statement_ms, halt_s=halt_s, modules=modules
+        source,
+        data,
+        settings,
+        machinery,
+        text.stem,
+        statement_ms=statement_ms,
+        halt_s=halt_s,
+        modules=modules,
     )
     if period_ms is not None and "LWR_CYCLE" not in settings:
         program.preset("LWR_CYCLE", period_ms)

@@ -142,7 +142,7 @@ def test_what_is_not_krl_is_refused_with_its_line(body: str, message: str) -> No
 
 
 def test_a_loop_that_never_waits_and_a_wrong_index_are_found_when_they_run() -> None:
-    with pytest.raises(ConfigurationError, match="line 2: the loop never waits"):
+    with pytest.raises(RobotError, match="line 2: the loop never waits"):
         run("LOOP\nENDLOOP")
     with pytest.raises(RobotError, match=r"line 3: \$FRI_TO_INT\[17\] is outside 1 to 16"):
         run("INT I=17\n$FRI_TO_INT[I]=1")
