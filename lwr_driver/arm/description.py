@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,10 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _JointEntry:
-    """One joint of the arm file. Limits are magnitudes; `position_deg` is (lower, upper)."""
+    """One joint of the arm file. Limits are magnitudes; `position_deg` is (lower, upper).
+
+    torque_sign : -1 where the joint torque sensor counts against the direction of the joint
+    """
 
     name: str
     position_deg: tuple[float, float]
@@ -34,6 +37,7 @@ class _JointEntry:
     torque_nm: float
     gear_ratio: float
     stiffness_nm_rad: float
+    torque_sign: int = 1
 
     def __post_init__(self) -> None:
         lower, upper = self.position_deg
@@ -41,9 +45,11 @@ class _JointEntry:
             raise ConfigurationError(
                 f"joint {self.name}: position_deg {lower} to {upper} is no range; the lower end comes first"
             )
-        for field, value in vars(self).items():
-            if field not in ("name", "position_deg") and not value > 0.0:
-                raise ConfigurationError(f"joint {self.name}: {field} is {value}; it must be above zero")
+        if self.torque_sign not in (1, -1):
+            raise ConfigurationError(f"joint {self.name}: torque_sign is {self.torque_sign}; it must be 1 or -1")
+        for key, value in vars(self).items():
+            if key not in ("name", "position_deg", "torque_sign") and not value > 0.0:
+                raise ConfigurationError(f"joint {self.name}: {key} is {value}; it must be above zero")
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,7 @@ class Arm:
     q_min, q_max : position limits [rad]; `q_low`, `q_high` are narrower by `margin` [rad]
     v_max, a_max, j_max : limits of every command [rad/s], [rad/s²], [rad/s³]
     tau_max : joint torque limits [Nm]; gear_ratio : motor turns per joint turn
+    torque_sign : +1 or -1, of the joint torque sensors; the driver turns the torques to the direction of the joint
     stiffness : joint stiffness [Nm/rad]; resonance_hz : lowest structural resonance [Hz]
     """
 
@@ -138,6 +145,7 @@ class Arm:
     resonance_hz: float
     urdf: str
     urdf_path: Path
+    torque_sign: Vector = field(default_factory=lambda: _fixed(np.ones(JOINTS)))
 
     def __repr__(self) -> str:
         rows = (
@@ -201,6 +209,7 @@ class Arm:
             resonance_hz=content.lowest_resonance_hz,
             urdf=urdf,
             urdf_path=urdf_path,
+            torque_sign=_fixed([joint.torque_sign for joint in joints]),
         )
         _check_urdf(arm, str(urdf_path))
         return arm
