@@ -309,6 +309,7 @@ class KrlProgram:
                 return "" if left == "EXIT" else left
             yield from self._spend()
             value += step
+        self._write(statement.variable, value)
         return ""
 
     def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:

@@ -296,11 +296,16 @@ class System:
             return get(self.stiffness, path, title)
         if title == "$MSG_T":
             return get(self._message, path, title)
-        return get(self._keep(title), path, title)
+        kept = self._keep(title, path)
+        if title not in _KEPT and (not isinstance(kept, dict) or (path and path[0] not in kept)):
+            return kept if not path else 0
+        return get(kept, path, title)
 
-    def _keep(self, title: str) -> Any:
+    def _keep(self, title: str, path: Path) -> Any:
+        """Content of a kept variable; an unknown one is made as its first use has it."""
         if title not in self._kept:
-            self._kept[title] = copy.deepcopy(_KEPT.get(title, 0))
+            unknown: Any = 0 if not path else {} if isinstance(path[0], str) else Table(0)
+            self._kept[title] = copy.deepcopy(_KEPT.get(title, unknown))
         return self._kept[title]
 
     @staticmethod
@@ -364,7 +369,7 @@ class System:
                 self._message["VALID"] = False
                 self.machinery.say(str(self._message.get("KEY", "")))
         else:
-            self._kept[title] = put(self._keep(title), path, value, title)
+            self._kept[title] = put(self._keep(title, path), path, value, title)
 
     def _write_element(self, title: str, number: int, value: Any) -> None:
         session, place = self._need(), number - 1
@@ -415,8 +420,9 @@ class System:
                 session.fri_close()
         except (ValueError, TypeError) as error:
             raise RobotError(f"{name}: {error}") from error
-        # friSetup and BAS have no effect: address, tool and velocities are the emulator's own.
-        return f"#{session.state.name}"
+        # friSetup and BAS have no effect: address, tool and velocities are the emulator's own. Neither have the
+        # subprograms of modules that are not there.
+        return f"#{session.state.name}" if name.startswith("FRI") else 0
 
 
 def _steps(name: str) -> Path:

@@ -134,7 +134,7 @@ class ControllerConfig:
     torque_limit: Joints = (200.0, 200.0, 120.0, 120.0, 100.0, 50.0, 50.0)
     impedance_torque_gain: float = 4.0
     motor_inertia: Joints = (3.0, 2.5, 2.0, 2.0, 0.8, 0.4, 0.4)
-    free_damping: Joints = (4.0, 4.0, 3.0, 3.0, 1.0, 0.5, 0.5)
+    free_damping: Joints = (10.0, 10.0, 8.0, 8.0, 3.0, 1.0, 1.0)
     velocity_cutoff_hz: float = 150.0
     command_cutoff_hz: float = 40.0
     model_period_ms: int = 20
