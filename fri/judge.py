@@ -102,7 +102,9 @@ class CommandJudge:
         self, command: CmdBuffer, target: np.ndarray, what: str, *, soft: bool = False
     ) -> Objection | None:
         """The commanded position equal to the total setpoint, within the tolerance; `soft` for a spring."""
-        tolerance = self._policy.soft_mirror_tolerance if soft else self._policy.mirror_tolerance
+        policy = self._policy
+        tolerance = max(policy.mirror_tolerance, policy.mirror_speed * self._period)
+        tolerance = policy.soft_mirror_tolerance if soft else tolerance
         q = command.jnt_pos.tolist()
         for joint, now in enumerate(target.tolist()):
             distance = abs(q[joint] - now)

@@ -45,6 +45,9 @@ class KrcPolicy:
         normal.
     mirror_tolerance : float
         Largest distance [rad] of the first command, and of any command with the drives off, from the mirror.
+    mirror_speed : float
+        Speed [rad/s] with which the first command may begin; the tolerance is at least its step in a cycle. KUKA's
+        sample client begins a sine with 0.055 rad/s.
     soft_mirror_tolerance : float
         The same [rad] for the first command of joint impedance control: published clients begin at the measured
         position, where the spring sags.
@@ -75,6 +78,7 @@ class KrcPolicy:
     drop_on_malformed: bool = True
     drop_on_drives_off: bool = True
     mirror_tolerance: float = 1e-3
+    mirror_speed: float = 0.1
     soft_mirror_tolerance: float = 0.1
     largest_stiffness: float = 5000.0
     largest_damping: float = 1.0
@@ -103,6 +107,7 @@ class KrcPolicy:
         for name in (
             "perfect_latency",
             "mirror_tolerance",
+            "mirror_speed",
             "soft_mirror_tolerance",
             "largest_stiffness",
             "largest_damping",

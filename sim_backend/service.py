@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 _RESEND_S = 0.2
 # After an answer the PC may think for long; a restarted PC waits for its first packet.
-_RESEND_HEARD_S = 5.0
+_RESEND_HEARD_S = 2.0
 _IDLE_S = 0.2
 # A damaged datagram is answered at once or not at all.
 _PERHAPS_S = 0.02
@@ -218,9 +218,8 @@ class Service:
         """Lock step: wait until the PC has answered `sent`.
 
         The wait has no end in monitor mode; in command mode it ends with the configured patience, or with the client.
-        The first
-        packet is repeated until the PC is heard, any other now and then, for a restarted PC. After an answer to
-        another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was perhaps
+        The first packet is repeated until the PC is heard, any other now and then, for a restarted PC. After an
+        answer to another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was perhaps
         lost: it is sent again, and the wait begins anew.
         """
         wanted = sent[:2]
@@ -239,7 +238,11 @@ class Service:
             if not self._serve(timeout_s):
                 if self.cabinet.session.state is State.OFF or self.operator.silent:
                     return
-                if deadline is None and time.monotonic() >= again:
+                if self._left() and commanding:
+                    self._impatient = True
+                    return
+                # In command mode the repetition asks whether the port of the client is still open.
+                if limit_s != _PERHAPS_S and time.monotonic() >= again:
                     self.end.send(sent)
                     again = time.monotonic() + self._patience_s
                 continue

@@ -46,7 +46,9 @@ class _JointEntry:
                 f"joint {self.name}: position_deg {lower} to {upper} is no range; the lower end comes first"
             )
         if self.torque_sign not in (1, -1):
-            raise ConfigurationError(f"joint {self.name}: torque_sign is {self.torque_sign}; it must be 1 or -1")
+            raise ConfigurationError(
+                f"joint {self.name}: torque_sign is {self.torque_sign}; it must be 1 or -1"
+            )
         for key, value in vars(self).items():
             if key not in ("name", "position_deg", "torque_sign") and not value > 0.0:
                 raise ConfigurationError(f"joint {self.name}: {key} is {value}; it must be above zero")

@@ -67,6 +67,7 @@ ptp {a1 10,a2 60.5,a4 -1}
 PTP TOUCHED($AXIS_ACT) C_PTP
 PTP_REL {A6 1.0}
 LIN XP1
+PTP XP1
 $MSG_T.KEY[]="ready; really"
 $MSG_T.VALID=TRUE
 WAIT FOR ($MSG_T.VALID == FALSE)
@@ -195,7 +196,10 @@ def test_what_has_no_effect_is_told_with_its_line() -> None:
 
 def test_an_unknown_system_variable_is_told_and_a_misspelt_one_of_the_interface_refused() -> None:
     program = KrlProgram("DEF p( )\n$SOMETHING[3]=2\n$FRI_TO_INT[1]=$SOMETHING_ELSE\nEND\n")
-    assert [remark.split(";")[0].split()[-1] for remark in program.remarks] == ["$SOMETHING", "$SOMETHING_ELSE"]
+    assert [remark.split(";")[0].split()[-1] for remark in program.remarks] == [
+        "$SOMETHING",
+        "$SOMETHING_ELSE",
+    ]
     rig = Rig()
     program.step(rig.session)
     assert program.finished
