@@ -89,7 +89,7 @@ class CommandJudge:
         for flag, field, what, largest, unit in fields:
             values = command.record[field]
             if command.cmd_flags & flag and not (
-                0.0 <= values.min() and values.max() <= largest * (1.0 + 1e-6)
+                values.min() >= 0.0 and values.max() <= largest * (1.0 + 1e-6)
             ):
                 joint = int(np.argmax(np.abs(values - 0.5 * largest)))
                 return (

@@ -184,7 +184,8 @@ def _declare(line: _Line) -> dict[str, Declaration] | None:
                 value = Constant(-float(value.operand.value))
             if not isinstance(value, (Constant, Aggregate)):
                 raise line.error(f"{line.text!r}: the value of {title} is no constant")
-        found[title] = Declaration(title, kind, size, value, line.number)
+        first = value if isinstance(value, (Constant, Aggregate)) else None
+        found[title] = Declaration(title, kind, size, first, line.number)
         if not line.skip(","):
             break
     line.end()
@@ -477,9 +478,9 @@ class _Reader:
             line.end()
             return Halt(line.number)
         if word in ("EXIT", "RETURN"):
-            value = line.whole_expression() if word == "RETURN" and line.peek else None
+            result = line.whole_expression() if word == "RETURN" and line.peek else None
             line.end()
-            return Leave(word, line.number, value)
+            return Leave(word, line.number, result)
         if kind != "name" or word in _KEYWORDS:
             raise line.error(f"{line.text!r} is no statement of a program that can be run here")
         if line.peek == "(":

@@ -412,7 +412,7 @@ class RemoteEnd:
         """Sign of the joint torque sensors, (7,) of +1 and -1; measured and external torques are multiplied by it."""
         values = np.array(sign, dtype=np.float32)
         if values.shape != (JOINTS,) or not (np.abs(values) == 1.0).all():
-            raise ConfigurationError(f"torque sign {sign} must be +1 or -1 for each of the {JOINTS} joints")
+            raise ConfigurationError(f"torque sign {values} must be +1 or -1 for each of the {JOINTS} joints")
         self._torque_sign = None if (values > 0.0).all() else values
 
     def _accept(self, length: int, source: tuple[str, int], received_ns: int | None = None) -> bool:

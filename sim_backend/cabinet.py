@@ -35,7 +35,7 @@ FLANGE_MM = (0.0, 0.0, 78.0)
 
 _JNT_POS = CMD_OFFSETS["jnt_pos"]
 _STILL_MS = 100
-_CARTESIAN = "Cartesian impedance control (strategy 20) is not simulated, the arm holds its position; use strategy 10 or 30"
+_CARTESIAN = "Cartesian impedance control (strategy 20) is not simulated; use strategy 10 or 30"
 # Control modes in which a spring, or nothing, holds the arm.
 _SOFT = (Control.JNT_IMP, Control.OTHER)
 

@@ -217,10 +217,10 @@ class Service:
     def _await(self, sent: bytes, age_s: float, limit_s: float | None = None) -> None:
         """Lock step: wait until the PC has answered `sent`.
 
-        The wait has no end in monitor mode; in command mode it ends with the configured patience, or with the client.
+        The wait has no end in monitor mode; in command mode it ends with the configured patience or the client.
         The first packet is repeated until the PC is heard, any other now and then, for a restarted PC. After an
-        answer to another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was perhaps
-        lost: it is sent again, and the wait begins anew.
+        answer to another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was
+        perhaps lost: it is sent again, and the wait begins anew.
         """
         wanted = sent[:2]
         commanding = self.cabinet.session.state is State.CMD

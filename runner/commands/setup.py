@@ -119,7 +119,6 @@ def _is_error(record: logging.LogRecord) -> bool:
     metavar="KEY=VALUE",
     help="Replace a key, e.g. krl.variables.LWR_STRATEGY=30.",
 )
-@click.option("--seed", type=click.IntRange(0), help="Seed of everything random; default: as configured.")
 @click.option(
     "--lock-step", is_flag=True, help="Own clock: one cycle for each answer, repeatable bit for bit."
 )
@@ -135,7 +134,6 @@ def emulator_command(
     period_ms: float | None,
     program: str | None,
     settings: tuple[str, ...],
-    seed: int | None,
     lock_step: bool,
     once: bool,
     as_json: bool,
@@ -163,7 +161,6 @@ def emulator_command(
         fri_port=fri_port,
         pendant_port=pendant_port,
         period_ms=period_ms,
-        seed=seed,
         settings={**read_settings(settings), **({} if program is None else {"fri.program": program})},
         once=once,
         verbosity=min(2, int(context.find_root().params.get("verbose", 0))),

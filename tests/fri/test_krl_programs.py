@@ -221,7 +221,7 @@ def test_statements_take_time() -> None:
 def test_a_goal_out_of_reach_and_an_early_strategy_stop_the_program_with_the_line() -> None:
     with pytest.raises(RobotError, match="line 2: software limit"):
         Bench("DEF p( )\nPTP {A1 200}\nEND\n").cycles(10)
-    with pytest.raises(RobotError, match="line 2: .* sample time 200 ms"):
+    with pytest.raises(RobotError, match=r"line 2: .* sample time 200 ms"):
         Bench("DEF p( )\nfriOpen(200)\nEND\n").cycles(10)
 
 

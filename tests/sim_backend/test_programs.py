@@ -56,7 +56,7 @@ def test_a_program_of_the_laboratory_is_run_by_its_file(tmp_path: Path) -> None:
 def test_an_unknown_program_is_named_with_the_known_ones_and_a_wrong_one_with_its_line(
     tmp_path: Path,
 ) -> None:
-    with pytest.raises(ConfigurationError, match="'kuka' is unknown; known: auto_start, .*or give the path"):
+    with pytest.raises(ConfigurationError, match=r"'kuka' is unknown; known: auto_start, .*or give the path"):
         krl_program("kuka")
     with pytest.raises(ConfigurationError, match=r"no\.src' not found"):
         krl_program("no.src")
