@@ -34,12 +34,16 @@ class Machinery(Protocol):
 
     currents: np.ndarray | None
     """(7,) motor currents in the unit of the emulated drives; None where `$CURR_ACT` does not exist."""
-    position: np.ndarray
-    """(7,) measured joint positions [rad]."""
-    joint_torque: np.ndarray
-    """(7,) joint torque sensors [Nm]."""
     powered: bool
     mode: str
+
+    @property
+    def position(self) -> np.ndarray:
+        """(7,) measured joint positions [rad]."""
+
+    @property
+    def joint_torque(self) -> np.ndarray:
+        """(7,) joint torque sensors [Nm]."""
 
     @property
     def load(self) -> tuple[float, ...]:

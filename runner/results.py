@@ -72,7 +72,8 @@ def true_base(experiment: Experiment, found: Identification) -> dict[str, float]
     """
     if experiment.backend != "emulator" or experiment.sealed:
         return {}
-    structure, standard = found.structure, {}
+    structure = found.structure
+    standard: dict[str, float] = {}
     try:
         config = load_configuration(experiment.emulator_path, experiment.emulator_settings)
         if config.robot.plant is not None or not _same_arm(config.beside(config.robot.urdf), structure.chain):

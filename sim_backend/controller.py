@@ -61,9 +61,9 @@ def _feedback(setpoint, gravity, motor_position, joint_torque, gains, memory, se
 
 
 @njit(cache=True)
-def _impedance(
+def _impedance(  # type: ignore[no-untyped-def]
     setpoint, gravity, position, motor_position, joint_torque, spring, gains, memory, settings, out
-):  # type: ignore[no-untyped-def]
+):
     """One cycle of the spring law.
 
     spring : rows K [Nm/rad], D [Nm s/rad], tau_add [Nm]. gains, memory : as in `_feedback`
