@@ -292,6 +292,13 @@ class Operator:
         self.cabinet.power(False)
         self.cabinet.session.t1 = name == "T1"
 
+    def gravity_compensation(self, active: bool = True) -> None:
+        """Gravity compensation, so that a hand moves the arm, or position control again; not in command mode."""
+        try:
+            self.cabinet.session.set_strategy(101 if active else 10)
+        except RuntimeError as error:
+            raise RobotError(str(error)) from error
+
     def drive_fault(self, joint: int, error: bool = True) -> None:
         """Error or warning of a drive."""
         if not 0 <= joint < self.cabinet.joints:

@@ -67,6 +67,25 @@ def test_in_lock_step_a_client_that_left_is_told_and_the_next_one_is_served(
     assert caplog.text.count("has left") <= 2
 
 
+def test_gravity_compensation_from_the_pendant_lets_a_push_move_the_arm() -> None:
+    port = free_port()
+    with Pc(port) as pc, emulator(port, {"fri.program": "lwr_identification"}) as pendant:
+        pc.run(100)
+        pendant.gravity_compensation()
+        pc.run(100)
+        before = pendant.status()
+        assert before["control"] == "OTHER"
+        pendant.push([8.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        pc.run(400)
+        pendant.push([0.0] * 7)
+        pendant.gravity_compensation(False)
+        pc.run(200)
+        after = pendant.status()
+    assert after["control"] == "POSITION"
+    assert after["position"][0] - before["position"][0] > 0.05
+    assert abs(after["setpoint"][0] - after["position"][0]) < 0.01
+
+
 def test_with_once_the_emulator_ends_with_its_client(caplog: pytest.LogCaptureFixture) -> None:
     port = free_port()
     config = load_configuration("emulator/default.yaml", {**QUICK, "fri.period_ms": 2})
