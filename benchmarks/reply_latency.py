@@ -35,7 +35,7 @@ from lwr_driver.driver import Driver, LinkSettings
 from lwr_driver.motion import move_to
 from lwr_driver.realtime import assess, set_up
 from lwr_driver.session import session_metadata
-from sim_backend.configuration import krl_program
+from sim_backend.program import krl_program
 
 START = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
 # Sleeping longer, the sender's processor would wake late.

@@ -6,6 +6,7 @@ and ``receive`` instead.
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from fri.states import State
 _BUFFER_SIZE = 2048
 _SLICE_S = 0.05
 _RESEND_S = 0.2
+# Of linux/in.h: errors of the network come back to the socket, as the closed port of a PC that left.
+_IP_RECVERR = 11
 # Time for passing over foreign datagrams, even with a timeout of zero.
 _SHORTEST_FLOOD_S = 0.005
 
@@ -25,7 +28,8 @@ _SHORTEST_FLOOD_S = 0.005
 class ControllerEnd:
     """UDP client of the controller; as a context manager it closes the socket.
 
-    remote : address and port of the PC; other datagrams are counted in `foreign` and dropped
+    remote : address and port of the PC; other datagrams are counted in `foreign` and dropped. `refused` counts its
+    answers that the port is closed
     local : address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``
 
     Raises NetworkError if the local address cannot be bound.
@@ -43,9 +47,11 @@ class ControllerEnd:
                 "choose a free port or 0"
             ) from error
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
         self.address: tuple[str, int] = self._socket.getsockname()
         self.foreign = 0
         self.send_errors = 0
+        self.refused = 0
 
     def fileno(self) -> int:
         """File descriptor, for waiting for several sockets at once."""
@@ -53,10 +59,24 @@ class ControllerEnd:
 
     def send(self, datagram: bytes) -> None:
         """Send one datagram to the PC; refusals of the network are counted in `send_errors`."""
-        try:
-            self._socket.sendto(datagram, self.remote)
-        except OSError:
-            self.send_errors += 1
+        # The error of an earlier datagram is reported instead of sending the next one.
+        for _ in range(3):
+            try:
+                self._socket.sendto(datagram, self.remote)
+            except ConnectionRefusedError:
+                self._take_errors()
+            except OSError:
+                self.send_errors += 1
+                return
+            else:
+                return
+
+    def _take_errors(self) -> None:
+        """Empty the queue of errors from the network."""
+        self.refused += 1
+        with contextlib.suppress(OSError):
+            while True:
+                self._socket.recvmsg(_BUFFER_SIZE, _BUFFER_SIZE, socket.MSG_ERRQUEUE)
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Next datagram of the PC, or None after `timeout_s` [s]; 0 does not wait."""
@@ -70,6 +90,9 @@ class ControllerEnd:
                 if remaining <= 0.0:
                     return None
                 select.select((self._socket,), (), (), remaining)
+                continue
+            except OSError:
+                self._take_errors()
                 continue
             if source == self.remote:
                 return datagram

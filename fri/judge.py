@@ -80,9 +80,31 @@ class CommandJudge:
             )
         return None
 
-    def mirror(self, command: CmdBuffer, target: np.ndarray, what: str) -> Objection | None:
-        """The commanded position equal to the total setpoint, within the tolerance."""
-        tolerance = self._policy.mirror_tolerance
+    def springs(self, command: CmdBuffer) -> Objection | None:
+        """Flagged stiffness and damping of the joints within the bounds of the policy."""
+        fields = (
+            (CommandFlag.JNTSTIFF, "jnt_stiffness", "stiffness", self._policy.largest_stiffness, " Nm/rad"),
+            (CommandFlag.JNTDAMP, "jnt_damping", "damping", self._policy.largest_damping, ""),
+        )
+        for flag, field, what, largest, unit in fields:
+            values = command.record[field]
+            if command.cmd_flags & flag and not (
+                values.min() >= 0.0 and values.max() <= largest * (1.0 + 1e-6)
+            ):
+                joint = int(np.argmax(np.abs(values - 0.5 * largest)))
+                return (
+                    EventKind.IMPEDANCE,
+                    f"{JOINT_NAMES[joint]} commanded {what} {values[joint]:g}{unit} is outside 0 to {largest:g}{unit}",
+                )
+        return None
+
+    def mirror(
+        self, command: CmdBuffer, target: np.ndarray, what: str, *, soft: bool = False
+    ) -> Objection | None:
+        """The commanded position equal to the total setpoint, within the tolerance; `soft` for a spring."""
+        policy = self._policy
+        tolerance = max(policy.mirror_tolerance, policy.mirror_speed * self._period)
+        tolerance = policy.soft_mirror_tolerance if soft else tolerance
         q = command.jnt_pos.tolist()
         for joint, now in enumerate(target.tolist()):
             distance = abs(q[joint] - now)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -107,7 +108,9 @@ class KrcSession:
     answered, needs_resync : bool
         Whether this cycle has its valid answer; whether KRL's setpoint must be set anew after a fallback.
     events : deque of Event
-        The last 256; `last_event` is the newest or None.
+        The last 256; `last_event` is the newest or None. `on_event`, if given, is called with each.
+    refused : dict of Control to str
+        Control modes without command mode here, with the reason.
     """
 
     _head = struct.Struct("<HH").pack_into
@@ -138,6 +141,8 @@ class KrcSession:
         self.cycle = 0
         self.last_event: Event | None = None
         self.events: deque[Event] = deque(maxlen=256)
+        self.on_event: Callable[[Event], None] | None = None
+        self.refused: dict[Control, str] = {}
 
         record = new_msr()
         self._record = record
@@ -282,6 +287,9 @@ class KrcSession:
                 EventKind.REFUSED,
                 "start refused: KRL's setpoint must be set anew after a fallback (PTP $AXIS_ACT)",
             )
+            return self.state
+        if self.control in self.refused:
+            self._note(EventKind.REFUSED, f"start refused: {self.refused[self.control]}")
             return self.state
         self._safety_limits = float(safety_limits)
         self._tighten_judge()
@@ -473,6 +481,8 @@ class KrcSession:
         event = Event(self.cycle, kind, text)
         self.last_event = event
         self.events.append(event)
+        if self.on_event is not None:
+            self.on_event(event)
         return event
 
     def _tighten_judge(self) -> None:
@@ -488,6 +498,8 @@ class KrcSession:
 
     def _try_start(self) -> None:
         if self._dwell < self.policy.start_dwell or self._track.ramping:
+            return
+        if self.control in self.refused:
             return
         if self.quality < self.policy.start_quality or not self._transition(Trigger.FRI_START):
             return
@@ -545,14 +557,18 @@ class KrcSession:
             return held, judge.mirror(command, held, "the command with the drives off")
         # Through a list: numpy warns of a signalling NaN, left to the judge.
         target = np.array(command.jnt_pos.tolist())
+        soft = self.control is Control.JNT_IMP
         if self._first_command:
-            objection = judge.mirror(command, held, "the first command")
+            objection = judge.mirror(command, held, "the first command", soft=soft)
         objection = (
             objection
+            or (judge.springs(command) if soft else None)
             or judge.position(command.jnt_pos.tolist(), "commanded")
-            or judge.velocity(command, held)
-            or judge.acceleration(*self._track.change_of_step(target))
         )
+        if objection is None and not (soft and self._first_command):
+            # A spring takes the way from its setpoint to the arm without a motion.
+            step = self._track.change_of_step(target)
+            objection = judge.velocity(command, held) or judge.acceleration(*step)
         self._first_command = False
         return target, objection
 

@@ -1,43 +1,54 @@
 """KRL programs on the emulated controller: the laboratory's program text itself is run.
 
-``KrlProgram`` knows the system variables and functions of the interface (``$FRI_TO_INT``, ``$FRISTATE``,
-``friOpen`` ...), the control strategy, motor currents and load data. ``Interpreter`` runs it beside an FRI
-session. Between two waits a program takes no time; a wait lasts whole ticks of 12 ms.
+``KrlProgram`` runs the tree of `fri.krl_source` with the variables of `fri.krl_system`. ``Interpreter`` runs it
+beside an FRI session. A statement takes `statement_ms`, by default nothing; a wait ends with a tick of the
+interpolation cycle, 12 ms. Interrupts, Cartesian motions and unknown system variables have no effect, and
+``KrlProgram.remarks`` names each of them.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import operator
 from collections.abc import Callable, Generator, Mapping
-from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from fri import krl_source as tree
-from fri.errors import ConfigurationError
+from fri import krl_source
+from fri import krl_tree as tree
+from fri.errors import ConfigurationError, RobotError
 from fri.krc import KrcSession
-from fri.states import State
+from fri.krl_check import Check, split
+from fri.krl_system import (
+    AXIS_NAMES,
+    HERE,
+    Machinery,
+    NoMachinery,
+    Path,
+    System,
+    first_value,
+    get,
+    positions,
+    put,
+)
+from fri.states import Control, State
 
-#: Period of the KRL interpreter [ms].
+#: Interpolation cycle of the controller: a wait ends at its ticks [ms].
 TICK_MS = 12
-#: Indices of the axes of KRL (A1 to A6, then E1) in the kinematic order A1 A2 E1 A3 A4 A5 A6.
-AXES = (0, 1, 3, 4, 5, 6, 2)
-#: Load data in the order of ``Machinery.load``: mass [kg], centre of mass [mm], inertia about it [kg m2].
-LOAD = (".M", ".CM.X", ".CM.Y", ".CM.Z", ".J.X", ".J.Y", ".J.Z")
 
 _LONGEST_RUN = 2000
-_ARRAYS = {f"$FRI_{way}_{kind}": 16 for way in ("FRM", "TO") for kind in ("INT", "REA", "BOOL")}
-_ARRAYS["$CURR_ACT"] = 7
-_STATES = ("$FRISTATE", "$FRIQUALITY", "$ON_PATH", "$ROB_STOPPED")
-_PLAIN = (*_STATES, "$STIFFNESS.STRATEGY", "$STIFFNESS.COMMIT", "$ADVANCE", "$LOAD")
-_READ_ONLY = (*_STATES, "$FRI_FRM_INT", "$FRI_FRM_REA", "$FRI_FRM_BOOL", "$CURR_ACT")
-_GOALS = ("$AXIS_ACT", "$AXIS_ACT_MES")
-_FUNCTIONS = {"FRISETUP": 3, "FRIOPEN": 1, "FRISTART": 1, "FRISTOP": 0, "FRICLOSE": 0, "BAS": 2}
+_DEEPEST = 100
+_SPEED_SHARE = 0.25
+_SHORTEST_MOTION_MS = 50.0
 _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
     "AND": lambda a, b: a and b,
     "OR": lambda a, b: a or b,
+    "EXOR": operator.ne,
+    "B_AND": operator.and_,
+    "B_OR": operator.or_,
+    "B_EXOR": operator.xor,
     "==": operator.eq,
     "<>": operator.ne,
     "<": operator.lt,
@@ -49,33 +60,38 @@ _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
     "*": operator.mul,
 }
 
-Flow = Generator[None, None, str]
+# Yields times of the interpreter's clock [ms]; the result is EXIT or RETURN if one of them ended the block.
+Flow = Generator[float, None, str]
 
 
-class Machinery(Protocol):
-    """Motor currents and load data of the controller, beside the FRI session."""
+class _Motion:
+    """A synchronous motion of all axes with the least jerk, from `start` to `goal` (7,) [rad]."""
 
-    currents: np.ndarray
-    """(7,) motor currents in kinematic order, in the unit of the emulated drives."""
+    def __init__(self, session: KrcSession, goal: np.ndarray, begin_ms: float, share: float) -> None:
+        self.start, self.goal, self.begin_ms = session.krl_setpoint, goal, begin_ms
+        way, limits = np.abs(goal - self.start), session.limits
+        # Peaks of the polynomial 10 s^3 - 15 s^4 + 6 s^5.
+        fast = 1.875 * way / (limits.v_max * share)
+        hard = np.sqrt(5.774 * way / (limits.a_max * share))
+        self.duration_ms = max(_SHORTEST_MOTION_MS, 1000.0 * float(np.max(np.maximum(fast, hard))))
+        self.commanded = session.state is State.CMD
 
-    @property
-    def load(self) -> tuple[float, ...]:
-        """Load data in force in the order of `LOAD`."""
+    def position(self, now_ms: float) -> np.ndarray:
+        """Setpoint (7,) [rad]."""
+        s = min(1.0, max(0.0, (now_ms - self.begin_ms) / self.duration_ms))
+        return (
+            self.goal
+            if s == 1.0
+            else self.start + s**3 * (10 - 15 * s + 6 * s * s) * (self.goal - self.start)
+        )
 
-    def set_load(self, load: tuple[float, ...]) -> None:
-        """Put load data in force."""
 
+class _Frame:
+    """A subprogram at work: its module and its own variables."""
 
-class NoMachinery:
-    """Drives without current, and load data without effect."""
-
-    def __init__(self) -> None:
-        self.currents = np.zeros(7)
-        self.load: tuple[float, ...] = (0.0,) * len(LOAD)
-
-    def set_load(self, load: tuple[float, ...]) -> None:
-        """Keep `load`."""
-        self.load = load
+    def __init__(self, module: int, values: dict[str, Any]) -> None:
+        self.module, self.values = module, values
+        self.result: Any = None
 
 
 class KrlProgram:
@@ -83,9 +99,13 @@ class KrlProgram:
 
     text, data : content of the `.src` and the `.dat` file
     settings : values for variables of the data list, e.g. ``LWR_CYCLE``
-    machinery : motor currents and load data; None takes drives without current
+    machinery : the controller and its arm; None takes drives without current
+    statement_ms : time of a statement [ms]. halt_s : time until somebody presses start after HALT [s]
+    modules : text and data of further modules by name, for their global subprograms
+    remarks : what the program asks for and does not get, a sentence each
 
-    Raises ConfigurationError with the line for a syntax error, or an unknown variable or function.
+    Raises ConfigurationError with the line for a syntax error, or an unknown variable or function. A program that
+    fails at work raises RobotError, as the controller stops it with a message.
     """
 
     def __init__(
@@ -95,77 +115,201 @@ class KrlProgram:
         settings: Mapping[str, float | int | str] | None = None,
         machinery: Machinery | None = None,
         name: str = "KRL program",
+        *,
+        statement_ms: float = 0.0,
+        halt_s: float = 1.0,
+        modules: Mapping[str, tuple[str, str]] | None = None,
     ) -> None:
         self.name = name
         self.finished = False
-        self.source = tree.parse_source(text, data, name)
         self.machinery: Any = machinery if machinery is not None else NoMachinery()
-        self._session: KrcSession | None = None
-        self._strategy = 10
-        self._tick = 0
+        self.source = krl_source.parse_source(text, data, name)
+        self._sources = [self.source]
+        for title, (more, values) in (modules or {}).items():
+            self._sources.append(krl_source.parse_source(more, values, title))
+        self._programs: dict[str, tuple[int, tree.Subprogram]] = {}
+        for number, source in enumerate(self._sources):
+            for title, subprogram in source.subprograms.items():
+                self._programs.setdefault(title, (number, subprogram))
+        check = Check(self._sources, self._programs, name)
+        check.run()
+        self.remarks: tuple[str, ...] = tuple(check.remarks)
+        self._statement_ms, self._halt_s = statement_ms, halt_s
+        self._system = System(self.machinery)
+        self._clock = self._due = self._owed = 0.0
+        self._ticks = 0
+        self._nested = 0
+        self._line = 0
         self._flow: Flow | None = None
-        _Check(self.source, name).module()
-        self._variables: dict[str, Any] = {}
-        for declared in self.source.declarations.values():
-            empty: Any = (0.0,) * len(LOAD) if declared.kind == "LOAD" else 0
-            self._variables[declared.name] = empty if declared.value is None else declared.value.value
+        self._motion: _Motion | None = None
+        self._frames = [_Frame(0, {})]
+        self._globals: list[dict[str, Any]] = []
+        for number, source in enumerate(self._sources):
+            self._globals.append({})
+            self._frames = [_Frame(number, {})]
+            self._globals[-1].update(self._first_values(source.declarations))
+            for element in source.elements:
+                self._write(element.target, self._value(element.value))
+        self._frames = [_Frame(0, {})]
+        known = self._globals[0]
         for key, value in (settings or {}).items():
-            if key.upper() not in self._variables:
-                known = ", ".join(sorted(self._variables))
-                raise ConfigurationError(f"{name}: has no variable {key}; it has {known}")
-            self._variables[key.upper()] = value
+            if key.upper() not in known:
+                raise ConfigurationError(f"{name}: has no variable {key}; it has {', '.join(sorted(known))}")
+            known[key.upper()] = value
+
+    def preset(self, name: str, value: float | int | str) -> bool:
+        """Set a variable of the data list before the start; whether the program has it."""
+        known = name in self._globals[0]
+        if known:
+            self._globals[0][name] = value
+        return known
 
     def step(self, session: KrcSession) -> None:
-        """One tick of the interpreter: on to the next wait."""
-        self._session = session
-        self._tick += 1
+        """One tick of the interpreter: all statements up to it."""
+        self.run(session, self._ticks * TICK_MS)
+        self._ticks += 1
+
+    def run(self, session: KrcSession, now_ms: float) -> None:
+        """Run all statements due at `now_ms` or before."""
+        self._system.session = session
         if self._flow is None:
-            self._flow = self._block(self.source.subprograms[self.source.main])
+            self._flow = self._enter(self.source.main, [])
+        while not self.finished and self._due <= now_ms + 1e-6:
+            self._clock = self._system.clock_ms = self._due
+            try:
+                self._due = next(self._flow)
+            except StopIteration:
+                self.finished = True
+            except (RobotError, ArithmeticError, TypeError, ValueError) as error:
+                self.finished = True
+                raise RobotError(f"{self.name}, line {self._line}: {error}") from error
+
+    def drive(self, session: KrcSession, now_ms: float) -> None:
+        """Give the session KRL's setpoint at `now_ms`, the end of the next cycle, during a motion."""
+        motion = self._motion
+        if motion is None:
+            return
+        if not self.machinery.powered or motion.commanded != (session.state is State.CMD):
+            self._motion = None
+            return
+        session.move_krl(motion.position(now_ms))
+        if now_ms - motion.begin_ms >= motion.duration_ms:
+            self._motion = None
+
+    # Flow
+
+    def _tick(self, after_ms: float = 0.0) -> float:
+        """The next tick; with `after_ms` the first one at least so much later."""
+        if after_ms > 0.0:
+            return math.ceil(round((self._clock + after_ms) / TICK_MS, 9)) * TICK_MS
+        return (math.floor(round(self._clock / TICK_MS, 9)) + 1) * TICK_MS
+
+    def _spend(self) -> Generator[float, None, None]:
+        """The time of a statement, and of functions before it."""
+        cost, self._owed = self._statement_ms + self._owed, 0.0
+        if cost > 0.0 and not self._nested:
+            yield self._clock + cost
+        elif self._nested:
+            self._owed += cost
+
+    def _pause(self, until_ms: float) -> Generator[float, None, None]:
+        if self._nested:
+            raise RobotError(
+                "a function that waits is called within an expression; assign its result to a variable"
+            )
+        yield until_ms
+
+    def _enter(self, title: str, arguments: list[Any]) -> Flow:
+        """Run the subprogram `title` with the values of its arguments; its frame holds the result."""
+        module, subprogram = self._programs[title]
+        if len(self._frames) > _DEEPEST:
+            raise RobotError(f"{title} calls itself without end")
+        frame = _Frame(module, self._first_values(subprogram.declarations))
+        for (name, _), value in zip(subprogram.parameters, arguments, strict=False):
+            frame.values[name] = copy.deepcopy(value)
+        self._frames.append(frame)
         try:
-            next(self._flow)
-        except StopIteration:
-            self.finished = True
+            yield from self._block(subprogram.body)
+        finally:
+            self._frames.pop()
+            self._last = frame
+        return ""
+
+    def _call(self, call: tree.Call) -> Flow:
+        """Run a subprogram of the program; changed arguments by reference go back to the caller."""
+        _, subprogram = self._programs[call.name]
+        yield from self._enter(call.name, [self._value(argument) for argument in call.arguments])
+        frame = self._last
+        for (name, by_value), argument in zip(subprogram.parameters, call.arguments, strict=False):
+            if not by_value and isinstance(argument, tree.Name):
+                self._write(argument, frame.values[name])
+        self._last = frame
+        return ""
 
     def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
         """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
         for statement in statements:
-            left = ""
-            if isinstance(statement, tree.Assign):
-                self._write(statement.target, self._value(statement.value))
-            elif isinstance(statement, tree.Call):
-                if statement.name in self.source.subprograms:
-                    yield from self._block(self.source.subprograms[statement.name])
-                else:
-                    self._function(statement)
-            elif isinstance(statement, tree.Leave):
-                left = statement.what
-            elif isinstance(statement, tree.Branch):
-                chosen = statement.then if self._value(statement.condition) else statement.otherwise
-                left = yield from self._block(chosen)
-            elif isinstance(statement, tree.Switch):
-                left = yield from self._block(self._case(statement))
-            elif isinstance(statement, tree.Loop):
-                left = yield from self._loop(statement)
-            elif isinstance(statement, tree.For):
-                left = yield from self._count(statement)
-            elif isinstance(statement, tree.WaitFor):
-                while not self._value(statement.condition):
-                    yield
-            elif isinstance(statement, tree.WaitSeconds):
-                for _ in range(math.ceil(round(1000 * float(self._value(statement.seconds)) / TICK_MS, 9))):
-                    yield
-            else:
-                yield from self._move()
+            self._line = statement.line
+            left = yield from self._statement(statement)
             if left:
                 return left
         return ""
 
+    def _statement(self, statement: tree.Statement) -> Flow:
+        left = ""
+        yield from self._spend()
+        if isinstance(statement, tree.Assign):
+            value = statement.value
+            if isinstance(value, tree.Call) and value.name in self._programs:
+                yield from self._call(value)
+                self._write(statement.target, self._last.result)
+            else:
+                self._write(statement.target, self._value(value))
+        elif isinstance(statement, tree.Call):
+            if statement.name in self._programs:
+                yield from self._call(statement)
+            else:
+                self._value(statement)
+        elif isinstance(statement, tree.Leave):
+            left = statement.what
+            if statement.value is not None:
+                self._frames[-1].result = copy.deepcopy(self._value(statement.value))
+        elif isinstance(statement, tree.Branch):
+            chosen = statement.then if self._value(statement.condition) else statement.otherwise
+            left = yield from self._block(chosen)
+        elif isinstance(statement, tree.Switch):
+            left = yield from self._block(self._case(statement))
+        elif isinstance(statement, (tree.Loop, tree.Repeat)):
+            left = yield from self._loop(statement)
+        elif isinstance(statement, tree.For):
+            left = yield from self._count(statement)
+        elif isinstance(statement, tree.WaitFor):
+            while not self._value(statement.condition):
+                yield from self._pause(self._tick())
+        elif isinstance(statement, tree.WaitSeconds):
+            milliseconds = 1000.0 * float(self._value(statement.seconds))
+            if milliseconds > 0.0:
+                yield from self._pause(self._tick(milliseconds))
+        elif isinstance(statement, tree.Halt):
+            self.machinery.say(
+                f"{self.name}, line {statement.line}: HALT; start is pressed in {self._halt_s:g} s"
+            )
+            yield from self._pause(self._tick(1000.0 * self._halt_s))
+        elif isinstance(statement, tree.Move):
+            yield from self._move(statement)
+        return left
+
     def _count(self, statement: tree.For) -> Flow:
-        for value in range(int(self._value(statement.first)), int(self._value(statement.last)) + 1):
+        value, last = int(self._value(statement.first)), int(self._value(statement.last))
+        step = int(self._value(statement.step))
+        while (value <= last) if step > 0 else (value >= last and step < 0):
             self._write(statement.variable, value)
             left = yield from self._block(statement.body)
             if left:
                 return "" if left == "EXIT" else left
+            yield from self._spend()
+            value += step
+        self._write(statement.variable, value)
         return ""
 
     def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:
@@ -175,30 +319,68 @@ class KrlProgram:
                 return block
         return statement.default
 
-    def _loop(self, statement: tree.Loop) -> Flow:
-        passes = 0
+    def _loop(self, statement: tree.Loop | tree.Repeat) -> Flow:
+        passes, until = 0, isinstance(statement, tree.Repeat)
         while True:
-            if statement.condition is not None and not self._value(statement.condition):
+            if not until and statement.condition is not None and not self._value(statement.condition):
                 return ""
-            tick = self._tick
+            clock = self._clock
             left = yield from self._block(statement.body)
             if left:
                 return "" if left == "EXIT" else left
-            passes = passes + 1 if tick == self._tick else 0
+            if until and statement.condition is not None and self._value(statement.condition):
+                return ""
+            yield from self._spend()
+            passes = passes + 1 if clock == self._clock else 0
             if passes > _LONGEST_RUN:
-                raise ConfigurationError(f"{self.name}, line {statement.line}: the loop never waits")
+                self._line = statement.line
+                raise RobotError("the loop never waits")
 
-    def _move(self) -> Generator[None, None, None]:
-        """Set KRL's setpoint to the position of the arm, once the arm stands."""
+    def _move(self, statement: tree.Move) -> Generator[float, None, None]:
+        """Move KRL's setpoint to the goal; to the place of the arm, once the arm stands."""
         session = self._need()
         while session.ramping:
-            yield
-        if session.state is not State.CMD:
-            session.resync()
+            yield from self._pause(self._tick())
+        here = isinstance(statement.goal, tree.Name) and statement.goal.name in HERE
+        if here:
+            if session.state is not State.CMD:
+                # A spring holds the arm away from its setpoint.
+                soft = session.control is not Control.POSITION
+                session.resync(self.machinery.position if soft else None)
+            return
+        goal = self._value(statement.goal)
+        if not isinstance(goal, dict) or not any(axis in goal for axis in AXIS_NAMES[:6]):
+            self.machinery.say(f"{self.name}, line {statement.line}: a Cartesian goal is passed over")
+            return
+        target = positions(goal, session.krl_setpoint, relative=statement.relative)
+        outside = (target < session.limits.q_min - 1e-6) | (target > session.limits.q_max + 1e-6)
+        if outside.any():
+            raise RobotError(
+                f"software limit: the goal {np.degrees(target).round(2).tolist()} deg is out of reach"
+            )
+        while True:
+            while session.ramping or not self.machinery.powered:
+                yield from self._pause(self._tick())
+            if session.state is not State.CMD:
+                session.resync()
+            share = _SPEED_SHARE * max(1.0, float(self._system.read("$OV_PRO", ()))) / 100.0
+            self._motion = _Motion(session, target, self._clock, share)
+            while self._motion is not None:
+                yield from self._pause(self._tick())
+            if session.state is State.CMD or np.array_equal(session.krl_setpoint, target.astype(np.float32)):
+                return
+
+    # Values
 
     def _need(self) -> KrcSession:
-        assert self._session is not None
-        return self._session
+        assert self._system.session is not None
+        return self._system.session
+
+    def _first_values(self, declarations: Mapping[str, tree.Declaration]) -> dict[str, Any]:
+        return {
+            one.name: first_value(one.kind, one.size) if one.value is None else self._value(one.value)
+            for one in declarations.values()
+        }
 
     def _value(self, expression: tree.Expression) -> Any:
         if isinstance(expression, tree.Constant):
@@ -214,160 +396,63 @@ class KrlProgram:
             return _OPERATORS[expression.operator](left, right)
         if isinstance(expression, tree.Unary):
             value = self._value(expression.operand)
-            return not value if expression.operator == "NOT" else -value
-        return self._function(expression)
+            if expression.operator == "NOT":
+                return not value
+            return ~value if expression.operator == "B_NOT" else -value
+        if isinstance(expression, tree.Aggregate):
+            return {name: self._value(value) for name, value in expression.items}
+        if expression.name in self._programs:
+            self._nested += 1
+            try:
+                for _ in self._call(expression):
+                    pass
+            finally:
+                self._nested -= 1
+            return self._last.result
+        return self._system.call(expression.name, [self._value(one) for one in expression.arguments])
+
+    def _place(self, name: tree.Name) -> tuple[str, Path, dict[str, Any] | None]:
+        """Name, path, and owner of a variable; None for the controller."""
+        title, fields = split(name.name)
+        path: list[str | int | tuple[int, ...]] = list(fields)
+        indices: list[int] = []
+        for step in ((name.index,) if name.index is not None else ()) + name.rest:
+            if isinstance(step, str):
+                path += [tuple(indices) if len(indices) > 1 else indices[0]] if indices else []
+                path.append(step[1:])
+                indices = []
+            else:
+                indices.append(int(self._value(step)))
+        path += [tuple(indices) if len(indices) > 1 else indices[0]] if indices else []
+        frame = self._frames[-1]
+        for owner in (frame.values, self._globals[frame.module]):
+            if title in owner:
+                return title, tuple(path), owner
+        return title, tuple(path), None
 
     def _read(self, name: tree.Name) -> Any:
-        session, (title, field) = self._need(), _split(name.name)
-        if title in self._variables or title == "$LOAD":
-            value = self.machinery.load if title == "$LOAD" else self._variables[title]
-            return value if not field else value[LOAD.index(field)]
-        if name.index is None:
-            return self._state(title)
-        place = self._place(name)
-        if title == "$CURR_ACT":
-            return float(self.machinery.currents[AXES[place]])
-        if title.endswith("_BOOL"):
-            return bool((session.to_bool if "_TO_" in title else session.from_bool) >> place & 1)
-        if title.endswith("_INT"):
-            return int((session.to_int if "_TO_" in title else session.from_int)[place])
-        return float((session.to_real if "_TO_" in title else session.from_real)[place])
-
-    def _state(self, title: str) -> Any:
-        session = self._need()
-        if title == "$FRISTATE":
-            return f"#{session.state.name}"
-        if title == "$FRIQUALITY":
-            return f"#{session.quality.name}"
-        if title == "$ON_PATH":
-            # A fallback leaves the arm away from the setpoint of KRL.
-            return not session.needs_resync
-        return not session.ramping if title == "$ROB_STOPPED" else self._strategy
+        title, path, owner = self._place(name)
+        return self._system.read(title, path) if owner is None else get(owner[title], path, title)
 
     def _write(self, name: tree.Name, value: Any) -> None:
-        session, (title, field) = self._need(), _split(name.name)
-        if field:
-            load = list(self._read(tree.Name(title)))
-            load[LOAD.index(field)] = float(value)
-            value = tuple(load)
-        if title == "$LOAD":
-            self.machinery.set_load(value)
-        elif title in self._variables:
-            self._variables[title] = value
-        elif title == "$STIFFNESS.STRATEGY":
-            self._strategy = int(value)
-        elif title == "$STIFFNESS.COMMIT":
-            session.set_strategy(self._strategy)
-        elif title == "$FRI_TO_INT":
-            session.to_int[self._place(name)] = int(value)
-        elif title == "$FRI_TO_REA":
-            session.to_real[self._place(name)] = float(value)
-        elif title == "$FRI_TO_BOOL":
-            bit = 1 << self._place(name)
-            session.to_bool = session.to_bool | bit if value else session.to_bool & ~bit
-
-    def _place(self, name: tree.Name) -> int:
-        assert name.index is not None
-        number = int(self._value(name.index))
-        if not 1 <= number <= _ARRAYS[name.name]:
-            raise ConfigurationError(
-                f"{self.name}: {name.name}[{number}] is outside 1 to {_ARRAYS[name.name]}"
-            )
-        return number - 1
-
-    def _function(self, call: tree.Call) -> Any:
-        session = self._need()
-        values = [self._value(argument) for argument in call.arguments]
-        if call.name == "FRIOPEN":
-            session.fri_open(int(values[0]))
-        elif call.name == "FRISTART":
-            session.fri_start(float(values[0]))
-        elif call.name == "FRISTOP":
-            session.fri_stop()
-        elif call.name == "FRICLOSE":
-            session.fri_close()
-        # friSetup and BAS have no effect: address, tool and velocities are the emulator's own.
-        return f"#{session.state.name}"
+        title, path, owner = self._place(name)
+        if owner is None:
+            self._system.write(title, path, value)
+        else:
+            owner[title] = put(owner[title], path, value, title)
 
 
 class Interpreter:
-    """Runs `program` beside `session`, a tick every 12 ms; the first tick comes with the first call."""
+    """Runs `program` beside `session`; the first statements run with the first call."""
 
     def __init__(self, session: KrcSession, program: KrlProgram) -> None:
         self.session = session
         self.program = program
-        self._due_ms = 0
+        self._now_ms = 0
 
     def advance(self, milliseconds: int) -> None:
-        """Let `milliseconds` pass, between two cycles; runs the ticks due."""
-        while self._due_ms <= 0:
-            if not self.program.finished:
-                self.program.step(self.session)
-            self._due_ms += TICK_MS
-        self._due_ms -= milliseconds
-
-
-@lru_cache(maxsize=256)
-def _split(name: str) -> tuple[str, str]:
-    """A name of load data and its field, `$LOAD` and `.CM.X`; any other name and nothing."""
-    for field in LOAD:
-        if name.endswith(field):
-            return name.removesuffix(field), field
-    return name, ""
-
-
-class _Check:
-    """Search a module for unknown names and wrong numbers of arguments."""
-
-    def __init__(self, source: tree.Source, name: str) -> None:
-        self._source, self._name = source, name
-
-    def module(self) -> None:
-        for block in self._source.subprograms.values():
-            self._part(block, 0, written=False)
-
-    def _statement(self, statement: tree.Statement) -> None:
-        for value in vars(statement).values():
-            self._part(value, statement.line, written=False)
-        if isinstance(statement, (tree.Assign, tree.For)):
-            target = statement.target if isinstance(statement, tree.Assign) else statement.variable
-            self._variable(target, statement.line, written=True)
-
-    def _part(self, value: Any, line: int, *, written: bool) -> None:
-        if isinstance(value, tuple):
-            for item in value:
-                self._part(item, line, written=written)
-        elif isinstance(value, tree.Name):
-            self._variable(value, line, written=written)
-        elif isinstance(value, tree.Statement) and not isinstance(value, tree.Call):
-            self._statement(value)
-        elif isinstance(value, tree.Call):
-            wanted = _FUNCTIONS.get(value.name, 0 if value.name in self._source.subprograms else None)
-            if wanted is None:
-                raise self._error(value.line, f"there is no function {value.name}")
-            if wanted != len(value.arguments):
-                raise self._error(
-                    value.line, f"{value.name} takes {wanted} arguments, not {len(value.arguments)}"
-                )
-            self._part(value.arguments, value.line, written=False)
-        elif isinstance(value, (tree.Unary, tree.Binary)):
-            for inner in vars(value).values():
-                self._part(inner, line, written=False)
-
-    def _variable(self, name: tree.Name, line: int, *, written: bool) -> None:
-        title, field = _split(name.name)
-        declared = self._source.declarations.get(title)
-        if field and title != "$LOAD" and (declared is None or declared.kind != "LOAD"):
-            raise self._error(line, f"there is no variable {name.name}")
-        if declared is None:
-            if title not in (*_ARRAYS, *_PLAIN, *_GOALS):
-                raise self._error(line, f"there is no variable {title}")
-            if title in _ARRAYS and name.index is None:
-                raise self._error(line, f"{title} needs an index")
-            if written and title in (*_READ_ONLY, *_GOALS):
-                raise self._error(line, f"{title} cannot be written")
-        if name.index is not None:
-            self._part(name.index, line, written=False)
-
-    def _error(self, line: int, text: str) -> ConfigurationError:
-        return ConfigurationError(f"{self._name}, line {line}: {text}")
+        """Let `milliseconds` pass, between two cycles; runs the statements due."""
+        if not self.program.finished:
+            self.program.run(self.session, self._now_ms)
+        self._now_ms += milliseconds
+        self.program.drive(self.session, self._now_ms + self.session.sample_time_ms)

@@ -51,6 +51,14 @@ class KrcPolicy:
         normal.
     mirror_tolerance : float
         Largest distance [rad] of the first command, and of any command with the drives off, from the mirror.
+    mirror_speed : float
+        Speed [rad/s] with which the first command may begin; the tolerance is at least its step in a cycle. KUKA's
+        sample client begins a sine with 0.055 rad/s.
+    soft_mirror_tolerance : float
+        The same [rad] for the first command of joint impedance control: published clients begin at the measured
+        position, where the spring sags.
+    largest_stiffness, largest_damping : float
+        Bounds of commanded joint stiffness [Nm/rad] and damping ratio.
     limit_tolerance : float
         Allowance on position and step limits for the rounding of float32 [rad].
     t1_velocity_factor : float
@@ -76,6 +84,10 @@ class KrcPolicy:
     drop_on_malformed: bool = True
     drop_on_drives_off: bool = True
     mirror_tolerance: Annotated[float, within(0.0, 1.0, "rad", above=True)] = 1e-3
+    mirror_speed: Annotated[float, within(0.0, 10.0, "rad/s", above=True)] = 0.1
+    soft_mirror_tolerance: Annotated[float, within(0.0, 3.0, "rad", above=True)] = 0.1
+    largest_stiffness: Annotated[float, within(0.0, 1e6, "Nm/rad", above=True)] = 5000.0
+    largest_damping: Annotated[float, within(0.0, 10.0, above=True)] = 1.0
     limit_tolerance: Annotated[float, within(0.0, 1e-3, "rad", below=True)] = 1e-6
     t1_velocity_factor: _Factor = 0.25
     acceleration_factor: _Factor | None = None

@@ -149,6 +149,7 @@ class RemoteEnd:
 
         self._msr = MsrBuffer()
         self.msr = self._msr.record
+        self._torque_sign: np.ndarray | None = None
         self.command = new_cmd()
         self.krl_real: np.ndarray = self.command["krl_real"]
         self.krl_int: np.ndarray = self.command["krl_int"]
@@ -432,6 +433,13 @@ class RemoteEnd:
             self._receive_timeout = timeout_s
         return 0
 
+    def set_torque_sign(self, sign: ArrayLike) -> None:
+        """Sign of the joint torque sensors, (7,) of +1 and -1; measured and external torques are multiplied by it."""
+        values = np.array(sign, dtype=np.float32)
+        if values.shape != (JOINTS,) or not (np.abs(values) == 1.0).all():
+            raise ConfigurationError(f"torque sign {values} must be +1 or -1 for each of the {JOINTS} joints")
+        self._torque_sign = None if (values > 0.0).all() else values
+
     def _accept(self, length: int, source: tuple[str, int], received_ns: int | None = None) -> bool:
         """Judge the datagram in the buffer; True if it is a new packet of the controller."""
         new_source = False
@@ -464,6 +472,9 @@ class RemoteEnd:
         if self._answered_last and tracker.lost == losses and msr.refl_seq != self.send_seq:
             self.unreflected += 1
         self._answered_last = False
+        if self._torque_sign is not None:
+            self.msr["msr_jnt_trq"] *= self._torque_sign
+            self.msr["est_ext_jnt_trq"] *= self._torque_sign
         self.received += 1
         self.received_ns = now_ns
         self.sequence = tracker.sequence

@@ -121,6 +121,7 @@ class EventKind(Enum):
     WRONG_FLAGS = "wrong command flags"
     FLAGS_CHANGED = "command flags changed"
     NOT_FINITE = "value not finite"
+    IMPEDANCE = "stiffness or damping out of range"
     NOT_MIRRORED = "command away from the mirror"
     POSITION = "position limit"
     VELOCITY = "velocity limit"

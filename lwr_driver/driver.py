@@ -157,6 +157,7 @@ class Driver:
                 link_timeout_s=link.link_timeout_s,
                 tracking_limit_rad=link.tracking_limit_rad,
                 joint_names=self.arm.joint_names,
+                torque_sign=tuple(self.arm.torque_sign.tolist()),
             )
             scheduling = Scheduling(
                 apply=not link.lock_step,

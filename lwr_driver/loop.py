@@ -72,6 +72,7 @@ class LoopSettings:
     link_timeout_s: float
     tracking_limit_rad: float
     joint_names: tuple[str, ...]
+    torque_sign: tuple[float, ...] = (1.0,) * JOINTS
 
 
 class Rest:
@@ -139,6 +140,7 @@ class Loop:
         self._ready_in = Mode.MIRROR  # mode of the prepared answers
         self._handshake = find_handshake(settings.handshake)
         self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
+        self.remote.set_torque_sign(settings.torque_sign)
         self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
         self._words = control.words
         msr = self.remote.msr

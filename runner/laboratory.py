@@ -152,7 +152,9 @@ class Laboratory:
                 settings={"fri.program": experiment.link.handshake, **experiment.emulator_settings},
             )
             self.emulator = stack.enter_context(emulator)
-            known = robot_file(load_configuration(experiment.emulator_path)).payloads
+            known = robot_file(
+                load_configuration(experiment.emulator_path, experiment.emulator_settings)
+            ).payloads
             operator = EmulatedOperator(emulator.pendant, frozenset(known), enters_load=enters_load)
         torque = experiment.motor_torque
         krl = torque.krl if torque.source == "krl_reals" else None

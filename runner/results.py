@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, LwrError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.choice import compared
@@ -31,7 +32,10 @@ from runner.experiment_file import Experiment
 from runner.published import characteristics
 from runner.terminal import write_json
 from sim_backend.configuration import load_configuration
-from sim_backend.robot import truth
+from sim_backend.robot import Payload as Body
+from sim_backend.robot import robot_file, truth
+
+log = logging.getLogger(__name__)
 
 
 def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
@@ -69,9 +73,36 @@ def true_base(experiment: Experiment, found: Identification) -> dict[str, float]
     if experiment.backend != "emulator" or experiment.sealed:
         return {}
     structure = found.structure
-    values = truth(experiment.emulator_path, payload=structure.payloads[0] if structure.payloads else None)
-    standard = np.array([values.get(name, 0.0) for name in structure.names])
-    return dict(zip(found.base.names, found.base.reduce(standard).tolist(), strict=True))
+    standard: dict[str, float] = {}
+    try:
+        config = load_configuration(experiment.emulator_path, experiment.emulator_settings)
+        if config.robot.plant is not None or not _same_arm(config.beside(config.robot.urdf), structure.chain):
+            return {}
+        mounted = {
+            plan.payload.name: plan.payload for plan in experiment.sessions if plan.payload is not None
+        }
+        known = robot_file(config).payloads
+        for name in structure.payloads or (None,):
+            body = known.get(name or "")
+            if body is None and name in mounted:
+                # The emulated person mounts it as the experiment announces it.
+                announced = mounted[name]
+                body = Body.from_centre_of_mass(announced.mass, announced.com, announced.inertia)
+            link = structure.chain.n if name is None else structure.payload_link(name)
+            assert link is not None
+            standard |= truth(config, body or Body(0.0), link=link + 1)
+    except LwrError as error:
+        log.warning("the emulated arm has no true parameters to compare with: %s", error)
+        return {}
+    values = np.array([standard.get(name, 0.0) for name in structure.names])
+    return dict(zip(found.base.names, found.base.reduce(values).tolist(), strict=True))
+
+
+def _same_arm(urdf: Path, chain: Chain) -> bool:
+    """Whether the emulated arm has the kinematics of the estimate, so that parameters mean the same."""
+    other = Chain.from_urdf(urdf.read_text(encoding="utf-8"))
+    pairs = ((getattr(other, name), getattr(chain, name)) for name in ("alpha", "d", "theta", "r", "gravity"))
+    return other.n == chain.n and all(np.allclose(one, two, atol=1e-6) for one, two in pairs)
 
 
 def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> float:

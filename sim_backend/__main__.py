@@ -10,10 +10,9 @@ import sys
 from typing import Any
 
 import click
-import yaml
 
 from fri.errors import ConfigurationError, LwrError
-from sim_backend.configuration import load_configuration
+from sim_backend.configuration import load_configuration, read_settings
 from sim_backend.service import Service
 
 
@@ -32,7 +31,8 @@ from sim_backend.service import Service
 )
 @click.option("--follow-stdin", is_flag=True, help="End when standard input ends.")
 @click.option("--announce", is_flag=True, help="Print the pendant's port as one line of JSON.")
-@click.option("-v", "--verbose", is_flag=True, help="Log what happens to standard error.")
+@click.option("--once", is_flag=True, help="Lock step: end when the client has left.")
+@click.option("-v", "--verbose", count=True, help="Tell the session's events; twice: finer changes too.")
 def main(
     config: str,
     lock_step: bool,
@@ -44,17 +44,22 @@ def main(
     settings: tuple[str, ...],
     follow_stdin: bool,
     announce: bool,
-    verbose: bool,
+    once: bool,
+    verbose: int,
 ) -> None:
     """Emulate a KUKA LWR4+ and its controller: talks FRI over UDP to the PC, and has a pendant."""
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
-    )
+    level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.basicConfig(level=level, format="%(name)s: %(message)s")
+    logging.getLogger("numba").setLevel(logging.WARNING)
     try:
         overrides = _overrides(settings, period_ms, seed)
         follow = sys.stdin.fileno() if follow_stdin else None
         service = Service(
-            load_configuration(config, overrides), (fri_host, fri_port), pendant_port, follow=follow
+            load_configuration(config, overrides),
+            (fri_host, fri_port),
+            pendant_port,
+            follow=follow,
+            once=once,
         )
         try:
             signal.signal(signal.SIGTERM, lambda *_: service.stop())
@@ -77,15 +82,7 @@ def main(
 
 
 def _overrides(settings: tuple[str, ...], period_ms: float | None, seed: int | None) -> dict[str, Any]:
-    overrides: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        if not equals or not key:
-            raise ConfigurationError(f"--set {setting!r} is not of the form KEY=VALUE")
-        try:
-            overrides[key] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigurationError(f"--set {setting!r}: the value is not valid YAML") from error
+    overrides = read_settings(settings)
     if period_ms is not None:
         if period_ms != int(period_ms):
             raise ConfigurationError(f"--period-ms {period_ms:g} is no whole number of milliseconds")

@@ -13,16 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from fri.errors import ConfigurationError, RobotError
+from fri.errors import ConfigurationError, LwrError, RobotError
 from fri.krc import KrcLimits, KrcSession, Sample
 from fri.krl import Interpreter, KrlProgram
 from fri.packets import CMD_OFFSETS, CMD_SIZE
-from fri.states import ALL_DRIVES, State
+from fri.states import ALL_DRIVES, CommandFlag, Control, State
 from lwr_driver.arm import Arm
-from sim_backend.configuration import OWN_PROGRAM, EmulatorConfig, LoadData, Plugin, krl_program
+from sim_backend.configuration import EmulatorConfig, LoadData, Plugin
 from sim_backend.controller import ControllerModel, PositionController
+from sim_backend.journal import Journal
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, ElasticArm, Plant, PlantEffect
+from sim_backend.program import PUBLISHED, krl_program
 from sim_backend.robot import chain, robot_file, robot_model, true_arm
 from sim_backend.sensors import ControllerTrace, KrlReals, Sensors
 
@@ -33,6 +35,9 @@ FLANGE_MM = (0.0, 0.0, 78.0)
 
 _JNT_POS = CMD_OFFSETS["jnt_pos"]
 _STILL_MS = 100
+_CARTESIAN = "Cartesian impedance control (strategy 20) is not simulated; use strategy 10 or 30"
+# Control modes in which a spring, or nothing, holds the arm.
+_SOFT = (Control.JNT_IMP, Control.OTHER)
 
 
 def _load(plugin: Plugin, *arguments: Any, **named: Any) -> Any:
@@ -63,9 +68,14 @@ class Cabinet:
         believed = chain(config.beside(config.controller.urdf))
         cutoff_hz = config.controller.external_cutoff_hz
         self.model = ControllerModel(believed, config.controller.load, cutoff_hz)
+        self.model.set_gravitation(config.controller.gravity)
         self.controller = PositionController(config.controller)
         self.krl_reals = KrlReals(config.krl_reals, self.joints)
-        self.currents = np.zeros(self.joints)
+        self.currents: np.ndarray | None = np.zeros(self.joints) if config.krl.currents else None
+        self.journal = Journal()
+        self.mode: str = config.fri.mode
+        self._springs = np.array([[1000.0], [0.7]]) * np.ones((2, self.joints))
+        self._law = Control.POSITION
         self.trace = ControllerTrace(config.trace, self.arm.joint_names)
         self.program_name: str = config.fri.program
         self.period_ms = config.fri.period_ms
@@ -85,9 +95,12 @@ class Cabinet:
         self._last_setpoint = np.zeros(self.joints)
         self._model_age = 0
         self._commanding = False
+        self._load_turn = (0.0, 0.0, 0.0)
         self._zero = np.zeros(self.joints)
         self._begin(np.array(config.robot.start_position))
-        self._compile(ControllerModel(believed, config.controller.load, cutoff_hz))
+        self._compile(
+            ControllerModel(chain(config.beside(config.controller.urdf)), config.controller.load, cutoff_hz)
+        )
 
     def _make_plant(self, seed: np.random.SeedSequence) -> Plant:
         robot = self.config.robot
@@ -129,6 +142,8 @@ class Cabinet:
         """Compile on the first run of a computer, before the PC waits for an answer."""
         scratch.update_model(self.reading.position)
         scratch.update_external(self.reading.position, self.reading.joint_torque, CYCLE_S)
+        spring = PositionController(self.config.controller)
+        spring.spring_cycle(self._zero, self._zero, self._zero, self._zero, self._zero)
         command = np.frombuffer(bytes(4 * self.joints), "<f4", self.joints)
         CommandMonitor(self.arm, CYCLE_S).take(command, 0)
 
@@ -144,22 +159,40 @@ class Cabinet:
             power=ALL_DRIVES if self.powered else 0,
             uptime_s=fri.uptime_s + self.milliseconds * CYCLE_S,
         )
+        self.session.on_event = self.journal.event
+        self.session.refused = {Control.CART_IMP: _CARTESIAN}
+        self.session.t1 = self.mode == "T1"
         self.interpreter: Interpreter | None = None
         self.program: KrlProgram | None = None
         self._commanding = False
         self.monitor.period_s = self.session.sample_time_s
 
     def start_program(self, name: str | None = None, period_ms: int | None = None) -> None:
-        """Select and start a KRL program; None keeps the last choice or the configured values."""
+        """Select and start a KRL program; None keeps the last choice or the configured values.
+
+        name : see `sim_backend.program.krl_program`
+        """
         name = self.program_name if name is None else name
         period_ms = self.period_ms if period_ms is None else period_ms
         if not 1 <= period_ms <= 100:
             raise ConfigurationError(f"period {period_ms} ms is outside 1 to 100 ms")
-        program = krl_program(name, period_ms, self)
+        krl = self.config.krl
+        program = krl_program(
+            name,
+            period_ms,
+            self,
+            beside=self.config.source.parent,
+            statement_ms=krl.statement_ms,
+            halt_s=krl.halt_s,
+            **(krl.variables if name == self.config.fri.program else {}),
+        )
+        for remark in program.remarks:
+            self.journal.warn(remark)
         self.stop_program()
         self.program_name, self.period_ms = name, period_ms
         self.program = program
         self.interpreter = Interpreter(self.session, self.program)
+        self.journal.say(f"KRL program {name} started")
 
     def stop_program(self) -> None:
         """Cancel the KRL program: FRI closes."""
@@ -174,18 +207,60 @@ class Cabinet:
 
     @property
     def load(self) -> tuple[float, ...]:
-        """Load data as KRL has them: mass [kg], centre of mass in the flange frame [mm], JX JY JZ [kg m2]."""
+        """Load data as KRL has them: mass [kg], centre of mass in the flange frame [mm], A B C [deg], JX JY JZ
+        [kg m2].
+        """
         load = self.model.load
         centre = (1000.0 * value - origin for value, origin in zip(load.com, FLANGE_MM, strict=True))
-        xx, _, _, yy, _, zz = load.inertia
-        return (load.mass, *centre, xx, yy, zz)
+        turn = _turn(*self._load_turn)
+        xx, xy, xz, yy, yz, zz = load.inertia
+        moments = np.diag(turn.T @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn).tolist()
+        return (load.mass, *centre, *self._load_turn, *moments)
 
     def set_load(self, load: tuple[float, ...]) -> None:
-        """Load data from KRL, as `load` gives them; the axes of the inertia are those of the flange."""
-        mass, x, y, z, xx, yy, zz = load
+        """Load data from KRL, as `load` gives them; A B C turn the axes of the inertia against the flange."""
+        mass, x, y, z, a, b, c, *moments = load
         right, up, out = FLANGE_MM
         centre = ((x + right) / 1000.0, (y + up) / 1000.0, (z + out) / 1000.0)
-        self.model.set_load(LoadData(mass, centre, (xx, 0.0, 0.0, yy, 0.0, zz)))
+        turn = _turn(a, b, c)
+        full = turn @ np.diag(moments) @ turn.T
+        self._load_turn = (a, b, c)
+        upper = full[np.triu_indices(3)].tolist()
+        self.model.set_load(
+            LoadData(mass, centre, (upper[0], upper[1], upper[2], upper[3], upper[4], upper[5]))
+        )
+
+    def enter_load(self, load: LoadData) -> None:
+        """Load data from the pendant; the axes of the inertia are those of the flange."""
+        self._load_turn = (0.0, 0.0, 0.0)
+        self.model.set_load(load)
+
+    @property
+    def position(self) -> np.ndarray:
+        """Measured joint positions (7,) [rad]."""
+        return self.reading.position
+
+    @property
+    def joint_torque(self) -> np.ndarray:
+        """Joint torque sensors (7,) [Nm]."""
+        return self.reading.joint_torque
+
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """`$GRAVITATION` [m/s^2]."""
+        return self.model.gravitation
+
+    def set_gravity(self, gravity: tuple[float, float, float]) -> None:
+        """Another `$GRAVITATION` [m/s^2]."""
+        self.model.set_gravitation(gravity)
+
+    def set_impedance(self, stiffness: np.ndarray, damping: np.ndarray) -> None:
+        """Springs without a command: (7,) [Nm/rad], (7,) damping ratios, from `$STIFFNESS`."""
+        self._springs[0], self._springs[1] = stiffness, damping
+
+    def say(self, text: str) -> None:
+        """A message of the KRL program."""
+        self.journal.say(text)
 
     def power(self, on: bool) -> None:
         """Drives on: brakes open, the setpoint is at the position of the arm. Off: brakes closed.
@@ -266,9 +341,52 @@ class Cabinet:
         self._model_age -= len(positions)
         period_s = len(positions) * CYCLE_S
         self.model.update_external(self.reading.position, self.reading.joint_torque, period_s)
-        if self.interpreter is not None:
-            self.interpreter.advance(len(positions))
+        self._choose_law()
+        self._run_program(len(positions))
         self.cycle += 1
+
+    def _run_program(self, milliseconds: int) -> None:
+        """Let the KRL program run; an error stops it, as on the controller."""
+        self.journal.time_s = self.milliseconds * CYCLE_S
+        if self.interpreter is None:
+            return
+        running = self.running
+        try:
+            self.interpreter.advance(milliseconds)
+        except LwrError as error:
+            self.journal.warn(f"KRL program stopped: {error}")
+            self.stop_program()
+            return
+        if running and not self.running:
+            self.journal.say("KRL program ended")
+
+    def _choose_law(self) -> None:
+        """Law of the coming cycle by the control mode, and the spring by the last command.
+
+        Coming back from a spring, the setpoint goes to the arm, and not the arm to the setpoint.
+        """
+        session, controller = self.session, self.controller
+        wanted = session.control if session.control in _SOFT else Control.POSITION
+        if wanted is not self._law and not session.ramping:
+            if self._law in _SOFT and session.state is not State.CMD:
+                session.resync(self.reading.position)
+                self._last_setpoint[:] = session.setpoint
+            position = self._last_setpoint
+            controller.reset(position, self.model.update_gravity(position), self.reading.motor_position)
+            self._law = wanted
+            self.journal.say(f"control of the arm: {session.control.name}")
+        if self._law is Control.OTHER:
+            controller.set_free()
+        elif self._law is Control.JNT_IMP:
+            (stiffness, damping), torque = self._springs, self._zero
+            if session.state is State.CMD and session.answered:
+                command, flags = session.command, int(session.command["cmd_flags"])
+                stiffness = command["jnt_stiffness"] if flags & CommandFlag.JNTSTIFF else stiffness
+                damping = command["jnt_damping"] if flags & CommandFlag.JNTDAMP else damping
+                torque = command["add_jnt_trq"] if flags & CommandFlag.JNTTRQ else torque
+            elif session.state is State.CMD:
+                return
+            controller.set_spring(stiffness, damping, torque, self.model.mass_matrix)
 
     def _millisecond(self, setpoint: np.ndarray) -> None:
         plant, reading = self.plant, self.reading
@@ -276,17 +394,35 @@ class Cabinet:
         self.sensors.read(plant)
         for effect in self.effects:
             effect.sense(time_s, plant, reading)
-        gravity = self.model.update_gravity(setpoint)
-        torque = self._zero
-        if self.powered:
-            torque = self.controller.cycle(setpoint, gravity, reading.motor_position, reading.joint_torque)
+        soft = self._law in _SOFT
+        gravity = self.model.update_gravity(reading.position if soft else setpoint)
+        torque, controller = self._zero, self.controller
+        if self.powered and soft:
+            torque = controller.spring_cycle(
+                setpoint, gravity, reading.position, reading.motor_position, reading.joint_torque
+            )
+        elif self.powered:
+            torque = controller.cycle(setpoint, gravity, reading.motor_position, reading.joint_torque)
         self.sensors.read_motor(plant.motor_torque, torque)
         for effect in self.effects:
             effect.sense_motor(time_s, plant, reading)
         plant.step(torque)
         self.milliseconds += 1
-        if self.program_name == OWN_PROGRAM:
-            self.currents = self.krl_reals.late(reading.motor_torque)
+        if self.program_name not in PUBLISHED:
+            if self.currents is not None:
+                self.currents = self.krl_reals.late(reading.motor_torque)
         elif self.config.krl_reals.enabled:
             self.krl_reals.millisecond(reading.motor_torque, self.session.to_real, self.session.to_int)
         self.trace.millisecond(time_s, reading.motor_torque, reading.position)
+
+
+def _turn(a: float, b: float, c: float) -> np.ndarray:
+    """Rotation matrix of the angles A B C of KRL [deg]: about z, then the new y, then the new x."""
+    (sa, sb, sc), (ca, cb, cc) = np.sin(np.radians([a, b, c])), np.cos(np.radians([a, b, c]))
+    return np.array(
+        [
+            [ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc],
+            [sa * cb, sa * sb * sc + ca * cc, sa * sb * cc - ca * sc],
+            [-sb, cb * sc, cb * cc],
+        ]
+    )

@@ -5,20 +5,17 @@ A file may name another one under `base`; its keys then replace those of the bas
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import yaml
+
 from fri.errors import ConfigurationError
-from fri.handshake import HANDSHAKES
-from fri.krl import KrlProgram, Machinery
 from fri.policy import KrcPolicy
 from fri.quantities import FileName, Name, Version, check, entries, within
-from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
-
-OWN_PROGRAM = "lwr_identification"
-"""The KRL program of this project."""
+from lwr_driver.configuration import CONFIGS, find, parse, read_mapping
 
 JOINTS = 7
 _FILES = (("robot", "urdf"), ("robot", "parameters"), ("controller", "urdf"), ("", "limits"))
@@ -41,6 +38,8 @@ _Delay = Annotated[int, within(0, 10_000, "ms")]
 _Index = Annotated[int, within(1, 16)]
 _Metres = Annotated[float, within(-0.5, 0.5, "m")]
 _Moment = Annotated[float, within(-5.0, 5.0, "kg m²")]
+_Acceleration = Annotated[float, within(-30.0, 30.0, "m/s²")]
+_Gravity = tuple[_Acceleration, _Acceleration, _Acceleration]
 
 
 @dataclass(frozen=True)
@@ -54,31 +53,6 @@ class Plugin:
         module, _, name = self.type.partition(":")
         if not module or not name.isidentifier():
             raise ConfigurationError(f"type {self.type!r} is not of the form `package.module:Class`")
-
-
-@dataclass(frozen=True)
-class RobotConfig:
-    """The true arm.
-
-    urdf : kinematics. parameters : file with the standard parameters and the named payloads, or an identified
-    `model.yaml` together with its effects
-    stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
-    substeps : steps of the joint dynamics within 1 ms
-    effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
-    plant : other physics altogether, called with `model, drive, random, **options` (see
-    `sim_backend.plant.Plant`); the `effects` act on its sensors only
-    """
-
-    urdf: FileName = "lwr4plus.urdf"
-    parameters: FileName = "emulator/table2.yaml"
-    payload: Name = "none"
-    start_position: _Angles = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
-    stiffness: _Stiffness = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
-    damping: _Gains = (15.0, 15.0, 10.0, 10.0, 3.0, 1.0, 0.5)
-    brake_torque: _Torques = (300.0, 300.0, 200.0, 200.0, 150.0, 80.0, 80.0)
-    substeps: Annotated[int, within(1, 200)] = 4
-    effects: Annotated[tuple[Plugin, ...], entries(0, 100)] = ()
-    plant: Plugin | None = None
 
 
 @dataclass(frozen=True)
@@ -96,14 +70,52 @@ class LoadData:
 
 
 @dataclass(frozen=True)
+class RobotConfig:
+    """The true arm.
+
+    urdf : kinematics. parameters : file with the standard parameters and the named payloads, or an identified
+    `model.yaml` together with its effects
+    payload : on the flange at the start, by its name in `payloads` or `parameters`. payloads : more of them by name
+    gravity : acceleration of gravity in the axes of the base [m/s^2]; (0, 0, 9.81) for an arm at the ceiling
+    stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
+    substeps : steps of the joint dynamics within 1 ms
+    effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
+    plant : other physics altogether, called with `model, drive, random, **options` (see
+    `sim_backend.plant.Plant`); the `effects` act on its sensors only
+    """
+
+    urdf: FileName = "lwr4plus.urdf"
+    parameters: FileName = "emulator/table2.yaml"
+    payload: Name = "none"
+    payloads: dict[str, LoadData] = field(default_factory=dict)
+    gravity: _Gravity = (0.0, 0.0, -9.81)
+    start_position: _Angles = (0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0)
+    stiffness: _Stiffness = (15e3, 15e3, 12e3, 12e3, 8e3, 6e3, 6e3)
+    damping: _Gains = (15.0, 15.0, 10.0, 10.0, 3.0, 1.0, 0.5)
+    brake_torque: _Torques = (300.0, 300.0, 200.0, 200.0, 150.0, 80.0, 80.0)
+    substeps: Annotated[int, within(1, 200)] = 4
+    effects: Annotated[tuple[Plugin, ...], entries(0, 100)] = ()
+    plant: Plugin | None = None
+
+    def __post_init__(self) -> None:
+        if "none" in self.payloads:
+            raise ConfigurationError(
+                "payloads has an entry `none`, the name of the empty flange; name it otherwise"
+            )
+
+
+@dataclass(frozen=True)
 class ControllerConfig:
     """The joint position controller and its model of the arm.
 
     urdf : the controller's model of the arm, CAD-like; its inertias differ from the truth
-    load : load data at the start. stiffness : the controller's value of the joint stiffness [Nm/rad]
+    load : load data at the start. gravity : `$GRAVITATION`, the opposite of `robot.gravity` if the controller knows
+    the mounting [m/s^2]. stiffness : the controller's value of the joint stiffness [Nm/rad]
     position_gain [Nm/rad], velocity_gain [Nm s/rad], torque_gain [-] : feedback of motor position and
     velocity and of the joint torque. viscous [Nm s/rad], coulomb [Nm] : friction compensation by the commanded
     velocity, linear below coulomb_speed [rad/s]. torque_limit [Nm] of the motors, referred to the joint
+    impedance_torque_gain [-] : torque feedback under joint impedance and gravity compensation; motor_inertia
+    [kg m^2] : the controller's value, for the damping of the springs. free_damping [Nm s/rad] : of gravity compensation
     velocity_cutoff_hz : filter on the motor velocity; command_cutoff_hz : filter on the commanded velocity
     model_period_ms : period of the Jacobian and the mass matrix in the packet
     external_cutoff_hz : filter of the estimated external torque
@@ -112,6 +124,7 @@ class ControllerConfig:
 
     urdf: FileName = "lwr4plus.urdf"
     load: LoadData = field(default_factory=LoadData)
+    gravity: _Gravity = (0.0, 0.0, 9.81)
     stiffness: _Stiffness = (10e3, 10e3, 10e3, 10e3, 10e3, 7.5e3, 7.5e3)
     position_gain: _Gains = (9e3, 9e3, 6e3, 6e3, 3e3, 2e3, 2e3)
     velocity_gain: _Gains = (250.0, 250.0, 160.0, 160.0, 60.0, 40.0, 40.0)
@@ -120,6 +133,9 @@ class ControllerConfig:
     coulomb: _Torques = (13.5, 15.0, 7.9, 9.0, 5.0, 4.0, 3.75)
     coulomb_speed: Annotated[float, within(1e-6, 10.0, "rad/s")] = 0.01
     torque_limit: _MotorLimits = (200.0, 200.0, 120.0, 120.0, 100.0, 50.0, 50.0)
+    impedance_torque_gain: Annotated[float, within(0.0, 1e6)] = 4.0
+    motor_inertia: Joints[Annotated[float, within(0.0, 100.0, "kg m²")]] = (3.0, 2.5, 2.0, 2.0, 0.8, 0.4, 0.4)
+    free_damping: _Gains = (10.0, 10.0, 8.0, 8.0, 3.0, 1.0, 1.0)
     velocity_cutoff_hz: _Cutoff = 150.0
     command_cutoff_hz: _Cutoff = 40.0
     model_period_ms: Annotated[int, within(1, 10_000, "ms")] = 20
@@ -185,14 +201,17 @@ class TraceConfig:
 class FriConfig:
     """The link: `friSetup` and `friOpen`, the KRL program, and the controller's limits.
 
-    program : KRL program by its name in configs/krl. autostart : it runs from the beginning
+    program : KRL program by its name in configs/krl, or a `.src` file of the laboratory. autostart : it runs from the
+    beginning. mode : operating mode at the beginning
     velocity [rad/s], acceleration [rad/s^2] : limits; beyond them the controller drops the session
     answer_delay_s : age of an undisturbed answer in lock step
     patience_s : in lock step and command mode, wall time before an answer counts as missing
+    leave_s : in lock step, wall time without an answer before the client counts as gone; at once if its port is closed
     """
 
-    program: Literal["lwr_identification", "stanford", "ros_control", "rcprg"] = "stanford"
+    program: FileName = "stanford"
     autostart: bool = True
+    mode: Literal["T1", "T2", "AUT", "EXT"] = "EXT"
     period_ms: Annotated[int, within(1, 100, "ms")] = 1
     local_host: Annotated[str, entries(1, 253)] = "127.0.0.1"
     local_port: Annotated[int, within(0, 65535)] = 0
@@ -203,11 +222,33 @@ class FriConfig:
     uptime_s: Annotated[float, within(0.0, 1e8, "s")] = 3600.0
     answer_delay_s: Annotated[float, within(0.0, 1.0, "s")] = 1e-4
     patience_s: Annotated[float, within(0.001, 3600.0, "s")] = 10.0
+    leave_s: Annotated[float, within(0.001, 1e6, "s")] = 300.0
 
     def __post_init__(self) -> None:
         for low, high in zip(self.position_min, self.position_max, strict=True):
             if not low < high:
                 raise ConfigurationError(f"position_min {low} is not below position_max {high}")
+
+
+@dataclass(frozen=True)
+class KrlConfig:
+    """The KRL interpreter; no document of KUKA gives its speed.
+
+    statement_ms : time of a statement [ms]. halt_s : time until somebody presses start after HALT [s]
+    currents : whether `$CURR_ACT` exists. variables : values for variables of the program's data list
+    """
+
+    statement_ms: Annotated[float, within(0.0, 1000.0, "ms")] = 0.1
+    halt_s: Annotated[float, within(0.0, 3600.0, "s")] = 1.0
+    currents: bool = True
+    variables: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, value in self.variables.items():
+            if not isinstance(value, (bool, int, float, str)):
+                raise ConfigurationError(
+                    f"variables: {name} is {value!r}; give a number, a truth value or a text"
+                )
 
 
 @dataclass(frozen=True)
@@ -226,6 +267,7 @@ class EmulatorConfig:
     krl_reals: KrlRealsConfig = field(default_factory=KrlRealsConfig)
     trace: TraceConfig = field(default_factory=TraceConfig)
     fri: FriConfig = field(default_factory=FriConfig)
+    krl: KrlConfig = field(default_factory=KrlConfig)
     policy: KrcPolicy = field(default_factory=KrcPolicy)
     limits: FileName = "lwr4plus.yaml"
     faults: Annotated[tuple[dict[str, Any], ...], entries(0, 1000)] = ()
@@ -235,21 +277,6 @@ class EmulatorConfig:
     def beside(self, name: str) -> Path:
         """Path of the file `name` of this configuration."""
         return find(name, beside=self.source.parent)
-
-
-def krl_program(
-    name: str, period_ms: int, machinery: Machinery | None = None, **settings: float
-) -> KrlProgram:
-    """Program `name` of configs/krl, ready to start with an FRI cycle of `period_ms`.
-
-    machinery : motor currents and load data, None leaves both at zero; settings : values for its data list
-    """
-    if name not in HANDSHAKES:
-        raise ConfigurationError(f"KRL program {name!r} is unknown; known: {', '.join(HANDSHAKES)}")
-    text = CONFIGS / f"krl/{name}.src"
-    data = read_text(text.with_suffix(".dat"))
-    values = {"LWR_CYCLE": period_ms, **settings}
-    return KrlProgram(read_text(text), data, values, machinery, name)
 
 
 def load_configuration(
@@ -267,6 +294,20 @@ def load_configuration(
     config = parse(EmulatorConfig, content, str(path))
     object.__setattr__(config, "source", path)
     return config
+
+
+def read_settings(settings: Iterable[str]) -> dict[str, Any]:
+    """Texts `KEY=VALUE` of a command line as overrides; the values are YAML."""
+    found: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key:
+            raise ConfigurationError(f"--set {setting!r} is not of the form KEY=VALUE")
+        try:
+            found[key] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigurationError(f"--set {setting!r}: the value is not valid YAML") from error
+    return found
 
 
 def _with_base(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:

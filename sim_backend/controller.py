@@ -9,6 +9,13 @@ within the torque limits of the motors. This is the state feedback of motor posi
 torque of Albu-Schaeffer, Ott and Hirzinger (2007). `Kt` reduces the apparent motor inertia by `1 + Kt`, so the
 motor side damps the oscillation of the link on its elastic joint. Friction compensation follows the commanded
 speed.
+
+Joint impedance control is a spring and damper about the setpoint on top of the controller's own dynamic model::
+
+    tau_d = K (q_d - q) - D q' + tau_add + g,   D = 2 zeta sqrt(K M),   M = diag of mass matrix + Ia / (1 + Kt)
+    tau_m = tau_d + Kt (tau_d - tau_j) + friction(theta')
+
+`K`, `zeta` and `tau_add` come with the command. Gravity compensation is the same without spring.
 """
 
 from __future__ import annotations
@@ -54,6 +61,32 @@ def _feedback(setpoint, gravity, motor_position, joint_torque, gains, memory, se
 
 
 @njit(cache=True)
+def _impedance(  # type: ignore[no-untyped-def]
+    setpoint, gravity, position, motor_position, joint_torque, spring, gains, memory, settings, out
+):
+    """One cycle of the spring law.
+
+    spring : rows K [Nm/rad], D [Nm s/rad], tau_add [Nm]. gains, memory : as in `_feedback`
+    settings : cycle [s], filter constant of the measured speed, Coulomb speed, torque gain
+    """
+    cycle, keep, slow, feedback = settings[0], settings[1], settings[2], settings[3]
+    for i in range(setpoint.shape[0]):
+        memory[3, i] = keep * memory[3, i] + (1.0 - keep) * (motor_position[i] - memory[1, i]) / cycle
+        memory[0, i] = setpoint[i] + gravity[i] / gains[0, i]
+        memory[1, i] = motor_position[i]
+        memory[2, i] = 0.0
+        speed = memory[3, i]
+        wanted = spring[0, i] * (setpoint[i] - position[i]) - spring[1, i] * speed + spring[2, i] + gravity[i]
+        torque = (
+            wanted
+            + feedback * (wanted - joint_torque[i])
+            + gains[4, i] * speed
+            + gains[5, i] * min(1.0, max(-1.0, speed / slow))
+        )
+        out[i] = min(gains[6, i], max(-gains[6, i], torque))
+
+
+@njit(cache=True)
 def _external(joint_torque, bias, mass, change, keep, estimate):  # type: ignore[no-untyped-def]
     """Low-pass of `joint_torque - mass @ change - bias` into `estimate`."""
     for i in range(estimate.shape[0]):
@@ -78,8 +111,12 @@ def _keep(cutoff_hz: float, period_s: float = CYCLE_S) -> float:
     return math.exp(-2.0 * math.pi * cutoff_hz * period_s)
 
 
+# Speed up to which the measured speed gives no sure direction for the friction compensation [rad/s].
+_IMPEDANCE_SPEED = 0.05
+
+
 class PositionController:
-    """State feedback on the motors; arrays are (n,) float64."""
+    """State feedback on the motors, for position or for a spring; arrays are (n,) float64."""
 
     def __init__(self, config: ControllerConfig) -> None:
         self._gains = np.array(
@@ -96,7 +133,18 @@ class PositionController:
         self._settings = np.array(
             [CYCLE_S, _keep(config.command_cutoff_hz), _keep(config.velocity_cutoff_hz), config.coulomb_speed]
         )
+        self._impedance = np.array(
+            [
+                CYCLE_S,
+                _keep(config.velocity_cutoff_hz),
+                _IMPEDANCE_SPEED,
+                config.impedance_torque_gain,
+            ]
+        )
+        self._inertia = np.array(config.motor_inertia) / (1.0 + config.impedance_torque_gain)
+        self._free_damping = np.array(config.free_damping)
         self._memory = np.zeros((4, self._gains.shape[1]))
+        self._spring = np.zeros((3, self._gains.shape[1]))
         self.torque = np.zeros(self._gains.shape[1])
 
     def reset(self, setpoint: np.ndarray, gravity: np.ndarray, motor_position: np.ndarray) -> None:
@@ -118,6 +166,45 @@ class PositionController:
             self._gains,
             self._memory,
             self._settings,
+            self.torque,
+        )
+        return self.torque
+
+    def set_spring(
+        self, stiffness: np.ndarray, damping: np.ndarray, torque: np.ndarray, mass_matrix: np.ndarray
+    ) -> None:
+        """Spring of the coming cycles: stiffness [Nm/rad], damping ratio, additional torque [Nm], all (n,).
+
+        mass_matrix : (n, n) [kg m^2]
+        """
+        self._spring[0] = stiffness
+        self._spring[1] = 2.0 * damping * np.sqrt(stiffness * (np.diag(mass_matrix) + self._inertia))
+        self._spring[2] = torque
+
+    def set_free(self) -> None:
+        """Gravity compensation: no spring, a little damping."""
+        self._spring[:] = 0.0
+        self._spring[1] = self._free_damping
+
+    def spring_cycle(
+        self,
+        setpoint: np.ndarray,
+        gravity: np.ndarray,
+        position: np.ndarray,
+        motor_position: np.ndarray,
+        joint_torque: np.ndarray,
+    ) -> np.ndarray:
+        """As `cycle`, for the spring of `set_spring` or `set_free`; gravity : at `position`."""
+        _impedance(
+            setpoint,
+            gravity,
+            position,
+            motor_position,
+            joint_torque,
+            self._spring,
+            self._gains,
+            self._memory,
+            self._impedance,
             self.torque,
         )
         return self.torque
@@ -144,7 +231,14 @@ class ControllerModel:
         self._cutoff_hz = external_cutoff_hz
         self._memory = np.zeros((3, n))
         self._begun = False
+        self.gravitation: tuple[float, float, float] = (0.0, 0.0, 9.81)
         self.set_load(load)
+
+    def set_gravitation(self, gravitation: tuple[float, float, float]) -> None:
+        """`$GRAVITATION`: the acceleration that holds the base against gravity, in its axes [m/s^2]."""
+        self.gravitation = gravitation
+        self._bare.gravity.linear = -np.array(gravitation)
+        self.set_load(self.load)
 
     def set_load(self, load: LoadData) -> None:
         """Use `load` from now on, independent of the mounted payload."""

@@ -69,7 +69,6 @@ class Operator:
         self.wire = wire
         self.ended = False
         self.estopped = False
-        self.operating_mode = "EXT"
         self._silent_until: int | None = None
         self._silent_since: int | None = None
         self._restart_at: int | None = None
@@ -93,6 +92,11 @@ class Operator:
         if entry.when in ("now", "start"):
             pending.due = self.cabinet.cycle + entry.after_cycles
         self._pending.append(pending)
+
+    @property
+    def operating_mode(self) -> str:
+        """T1, T2, AUT or EXT."""
+        return self.cabinet.mode
 
     @property
     def silent(self) -> bool:
@@ -121,6 +125,16 @@ class Operator:
         if self._ceiling_until is not None and cycle >= self._ceiling_until:
             self._ceiling_until = None
             cabinet.session.quality_ceiling = Quality.PERFECT
+        session = cabinet.session
+        if cabinet.journal.detailed:
+            cabinet.journal.watch(
+                quality=session.quality.name,
+                control=session.control.name,
+                drives=f"{session.power:#04x}",
+                missing_answers=session.miss_counter,
+                payload=cabinet.payload_name,
+                load_data=f"{cabinet.model.load.mass:g} kg",
+            )
         if self._pending:
             self._run_schedule(cycle)
 
@@ -151,6 +165,9 @@ class Operator:
         if command not in COMMANDS:
             raise ConfigurationError(f"command {command!r} is unknown; known: {', '.join(COMMANDS)}")
         _check_arguments(command, arguments)
+        if command not in ("status", "save_trace"):
+            given = ", ".join(f"{key}={value}" for key, value in arguments.items())
+            self.cabinet.journal.say(f"pendant: {command}({given})")
         return getattr(self, command)(**arguments)
 
     def status(self) -> dict[str, Any]:
@@ -230,7 +247,7 @@ class Operator:
         self, mass: float, com: tuple[float, ...] = (0.0,) * 3, inertia: tuple[float, ...] = (0.0,) * 6
     ) -> None:
         """Load data of the controller."""
-        self.cabinet.model.set_load(_load(mass, com, inertia))
+        self.cabinet.enter_load(_load(mass, com, inertia))
 
     def drives(self, on: bool) -> None:
         """Drives on or off; in YAML write `drives_on` or `drives_off`, for `on` is a truth value there."""
@@ -267,10 +284,17 @@ class Operator:
             raise ConfigurationError(f"mode {name!r} is unknown; known: T1, T2, AUT, EXT")
         if name == self.operating_mode:
             return
-        self.operating_mode = name
+        self.cabinet.mode = name
         self.cabinet.session.drop(EventKind.EXTERNAL, f"operating mode changed to {name}")
         self.cabinet.power(False)
         self.cabinet.session.t1 = name == "T1"
+
+    def gravity_compensation(self, active: bool = True) -> None:
+        """Gravity compensation, so that a hand moves the arm, or position control again; not in command mode."""
+        try:
+            self.cabinet.session.set_strategy(101 if active else 10)
+        except RuntimeError as error:
+            raise RobotError(str(error)) from error
 
     def drive_fault(self, joint: int, error: bool = True) -> None:
         """Error or warning of a drive."""
@@ -301,7 +325,6 @@ class Operator:
         cabinet.power(False)
         cabinet.stop_program()
         cabinet.cold_start()
-        cabinet.session.t1 = self.operating_mode == "T1"
         self.wire.restart()
         self._restart_at = cabinet.cycle + int(silent_cycles)
         self._drives_after_restart = drives_on

@@ -178,6 +178,10 @@ class Pendant:
         """The controller rates the link UNACCEPTABLE for `cycles` cycles."""
         self.request("degrade_quality", cycles=cycles)
 
+    def gravity_compensation(self, active: bool = True) -> None:
+        """Gravity compensation: a push moves the arm; False is position control again. Not in command mode."""
+        self.request("gravity_compensation", active=active)
+
     def drive_fault(self, joint: int, error: bool = True) -> None:
         """Error (drives off) or warning bit of the drive of `joint` (0 to 6)."""
         self.request("drive_fault", joint=joint, error=error)

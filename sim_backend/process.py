@@ -37,6 +37,9 @@ class Emulator:
     period_ms : FRI cycle, whole milliseconds from 1 to 100; None as configured
     seed : seed of everything random in the emulator, None as configured
     settings : overrides of configuration keys by their dotted names, e.g. ``{"robot.payload": "paper_load"}``
+    once : in lock step, end when the client has left
+    verbosity : None keeps messages for `messages`; otherwise they go to the terminal: 0 what must be seen, 1 events of
+    the session, 2 finer changes
     start_s : time limit for the start of the emulator [s]
 
     The child ends with `stop`, with the `with` block, and with this process: it watches a pipe from its parent.
@@ -54,6 +57,8 @@ class Emulator:
         period_ms: float | None = None,
         seed: int | None = None,
         settings: Mapping[str, Any] | None = None,
+        once: bool = False,
+        verbosity: int | None = None,
         start_s: float = 60.0,
     ) -> None:
         self.config = find(config)
@@ -74,7 +79,8 @@ class Emulator:
                 'such as {"robot.payload": "paper_load"}'
             )
         self.settings = dict(settings or {})
-        self._options: list[str] = []
+        self._shown = verbosity is not None
+        self._options: list[str] = ["-v"] * (verbosity or 0) + ["--once"] * once
         if period_ms is not None:
             self._options += ["--period-ms", str(_whole("period_ms", period_ms, 1, 100))]
         if seed is not None:
@@ -149,7 +155,9 @@ class Emulator:
             "--announce",
             *self._options,
         ]
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
+        self._errors = None
+        if not self._shown:
+            self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -183,7 +191,7 @@ class Emulator:
 
     def _failure(self, status: int) -> LwrError:
         lines = self.messages().strip().splitlines()
-        reason = lines[-1] if lines else "no message"
+        reason = "its message is above" if self._shown else lines[-1] if lines else "no message"
         kind = ConfigurationError if status == ConfigurationError.exit_code else RobotError
         return kind(f"emulator {self.config.name} ended with status {status}: {reason}")
 

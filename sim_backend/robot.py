@@ -9,7 +9,7 @@ Fvm Fcm offm` of its drive. `truth("emulator/default.yaml", payload="paper_load"
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -196,13 +196,18 @@ def robot_file(config: EmulatorConfig) -> RobotFile:
     """Read the arm's parameters of `config`: a parameter file, or an identified `model.yaml`."""
     path = config.beside(config.robot.parameters)
     model = robot_model(config)
+    own = {
+        name: Payload.from_centre_of_mass(body.mass, body.com, body.inertia)
+        for name, body in config.robot.payloads.items()
+    }
     if model is None:
-        return parse(RobotFile, read_mapping(path), str(path))
+        content = parse(RobotFile, read_mapping(path), str(path))
+        return replace(content, payloads={**content.payloads, **own})
     from sim_backend.model_arm import model_parameters, model_payloads
 
     try:
         payloads = {name: Payload(**values) for name, values in model_payloads(model).items()}
-        return RobotFile(model_parameters(model), payloads)
+        return RobotFile(model_parameters(model), {**payloads, **own})
     except (ConfigurationError, DataError) as error:
         raise ConfigurationError(f"{path}: this model cannot be emulated: {error}") from error
 
@@ -224,19 +229,26 @@ def robot_model(config: EmulatorConfig) -> DynamicModel | None:
     return model
 
 
-def truth(config: EmulatorConfig | str | Path, payload: str | None = None) -> dict[str, float]:
-    """All standard parameters by name: links 1 to 7, and link 8, the payload (zeros without one).
+def truth(
+    config: EmulatorConfig | str | Path,
+    payload: str | Payload | None = None,
+    *,
+    link: int = JOINTS + 1,
+) -> dict[str, float]:
+    """All standard parameters by name: links 1 to 7, and `link`, the payload (zeros without one).
 
-    payload : name of the payload, None for the one the configuration starts with
+    payload : its name or the body itself; None for the one the configuration starts with
     """
     if not isinstance(config, EmulatorConfig):
         config = load_configuration(config)
     content = robot_file(config)
-    load = content.payload(config.robot.payload if payload is None else payload) or Payload(0.0)
+    if not isinstance(payload, Payload):
+        payload = content.payload(config.robot.payload if payload is None else payload)
+    load = payload or Payload(0.0)
     names = (*BODY_PARAMETERS, *DRIVE_PARAMETERS)
-    own = [f"{name}{link}" for link in range(1, JOINTS + 1) for name in names]
+    own = [f"{name}{number}" for number in range(1, JOINTS + 1) for name in names]
     values = {name: float(content.parameters[name]) for name in own}
-    return values | {f"{name}{JOINTS + 1}": float(getattr(load, name, 0.0)) for name in names}
+    return values | {f"{name}{link}": float(getattr(load, name, 0.0)) for name in names}
 
 
 def true_arm(config: EmulatorConfig, content: RobotFile) -> tuple[pin.Model, Drive]:
@@ -247,6 +259,7 @@ def true_arm(config: EmulatorConfig, content: RobotFile) -> tuple[pin.Model, Dri
     if bare.nv != JOINTS:
         raise ConfigurationError(f"{path}: {bare.nv} joints; the FRI carries {JOINTS}")
     model = with_inertias(bare, content.parameters)
+    model.gravity.linear = np.array(robot.gravity, dtype=float)
     rows = {
         name: np.array([content.parameters[f"{name}{i}"] for i in range(1, JOINTS + 1)], dtype=float)
         for name in DRIVE_PARAMETERS

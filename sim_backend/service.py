@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 _RESEND_S = 0.2
 # After an answer the PC may think for long; a restarted PC waits for its first packet.
-_RESEND_HEARD_S = 5.0
+_RESEND_HEARD_S = 2.0
 _IDLE_S = 0.2
 # A damaged datagram is answered at once or not at all.
 _PERHAPS_S = 0.02
@@ -35,6 +35,7 @@ class Service:
     """One emulator: cabinet, operator, FRI socket and pendant.
 
     follow : file descriptor of a pipe from the parent; its end of file ends the emulator
+    once : in lock step, end when the client has left
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Service:
         pendant_port: int = 0,
         *,
         follow: int | None = None,
+        once: bool = False,
     ) -> None:
         self.config = config
         self.cabinet = Cabinet(config)
@@ -60,6 +62,10 @@ class Service:
         self._stepping = False
         self._last_head = b""  # counters of the answer taken last
         self._reminded = False
+        self._once = once
+        self._heard_s: float | None = None
+        self._absent = False
+        self._refused = 0
         self._poller = select.poll()
         self._fri = self.end.fileno()
         self._poller.register(self._fri, select.POLLIN)
@@ -195,6 +201,10 @@ class Service:
                 return None
             self._last_head = datagram[:4]
         cabinet = self.cabinet
+        self._heard_s, self._refused = time.monotonic(), self.end.refused
+        if self._absent:
+            self._absent = False
+            cabinet.journal.warn("a client answers again")
         cabinet.arrived(datagram)
         if self.wire.quiet:
             cabinet.receive(datagram, age_s)
@@ -207,10 +217,10 @@ class Service:
     def _await(self, sent: bytes, age_s: float, limit_s: float | None = None) -> None:
         """Lock step: wait until the PC has answered `sent`.
 
-        The wait has no end in monitor mode; in command mode it ends with the configured patience. The first
-        packet is repeated until the PC is heard, any other now and then, for a restarted PC. After an answer to
-        another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was perhaps
-        lost: it is sent again, and the wait begins anew.
+        The wait has no end in monitor mode; in command mode it ends with the configured patience or the client.
+        The first packet is repeated until the PC is heard, any other now and then, for a restarted PC. After an
+        answer to another packet the wait is short. After a reminder of the PC (`RemoteEnd.remind`) the packet was
+        perhaps lost: it is sent again, and the wait begins anew.
         """
         wanted = sent[:2]
         commanding = self.cabinet.session.state is State.CMD
@@ -219,7 +229,7 @@ class Service:
         if limit_s is None and self._serve_until_heard(sent):
             return
         deadline = None if limit_s is None else time.monotonic() + limit_s
-        again = time.monotonic() + _RESEND_HEARD_S
+        again = time.monotonic() + self._patience_s
         while self.running:
             timeout_s = _IDLE_S if deadline is None else min(_IDLE_S, deadline - time.monotonic())
             if timeout_s <= 0.0:
@@ -228,9 +238,13 @@ class Service:
             if not self._serve(timeout_s):
                 if self.cabinet.session.state is State.OFF or self.operator.silent:
                     return
-                if deadline is None and time.monotonic() >= again:
+                if self._left() and commanding:
+                    self._impatient = True
+                    return
+                # In command mode the repetition asks whether the port of the client is still open.
+                if limit_s != _PERHAPS_S and time.monotonic() >= again:
                     self.end.send(sent)
-                    again = time.monotonic() + _RESEND_HEARD_S
+                    again = time.monotonic() + self._patience_s
                 continue
             datagram = self._take(age_s)
             if datagram is None:
@@ -243,6 +257,31 @@ class Service:
                 self._impatient = False
                 return
             deadline = time.monotonic() + _PERHAPS_S
+
+    @property
+    def _patience_s(self) -> float:
+        return _RESEND_S if self._absent else _RESEND_HEARD_S
+
+    def _left(self) -> bool:
+        """Lock step: whether the client has left, told once: its port is closed, or it is silent for too long."""
+        if self._heard_s is None:
+            return False
+        closed = self.end.refused > self._refused
+        silent_s = time.monotonic() - self._heard_s
+        if not closed and silent_s < self.config.fri.leave_s:
+            return False
+        if not self._absent:
+            self._absent = True
+            host, port = self.end.remote
+            why = "its port is closed" if closed else f"no answer for {silent_s:.0f} s"
+            then = (
+                "the emulator ends"
+                if self._once
+                else "time stands still until a client answers; Ctrl-C ends it"
+            )
+            self.cabinet.journal.warn(f"the client at {host}:{port} has left ({why}); {then}")
+            self._ended = self._ended or self._once
+        return True
 
     def _serve_until_heard(self, sent: bytes) -> bool:
         """Repeat a session's packet until it had its first answer; True if the wait is over for good.

@@ -1,6 +1,7 @@
 /* The smallest FRI client that does its duty: the yardstick for the driver's reply latency, and one of other
  * people's clients for the emulator. Mirrors outside command mode; in command mode it superposes or sends
- * absolute positions. Usage: client PORT PRIORITY(0: none) CPU(-1: any) STYLE(hold|superpose|absolute)
+ * absolute positions. `sample`: as samples do that superpose a sine at full speed from its first cycle, and leave at
+ * $FRI_TO_INT[1] = -1. `impedance`: a spring about the measured position of its first cycle, never mirroring. Usage: client PORT PRIORITY(0: none) CPU(-1: any) STYLE(hold|superpose|absolute|sample|impedance)
  * HANDSHAKE(stanford|ros|none) PACKETS(0: until a second of silence). Prints: received commanded */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -62,6 +63,8 @@ int main(int argc, char **argv) {
         sched_setaffinity(0, sizeof set, &set);
     }
     int superpose = !strcmp(argv[4], "superpose"), absolute = !strcmp(argv[4], "absolute");
+    int sample = !strcmp(argv[4], "sample"), impedance = !strcmp(argv[4], "impedance");
+    double since = 0.0;
     int stanford = !strcmp(argv[5], "stanford"), ros = !strcmp(argv[5], "ros");
     long wanted = atol(argv[6]), received = 0, commanded = 0, patient = 120;
     struct msr msr;
@@ -71,6 +74,13 @@ int main(int argc, char **argv) {
     cmd.id = 0x1005;
     cmd.flags = 1;
     float begin[7] = {0};
+    if (impedance) {
+        cmd.flags = 0x35;
+        for (int j = 0; j < 7; j++) {
+            cmd.rest[25 + j] = 200.0f;
+            cmd.rest[32 + j] = 0.7f;
+        }
+    }
     while (!wanted || received < wanted) {
         socklen_t length = sizeof there;
         ssize_t got = recvfrom(wire, &msr, sizeof msr, 0, (struct sockaddr *)&there, &length);
@@ -80,6 +90,8 @@ int main(int argc, char **argv) {
         received++;
         int moves = msr.state == 2 && msr.power;
         if (!moves) commanded = 0;
+        if (sample && msr.ints[0] == -1) break;
+        since = moves ? since + msr.cmd_time : 0.0;
         /* One minus cosine, 0.3 Hz, from rest. */
         double shift = moves ? 0.1 * (1.0 - cos(2.0 * M_PI * 0.3 * (double)commanded * msr.cmd_time)) : 0.0;
         for (int j = 0; j < 7; j++) {
@@ -88,11 +100,14 @@ int main(int argc, char **argv) {
             cmd.position[j] = now;
             if (moves && superpose) cmd.position[j] = msr.command[j] + (float)shift + (begin[j] - msr.command[j]);
             if (moves && absolute) cmd.position[j] = begin[j] + (float)shift;
-            if (moves && !superpose && !absolute) cmd.position[j] = begin[j];
+            if (moves && sample) cmd.position[j] = msr.command[j] + (float)(sin(since * M_PI * 0.1) * 10.0 / 180.0 * M_PI);
+            if (impedance) cmd.position[j] = moves ? begin[j] + (float)shift : msr.position[j];
+            if (moves && impedance && commanded == 0) begin[j] = cmd.position[j] = msr.position[j];
+            if (moves && !superpose && !absolute && !sample && !impedance) cmd.position[j] = begin[j];
         }
         if (moves) commanded++;
         if (stanford) {
-            cmd.ints[14] = 10;
+            cmd.ints[14] = impedance ? 30 : 10;
             cmd.ints[15] = 10;
         }
         if (ros) {

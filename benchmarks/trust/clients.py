@@ -1,4 +1,4 @@
-"""Other people's FRI clients on the emulator: both styles, both published handshakes, 1 to 100 ms."""
+"""Other people's FRI clients on the emulator: their styles, the published handshakes and none, 1 to 100 ms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from sim_backend.process import EmulatorProcess
 __all__ = ["campaign"]
 
 _PERIODS_MS = (1, 2, 5, 10, 20, 50, 100)
-_PROGRAMS = {"stanford": "stanford", "ros": "ros_control"}
+_PROGRAMS = {"stanford": "stanford", "ros": "ros_control", "none": "auto_start"}
+# Styles of a client, with the handshakes of the clients that have it.
+_STYLES = {
+    "superpose": ("stanford", "ros", "none"),
+    "absolute": ("stanford", "ros", "none"),
+    "sample": ("none",),
+    "impedance": ("stanford",),
+}
 _KRC = "fri/test_krc.py"
 _LINES = {
     "packets as published clients send them": [
@@ -35,8 +42,9 @@ def campaign(ledger: Ledger, options: Any) -> None:
         program = compiled.client(Path(name))
         if program is None:
             ledger.line("clients", "no C compiler here: not measured")
-        for style in ("superpose", "absolute") if program is not None else ():
-            for handshake, krl in _PROGRAMS.items():
+        for style, handshakes in _STYLES.items() if program is not None else ():
+            for handshake in handshakes:
+                krl = _PROGRAMS[handshake]
                 line = ledger.line("clients", f"C client, {style}, {krl}")
                 for period_ms in _PERIODS_MS:
                     piece = f"{style} {handshake} {period_ms}"

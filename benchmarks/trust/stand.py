@@ -37,9 +37,9 @@ from lwr_driver.session import session_metadata
 from lwr_driver.session.recording import Recorded, Recording, SessionRequest
 from lwr_driver.turnaround import Turnaround
 from runner.planning import dwell
-from sim_backend.configuration import krl_program
 from sim_backend.faults import FaultyWire, Parcel, WireFault
 from sim_backend.monitor import CommandMonitor
+from sim_backend.program import krl_program
 
 __all__ = ["LABEL", "START", "Stand", "the_arm", "the_motion"]
 

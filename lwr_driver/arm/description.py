@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,7 +31,10 @@ _LEAST_RANGE_DEG = 10.0
 
 @dataclass(frozen=True)
 class _JointEntry:
-    """One joint of the arm file. Limits are magnitudes; `position_deg` is (lower, upper)."""
+    """One joint of the arm file. Limits are magnitudes; `position_deg` is (lower, upper).
+
+    torque_sign : -1 where the joint torque sensor counts against the direction of the joint
+    """
 
     name: Name
     position_deg: tuple[_Angle, _Angle]
@@ -41,6 +44,7 @@ class _JointEntry:
     torque_nm: Annotated[float, within(1.0, 1000.0, "Nm")]
     gear_ratio: Annotated[float, within(1.0, 1000.0)]
     stiffness_nm_rad: Annotated[float, within(100.0, 1e6, "Nm/rad")]
+    torque_sign: Annotated[int, within(-1, 1)] = 1
 
     def __post_init__(self) -> None:
         lower, upper = self.position_deg
@@ -54,6 +58,8 @@ class _JointEntry:
                 f"joint {self.name}: position_deg {lower:g} to {upper:g} deg is less than {_LEAST_RANGE_DEG:g} deg; "
                 f"{advice or 'give both ends'}"
             )
+        if self.torque_sign == 0:
+            raise ConfigurationError(f"joint {self.name}: torque_sign is 0; it must be 1 or -1")
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,7 @@ class Arm:
     q_min, q_max : position limits [rad]; `q_low`, `q_high` are narrower by `margin` [rad]
     v_max, a_max, j_max : limits of every command [rad/s], [rad/s²], [rad/s³]
     tau_max : joint torque limits [Nm]; gear_ratio : motor turns per joint turn
+    torque_sign : +1 or -1, of the joint torque sensors; the driver turns the torques to the direction of the joint
     stiffness : joint stiffness [Nm/rad]; resonance_hz : lowest structural resonance [Hz]
     model : what the arm is; the limits of the LWR4+ (`ceilings`) hold for it whatever its file says, and for every arm
     with its joint names. Raises ConfigurationError beyond them.
@@ -143,6 +150,7 @@ class Arm:
     urdf: str
     urdf_path: Path
     model: str = MODEL
+    torque_sign: Vector = field(default_factory=lambda: _fixed(np.ones(JOINTS)))
 
     def __post_init__(self) -> None:
         if self.model == MODEL or self.joint_names == JOINT_NAMES:
@@ -210,6 +218,7 @@ class Arm:
             urdf=urdf,
             urdf_path=urdf_path,
             model=content.model,
+            torque_sign=_fixed([joint.torque_sign for joint in joints]),
         )
         try:
             arm = cls(**values)

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 import click
 from click.shell_completion import get_completion_class
 
-from fri.errors import ConfigurationError, LwrError
+from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
 from runner.terminal import StatusLine, json_option, to_json
 
@@ -112,29 +112,47 @@ def _is_error(record: logging.LogRecord) -> bool:
     "--pendant-port", default=0, type=click.IntRange(0, 65535), help="Port of the pendant; 0: any free port."
 )
 @click.option("--period-ms", type=click.FloatRange(1, 100), help="FRI cycle; default: as configured.")
+@click.option("--program", help="KRL program: a name of configs/krl, or a .src file.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Replace a key, e.g. krl.variables.LWR_STRATEGY=30.",
+)
 @click.option(
     "--lock-step", is_flag=True, help="Own clock: one cycle for each answer, repeatable bit for bit."
 )
+@click.option("--once", is_flag=True, help="With --lock-step: end when the client has left.")
 @json_option
+@click.pass_context
 def emulator_command(
+    context: click.Context,
     config: str,
     fri_host: str,
     fri_port: int,
     pendant_port: int,
     period_ms: float | None,
+    program: str | None,
+    settings: tuple[str, ...],
     lock_step: bool,
+    once: bool,
     as_json: bool,
 ) -> None:
     """Run the emulated controller and arm in real time until Ctrl-C.
 
     It behaves as the KRC of a KUKA LWR4+: it sends to --fri-host:--fri-port and expects an answer in each
-    cycle. Any FRI 1.0 client can connect.
+    cycle. Any FRI 1.0 client can connect. With -v before the command it tells monitor and command mode and the
+    reason of a drop, with -vv quality, drives and missing answers too.
 
     \b
-    lwr-run emulator                             the default arm at its configured cycle
-    lwr-run emulator --period-ms 2 --fri-port 7001
+    lwr-run emulator                             for Stanford's library, cycle as configured
+    lwr-run emulator --program auto_start        command mode without a request, as KUKA's samples expect
+    lwr-run emulator --program my_lab.src        a laboratory's own KRL program
+    lwr-run -v emulator --period-ms 2 --fri-port 7001
     lwr-run emulator --json                      its ports as one JSON value, for a script
     """
+    from sim_backend.configuration import read_settings
     from sim_backend.process import EmulatorProcess
 
     emulator = EmulatorProcess(
@@ -144,20 +162,20 @@ def emulator_command(
         fri_port=fri_port,
         pendant_port=pendant_port,
         period_ms=period_ms,
+        settings={**read_settings(settings), **({} if program is None else {"fri.program": program})},
+        once=once,
+        verbosity=min(2, int(context.find_root().params.get("verbose", 0))),
     )
     with emulator:
         ports = {"fri_host": fri_host, "fri_port": fri_port, "pendant_port": emulator.pendant_port}
         text = f"sends to {fri_host}:{fri_port}, pendant on 127.0.0.1:{emulator.pendant_port}; Ctrl-C ends it"
         try:
             click.echo(to_json(ports) if as_json else text)
-            emulator.wait()
+            status = emulator.wait()
         except KeyboardInterrupt:
             click.echo("ended", err=True)
             return
-        messages = emulator.messages().strip()
-    if messages:
-        raise LwrError(f"the emulator ended by itself: {messages.splitlines()[-1]}")
-    sys.exit(0)
+    sys.exit(status)
 
 
 @click.command("completion")

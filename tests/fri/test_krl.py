@@ -9,7 +9,7 @@ from fri.krc import EventKind
 from fri.krl import Interpreter, KrlProgram
 from fri.packets import new_cmd, new_msr
 from fri.states import ALL_DRIVES, Control, State
-from sim_backend.configuration import krl_program
+from sim_backend.program import krl_program
 from tests.fri.fri_rig import V_MAX, Rig
 
 NAMES = ["lwr_identification", "rcprg", "ros_control", "stanford"]

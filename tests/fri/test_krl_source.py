@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, RobotError
 from fri.handshake import IdentificationHandshake
 from fri.krc import EventKind
-from fri.krl import AXES, Interpreter, KrlProgram, NoMachinery
-from fri.krl_source import (
+from fri.krl import Interpreter, KrlProgram
+from fri.krl_source import parse_source
+from fri.krl_system import AXES, NoMachinery
+from fri.krl_tree import (
+    Aggregate,
     Assign,
     Binary,
     Branch,
@@ -17,6 +20,8 @@ from fri.krl_source import (
     Constant,
     Declaration,
     For,
+    Halt,
+    Ignored,
     Leave,
     Loop,
     Move,
@@ -24,12 +29,11 @@ from fri.krl_source import (
     Unary,
     WaitFor,
     WaitSeconds,
-    parse_source,
 )
 from fri.packets import JOINT_NAMES, new_cmd, new_msr
 from fri.states import Control, State
 from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder
-from sim_backend.configuration import krl_program
+from sim_backend.program import krl_program
 from tests.fri.fri_rig import Rig
 
 
@@ -138,10 +142,15 @@ def test_what_is_not_krl_is_refused_with_its_line(body: str, message: str) -> No
 
 
 def test_a_loop_that_never_waits_and_a_wrong_index_are_found_when_they_run() -> None:
-    with pytest.raises(ConfigurationError, match="line 2: the loop never waits"):
+    with pytest.raises(RobotError, match="line 2: the loop never waits"):
         run("LOOP\nENDLOOP")
-    with pytest.raises(ConfigurationError, match=r"FRI_TO_INT\[17\] is outside 1 to 16"):
+    with pytest.raises(RobotError, match=r"line 3: \$FRI_TO_INT\[17\] is outside 1 to 16"):
         run("INT I=17\n$FRI_TO_INT[I]=1")
+
+
+def as_krl(load: np.ndarray) -> tuple[float, ...]:
+    """Load data of the link as the controller has them: the axes of the inertia are not turned."""
+    return (*load[:4].tolist(), 0.0, 0.0, 0.0, *load[4:].tolist())
 
 
 class Bench:
@@ -191,7 +200,7 @@ def test_load_data_are_taken_in_monitor_mode_only_and_reported() -> None:
     bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, load)
     bench.cycles(20)
     assert bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
-    assert bench.machinery.load == pytest.approx(load)
+    assert bench.machinery.load == pytest.approx(as_krl(load))
     assert bench.handshake.load(bench.rig.msr) == pytest.approx([3.34, 0.0, -66.0, 66.0])
     # The same load is not asked for again, another one is; in command mode it has to wait.
     bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, load)
@@ -205,7 +214,7 @@ def test_load_data_are_taken_in_monitor_mode_only_and_reported() -> None:
     bench.handshake.request_stop(bench.rig.cmd, bench.rig.msr)
     bench.cycles(60)
     assert bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
-    assert bench.machinery.load == (0.0,) * 7
+    assert bench.machinery.load == (0.0,) * 10
 
 
 @pytest.mark.parametrize("mass", [-1.0, 15.0])
@@ -215,7 +224,7 @@ def test_a_load_that_cannot_be_is_not_taken(mass: float) -> None:
     bench.handshake.request_load(bench.rig.cmd, bench.rig.msr, np.array([mass, 0, 0, 0, 0, 0, 0]))
     bench.cycles(40)
     assert not bench.handshake.load_taken(bench.rig.cmd, bench.rig.msr)
-    assert bench.machinery.load == (0.0,) * 7
+    assert bench.machinery.load == (0.0,) * 10
 
 
 def test_the_program_ends_when_it_is_asked_to() -> None:
@@ -264,7 +273,7 @@ def test_a_damaged_bit_is_no_request_and_no_load() -> None:
     bench.rig.cmd["krl_int"][12:14] = (-7, 7)
     bench.rig.cmd["krl_real"][3] = 600.0
     bench.cycles(20)
-    assert bench.machinery.load == pytest.approx(load)
+    assert bench.machinery.load == pytest.approx(as_krl(load))
 
 
 def test_after_a_fallback_a_damaged_request_does_not_start_anything() -> None:
@@ -288,7 +297,7 @@ def only_statement(line: str) -> object:
     """The tree of a line, with some declarations around it."""
     data = "DECL INT N=3\nDECL REAL R=-1.5\nDECL BOOL B=TRUE\nDECL CHAR HOST[8]"
     source = parse_source(f"DEF p( )\n{line}\nEND\n", data)
-    (statement,) = source.subprograms["P"]
+    (statement,) = source.subprograms["P"].body
     return statement
 
 
@@ -309,8 +318,14 @@ def only_statement(line: str) -> object:
         ("WAIT SEC 0.012", WaitSeconds(Constant(0.012), 2)),
         ("WAIT FOR B", WaitFor(Name("B"), 2)),
         ("PTP XHOME", Move(Name("XHOME"), 2)),
+        ("PTP_REL {A1 0.5}", Move(Aggregate((("A1", Constant(0.5)),)), 2, relative=True)),
+        ("HALT", Halt(2)),
+        ("INTERRUPT ON 3", Ignored("INTERRUPT ON 3", 2)),
         ("EXIT", Leave("EXIT", 2)),
         ("RETURN", Leave("RETURN", 2)),
+        ("RETURN N", Leave("RETURN", 2, Name("N"))),
+        ("T[2].X=1.", Assign(Name("T", Constant(2), (".X",)), Constant(1.0), 2)),
+        ("N='HFF'", Assign(Name("N"), Constant(255), 2)),
     ],
 )
 def test_a_line_becomes_its_tree(line: str, expected: object) -> None:
@@ -329,7 +344,8 @@ def test_blocks_keep_their_statements_and_lines() -> None:
 
 def test_declarations_have_kind_size_value_and_line() -> None:
     data = 'DEFDAT p\n; nothing\nDECL INT A, B=-2\nREAL C[7]\nDECL CHAR HOST[8]\nHOST[]="abc"\nENDDAT'
-    found = parse_source("DEF p( )\nBOOL D=TRUE\nEND\n", data).declarations
+    source = parse_source("DEF p( )\nBOOL D=TRUE\nEND\n", data)
+    found = source.declarations | source.subprograms["P"].declarations
     assert found == {
         "A": Declaration("A", "INT", 0, None, 3),
         "B": Declaration("B", "INT", 0, Constant(-2.0), 3),
@@ -360,10 +376,10 @@ def test_load_data_begin_with_zeros_and_are_set_field_by_field() -> None:
     machinery = NoMachinery()
     body = "$LOAD=L\nL.CM.Y=2.5\nL.M=3\n$FRI_TO_REA[1]=L.CM.Y\n$LOAD.J.Z=0.5\n$FRI_TO_REA[2]=$LOAD.J.Z"
     rig = Rig()
-    machinery.set_load((9.0,) * 7)
+    machinery.set_load((9.0,) * 10)
     program = KrlProgram(f"DEF p( )\nLOAD L\n{body}\nEND\n", machinery=machinery)
     program.step(rig.session)
-    assert machinery.load == (0.0,) * 6 + (0.5,)
+    assert machinery.load == (0.0,) * 9 + (0.5,)
     assert rig.session.to_real[:3].tolist() == [2.5, 0.5, 0.0]
 
 

@@ -16,7 +16,7 @@ from fri.krc import EventKind, KrcPolicy, KrcSession, Sample, Setpoint
 from fri.krl import Interpreter
 from fri.remote import RemoteEnd
 from fri.states import Control, State
-from sim_backend.configuration import krl_program
+from sim_backend.program import krl_program
 from tests.fri.fri_rig import LIMITS, Q_START, QUICK
 
 PATIENCE_S = 5.0

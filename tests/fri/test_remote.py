@@ -492,3 +492,19 @@ def test_a_reminder_is_the_last_answer_again(end, controller):
     end.remind()
     assert int(controller.answer()["krl_int"][3]) == 5
     assert end.counters()["answered"] == 1
+
+
+def test_torques_are_turned_by_the_sign_of_their_sensors(end, controller):
+    sign = np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
+    end.set_torque_sign(sign)
+    for _ in range(2):
+        controller.send(
+            msr_jnt_trq=np.arange(1.0, 8.0), est_ext_jnt_trq=np.full(7, 0.5), gravity=np.full(7, 2.0)
+        )
+        msr = end.receive(PATIENCE_S)
+        assert msr["msr_jnt_trq"].tolist() == (np.arange(1.0, 8.0) * sign).tolist()
+        assert msr["est_ext_jnt_trq"].tolist() == (0.5 * sign).tolist()
+        assert msr["gravity"].tolist() == [2.0] * 7
+        end.answer()
+    with pytest.raises(ConfigurationError, match="must be"):
+        end.set_torque_sign(np.zeros(7))

@@ -23,7 +23,7 @@ from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
-from sim_backend.configuration import krl_program
+from sim_backend.program import krl_program
 
 DEG = np.pi / 180.0
 START = np.array([0.1, 0.5, -0.2, -1.3, 0.3, 0.8, -0.1])
