@@ -66,8 +66,8 @@ class Replayed:
     """Measured minus simulated, in means over 20 ms: position (m, n) [rad], motor and joint torque [Nm].
 
     position, motor : None without motor torques in the log or in the model; motor : NaN near standstill. inertia : (n,)
-    of the spring and damper [kg m^2]. exact : whether the model itself was simulated, or the nearest physically possible one. stiff : whether
-    the stiffness of the joints is unknown. duration_s : of the compared part.
+    of the spring and damper [kg m^2]. exact : whether the model itself was simulated, or the nearest physically
+    possible one. stiff : whether the stiffness of the joints is unknown. duration_s : of the compared part.
     """
 
     position: Floats | None
@@ -83,8 +83,8 @@ class Replay:
     """Replays sessions; call it with a model and sessions.
 
     stiffness : (n,) of the joints [Nm/rad], None: stiff ones. sessions : all of the diagnosis, for their numbers.
-    longest_s : longest simulated part of a session, extended for an effect at a later moment. encoder : side of the elastic joints with the published positions. first : by call, the first replayed session and
-    its replay.
+    longest_s : longest simulated part of a session, extended for an effect at a later moment. encoder : side of the
+    elastic joints with the published positions. first : by call, the first replayed session and its replay.
     """
 
     def __init__(
