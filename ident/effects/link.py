@@ -26,7 +26,7 @@ from ident.effects.effect import (
 )
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
-from ident.effects.words import Values, quantity, quantity_text, times, wave
+from ident.effects.words import Values, one_joint, quantity, quantity_text, times, wave
 from ident.rows.filters import differentiate, low_pass
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
@@ -240,8 +240,11 @@ class _Spring(Form):
     TAUT_ABOVE = "taut above", "stiffness", "slack"
     TAUT_BELOW = "taut below", "stiffness", "slack"
     PLAY = "play", "stiffness", "slack", "play"
+    TWO_JOINTS = "over two joints", "stiffness", "source", "ratio"
 
 
+# Angle of the second joint over that of the first, in the length of a hose, to begin with.
+_RATIOS = (-1.6, -0.6, 0.6, 1.6)
 # Distance in which the friction of a hose along the arm reverses [rad].
 _RUB_RAD = 0.1
 
@@ -251,7 +254,8 @@ class CableSpring(Effect):
 
     f is q; q^3 (cubic); the angle above or below `slack` (taut above, taut below); the angle beyond `play` on either
     side of `slack` (play). A hardening one pulls with `stiffness q + quadratic q^2 + cubic q^3`, equal to
-    `k (q - c) + h (q - c)^3` about its angle of rest c.
+    `k (q - c) + h (q - c)^3` about its angle of rest c. A hose over two joints is longer by `q + ratio q_source`, and
+    pulls at both: with `stiffness` times that here, and `ratio` times as much at joint `source`.
     """
 
     cause = "cable_spring"
@@ -265,6 +269,8 @@ class CableSpring(Effect):
         Parameter("cubic", "Nm/rad^3", "of a hardening one"),
         Parameter("slack", "rad", "angle at which the cable becomes taut, or middle of its play", shape=True),
         Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
+        Parameter("source", "1", "the other joint of a hose over two, from 1", shape=True, fixed=True),
+        Parameter("ratio", "1", "its angle over that of the first", shape=True, low=-5.0, high=5.0),
     )
     forms = _Spring
     depends_on = "position"
@@ -274,7 +280,7 @@ class CableSpring(Effect):
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Linear, cubic, hardening and one-sided springs, and springs with play."""
+        """Linear, cubic, hardening and one-sided springs, springs with play, and hoses on to the next two joints."""
         low, high = setting.position_range[joint]
         angles = [float(low + share * (high - low)) for share in (0.3, 0.5, 0.7)]
         taut, plays = (
@@ -285,6 +291,11 @@ class CableSpring(Effect):
             *(Shape(form) for form in (_Spring.LINEAR, _Spring.CUBIC, _Spring.HARDENING)),
             *(Shape(form, slack=angle) for form in taut for angle in angles),
             *(Shape(_Spring.PLAY, slack=angle, play=play) for angle in angles for play in plays),
+            *(
+                Shape(_Spring.TWO_JOINTS, source=other + 1, ratio=ratio)
+                for other in range(joint + 1, min(joint + 3, len(setting.gear_ratio)))
+                for ratio in _RATIOS
+            ),
         ]
 
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
@@ -295,6 +306,12 @@ class CableSpring(Effect):
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The same torque on both sides."""
+        if shape.form is _Spring.TWO_JOINTS:
+            other, ratio = round(shape["source"]) - 1, shape["ratio"]
+            pull = motion.q[:, joint] + ratio * motion.q[:, other]
+            both = np.zeros_like(motion.q)
+            both[:, joint], both[:, other] = pull, ratio * pull
+            return (both_sides(both),)
         return tuple(both_sides(pull) for pull in _pulls(motion.q[:, joint], shape))
 
     def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
@@ -302,7 +319,13 @@ class CableSpring(Effect):
         return (both_sides(dahl(np.ascontiguousarray(motion.q[:, joint]), _RUB_RAD, 0.0)),)
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
-        """A torque on the link."""
+        """A torque on the link, or on both."""
+        if run.shape.form is _Spring.TWO_JOINTS:
+            other, ratio = round(run.values["source"]) - 1, run.values["ratio"]
+            pull = run.values["stiffness"] * (plant.position[run.joint] + ratio * plant.position[other])
+            loads.link_torque[run.joint] -= pull
+            loads.link_torque[other] -= ratio * pull
+            return
         pulls = _pulls(plant.position[run.joint], run.shape)
         pull = sum(c * one for c, one in zip(run.coefficients, pulls, strict=False))
         loads.link_torque[run.joint] -= pull
@@ -321,6 +344,9 @@ class CableSpring(Effect):
             return [f"{stiffness}, with no pull within {play} of {slack}"]
         if form is _Spring.LINEAR:
             return [stiffness]
+        if form is _Spring.TWO_JOINTS:
+            other, ratio = one_joint(round(values["source"][0]), names), quantity(values["ratio"])
+            return [f"{stiffness}, of its angle plus {ratio} times that of {other}"]
         sense = "above" if form is _Spring.TAUT_ABOVE else "below"
         return [f"{stiffness}, taut {sense} {quantity(values['slack'])} and slack elsewhere"]
 

@@ -50,7 +50,7 @@ ROUGH = {
 FORMS = [
     pytest.param(effect, form, id=effect.cause + (f" {form.value}" if form else ""))
     for effect in EFFECTS.values()
-    for form in (effect.known_forms or [None])
+    for form in (*effect.known_forms, *([None] if effect.plain or not effect.known_forms else []))
 ]
 
 
@@ -105,6 +105,7 @@ def setting(motion: ArmMotion, encoder: str | None = None) -> Setting:
         position_range=np.stack([motion.q.min(axis=0), motion.q.max(axis=0)], axis=1),
         encoder=encoder,  # type: ignore[arg-type]
         compared=True,
+        pauses=True,
         clipped=0.6 * np.abs(motion.joint_torque).max(axis=0) if encoder else None,
     )
 
