@@ -49,7 +49,8 @@ class RecordStretch:
 class SessionRecord:
     """A session ready for rows.
 
-    number : in the order of the sessions' beginnings. begun_s : beginning of the log [s], by its clock. payload : mounted, None for none.
+    number : in the order of the sessions' beginnings. begun_s : beginning of the log [s], by its clock.
+    payload : mounted, None for none.
     period_s : of the excitation, or the duration without repetition; start_s : its beginning.
     has_effort, has_motor : existing channels. test : held-out session.
     clipped : (n,) torque [Nm] at the limit of a joint's sensor, NaN without a visible limit. stuck : values reported

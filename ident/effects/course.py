@@ -35,7 +35,8 @@ _LASTING_S = (300.0, 1200.0, 5000.0)
 
 class Course(Form):
     """How a value drifts: as 1 - exp(-t / time_constant) in each session; with the heat of the drive's friction in its
-    place; with that heat carried over from session to session; from session `since` on, without and with a level of the sessions before it; in all sessions.
+    place; with that heat carried over from session to session; from session `since` on, without and with a level of the
+    sessions before it; in all sessions.
     """
 
     WITHIN = "within a session", "change", "drift", "time_constant"

@@ -286,9 +286,9 @@ class FrictionTemperature(Drifting):
     """Drive friction times `1 + change w`, with w from 0 to 1 as the drive warms up.
 
     Within a session w starts anew in each: as 1 - exp(-t / time_constant), or heated by the power of the friction
-    itself, `time_constant w' = P / P1 - w` with P1 the power at 1 rad/s; carried over, w keeps its value from session to
-    session and falls in the pauses. Between sessions w is 1 from the session
-    `since` on, beside a `level` of all sessions; against a reference it is 1 in all.
+    itself, `time_constant w' = P / P1 - w` with P1 the power at 1 rad/s; carried over, w keeps its value from session
+    to session and falls in the pauses. Between sessions w is 1 from the session `since` on, beside a `level` of all
+    sessions; against a reference it is 1 in all.
     """
 
     cause = "friction_temperature"
