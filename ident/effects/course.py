@@ -41,7 +41,7 @@ class Course(Form):
 
     WITHIN = "within a session", "change", "drift", "time_constant"
     HEATED = "heated by friction", "change", "time_constant"
-    CARRIED = "heated by friction, carried over", "change", "time_constant"
+    CARRIED = "heat carried over", "change", "time_constant"
     STEP = "between sessions", "change", "drift", "since"
     LEVEL_AND_STEP = "level, and step between sessions", "change", "level", "drift", "zero", "since"
     SINCE_REFERENCE = "since the reference", "change", "drift"

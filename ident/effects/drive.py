@@ -308,7 +308,10 @@ class FrictionTemperature(Drifting):
     law = Law("time", signed=True)
     confused_with = ("viscous_nonlinear", "motor_torque_gain")
     experiment = Discriminator.HOT_AND_COLD
-    tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
+    tell_apart = (
+        "the same speed staircase of joint {joint} cold, after twenty minutes, and after a pause of twenty more, in "
+        "random order"
+    )
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The model's friction times w in the motor torque."""
@@ -448,9 +451,9 @@ class GearRipple(Effect):
     plain = ("cosine", "sine", "cycles_per_turn", "gear_ratio")
     depends_on = "motor angle"
     law = Law("q")
-    confused_with = ("sensor_ripple", "friction_position")
+    confused_with = ("sensor_ripple", "friction_position", "motor_torque_delay")
     experiment = Discriminator.SLOW_SWEEP
-    tell_apart = "the same path of joint {joint} at two constant speeds below 0.1 rad/s and with two payloads"
+    tell_apart = "the same path of joint {joint}, both ways, at two constant speeds below 0.1 rad/s and with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """Once and twice a turn of the motor, in both directions alike, and apart with a delay."""

@@ -275,7 +275,13 @@ class CableSpring(Effect):
     forms = _Spring
     depends_on = "position"
     law = Law("q")
-    confused_with = ("joint_zero_offset", "payload_error", "sensor_ripple", "encoder_eccentricity")
+    confused_with = (
+        "joint_zero_offset",
+        "payload_error",
+        "sensor_ripple",
+        "sensor_crosstalk",
+        "encoder_eccentricity",
+    )
     experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
