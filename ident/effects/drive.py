@@ -453,7 +453,7 @@ class GearRipple(Effect):
     law = Law("q")
     confused_with = ("sensor_ripple", "friction_position", "motor_torque_delay")
     experiment = Discriminator.SLOW_SWEEP
-    tell_apart = "the same path of joint {joint} both ways, at two constant speeds below 0.1 rad/s and with two payloads"
+    tell_apart = "the same path of joint {joint} both ways at two constant speeds below 0.1 rad/s and with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """Once and twice a turn of the motor, in both directions alike, and apart with a delay."""
