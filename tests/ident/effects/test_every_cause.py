@@ -119,6 +119,7 @@ def stated(effect: Effect, form: Form | None, motion: ArmMotion) -> dict[str, fl
     shape |= {"delay": 0.015} if effect.channel else {}
     # Crossed over so much torque, a gap passes the filter of its twist.
     shape |= {"width": 8.0} if effect.cause == "backlash" else {}
+    shape |= {"source": 6.0, "ratio": -0.6} if form is not None and form.value == "over two joints" else {}
     used = [p.name for p in effect.used(form)]
     sizes = {p.name: SIZES.get(p.unit, 0.4) * (1.0 + 0.3 * k) for k, p in enumerate(effect.linear)}
     values = {**sizes, **shape}
