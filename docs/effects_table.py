@@ -20,7 +20,8 @@ def row(name: str, effect: Effect) -> str:
     """One cause as a row of its table."""
     shown = [p for p in effect.parameters if p.name not in effect.hidden]
     parameters = ", ".join(f"{p.name} [{p.unit}]" if p.unit != "1" else p.name for p in shown)
-    forms = f"; form: {', '.join(form.value for form in effect.known_forms)}" if effect.known_forms else ""
+    named = [*(["none"] if effect.plain else []), *(form.value for form in effect.known_forms)]
+    forms = f"; form: {', '.join(named)}" if named else ""
     alike = ", ".join(f"`{cause}`" for cause in effect.confused_with)
     decides = effect.tell_apart.replace("joint {joint}", "the joint").replace("{joint}", "the joint")
     return f"| `{name}` | {effect.physics} | {parameters}{forms} | {alike} | {decides} |"

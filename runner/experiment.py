@@ -37,6 +37,7 @@ from runner.preflight import (
     check_link,
     check_payload,
     check_rights,
+    load_data,
     set_load,
 )
 from runner.terminal import Interrupts, StatusLine

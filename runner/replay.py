@@ -1,98 +1,116 @@
-"""Replay of a session in simulation: the same commands to the emulated arm with a model, measured minus simulated.
+"""Replay of a session in simulation: the arm of a model along the measured positions, measured minus simulated.
 
-The arm is the emulator's plant with the links, drives and effects of the model and the joint stiffness of the arm's
-description. The emulator's position controller gets the announced load; the sensors are without noise. The replay
-runs in this process, about ten times faster than the session. A real arm has another controller, so the position
-error serves only to compare models.
+The arm is the emulator's plant with the links, drives and effects of the model. No controller of a real arm enters:
+
+- *Torques*: the simulated arm is led along the measured positions by a stiff spring and damper at its motors (20 Hz);
+  the torques that it needs are compared with the measured ones. Near standstill a motor torque may be anything within
+  the friction, so it is left out there.
+- *Position*: the simulated motors get the measured motor torques, and a soft spring and damper (3 Hz) about the
+  measured positions, because an arm under given torques alone drifts away. A torque error `e` of the model at low
+  frequencies moves the joint by `e / (J w^2)`, with its inertia `J` and the angular frequency `w` of the spring.
+
+Spring and damper are made from the inertia of the first model and are those of each further one, so two models differ
+by their physics alone. The sensors are without noise. The replay runs in this process, faster than the session.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
+import pinocchio as pin
 import yaml
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import maximum_filter1d
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
 from ident.model import DynamicModel
 from ident.rows.filters import low_pass
 from ident.rows.sessions import payload_name
-from lwr_driver.arm import Arm
-from lwr_driver.configuration import find, parse
+from lwr_driver.configuration import parse
 from lwr_driver.session import Session
 from runner.experiment_file import Experiment
-from sim_backend.configuration import EmulatorConfig, LoadData, load_configuration
-from sim_backend.controller import ControllerModel, PositionController
-from sim_backend.model_arm import arm_of, is_possible, model_effects
-from sim_backend.plant import CYCLE_S, ElasticArm, Reading
-from sim_backend.robot import chain, robot_file, true_arm
+from sim_backend.model_arm import ModelEffect, arm_of, is_possible, links_of, model_effects
+from sim_backend.plant import CYCLE_S, ElasticArm, PlantEffect, Reading
+from sim_backend.robot import Drive
 
 Floats = NDArray[np.float64]
+Encoder = Literal["link", "motor"]
+
+METHOD = {
+    "torques": "simulated arm led along the measured positions; motor torques without standstill",
+    "position": "simulated arm under the measured motor torques, held by a 3 Hz spring about the measured positions",
+}
+"""The simulation behind each error, in words."""
 
 _BIN = 20
-_SETTLE = 500
+_BEGIN = 500
 _POSES = 100
-_COMMAND_HZ = 20.0
-_LATEST_S = 0.02
-"""A command acts at most this much later than it was logged."""
+_PATH_HZ, _TWIST_HZ = 20.0, 12.0
+_LED_HZ, _HELD_HZ = 20.0, 3.0
+# Speed below which a drive may stick [rad/s], and time around it [s]: positions then tell nothing of the friction.
+_SLOW, _AROUND_S = 0.01, 0.05
+# Joints of unknown stiffness ring at this frequency, with this damping ratio.
+_STIFF_HZ, _DAMPING = 40.0, 0.03
+# Drives of a model without motor side: inertia over that of the links.
+_ROTOR = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
     """Measured minus simulated, in means over 20 ms: position (m, n) [rad], motor and joint torque [Nm].
 
-    delay_s : of the commands against their log, estimated from the positions. commanded : whether the log has
-    commands; otherwise the measured positions were commanded. exact : whether the model itself was simulated, or the
-    nearest physically possible one. borrowed : whether the drives (inertia, friction, offset of the motor side) are
-    the emulated arm's, for a model without motor side. duration_s : of the simulation.
+    position, motor : None without motor torques in the log or in the model; motor : NaN near standstill. inertia : (n,)
+    of the spring and damper [kg m^2]. exact : whether the model itself was simulated, or the nearest physically
+    possible one. stiff : whether the stiffness of the joints is unknown. duration_s : of the compared part.
     """
 
-    position: Floats
+    position: Floats | None
     motor: Floats | None
     joint: Floats | None
-    delay_s: float
-    commanded: bool
+    inertia: Floats
     exact: bool
-    borrowed: bool
+    stiff: bool
     duration_s: float
 
 
 class Replay:
-    """Replays sessions of `arm`; call it with a model and sessions.
+    """Replays sessions; call it with a model and sessions.
 
-    sessions : all of the diagnosis, for their numbers. longest_s : longest simulated part of a session, extended for
-    an effect at a later moment. config : emulator with the controller. first : by call, the first replayed session
-    and its replay.
+    stiffness : (n,) of the joints [Nm/rad], None: stiff ones. sessions : all of the diagnosis, for their numbers.
+    longest_s : longest simulated part of a session, extended for an effect at a later moment. encoder : side of the
+    elastic joints with the published positions. first : by call, the first replayed session and its replay.
     """
 
     def __init__(
         self,
-        arm: Arm,
+        stiffness: Floats | None,
         sessions: Sequence[Session] = (),
         *,
         longest_s: float = 60.0,
-        config: EmulatorConfig | None = None,
+        encoder: Encoder = "link",
     ) -> None:
-        self.arm = arm
+        self.stiffness = stiffness
         self.longest_s = longest_s
-        self.config = config or load_configuration()
+        self.encoder = encoder
         self._failed: dict[str, dict[str, None]] = {}
-        self._uncommanded: dict[str, None] = {}
+        self._undriven: dict[str, None] = {}
         self._stood_in: dict[str, None] = {}
-        self._borrowed: dict[str, None] = {}
+        self._stiff: dict[str, None] = {}
         self._order = sorted(session.start for session in sessions)
-        self._delays: dict[int, float] = {}
+        self._inertia: dict[int, Floats] = {}
         self.first: list[tuple[str, Replayed]] = []
 
     def __call__(self, model: DynamicModel, sessions: Sequence[Session]) -> SimulationError | None:
         """Error over all sessions; None if none can be simulated."""
-        squares, count = np.zeros((3, len(self.arm.joint_names))), np.zeros(3)
+        n = model.structure.chain.n
+        squares, count = np.zeros((3, n)), np.zeros((3, n))
+        done: Replayed | None = None
         for session in sessions:
             name = session.path.name
             number = self._order.index(session.start) if session.start in self._order else None
@@ -100,54 +118,55 @@ class Replay:
                 done = replay(
                     model,
                     session,
-                    self.arm,
-                    self.config,
                     self.longest_s,
+                    stiffness=self.stiffness,
+                    encoder=self.encoder,
                     number=number,
-                    delay_s=self._delays.get(session.start),
+                    inertia=self._inertia.get(session.start),
                 )
             except (DataError, ConfigurationError) as error:
                 self._failed.setdefault(str(error), {})[name] = None
                 continue
-            self._delays.setdefault(session.start, done.delay_s)
-            if not count[0]:
+            self._inertia.setdefault(session.start, done.inertia)
+            if not np.any(count):
                 self.first.append((name, done))
-            if not done.commanded:
-                self._uncommanded[name] = None
-            if not done.exact:
-                self._stood_in[name] = None
-            if done.borrowed:
-                self._borrowed[name] = None
+            for flag, names in (
+                (done.position is None, self._undriven),
+                (not done.exact, self._stood_in),
+                (done.stiff, self._stiff),
+            ):
+                if flag:
+                    names[name] = None
             for k, part in enumerate((done.position, done.motor, done.joint)):
                 if part is not None:
                     squares[k] += np.nansum(part**2, axis=0)
-                    count[k] += len(part)
-        if not count[0]:
+                    count[k] += np.isfinite(part).sum(axis=0)
+        if not np.any(count):
             return None
-        rms = [np.sqrt(s / c) if c else None for s, c in zip(squares, count, strict=True)]
-        assert rms[0] is not None
-        return SimulationError(position=rms[0], motor=rms[1], joint=rms[2])
+        rms = [
+            np.sqrt(s / np.where(c > 0.0, c, np.nan)) if c.any() else None
+            for s, c in zip(squares, count, strict=True)
+        ]
+        return SimulationError(position=rms[0], motor=rms[1], joint=rms[2], method=METHOD)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sessions left out and reasons, and other limits of the replay, a sentence each."""
         found = [f"no simulation of {', '.join(names)}: {reason}" for reason, names in self._failed.items()]
-        if self._uncommanded:
+        if self._undriven:
             found.append(
-                f"{', '.join(self._uncommanded)}: no commands in the log, so the simulated arm followed the measured "
-                "positions; the position error shows the tracking of the controller, not the response of the arm"
+                f"replay of {', '.join(self._undriven)}: no motor torques in the log or in the model, so there is no "
+                "simulated position, only joint torques along the measured positions"
+            )
+        if self._stiff:
+            found.append(
+                f"replay of {', '.join(self._stiff)}: the stiffness of the joints is unknown; the simulated ones ring "
+                f"at {_STIFF_HZ:g} Hz. Name the description of the arm with --arm"
             )
         if self._stood_in:
             found.append(
                 f"replay of {', '.join(self._stood_in)}: the estimated inertias are physically impossible, so the "
                 "nearest possible arm was simulated; a more exciting motion would improve the estimate"
-            )
-        if self._borrowed:
-            found.append(
-                f"replay of {', '.join(self._borrowed)}: the model has no motor side, so drive inertia, motor friction "
-                "and motor offset are those of the emulated arm, its true ones for a session of the emulator; the "
-                "position and motor errors say nothing about the drives of this arm. Identify Model 2 from a log with "
-                "motor torques"
             )
         return tuple(found)
 
@@ -155,129 +174,173 @@ class Replay:
 def replay(
     model: DynamicModel,
     session: Session,
-    arm: Arm,
-    config: EmulatorConfig,
     longest_s: float,
     *,
+    stiffness: Floats | None = None,
+    encoder: Encoder = "link",
     number: int | None = None,
-    delay_s: float | None = None,
+    inertia: Floats | None = None,
 ) -> Replayed:
     """Simulate a session from the beginning of its excitation.
 
-    number : of the session in the diagnosis, from 0. delay_s : of the commands; None: estimated from the positions of
-    a first simulation. Raises DataError for a model of no possible arm.
+    stiffness : (n,) of the joints [Nm/rad], None: stiff ones. encoder : side with the published positions. number : of
+    the session in the diagnosis, from 0. inertia : (n,) of spring and damper [kg m^2]; None: of this model.
+    Raises DataError for a model of no possible arm, and for a session without positions.
     """
     chosen = session.select(model.structure.chain.joint_names)
-    source = chosen.command if chosen.command is not None and len(chosen.command) else None
-    if source is None and not len(chosen.joint):
+    if not len(chosen.joint):
         raise DataError("the session holds no positions")
     joint = chosen.joint
     spans = chosen.spans("period") or ((chosen.start, int(joint.log_time[-1])),)
     start, stop = max(int(spans[0][0]), int(joint.log_time[0])), int(spans[-1][1])
-    if source is not None:
-        start, stop = max(start, int(source.log_time[0])), min(stop, int(source.log_time[-1]))
     latest = max((float(e["parameters"]["time"]["value"]) for e in _events(model, number)), default=0.0)
-    stop = min(stop, start + int(max(longest_s, latest + longest_s / 2.0) * 1e9))
+    stop = min(stop, int(joint.log_time[-1]), start + int(max(longest_s, latest + longest_s / 2.0) * 1e9))
     grid = np.arange(start, stop, int(CYCLE_S * 1e9))
-    if len(grid) < 2 * _BIN:
+    if len(grid) < _BEGIN + 2 * _BIN:
         raise DataError(
-            f"commands and positions overlap for less than {2 * _BIN * CYCLE_S:g} s; record a longer session"
+            f"positions of less than {(_BEGIN + 2 * _BIN) * CYCLE_S:g} s; record a longer session"
         )
-    bench = _Bench(model, chosen, arm, config, number, begin_s=(start - chosen.start) * 1e-9)
-    measured = _resampled(joint.log_time, joint.position, grid)
-    if source is None:
-        wanted, delay = _smooth(joint.log_time, joint.position, grid), 0.0
-        run = bench.run(wanted)
-    else:
-        wanted = _resampled(source.log_time, source.position, grid)
-        delay = 0.0 if delay_s is None else delay_s
-        run = bench.run(_late(wanted, delay))
-        if delay_s is None:
-            delay = _delay(measured, run[0])
-            run = bench.run(_late(wanted, delay))
-    position, motor, link = run
-    motor_error = None
-    if chosen.motor is not None and chosen.motor.effort.shape[1]:
-        times = chosen.motor.log_time
-        inside = (times >= grid[0]) & (times <= grid[-1])
-        motor_error = chosen.motor.effort[inside] - _resampled(grid, motor, times[inside])
-    joint_error = None
-    if joint.effort.shape[1]:
-        joint_error = _binned(_resampled(joint.log_time, joint.effort, grid) - link)
-    errors = _binned(measured - position), motor_error, joint_error
-    return Replayed(*errors, delay, source is not None, bench.exact, bench.borrowed, len(grid) * CYCLE_S)
+    bench = _Bench(model, chosen, stiffness, encoder, number, (start - chosen.start) * 1e-9, inertia)
+    path = _smooth(joint.log_time, joint.position, grid)
+    _, motor, link = bench.run(path, _LED_HZ)
+    used, times = slice(_BEGIN, None), grid[_BEGIN:]
+    position_error = motor_error = joint_error = None
+    if chosen.motor is not None and chosen.motor.effort.shape[1] and "motor" in model.structure.sides:
+        measured = _resampled(chosen.motor.log_time, chosen.motor.effort, grid)
+        motor_error = _binned(np.where(_sticking(path), np.nan, measured - motor)[used])
+        position, _, _ = bench.run(path, _HELD_HZ, measured)
+        position_error = _binned((_resampled(joint.log_time, joint.position, grid) - position)[used])
+    if joint.effort.shape[1] and "joint" in model.structure.sides:
+        joint_error = _binned(_resampled(joint.log_time, joint.effort, times) - link[used])
+    errors = position_error, motor_error, joint_error
+    return Replayed(*errors, bench.inertia, bench.exact, stiffness is None, len(times) * CYCLE_S)
 
 
 class _Bench:
-    """A simulated arm under its controller, made for one session."""
+    """A simulated arm led by springs and dampers at its motors, made for one session."""
 
     def __init__(
         self,
         model: DynamicModel,
         session: Session,
-        arm: Arm,
-        config: EmulatorConfig,
+        stiffness: Floats | None,
+        encoder: Encoder,
         number: int | None,
         begin_s: float,
+        inertia: Floats | None,
     ) -> None:
+        n = model.structure.chain.n
+        if stiffness is not None and len(stiffness) != n:
+            raise DataError(f"the description of the arm has {len(stiffness)} joints, the model {n}")
+        if model.structure.couplings:
+            raise DataError("coupled drives are not simulated")
         payload = payload_name(session)
         known = payload if payload in model.structure.payloads else None
-        stiffness = np.asarray(arm.stiffness, dtype=float)
-        damping = np.array(config.robot.damping, dtype=float)
-        if len(stiffness) != model.structure.chain.n or len(damping) != len(stiffness):
-            raise DataError(
-                f"the simulated arm has {len(damping)} joints, the model {model.structure.chain.n}; "
-                "other arms have no simulated controller"
-            )
-        self.config = config
-        self.number, self.begin_s, self.model = number, begin_s - _SETTLE * CYCLE_S, model
+        self.at_motor = encoder == "motor"
+        self.number, self.begin_s, self.model = number, begin_s, model
         poses = session.joint.position[:: max(1, len(session.joint) // _POSES)]
         self.exact = is_possible(model, poses)
-        self.borrowed = "motor" not in model.structure.sides
-        self.links, self.drive = arm_of(
+        zero = np.zeros(n)
+        missing = Drive(np.ones(n), zero, zero, zero, zero, zero, zero, np.ones(n), zero)
+        self.links, drive = arm_of(
             model,
-            chain(find(arm.urdf_path)),
+            links_of(model.structure.chain),
             known,
-            stiffness=stiffness,
-            damping=damping,
+            stiffness=np.ones(n),
+            damping=zero,
             poses=poses,
-            motors=true_arm(config, robot_file(config))[1] if self.borrowed else None,
+            motors=missing,
         )
-        self.load = _announced_load(session)
+        data = self.links.createData()
+        masses = np.array([np.diag(pin.crba(self.links, data, pose)) for pose in poses])
+        mass = np.asarray(masses.mean(axis=0))
+        if "motor" not in model.structure.sides:
+            drive = replace(drive, Ia=_ROTOR * mass)
+        hard = masses.max(axis=0) * (2.0 * np.pi * _STIFF_HZ) ** 2 if stiffness is None else stiffness
+        self.drive = replace(drive, stiffness=hard, damping=2.0 * _DAMPING * np.sqrt(hard * mass))
+        self.inertia = mass + drive.Ia if inertia is None else inertia
 
-    def run(self, wanted: Floats) -> tuple[Floats, Floats, Floats]:
-        """Noiseless position, motor and joint torque (N, n) for set points (N, n)."""
-        config = self.config
+    def run(self, path: Floats, hertz: float, torque: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+        """Noiseless position, motor and joint torque (N, n) along `path` (N, n), as published and reported.
+
+        hertz : of spring and damper. torque : (N, n) of the motors, as measured; None: that of the model on the path.
+        """
+        rate = np.gradient(path, CYCLE_S, axis=0)
+        rigid, target = self._rigid(path, rate)
+        # In the middle of each cycle.
+        target_rate = np.diff(target, axis=0, append=2.0 * target[-1:] - target[-2:-1]) / CYCLE_S
         effects = model_effects(self.model, session=self.number, begin_s=self.begin_s)
-        plant = ElasticArm(self.links, self.drive, substeps=config.robot.substeps, effects=effects)
-        controller = PositionController(config.controller)
-        believed = ControllerModel(
-            chain(config.beside(config.controller.urdf)), self.load, config.controller.external_cutoff_hz
-        )
-        n = wanted.shape[1]
-        reading = Reading(*np.zeros((4, n)))
-        out = np.zeros((3, len(wanted), n))
-        plant.reset(wanted[0])
-        controller.reset(wanted[0], believed.update_gravity(wanted[0]), plant.motor_position)
-        for k in range(-_SETTLE, len(wanted)):
-            setpoint = wanted[max(k, 0)]
-            time_s = (k + _SETTLE) * CYCLE_S
-            reading.position[:], reading.motor_position[:] = plant.position, plant.motor_position
-            reading.joint_torque[:] = plant.joint_torque
-            for effect in plant.effects:
+        pull, damper = self.inertia * (2.0 * np.pi * hertz) ** 2, _Damper(4.0 * np.pi * hertz * self.inertia)
+        plant = ElasticArm(self.links, self.drive, effects=[*effects, damper])
+        plant.reset(path[0])
+        plant.velocity[:] = plant.motor_velocity[:] = rate[0]
+        answering = [effect for effect in effects if torque is None or not _late(effect)]
+        n = path.shape[1]
+        reading, out, own = Reading(*np.zeros((4, n))), np.zeros((3, len(path), n)), np.zeros(n)
+        for k in range(len(path)):
+            time_s = k * CYCLE_S
+            published = plant.motor_position if self.at_motor else plant.position
+            reading.position[:], reading.motor_position[:] = published, plant.motor_position
+            reading.joint_torque[:], reading.motor_torque[:] = plant.joint_torque, own
+            for effect in effects:
                 effect.sense(time_s, plant, reading)
-            torque = controller.cycle(
-                setpoint, believed.update_gravity(setpoint), reading.motor_position, reading.joint_torque
-            )
-            reading.motor_torque[:] = 0.5 * (plant.motor_torque + torque)
-            for effect in plant.effects:
+            for effect in answering:
                 effect.sense_motor(time_s, plant, reading)
-            if k >= 0:
-                out[0, k], out[1, k], out[2, k] = reading.position, reading.motor_torque, reading.joint_torque
-            plant.step(torque)
+            out[0, k], out[1, k], out[2, k] = reading.position, reading.motor_torque, reading.joint_torque
+            away = target[k] - plant.motor_position - (reading.position - published)
+            if torque is None:
+                given = rigid[k] + damper.resistance(plant, target_rate[k])
+            else:
+                # The arm gets the torques as they were before the errors of their measurement.
+                given = torque[k] - (reading.motor_torque - own)
+            before = plant.motor_velocity.copy()
+            applied = given + pull * away + damper.drag * target_rate[k]
+            plant.step(applied)
+            own = applied - 0.5 * damper.drag * (before + plant.motor_velocity)
             if not np.all(np.isfinite(plant.position)):
                 raise DataError("the simulated arm became unstable; the parameters are physically impossible")
         return out[0], out[1], out[2]
+
+    def _rigid(self, path: Floats, rate: Floats) -> tuple[Floats, Floats]:
+        """Torque (N, n) of links and rotors along a path without friction, and positions (N, n) of the motors."""
+        data, acceleration = self.links.createData(), np.gradient(rate, CYCLE_S, axis=0)
+        links = np.array(
+            [pin.rnea(self.links, data, *row).copy() for row in zip(path, rate, acceleration, strict=True)]
+        )
+        twist = low_pass(links / self.drive.stiffness, CYCLE_S, _TWIST_HZ)
+        return links + self.drive.Ia * acceleration, path if self.at_motor else path + twist
+
+
+class _Damper(PlantEffect):
+    """Dampers between the motors and their targets; the part at the motors' speed is integrated with the friction.
+
+    drag : (n,) [Nm s/rad].
+    """
+
+    def __init__(self, drag: Floats) -> None:
+        self.drag = drag
+
+    def load(self, time_s: float, plant: Any, loads: Any) -> None:
+        """Adds the drag to the friction of the drives."""
+        loads.Fvm += self.drag
+
+    def resistance(self, plant: ElasticArm, rate: Floats) -> Floats:
+        """Torque (n,) against friction and effects at the motors' speed (n,), with those of the last cycle."""
+        loads, way = plant.loads, np.clip(rate / _SLOW, -1.0, 1.0)
+        viscous = plant.drive.Fvm + loads.Fvl if plant.cycles == 0 else loads.Fvm - self.drag + loads.Fvl
+        coulomb, offset = loads.Fcm + loads.Fcl, loads.offm + loads.offl
+        return np.asarray(viscous * rate + coulomb * way + offset - loads.motor_torque - loads.link_torque)
+
+
+def _sticking(path: Floats) -> NDArray[np.bool_]:
+    """Samples (N, n) with a drive near standstill."""
+    slow = np.abs(np.gradient(path, CYCLE_S, axis=0)) < _SLOW
+    near: NDArray[np.bool_] = maximum_filter1d(slow, 2 * round(_AROUND_S / CYCLE_S) + 1, axis=0)
+    return near
+
+
+def _late(effect: ModelEffect) -> bool:
+    return effect.part.effect.channel is not None
 
 
 def _events(model: DynamicModel, number: int | None) -> list[dict[str, Any]]:
@@ -302,41 +365,13 @@ def attached_experiment(session: Session) -> Experiment | None:
         return None
 
 
-def _announced_load(session: Session) -> LoadData:
-    """The load data given to the controller, from the experiment file in the log; else the mass alone."""
-    payload = payload_name(session)
-    if payload is None:
-        return LoadData()
-    experiment = attached_experiment(session)
-    announced = None if experiment is None else experiment.payloads().get(payload)
-    if announced is not None:
-        return LoadData(announced.mass, announced.com, announced.inertia)
-    return LoadData(float(session.metadata.get("payload_mass", 0.0) or 0.0))
-
-
-def _delay(measured: Floats, simulated: Floats) -> float:
-    """Time [s] by which the measured positions (N, n) lag the simulated ones, by least squares of all joints."""
-    speed = np.gradient(simulated, CYCLE_S, axis=0)
-    offset = np.mean(measured - simulated, axis=0)
-    late = -float(np.sum(speed * (measured - simulated - offset)) / max(float(np.sum(speed**2)), 1e-12))
-    return float(np.clip(late, 0.0, _LATEST_S))
-
-
-def _late(wanted: Floats, delay_s: float) -> Floats:
-    """Set points (N, n), `delay_s` later."""
-    if delay_s <= 0.0:
-        return wanted
-    at = np.arange(len(wanted)) * CYCLE_S
-    return np.column_stack([np.interp(at - delay_s, at, column) for column in wanted.T])
-
-
 def _smooth(times: NDArray[np.int64], position: Floats, grid: NDArray[np.int64]) -> Floats:
-    """Measured positions as a smooth path (N, n) for the controller."""
+    """Measured positions as a smooth path (N, n)."""
     here = (times - times[0]) * 1e-9
     step = float(np.median(np.diff(here)))
     even = np.arange(0.0, here[-1], step)
     values = np.column_stack([np.interp(even, here, column) for column in position.T])
-    values = low_pass(values, step, min(_COMMAND_HZ, 0.2 / step))
+    values = low_pass(values, step, min(_PATH_HZ, 0.2 / step))
     return np.asarray(CubicSpline(even, values)((grid - times[0]) * 1e-9))
 
 

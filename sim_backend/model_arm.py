@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import regressor
+from ident.dynamics.kinematics import Chain, mdh_transform
 from ident.dynamics.parameters import INERTIAL, PER_LINK
 from ident.effects import Parameters, Simulated, find_effect, parameter_values
 from ident.estimators.physical import cad_prior
@@ -60,6 +61,17 @@ def model_payloads(model: DynamicModel, poses: Floats | None = None) -> dict[str
         values = standard[first : first + len(INERTIAL)]
         found[name] = dict(zip(INERTIAL, map(float, values), strict=True))
     return found
+
+
+def links_of(chain: Chain) -> pin.Model:
+    """Joints of a chain, one body each in its modified Denavit-Hartenberg frame, without inertia."""
+    links = pin.Model()
+    links.gravity.linear = np.array(chain.gravity)
+    for k, name in enumerate(chain.joint_names):
+        kind = pin.JointModelPZ() if chain.prismatic[k] else pin.JointModelRZ()
+        place = mdh_transform(chain.alpha[k], chain.d[k], chain.theta[k], chain.r[k])
+        links.addJoint(k, kind, pin.SE3(place), name)
+    return links
 
 
 def arm_of(

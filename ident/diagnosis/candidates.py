@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -29,6 +29,8 @@ _VALLEY = 30.0
 _TIED = 6.0
 # Least time of a lasting step from the ends of a session, against their transients.
 _STEP_ROOM_S = 1.0
+# Longest pause between sessions over which a drive stays warm [s].
+_DAY_S = 86400.0
 
 
 @dataclass(frozen=True)
@@ -415,7 +417,15 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         compared=compared,
         compliance=arm.compliance if all(m.springs is not None for m in motions) else None,
         clipped=_clipped(nominal),
+        pauses=_apart(nominal),
     )
+
+
+def _apart(nominal: Nominal) -> bool:
+    """Whether each session begins after the end of the one before, within a day."""
+    ordered = sorted(nominal.recordings, key=lambda r: r.begun_s)
+    pauses = [b.begun_s - a.begun_s - a.duration_s for a, b in pairwise(ordered)]
+    return bool(pauses) and all(0.0 < pause < _DAY_S for pause in pauses)
 
 
 def _clipped(nominal: Nominal) -> Floats:

@@ -29,7 +29,7 @@ from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
 from ident.effects import effects_torque
-from ident.effects.motion import ArmMotion, dahl
+from ident.effects.motion import ArmMotion, dahl, in_order
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
@@ -144,7 +144,7 @@ class Nominal:
     )
 
     def __post_init__(self) -> None:
-        self.motions = self.motions or [self._motion(r, s, s.effort) for r, s in self.stretches]
+        self.motions = self.motions or in_order([self._motion(r, s, s.effort) for r, s in self.stretches])
         self._make_rows()
 
     @property
@@ -179,7 +179,7 @@ class Nominal:
             body = bodies[recording.payload]
             link = self._link_torque(before.q, before.qd, before.qdd, body, drive)
             motions.append(self._motion(recording, stretch, link, body, drive))
-        self.motions = motions
+        self.motions = in_order(motions)
         self._make_rows()
 
     def _link_torque(
@@ -251,6 +251,7 @@ class Nominal:
             slip=slip,
             springs=springs,
             loaded=recording.payload is not None or all(r.payload is None for r in self.recordings),
+            begun_s=recording.begun_s,
         )
 
     @property

@@ -49,8 +49,9 @@ class RecordStretch:
 class SessionRecord:
     """A session ready for rows.
 
-    number : in the order of the sessions' beginnings. payload : mounted, None for none. payload_mass : as announced
-    [kg]. period_s : of the excitation, or the duration without repetition; start_s : its beginning.
+    number : in the order of the sessions' beginnings. begun_s : beginning of the log [s], by its clock.
+    payload : mounted, None for none; payload_mass : as announced [kg].
+    period_s : of the excitation, or the duration without repetition; start_s : its beginning.
     has_effort, has_motor : existing channels. test : held-out session.
     clipped : (n,) torque [Nm] at the limit of a joint's sensor, NaN without a visible limit. stuck : values reported
     repeatedly as motor torque without being measurements.
@@ -73,6 +74,7 @@ class SessionRecord:
     joint_band_hz: float | None = None
     motor_band_hz: float | None = None
     payload_mass: float | None = None
+    begun_s: float = 0.0
 
     @property
     def repeats(self) -> bool:
@@ -141,6 +143,7 @@ def record(
         # An earlier filter worked sample by sample, so its band is visible in the samples as published.
         joint_band_hz=passed_band(chosen.joint.effort, chosen.joint.period_s),
         motor_band_hz=None if motor is None else passed_band(motor.effort, motor.period_s),
+        begun_s=chosen.start * 1e-9,
     )
 
 

@@ -142,11 +142,15 @@ class Nameless:
 
 @dataclass(frozen=True, eq=False)
 class SimulationError:
-    """RMS error (n,) of the simulated session: position [rad], motor and joint torque [Nm]."""
+    """RMS error (n,) of the simulated session: position [rad], motor and joint torque [Nm].
 
-    position: Floats
+    method : the simulation behind each of them, in words.
+    """
+
+    position: Floats | None
     motor: Floats | None
     joint: Floats | None
+    method: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content."""
@@ -282,6 +286,7 @@ class Diagnosis(Tabular):
                 "test_rms_extended": _sides(self.rms_extended),
                 "simulation_error_base": base,
                 "simulation_error_extended": extended,
+                "simulation": dict(self.simulation_base.method) if self.simulation_base else {},
             },
             "extension": list(self.extension),
             "model": "model_extended.yaml",

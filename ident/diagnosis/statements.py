@@ -585,7 +585,7 @@ def _simulated(content: Plain) -> tuple[Plain, Plain]:
 
 
 def _replay(content: Plain, names: Sequence[str]) -> Part:
-    """Error of the replay with the same commands, without and with the extension."""
+    """Error of the replay along the measured positions, without and with the extension."""
     before, after = _simulated(content)
     rows: list[Row] = []
     for key, label, unit, scale in REPLAYED:
@@ -593,8 +593,10 @@ def _replay(content: Plain, names: Sequence[str]) -> Part:
             if errors.get(key) and (model == "base model" or (is_extended(content) and before.get(key))):
                 cells = [Number(None if v is None else scale * v, ".3f") for v in errors[key]]
                 rows.append((f"{label} [{unit}], {model}", *cells))
-    sentence = "The same commands to the simulated arm: measured minus simulated, root mean square."
-    return Part("replay", "Replay in simulation", [sentence] * bool(rows), ("", *names), rows)
+    said = ["No controller enters: measured minus simulated, root mean square."]
+    method = (content.get("gain") or {}).get("simulation") or {}
+    said += [f"{_capital(what)}: {how}." for what, how in method.items()]
+    return Part("replay", "Replay in simulation", said * bool(rows), ("", *names), rows)
 
 
 def _absorbed(details: Plain) -> Part:

@@ -29,15 +29,19 @@ TIME_CONSTANT = (
 )
 # Time constants to begin with, over the longest session: from a part of it to a steady drift.
 _SHARES = (0.15, 0.4, 1.0, 5.0)
+# Time constants of a heat that outlasts the pause between sessions [s].
+_LASTING_S = (300.0, 1200.0, 5000.0)
 
 
 class Course(Form):
     """How a value drifts: as 1 - exp(-t / time_constant) in each session; with the heat of the drive's friction in its
-    place; from session `since` on, without and with a level of the sessions before it; in all sessions.
+    place; with that heat carried over from session to session; from session `since` on, without and with a level of the
+    sessions before it; in all sessions.
     """
 
     WITHIN = "within a session", "change", "drift", "time_constant"
     HEATED = "heated by friction", "change", "time_constant"
+    CARRIED = "heat carried over", "change", "time_constant"
     STEP = "between sessions", "change", "drift", "since"
     LEVEL_AND_STEP = "level, and step between sessions", "change", "level", "drift", "zero", "since"
     SINCE_REFERENCE = "since the reference", "change", "drift"
@@ -58,7 +62,15 @@ class Drifting(Effect):
         longest = max(setting.durations_s)
         step = Course.LEVEL_AND_STEP if setting.compared else Course.STEP
         return [
-            *(Shape(form, time_constant=share * longest) for form in self.courses for share in _SHARES),
+            *(
+                Shape(form, time_constant=time)
+                for form in self.courses
+                for time in (
+                    (share * longest for share in _SHARES)
+                    if form is not Course.CARRIED
+                    else (_LASTING_S if setting.pauses else ())
+                )
+            ),
             *(Shape(step, since=k) for k in range(2, setting.sessions + 1)),
             Shape(Course.SINCE_REFERENCE),
         ]
@@ -70,15 +82,24 @@ class Drifting(Effect):
 
     def mode(self, shape: Shape) -> Literal["within", "between"]:
         """Within a session or between sessions."""
-        return "within" if shape.form in (Course.WITHIN, Course.HEATED) else "between"
+        lasting = shape.form in (Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE)
+        return "between" if lasting else "within"
 
     def course(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
         if shape.form is Course.HEATED:
-            friction = motion.drive_friction[:, joint]
-            power = np.ascontiguousarray(friction * motion.motor_speed[:, joint])
-            usual = max(float(motion.friction(np.ones((1, motion.n)))[0, joint]), 1e-9)
-            return (first_order(power / usual, np.exp(-motion.dt / shape["time_constant"]), 0.0),)
+            return (_warmth(motion, joint, shape["time_constant"], 0.0),)
+        if shape.form is Course.CARRIED:
+            past: list[ArmMotion] = [motion]
+            while past[-1].earlier is not None:
+                past.append(past[-1].earlier)
+            start, end_s, found = 0.0, past[-1].begun_s, np.zeros(0)
+            for one in reversed(past):
+                pause = max(0.0, one.begun_s + float(one.time[0]) - end_s)
+                start *= float(np.exp(-pause / shape["time_constant"]))
+                found = _warmth(one, joint, shape["time_constant"], start)
+                start, end_s = float(found[-1]), one.begun_s + float(one.time[-1])
+            return (found,)
         if shape.form is Course.WITHIN:
             return (1.0 - np.exp(-motion.time / shape["time_constant"]),)
         whole = np.ones(len(motion.time))
@@ -109,5 +130,16 @@ class Drifting(Effect):
             return [f"{size} from session {values['since'][0]:.0f} on"]
         if form is Course.SINCE_REFERENCE:
             return [f"{size} against the reference"]
-        when = "with the heat of its own friction" if form is Course.HEATED else "while a session lasts"
+        when = {
+            Course.HEATED: "with the heat of its own friction",
+            Course.CARRIED: "with the heat of its own friction, kept from session to session",
+        }.get(form, "while a session lasts")
         return [f"{size} {when}, with a time constant of {quantity(values['time_constant'])}"]
+
+
+def _warmth(motion: ArmMotion, joint: int, time_constant: float, start: float) -> Floats:
+    """Warmth (N,) of a drive by the power of its friction, over that at 1 rad/s, from `start` on."""
+    power = np.ascontiguousarray(motion.drive_friction[:, joint] * motion.motor_speed[:, joint])
+    usual = max(float(motion.friction(np.ones((1, motion.n)))[0, joint]), 1e-9)
+    warmth: Floats = first_order(power / usual, np.exp(-motion.dt / time_constant), start)
+    return warmth

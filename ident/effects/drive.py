@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,15 @@ def dahl_step(run: Simulated, here: float, length: float) -> float:
     return float(run.state[0])
 
 
+class _Turning(Form):
+    SMOOTH = "smooth in speed", "amplitude", "velocity"
+
+
 class PreslidingHysteresis(Effect):
-    """Part of the Coulomb friction is Dahl's: it reverses within a sliding distance, not at once."""
+    """Part of the Coulomb friction is Dahl's: it reverses within a sliding distance, not at once.
+
+    Smooth in speed, that part is `amplitude tanh(v / velocity)`: a film that creeps, without friction at standstill.
+    """
 
     cause = "presliding_hysteresis"
     side = "motor"
@@ -47,7 +55,10 @@ class PreslidingHysteresis(Effect):
     parameters = (
         Parameter("amplitude", "Nm", "Coulomb friction that turns over slowly", low=0.0),
         Parameter("length", "rad", "distance in which it turns by 63 %", shape=True, low=1e-5, high=0.5),
+        Parameter("velocity", "rad/s", "speed with 76 % of it", shape=True, low=2e-3, high=0.3),
     )
+    forms = _Turning
+    plain = ("amplitude", "length")
     depends_on = "velocity"
     evidence_factor = 2.0
     confused_with = ("stribeck", "backlash", "motor_torque_delay")
@@ -58,11 +69,14 @@ class PreslidingHysteresis(Effect):
         """From half a milliradian, or ten times the presliding length of the model, to a tenth of a radian."""
         # A length near that of the healthy drive is a small change of the latter, not another friction.
         least = 0.0 if setting.presliding is None else 10.0 * float(setting.presliding[joint])
-        return [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
+        lengths = [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
+        return [*lengths, *(Shape(_Turning.SMOOTH, velocity=v) for v in (0.005, 0.02, 0.06))]
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Dahl's state less sign(v) in the motor torque."""
+        """Dahl's state, or the hyperbolic tangent of the speed, less sign(v) in the motor torque."""
         speed = motion.motor_speed[:, joint]
+        if shape.form is _Turning.SMOOTH:
+            return (Column(motor=np.tanh(speed / shape["velocity"]) - motion.direction[:, joint]),)
         path = np.cumsum(speed) * motion.dt
         state = dahl(path, shape["length"], float(np.sign(speed[0])))
         return (Column(motor=state - motion.direction[:, joint]),)
@@ -70,6 +84,13 @@ class PreslidingHysteresis(Effect):
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """Moves the amplitude from the set-valued friction to Dahl's."""
         joint, amplitude = run.joint, run.values["amplitude"]
+        if run.shape.form is _Turning.SMOOTH:
+            # As a viscous friction it is integrated with the speed, stable for any slope.
+            speed, slow = float(plant.motor_velocity[joint]), run.values["velocity"]
+            loads.Fcm[joint] = max(0.0, loads.Fcm[joint] - amplitude)
+            secant = np.tanh(speed / slow) / speed if abs(speed) > 1e-6 * slow else 1.0 / slow
+            loads.Fvm[joint] += amplitude * secant
+            return
         state = dahl_step(run, float(plant.motor_position[joint]), run.values["length"])
         loads.Fcm[joint] = max(0.0, loads.Fcm[joint] - amplitude)
         loads.motor_torque[joint] -= amplitude * state
@@ -110,7 +131,7 @@ class Stribeck(Effect):
     def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """Bristles with a higher load at low speed are no stiffer: they bend further before they slip."""
         turning = PreslidingHysteresis()
-        shapes = turning.shapes(setting, joint)
+        shapes = [shape for shape in turning.shapes(setting, joint) if shape.form is None]
         return tuple(column for shape in shapes for column in turning.columns(motion, joint, shape))
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
@@ -265,8 +286,9 @@ class FrictionTemperature(Drifting):
     """Drive friction times `1 + change w`, with w from 0 to 1 as the drive warms up.
 
     Within a session w starts anew in each: as 1 - exp(-t / time_constant), or heated by the power of the friction
-    itself, `time_constant w' = P / P1 - w` with P1 the power at 1 rad/s. Between sessions w is 1 from the session
-    `since` on, beside a `level` of all sessions; against a reference it is 1 in all.
+    itself, `time_constant w' = P / P1 - w` with P1 the power at 1 rad/s; carried over, w keeps its value from session
+    to session and falls in the pauses. Between sessions w is 1 from the session `since` on, beside a `level` of all
+    sessions; against a reference it is 1 in all.
     """
 
     cause = "friction_temperature"
@@ -282,11 +304,14 @@ class FrictionTemperature(Drifting):
         ),
         *TIME_CONSTANT,
     )
-    courses = (Course.WITHIN, Course.HEATED)
+    courses = (Course.WITHIN, Course.HEATED, Course.CARRIED)
     law = Law("time", signed=True)
     confused_with = ("viscous_nonlinear", "motor_torque_gain")
     experiment = Discriminator.HOT_AND_COLD
-    tell_apart = "the same speed staircase of joint {joint} cold and after twenty minutes, in random order"
+    tell_apart = (
+        "the same speed staircase of joint {joint} cold, after twenty minutes, and after a pause of twenty more, in "
+        "random order"
+    )
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The model's friction times w in the motor torque."""
@@ -297,7 +322,7 @@ class FrictionTemperature(Drifting):
         """Scales the friction of the drive."""
         joint = run.joint
         factor = 1.0 + self.drift(run.values, run.form, time_s)
-        if self.form_of(run.form) is Course.HEATED:
+        if self.form_of(run.form) in (Course.HEATED, Course.CARRIED):
             change, level = run.coefficients
             coulomb, viscous = loads.Fcm[joint], loads.Fvm[joint]
             speed = abs(float(plant.motor_velocity[joint]))
@@ -389,8 +414,23 @@ def _curves(angle: Any, shape: Shape) -> tuple[Any, ...]:
 _ANSWER = 0.4
 
 
+class _Ripple(Form):
+    BY_DIRECTION = (
+        "by direction",
+        *("cosine", "sine", "cosine_backward", "sine_backward", "cycles_per_turn", "gear_ratio", "delay"),
+    )
+
+
+# Delays of a ripple to begin with [s].
+_RIPPLE_DELAYS = (0.0, 0.01, 0.025, 0.045)
+
+
 class GearRipple(Effect):
-    """Motor torque `cosine cos(k N q) + sine sin(k N q)`, N the gear ratio."""
+    """Motor torque `cosine cos(k N q) + sine sin(k N q)`, N the gear ratio.
+
+    By direction, forward and backward motion have a cosine and a sine each, since the teeth touch with their other
+    flanks, and the angle is that of `delay` ago, for a current that comes late.
+    """
 
     cause = "gear_ripple"
     side = "motor"
@@ -401,24 +441,38 @@ class GearRipple(Effect):
     parameters = (
         Parameter("cosine", "Nm", "torque with cos(k N q)"),
         Parameter("sine", "Nm", "torque with sin(k N q)"),
+        Parameter("cosine_backward", "Nm", "in backward motion, if it differs by direction"),
+        Parameter("sine_backward", "Nm", "in backward motion, if it differs by direction"),
         Parameter("cycles_per_turn", "1/turn of the motor", "k", shape=True, fixed=True),
         Parameter("gear_ratio", "1", "N", shape=True, fixed=True),
+        Parameter("delay", "s", "of the ripple against the angle", shape=True, low=0.0, high=0.1),
     )
+    forms = _Ripple
+    plain = ("cosine", "sine", "cycles_per_turn", "gear_ratio")
     depends_on = "motor angle"
     law = Law("q")
-    confused_with = ("sensor_ripple", "friction_position")
+    confused_with = ("sensor_ripple", "friction_position", "motor_torque_delay")
     experiment = Discriminator.SLOW_SWEEP
-    tell_apart = "the same path of joint {joint} at two constant speeds below 0.1 rad/s and with two payloads"
+    tell_apart = "the same path of joint {joint} both ways at two constant speeds below 0.1 rad/s and with two payloads"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Once and twice a turn of the motor."""
+        """Once and twice a turn of the motor, in both directions alike, and apart with a delay."""
         ratio = float(setting.gear_ratio[joint])
-        return [Shape(cycles_per_turn=k, gear_ratio=ratio) for k in (1.0, 2.0)] if ratio > 1.0 else []
+        if ratio <= 1.0:
+            return []
+        plain = [Shape(cycles_per_turn=k, gear_ratio=ratio) for k in (1.0, 2.0)]
+        delayed = product(plain, _RIPPLE_DELAYS)
+        return [*plain, *(Shape(_Ripple.BY_DIRECTION, **one, delay=delay) for one, delay in delayed)]
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Cosine and sine in the motor torque."""
-        angle = shape["cycles_per_turn"] * shape["gear_ratio"] * motion.q[:, joint]
-        return Column(motor=np.cos(angle)), Column(motor=np.sin(angle))
+        """Cosine and sine in the motor torque, of each direction if they differ."""
+        late = shape.get("delay", 0.0) * motion.motor_speed[:, joint]
+        angle = shape["cycles_per_turn"] * shape["gear_ratio"] * (motion.q[:, joint] - late)
+        waves = np.cos(angle), np.sin(angle)
+        if shape.form is None:
+            return tuple(Column(motor=one) for one in waves)
+        forward = 0.5 * (1.0 + motion.direction[:, joint])
+        return tuple(Column(motor=share * one) for share in (forward, 1.0 - forward) for one in waves)
 
     def follows_from(self, shape: Shape, coefficients: Floats, other: Effect, at: Shape, of: Floats) -> bool:
         """Whether the controller makes it from a larger ripple of the joint torque sensor's reading."""
@@ -429,14 +483,23 @@ class GearRipple(Effect):
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque at the motor."""
-        cosine, sine = run.coefficients
+        cosine, sine = run.coefficients[:2]
+        speed = float(plant.motor_velocity[run.joint])
+        if run.shape.form is not None:
+            forward = 0.5 * (1.0 + np.sign(speed))
+            cosine, sine = forward * run.coefficients[:2] + (1.0 - forward) * run.coefficients[2:]
         cycles = run.values["cycles_per_turn"] * run.values["gear_ratio"]
-        angle = cycles * plant.motor_position[run.joint]
+        angle = cycles * (plant.motor_position[run.joint] - run.values.get("delay", 0.0) * speed)
         loads.motor_torque[run.joint] -= cosine * np.cos(angle) + sine * np.sin(angle)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Amplitude and cycles."""
-        return [f"{wave(values)}, {times(values['cycles_per_turn'][0])} a turn of the motor"]
+        often = f"{times(values['cycles_per_turn'][0])} a turn of the motor"
+        if form is None:
+            return [f"{wave(values)}, {often}"]
+        back = {name: values[f"{name}_backward"] for name in ("cosine", "sine")}
+        late = f"{quantity(values['delay'])} late"
+        return [f"{wave(values)} forward, {wave(back)} backward with another phase, {often}, {late}"]
 
 
 class ScaleError(Effect):
@@ -456,10 +519,15 @@ class ScaleError(Effect):
         return [f"reads {quantity_text(100.0 * abs(error), 100.0 * std, '1')} % too {much}"]
 
 
+class _Constant(Form):
+    SATURATING = "saturating", "error", "cubic"
+
+
 class MotorTorqueGain(ScaleError):
     """The motor torque is reported `1 + error` times too large.
 
-    Friction and drive inertia take up their share of the error; the load of the joint shows the rest.
+    Friction and drive inertia take up their share of the error; the load of the joint shows the rest. A saturating
+    constant falls with the current: `1 + error + cubic tau^2` times too large.
     """
 
     cause = "motor_torque_gain"
@@ -467,12 +535,32 @@ class MotorTorqueGain(ScaleError):
     summary = "wrong torque constant"
     physics = "the constant between current and torque is wrong"
     source = "Gautier and Briot, ICRA 2011; Jubien, Gautier and Janot, IFAC 2014"
+    parameters = (
+        *ScaleError.parameters,
+        Parameter("cubic", "1/Nm^2", "growth of the error with the torque squared", low=0.0),
+    )
+    forms = _Constant
+    plain = ("error",)
     confused_with = ("friction_load", "sensor_gain", "friction_temperature")
 
+    def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
+        """A constant error, and one that grows with the torque."""
+        return [Shape(), Shape(_Constant.SATURATING)]
+
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """The predicted motor torque."""
-        return (Column(motor=motion.motor_torque[:, joint]),)
+        """The predicted motor torque, and its cube."""
+        torque = motion.motor_torque[:, joint]
+        first = Column(motor=torque)
+        return (first,) if shape.form is None else (first, Column(motor=torque**3))
 
     def sense_motor(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Scales the reported motor torque."""
-        reading.motor_torque[run.joint] *= 1.0 + run.values["error"]
+        torque = float(reading.motor_torque[run.joint])
+        reading.motor_torque[run.joint] *= (
+            1.0 + run.values["error"] + run.values.get("cubic", 0.0) * torque**2
+        )
+
+    def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
+        """The error, and its growth."""
+        more = [] if form is None else [f"growing with the torque squared, {quantity(values['cubic'])}"]
+        return [*super().sentence(values, form, names), *more]

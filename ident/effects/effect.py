@@ -162,7 +162,8 @@ class Setting:
         with the published positions, None if unknown. presliding : (n,) presliding length of the model [rad],
         None if unknown. compared : whether the sessions are compared with a reference. compliance : (n,) [rad/Nm]
         of the springs behind published motors, None if the links' positions are published. clipped : (n,) torque
-        limit seen in the samples of a joint's sensor [Nm], NaN for none.
+        limit seen in the samples of a joint's sensor [Nm], NaN for none. pauses : whether the sessions follow one
+        another by their clock, with pauses.
     """
 
     sessions: int
@@ -177,6 +178,7 @@ class Setting:
     compared: bool = False
     compliance: Floats | None = None
     clipped: Floats | None = None
+    pauses: bool = False
 
 
 class Plant(Protocol):
@@ -250,7 +252,8 @@ class Effect(ABC):
 
     cause, side : as in the table of the diagnosis. summary : the fault in a few words. physics : a sentence.
     source : literature. parameters : all of them, the linear ones first in the order of the columns.
-    forms : its forms, if it has several. depends_on : the independent variable of its torque.
+    forms : its forms, if it has several. plain : parameters of its form without a name, beside those with one.
+    depends_on : the independent variable of its torque.
     law : the variable of its law, for the model-form error; None if unknown.
     whole_arm : the effect belongs to no single joint. event : it acts during a part of the time only, found by a
         search over times. step : it sets in at its `time` and stays. displaces : it turns the link under load.
@@ -274,6 +277,7 @@ class Effect(ABC):
     source: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     forms: ClassVar[type[Form] | None] = None
+    plain: ClassVar[tuple[str, ...]] = ()
     depends_on: ClassVar[Variable]
     law: ClassVar[Law | None] = None
     whole_arm: ClassVar[bool] = False
@@ -372,6 +376,8 @@ class Effect(ABC):
 
     def form_of(self, name: FormName) -> Form | None:
         """The form of a name from a file. Raises ConfigurationError for a missing, unknown or foreign one."""
+        if self.plain and name is None:
+            return None
         if self.known_forms:
             known = {form.value: form for form in self.known_forms}
             found = known.get(name.value if isinstance(name, Form) else name)
@@ -389,7 +395,8 @@ class Effect(ABC):
     def used(self, form: Form | None) -> tuple[Parameter, ...]:
         """The parameters of a form, without the hidden ones."""
         shown = (p for p in self.parameters if p.name not in self.hidden)
-        return tuple(p for p in shown if form is None or p.name in form.uses)
+        uses = self.plain if form is None else form.uses
+        return tuple(p for p in shown if not uses or p.name in uses)
 
     def check(self, parameters: Mapping[str, Any], form: FormName, *, whole: bool = False) -> None:
         """Raise ConfigurationError for a foreign and for a missing parameter.

@@ -26,7 +26,7 @@ from ident.effects.effect import (
 )
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
-from ident.effects.words import Values, quantity, quantity_text, times, wave
+from ident.effects.words import Values, one_joint, quantity, quantity_text, times, wave
 from ident.rows.filters import differentiate, low_pass
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
@@ -240,6 +240,7 @@ class _Spring(Form):
     TAUT_ABOVE = "taut above", "stiffness", "slack"
     TAUT_BELOW = "taut below", "stiffness", "slack"
     PLAY = "play", "stiffness", "slack", "play"
+    TWO_JOINTS = "over two joints", "stiffness", "source", "ratio"
 
 
 # Distance in which the friction of a hose along the arm reverses [rad].
@@ -251,7 +252,8 @@ class CableSpring(Effect):
 
     f is q; q^3 (cubic); the angle above or below `slack` (taut above, taut below); the angle beyond `play` on either
     side of `slack` (play). A hardening one pulls with `stiffness q + quadratic q^2 + cubic q^3`, equal to
-    `k (q - c) + h (q - c)^3` about its angle of rest c.
+    `k (q - c) + h (q - c)^3` about its angle of rest c. A hose over two joints is longer by `q + ratio q_source`, and
+    pulls at both: with `stiffness` times that here, and `ratio` times as much at joint `source`.
     """
 
     cause = "cable_spring"
@@ -265,16 +267,28 @@ class CableSpring(Effect):
         Parameter("cubic", "Nm/rad^3", "of a hardening one"),
         Parameter("slack", "rad", "angle at which the cable becomes taut, or middle of its play", shape=True),
         Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
+        Parameter("source", "1", "the other joint of a hose over two, from 1", shape=True, fixed=True),
+        Parameter("ratio", "1", "its angle over that of the first", shape=True),
     )
     forms = _Spring
     depends_on = "position"
     law = Law("q")
-    confused_with = ("joint_zero_offset", "payload_error", "sensor_ripple", "encoder_eccentricity")
+    confused_with = (
+        "joint_zero_offset",
+        "payload_error",
+        "sensor_ripple",
+        "sensor_crosstalk",
+        "encoder_eccentricity",
+    )
     experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Linear, cubic, hardening and one-sided springs, and springs with play."""
+        """Linear, cubic, hardening and one-sided springs, and springs with play.
+
+        A hose over two joints is not searched for: with a ratio far from one it is a spring at one joint, so it would
+        stand beside each spring of a single joint as a further look-alike.
+        """
         low, high = setting.position_range[joint]
         angles = [float(low + share * (high - low)) for share in (0.3, 0.5, 0.7)]
         taut, plays = (
@@ -295,6 +309,12 @@ class CableSpring(Effect):
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The same torque on both sides."""
+        if shape.form is _Spring.TWO_JOINTS:
+            other, ratio = round(shape["source"]) - 1, shape["ratio"]
+            pull = motion.q[:, joint] + ratio * motion.q[:, other]
+            both = np.zeros_like(motion.q)
+            both[:, joint], both[:, other] = pull, ratio * pull
+            return (both_sides(both),)
         return tuple(both_sides(pull) for pull in _pulls(motion.q[:, joint], shape))
 
     def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
@@ -302,7 +322,13 @@ class CableSpring(Effect):
         return (both_sides(dahl(np.ascontiguousarray(motion.q[:, joint]), _RUB_RAD, 0.0)),)
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
-        """A torque on the link."""
+        """A torque on the link, or on both."""
+        if run.shape.form is _Spring.TWO_JOINTS:
+            other, ratio = round(run.values["source"]) - 1, run.values["ratio"]
+            pull = run.values["stiffness"] * (plant.position[run.joint] + ratio * plant.position[other])
+            loads.link_torque[run.joint] -= pull
+            loads.link_torque[other] -= ratio * pull
+            return
         pulls = _pulls(plant.position[run.joint], run.shape)
         pull = sum(c * one for c, one in zip(run.coefficients, pulls, strict=False))
         loads.link_torque[run.joint] -= pull
@@ -321,6 +347,9 @@ class CableSpring(Effect):
             return [f"{stiffness}, with no pull within {play} of {slack}"]
         if form is _Spring.LINEAR:
             return [stiffness]
+        if form is _Spring.TWO_JOINTS:
+            other, ratio = one_joint(round(values["source"][0]), names), quantity(values["ratio"])
+            return [f"{stiffness}, of its angle plus {ratio} times that of {other}"]
         sense = "above" if form is _Spring.TAUT_ABOVE else "below"
         return [f"{stiffness}, taut {sense} {quantity(values['slack'])} and slack elsewhere"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -36,6 +36,8 @@ class ArmMotion:
     springs : between published motors and the links; None if the links' positions are published, or the stiffness
         is unknown.
     loaded : whether the payload is attached.
+    begun_s : beginning of the session [s] by a clock of all sessions. earlier : the motion before it by that clock, of
+        this session or of another one; None for the first.
     """
 
     chain: Chain
@@ -58,6 +60,8 @@ class ArmMotion:
     slip: Floats | None = None
     springs: Springs | None = None
     loaded: bool = True
+    begun_s: float = 0.0
+    earlier: ArmMotion | None = None
 
     @property
     def n(self) -> int:
@@ -104,6 +108,14 @@ class ArmMotion:
         """
         moved = self.rigid_torque(self.q + shift, self.qd + rate, self.qdd + acceleration)
         return moved - self.rigid_torque(self.q, self.qd, self.qdd)
+
+
+def in_order(motions: Sequence[ArmMotion]) -> list[ArmMotion]:
+    """The same motions, each with the one before it by the clock of all sessions."""
+    found, before = list(motions), None
+    for k in sorted(range(len(found)), key=lambda k: found[k].begun_s + float(found[k].time[0])):
+        found[k] = before = replace(found[k], earlier=before)
+    return found
 
 
 @njit(cache=True)

@@ -25,7 +25,7 @@ from ident.estimation.scores import finite
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
-from lwr_driver.arm import JOINTS, Arm
+from lwr_driver.arm import Arm
 from lwr_driver.session import Session
 from runner.diagnosis.discriminating import Discriminating, foresee
 from runner.diagnosis.records import (
@@ -161,7 +161,7 @@ def study(
 ) -> Study:
     """Diagnose `sessions` and measure the gain.
 
-    arm : description of the arm, for stiffness, gear ratios and the simulation; without it nothing is replayed.
+    arm : description of the arm, for stiffness and gear ratios; without it the simulated joints are stiff.
     data : of its drives; default: from the description.
     model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
     compare : causes to put side by side besides those of open findings. sure : see `Study`.
@@ -171,8 +171,9 @@ def study(
     data = arm_data(arm, chain) if data is None else data
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     replay = None
-    if simulate and arm is not None:
-        replay = Replay(_as_stiff(arm, healthy), everything)
+    if simulate:
+        encoder = "link" if healthy is None else healthy.encoder
+        replay = Replay(_stiffness(arm, healthy), everything, encoder=encoder)
     logs, held_out = list(sessions), list(test)
     with _unadvised():
         found = diagnose(
@@ -182,11 +183,6 @@ def study(
     notes = [*found.notes, *_little(found, everything)]
     if replay is not None:
         notes += replay.notes
-    elif simulate:
-        lack = "the emulator has no such arm; name its description with --arm"
-        if chain.n != JOINTS:
-            lack = f"the emulator has a controller for {JOINTS} joints, this arm has {chain.n}"
-        notes.append(f"no simulation: {lack}")
     notes += unshown
     names = tuple(session.path.name for session in everything)
     return Study(
@@ -262,10 +258,11 @@ def _unadvised() -> Iterator[None]:
         logger.removeFilter(wanted)
 
 
-def _as_stiff(arm: Arm, healthy: Reference | None) -> Arm:
-    compliance = np.zeros(0) if healthy is None else healthy.compliance
-    usable = len(compliance) == len(arm.stiffness) and bool(np.all(compliance > 0.0))
-    return replace(arm, stiffness=1.0 / compliance) if usable else arm
+def _stiffness(arm: Arm | None, healthy: Reference | None) -> NDArray[np.float64] | None:
+    """Of the joints (n,) [Nm/rad], from the reference or from the description of the arm; None if unknown."""
+    if healthy is not None and len(healthy.compliance) and np.all(healthy.compliance > 0.0):
+        return np.asarray(1.0 / healthy.compliance)
+    return None if arm is None else np.asarray(arm.stiffness, dtype=float)
 
 
 def chain_of(sessions: Sequence[Session], urdf: Path | None) -> Chain:

@@ -69,6 +69,10 @@ GAIN, ONCE, TWICE, ONCE_PHASE, TWICE_PHASE, GEAR = (
 CABLE, CABLE_CUBIC, CABLE_CENTRE, CABLE_SLACK, CABLE_RUB, CABLE_REACH = (
     _AT[name] for name in ("cable", "cable_cubic", "cable_centre", "cable_slack", "cable_rub", "cable_reach")
 )
+BACK, LATE, FALLS, CREEP, CREEP_SPEED = (
+    _AT[name] for name in ("ripple_back", "ripple_late", "gain_falls", "creep", "creep_speed")
+)
+HOSE, HOSE_OTHER, HOSE_RATIO = (_AT[name] for name in ("hose", "hose_other", "hose_ratio"))
 OTHER, OTHER_FRICTION, OTHER_PHASE, OTHER_DRAG = (
     _AT[name] for name in ("other", "other_friction", "other_phase", "other_drag")
 )
@@ -231,7 +235,7 @@ def advance(
             friction, bristle_power = 0.0, 0.0
             if coulomb > 0.0:
                 level = _level(i, p, speed, q, theta[i], transmitted, inner[_RATE, i], loss, coulomb)
-                share = (1.0 - p[LONG_SHARE, i]) / SHORT
+                share = (1.0 - p[LONG_SHARE, i] - p[CREEP, i]) / SHORT
                 reach = p[PRESLIDING, i] / p[SPREAD, i]
                 for k in range(SHORT):
                     before = inner[k, i]
@@ -248,6 +252,11 @@ def advance(
             viscous = drive[3, i] * p[VISCOUS, i] * loss
             if p[FORWARD_VISCOUS, i] != 0.0:
                 viscous *= 1.0 + p[FORWARD_VISCOUS, i] * (1.0 if speed > 0.0 else -1.0)
+            if p[CREEP, i] != 0.0:
+                # As a viscous friction, for the midpoint to be stable.
+                slow = p[CREEP_SPEED, i]
+                steep = math.tanh(speed / slow) / speed if abs(speed) > 1e-6 * slow else 1.0 / slow
+                viscous += coulomb * p[CREEP, i] * steep
             if p[POWER, i] != 1.0:
                 viscous *= (1.0 + abs(speed) / p[CORNER, i]) ** (p[POWER, i] - 1.0)
 
@@ -257,10 +266,12 @@ def advance(
             inner[_HOUSING, i] += h * (flow - p[HOUSING_G, i] * inner[_HOUSING, i]) / p[HOUSING_C, i]
 
             more = -drive[5, i]
+            past = theta[i] - p[LATE, i] * inner[_SPEED, i]
+            turned = p[BACK, i] if speed < 0.0 else 0.0
             if p[ONCE, i] != 0.0:
-                more += p[ONCE, i] * math.sin(p[GEAR, i] * theta[i] + p[ONCE_PHASE, i])
+                more += p[ONCE, i] * math.sin(p[GEAR, i] * past + p[ONCE_PHASE, i] + turned)
             if p[TWICE, i] != 0.0:
-                more += p[TWICE, i] * math.sin(2.0 * p[GEAR, i] * theta[i] + p[TWICE_PHASE, i])
+                more += p[TWICE, i] * math.sin(2.0 * p[GEAR, i] * past + p[TWICE_PHASE, i] + turned)
             if p[OTHER_DRAG, i] != 0.0:
                 more -= p[OTHER_DRAG, i] * link_speed[int(p[OTHER, i]) - 1]
             if p[MEMORY, i] != 0.0:
@@ -274,7 +285,11 @@ def advance(
             motor_diagonal[i] = inertia + grip[i] + 0.5 * h * viscous
             mid = torque + (0.25 * h * slope + 0.5 * damping) * slip
             motor_right[i] = inertia * speed + h * (
-                p[GAIN, i] * reported[i] - mid - 0.5 * viscous * speed - friction + more
+                p[GAIN, i] * (1.0 - p[FALLS, i] * reported[i] ** 2) * reported[i]
+                - mid
+                - 0.5 * viscous * speed
+                - friction
+                + more
             )
 
             outside = -drive[8, i] - 0.5 * drive[6, i] * link_speed[i]
@@ -289,6 +304,12 @@ def advance(
                 outside -= p[CABLE_RUB, i] * inner[_RUB, i]
             right[i] = h * (mid - bias[i] + outside)
 
+        for i in range(n):
+            if p[HOSE, i] != 0.0:
+                far, ratio = int(p[HOSE_OTHER, i]) - 1, p[HOSE_RATIO, i]
+                pull = p[HOSE, i] * (q[i] + ratio * q[far])
+                right[i] -= h * pull
+                right[far] -= h * ratio * pull
         for i in range(n):
             for j in range(n):
                 entry = mass[i, j] if j >= i else mass[j, i]

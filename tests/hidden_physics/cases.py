@@ -22,6 +22,7 @@ from tests.hidden_physics.motions import SCHEDULES, exciting_motion
 from tests.hidden_physics.outside import OUTSIDE
 from tests.hidden_physics.recording import Order, begin_s, record
 from tests.hidden_physics.robots import SESSIONS, Day, Encoder, Setting, session_settings
+from tests.hidden_physics.variants import VARIANTS
 
 __all__ = ["KINDS", "Case", "Sessions", "Store", "draw"]
 
@@ -184,8 +185,8 @@ def draw(
     if kind == "none":
         day = Day(10_000 + seed, encoder)
         return Case(twin(schedule, day).name, seed, kind, schedule, day)
-    known = OUTSIDE if kind == "outside" else CAUSES
-    names = list(known if causes is None else causes)
+    known = OUTSIDE if kind == "outside" else CAUSES | VARIANTS
+    names = list((OUTSIDE if kind == "outside" else CAUSES) if causes is None else causes)
     count = {"pair": 2, "triple": 3}.get(kind, 1)
     chosen = _compatible(random, [known[name] for name in names], count)
     needed = {cause.encoder for cause in chosen} - {None}

@@ -16,6 +16,7 @@ from tests.hidden_physics.causes import CAUSES
 from tests.hidden_physics.hidden import Scene
 from tests.hidden_physics.outside import OUTSIDE
 from tests.hidden_physics.robots import SESSIONS, Day, Setting, session_settings
+from tests.hidden_physics.variants import VARIANTS
 
 CONTRACT = {
     "stribeck": "motor",
@@ -64,12 +65,17 @@ def test_every_cause_of_the_contract_can_be_hidden() -> None:
     assert not set(OUTSIDE) & set(CAUSES)
 
 
-@pytest.mark.parametrize("name", [*CAUSES, *OUTSIDE])
+def test_a_variant_is_of_a_listed_cause() -> None:
+    assert {(variant.name, variant.side) for variant in VARIANTS.values()} <= set(CONTRACT.items())
+    assert not set(VARIANTS) & (set(CAUSES) | set(OUTSIDE))
+
+
+@pytest.mark.parametrize("name", [*CAUSES, *OUTSIDE, *VARIANTS])
 def test_a_cause_turned_down_vanishes_and_keeps_its_shape(name: str) -> None:
-    cause = CAUSES.get(name) or OUTSIDE[name]
+    cause = (CAUSES | OUTSIDE | VARIANTS)[name]
     for joint in cause.joints:
         small, large = (cause.draw(np.random.default_rng(4), joint, SCENE)(size) for size in (1e-9, 2.0))
-        assert small.cause == large.cause == name
+        assert small.cause == large.cause == cause.name
         assert small.joints == large.joints == ((joint,) if joint else ())
         assert small.variant == large.variant
         assert len(small.settings) == SESSIONS

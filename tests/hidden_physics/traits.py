@@ -64,6 +64,14 @@ _HEALTHY: dict[str, float] = {
     "ripple_once_phase": 0.0,
     "ripple_twice_phase": 0.0,
     "gear": 100.0,
+    # another phase of the ripples in backward motion [rad] and their age [s]; fall of the torque constant with the
+    # reported torque squared [1/Nm^2]; share of the Coulomb torque that creeps, and the speed at which it is whole
+    # [rad/s]
+    "ripple_back": 0.0,
+    "ripple_late": 0.0,
+    "gain_falls": 0.0,
+    "creep": 0.0,
+    "creep_speed": 0.02,
     # hose: stiffness beyond the slack [Nm/rad], cubic part [Nm/rad^3], centre and half the slack [rad];
     # rubbing torque [Nm] and its reach [rad]
     "cable": 0.0,
@@ -72,6 +80,10 @@ _HEALTHY: dict[str, float] = {
     "cable_slack": 0.0,
     "cable_rub": 0.0,
     "cable_reach": 0.1,
+    # hose on to another joint (1 to 7): stiffness [Nm/rad], and length per angle of that joint over that of this one
+    "hose": 0.0,
+    "hose_other": 1.0,
+    "hose_ratio": 0.0,
     # encoder zero [rad]; its disc off the axis, over the radius of its track, and the angle of that [rad]
     "zero": 0.0,
     "eccentric": 0.0,

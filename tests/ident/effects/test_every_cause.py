@@ -50,7 +50,7 @@ ROUGH = {
 FORMS = [
     pytest.param(effect, form, id=effect.cause + (f" {form.value}" if form else ""))
     for effect in EFFECTS.values()
-    for form in (effect.known_forms or [None])
+    for form in (*effect.known_forms, *([None] if effect.plain or not effect.known_forms else []))
 ]
 
 
@@ -105,6 +105,7 @@ def setting(motion: ArmMotion, encoder: str | None = None) -> Setting:
         position_range=np.stack([motion.q.min(axis=0), motion.q.max(axis=0)], axis=1),
         encoder=encoder,  # type: ignore[arg-type]
         compared=True,
+        pauses=True,
         clipped=0.6 * np.abs(motion.joint_torque).max(axis=0) if encoder else None,
     )
 
@@ -118,6 +119,7 @@ def stated(effect: Effect, form: Form | None, motion: ArmMotion) -> dict[str, fl
     shape |= {"delay": 0.015} if effect.channel else {}
     # Crossed over so much torque, a gap passes the filter of its twist.
     shape |= {"width": 8.0} if effect.cause == "backlash" else {}
+    shape |= {"source": 6.0, "ratio": -0.6} if form is not None and form.value == "over two joints" else {}
     used = [p.name for p in effect.used(form)]
     sizes = {p.name: SIZES.get(p.unit, 0.4) * (1.0 + 0.3 * k) for k, p in enumerate(effect.linear)}
     values = {**sizes, **shape}

@@ -15,11 +15,9 @@ import yaml
 from click.testing import CliRunner
 
 from fri.errors import DataError
-from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
-from lwr_driver.session import read_session
 from runner.cli import main
 from runner.commands.commission import record_sets
 from runner.diagnosis import Study, after_run
@@ -27,11 +25,9 @@ from runner.diagnosis.after_run import conclude_run
 from runner.diagnosis.records import QUANTITIES, ReplayErrors, Residuals
 from runner.experiment_file import Experiment
 from runner.planning import Excitations
-from runner.replay import Replay, replay
 from runner.report.diagnosis_figures import AGAINST
 from runner.report.folder import ResultFolder
 from runner.report.page import report_html
-from sim_backend.configuration import load_configuration
 
 pytestmark = pytest.mark.slow
 
@@ -119,6 +115,7 @@ def test_diagnosis_json_keeps_the_contract(done: Done) -> None:
         "test_rms_extended",
         "simulation_error_base",
         "simulation_error_extended",
+        "simulation",
     }
     for error in (found["baseline"]["simulation_error"], found["gain"]["simulation_error_extended"]):
         assert {key: len(values) for key, values in error.items()} == {"motor": 7, "joint": 7, "position": 7}
@@ -131,38 +128,11 @@ def test_the_extended_model_simulates_the_hidden_arm_better(done: Done) -> None:
     assert extended["motor"][1] < 0.95 * base["motor"][1]
 
 
-def test_the_replay_finds_when_commands_act_and_lives_without_them(done: Done) -> None:
-    model = read_model(done.folder / "diagnosis" / "model_extended.yaml")
-    session = read_session(done.folder / "unloaded.mcap")
-    done_once = replay(model, session, Arm.load(), load_configuration(), 3.0)
-    # A command acts in the cycle after the one it answers.
-    assert done_once.delay_s == pytest.approx(0.01, abs=0.002)
-    silent = dataclasses.replace(session, command=None)
-    follower = Replay(Arm.load(), [silent], longest_s=3.0)
-    error = follower(model, [silent])
-    assert error is not None
-    assert np.all(error.position < 0.01)
-    assert any("no commands in the log" in note for note in follower.notes)
-
-
-def test_a_replay_with_borrowed_drives_says_so(done: Done) -> None:
-    model = read_model(done.folder / "model.yaml")
-    structure = dataclasses.replace(model.structure, model=1, sides=("joint",))
-    standard = dict(zip(model.structure.names, model.standard.tolist(), strict=True))
-    values = [standard[name] for name in structure.names]
-    alone = DynamicModel(model.robot, structure, structure.names, np.array(values))
-    session = read_session(done.folder / "unloaded.mcap")
-    for one, borrowed in ((model, False), (alone, True)):
-        follower = Replay(Arm.load(), [session], longest_s=1.0)
-        assert follower(one, [session]) is not None
-        assert any("the model has no motor side" in note for note in follower.notes) is borrowed
-
-
 def test_errors_of_the_replay_are_kept_over_time_and_drawn(done: Done) -> None:
     folder = done.folder / "diagnosis"
     replayed = ReplayErrors.load(folder / "replay.npz")
     assert replayed.session == "unloaded.mcap"
-    assert replayed.duration_s == pytest.approx(12.0, abs=0.5)
+    assert replayed.duration_s == pytest.approx(11.5, abs=0.5)
     error = content(done, "diagnosis.json")["gain"]["simulation_error_extended"]
     for quantity in QUANTITIES:
         # One session was replayed, so what is drawn has the error that is told.

@@ -1,0 +1,163 @@
+"""A replay along the measured positions compares models, whatever the controller of the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ident.diagnosis import SimulationError
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import read_model
+from lwr_driver.arm import Arm
+from lwr_driver.session import Session, read_session
+from runner.replay import METHOD, Replay
+from tests.hidden_physics.engine import REFERENCE
+from tests.hidden_physics.motions import exciting_motion
+from tests.hidden_physics.recording import Order, record
+from tests.ident.real.real_lwr4 import identified, joint_rms, needs_recordings, session
+
+HOSE_NM_RAD, FILM_NM, FILM_RAD_S = 4.0, 4.0, 0.08
+SECONDS = 8.0
+# A third of the feedback, half of the friction compensation.
+SOFT = {
+    "controller.position_gain": [3e3, 3e3, 2e3, 2e3, 1e3, 700.0, 700.0],
+    "controller.velocity_gain": [120.0, 120.0, 120.0, 120.0, 30.0, 20.0, 20.0],
+    "controller.coulomb": [7.0, 8.0, 4.0, 5.0, 2.5, 2.0, 2.0],
+    "controller.torque_gain": [0.2] * 7,
+}
+
+
+def hidden() -> list[dict[str, Any]]:
+    return [
+        {
+            "type": "sim_backend.model_arm:Cause",
+            "options": {
+                "cause": entry["cause"],
+                "joint": entry["joints"][0],
+                "form": entry.get("form"),
+                "parameters": {name: value["value"] for name, value in entry["parameters"].items()},
+            },
+        }
+        for entry in EFFECTS
+    ]
+
+
+def numbers(**values: float) -> dict[str, Any]:
+    return {name: {"value": value, "std": 0.01, "unit": "1"} for name, value in values.items()}
+
+
+EFFECTS: tuple[dict[str, Any], ...] = (
+    {
+        "cause": "cable_spring",
+        "side": "joint",
+        "joints": [4],
+        "form": "linear",
+        "parameters": numbers(stiffness=HOSE_NM_RAD),
+    },
+    {
+        "cause": "stribeck",
+        "side": "motor",
+        "joints": [2],
+        "parameters": numbers(amplitude=FILM_NM, velocity=FILM_RAD_S, exponent=1.0),
+    },
+)
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Session]:
+    folder = tmp_path_factory.mktemp("replayed")
+
+    def recorded(name: str, controller: Mapping[str, Any]) -> Session:
+        settings = {**controller, "robot.effects": hidden()}
+        return read_session(record(Order(exciting_motion("A1"), folder / f"{name}.mcap", settings, uid=name)))
+
+    return {name: recorded(name, settings) for name, settings in (("nominal", {}), ("soft", SOFT))}
+
+
+@pytest.fixture(scope="module")
+def models() -> tuple[DynamicModel, DynamicModel]:
+    base = replace(read_model(REFERENCE), effects=())
+    return base, replace(base, effects=EFFECTS)
+
+
+def errors(models: tuple[DynamicModel, DynamicModel], session: Session) -> tuple[SimulationError, ...]:
+    follower = Replay(Arm.load().stiffness, [session], longest_s=SECONDS)
+    found = tuple(follower(model, [session]) for model in models)
+    assert all(one is not None for one in found)
+    return found  # type: ignore[return-value]
+
+
+def of(error: SimulationError, quantity: str) -> np.ndarray:
+    values = getattr(error, quantity)
+    assert values is not None
+    return np.asarray(values)
+
+
+def test_another_tuning_of_the_controller_leaves_the_errors_of_both_models(
+    models: tuple[DynamicModel, DynamicModel], sessions: Mapping[str, Session]
+) -> None:
+    nominal, soft = (errors(models, sessions[name]) for name in ("nominal", "soft"))
+    for one, other in zip(nominal, soft, strict=True):
+        np.testing.assert_allclose(of(one, "motor"), of(other, "motor"), rtol=0.2)
+        np.testing.assert_allclose(of(one, "position"), of(other, "position"), rtol=0.2)
+        # The links ring more behind a softer controller.
+        np.testing.assert_allclose(of(one, "joint"), of(other, "joint"), rtol=0.5, atol=0.1)
+
+
+@pytest.mark.parametrize("controller", ["nominal", "soft"])
+def test_the_gain_is_that_of_the_missing_physics(
+    models: tuple[DynamicModel, DynamicModel], sessions: Mapping[str, Session], controller: str
+) -> None:
+    base, extended = errors(models, sessions[controller])
+    # The hose of A3, and the film of A2 in the motor torque alone.
+    for quantity in ("motor", "joint", "position"):
+        assert of(extended, quantity)[3] < 0.3 * of(base, quantity)[3]
+    assert of(extended, "motor")[1] < 0.8 * of(base, "motor")[1]
+    assert of(extended, "position")[1] < 0.5 * of(base, "position")[1]
+    others = [0, 2, 4, 5, 6]
+    for quantity in ("motor", "joint", "position"):
+        np.testing.assert_allclose(of(base, quantity)[others], of(extended, quantity)[others], rtol=0.05)
+
+
+def test_without_motor_torques_there_is_no_simulated_position(
+    models: tuple[DynamicModel, DynamicModel], sessions: Mapping[str, Session]
+) -> None:
+    session = replace(sessions["nominal"], motor=None, command=None)
+    follower = Replay(None, [session], longest_s=2.0)
+    error = follower(models[0], [session])
+    assert error is not None
+    assert error.position is None
+    assert error.motor is None
+    assert error.to_dict()["joint"] is not None
+    assert error.method == METHOD
+    told = " ".join(follower.notes)
+    assert "no simulated position" in told
+    assert "stiffness of the joints is unknown" in told
+
+
+def test_published_motor_positions_are_led_to_the_same_torques(
+    models: tuple[DynamicModel, DynamicModel], tmp_path: Path
+) -> None:
+    settings = {"sensors.position_sensor": "motor", "robot.effects": hidden()}
+    log = record(Order(exciting_motion("A1"), tmp_path / "motor.mcap", settings, uid="motor"))
+    session = read_session(log)
+    follower = Replay(Arm.load().stiffness, [session], longest_s=SECONDS, encoder="motor")
+    base, extended = (follower(model, [session]) for model in models)
+    assert base is not None
+    assert extended is not None
+    assert np.all(of(extended, "motor") < 1.0)
+    assert of(extended, "joint")[3] < 0.3 * of(base, "joint")[3]
+
+
+@needs_recordings
+def test_a_real_arm_is_replayed_to_the_error_of_its_model() -> None:
+    found, run = identified((1, 2), "physical"), session(3)
+    error = Replay(Arm.load().stiffness, [run])(found.model, [run])
+    assert error is not None
+    assert error.position is None
+    assert np.all(of(error, "joint") < 2.5 * joint_rms(found, 3) + 0.1)
