@@ -13,9 +13,10 @@ from ident.diagnosis.statements import REPLAYED
 from ident.effects import WEAR, Parameters, find_effect
 from ident.effects.words import joints_text, spoken
 from runner.diagnosis.records import ReplayErrors, Residuals, SideResiduals
+from runner.report.figure import Figure
 from runner.report.figures import bin_means
+from runner.report.paper import joint_labels
 from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
-from runner.report.svg import Figure
 
 Floats = NDArray[np.float64]
 

@@ -221,9 +221,9 @@ def motion_section(results: ResultFolder) -> str:
     parts = []
     for index, one in enumerate(results.curves):
         if one.side == "joint":
-            velocity = figure_html(velocity_figure(results, one.session))
+            velocity = figure_html(velocity_figure(results, one.session, joints="names"))
             parts.append(fold(f"2a, joint velocities, {one.session}", velocity, is_open=not index))
-        torque = figure_html(motion_figure(results, one.session, one.side))
+        torque = figure_html(motion_figure(results, one.session, one.side, joints="names"))
         parts.append(fold(f"2b, {one.side} torques, {one.session}", torque, is_open=not index))
     return section("motion", "Figure 2: velocities and torques of the motion", *parts) if parts else ""
 
@@ -273,7 +273,7 @@ def torque_section(results: ResultFolder) -> str:
         parts.append(
             fold(
                 f"{one.label}: torque error of all joints {100 * one.relative:.2f} %",
-                figure_html(torque_figure(results, one.session, one.side)),
+                figure_html(torque_figure(results, one.session, one.side, joints="names")),
                 table(head, rows, f"Residuals, {one.label}"),
                 is_open=index < 2,
             )
@@ -286,7 +286,7 @@ def residual_section(results: ResultFolder) -> str:
     parts = []
     for index, one in enumerate(results.curves):
         for against in ("time", "position", "velocity"):
-            figure = figure_html(residual_figure(results, one.session, one.side, against))
+            figure = figure_html(residual_figure(results, one.session, one.side, against, joints="names"))
             parts.append(fold(f"against {against}: {one.label}", figure, is_open=index == 0))
     return section("residuals", "Residuals against time, position and velocity", *parts) if parts else ""
 
