@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +41,15 @@ _BOTH_WAYS = 0.15
 _MODELS: tuple[tuple[Role, str], ...] = (("backward", "base model"), ("forward", "extended model"))
 
 
-def residual_figures(residuals: Residuals, side: str) -> list[Figure]:
-    """One figure a quantity, one panel a joint."""
-    joints = np.flatnonzero(np.isfinite(residuals.sides[side].base).any(axis=0)).tolist()
+def residual_figures(residuals: Residuals, side: str, *, joints: str = "numbers") -> list[Figure]:
+    """One figure a quantity, one panel a joint; joints as in `runner.report.figures`."""
+    residuals = replace(residuals, joint_names=joint_labels(residuals.joint_names, joints))
+    used = np.flatnonzero(np.isfinite(residuals.sides[side].base).any(axis=0)).tolist()
     return [
         Figure(
             f"residual-{side}-{against.replace(' ', '-')}",
             f"Held-out residual of the {side} torque against {against}",
-            tuple(_panel(residuals, side, joint, against) for joint in joints),
+            tuple(_panel(residuals, side, joint, against) for joint in used),
         )
         for against in AGAINST
     ]

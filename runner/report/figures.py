@@ -8,15 +8,14 @@
     axes = torque_figure(folder, joints="names").plot("ifac-wide")        # matplotlib axes, to be changed
     residual_figure(folder).plotly()                                      # interactive
 
-Every function takes a folder of results, or a `ResultFolder` to share the work between figures. joints : `numbers` (1 to
-n in kinematic order, as papers have them) or `names` of the arm.
+Every function takes a folder of results, or a `ResultFolder` to share the work between figures.
+joints : `numbers` (1 to n in kinematic order, as papers have them) or `names` of the arm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +54,9 @@ def velocity_figure(results: Results, session: str | None = None, *, joints: str
         alt = f"Velocity of {joint} over time, session {one.session}: at most {fastest:.2f} rad/s."
         return Panel(joint, "time [s]", "velocity [rad/s]", marks, alt, f"at most {fastest:.2f} rad/s")
 
-    return _by_joint(one, joints, f"velocity-{one.session}", f"Joint velocities, session {one.session}", panel)
+    return _by_joint(
+        one, joints, f"velocity-{one.session}", f"Joint velocities, session {one.session}", panel
+    )
 
 
 def motion_figure(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits
+from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits, thin
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +26,8 @@ _GRID = "#e3e3e3"
 _SPLIT = 0.32
 _SHORT = 60
 """Columns below this length keep their numbers."""
+_FULL, _FEWEST = 700, 60
+"""Points of a line, and the fewest of a page with very many."""
 _LEVELS = 20_000
 """Places of the grid between the least and the largest value of a column."""
 DIVERGING: tuple[tuple[float, str], ...] = (
@@ -51,6 +53,26 @@ def zipped(text: str) -> str:
 def chart_json(chart: dict[str, Any]) -> str:
     """A chart as JSON; long columns as steps of a fine grid, which compress to two bytes a value."""
     return json.dumps(chart, separators=(",", ":"), default=_plain)
+
+
+def lighter_charts(charts: str, budget: int) -> str:
+    """Charts (a JSON list) with fewer points of their lines, until they zip to `budget` bytes at most."""
+    points = _FULL
+    while len(zipped(charts)) > budget and points > _FEWEST:
+        points = int(0.7 * points)
+        plain = json.loads(charts)
+        for trace in (trace for chart in plain for trace in chart["data"]):
+            if trace.get("mode") == "lines" and isinstance(trace.get("y"), dict):
+                x, y = (np.asarray(_unpacked(trace[key]), dtype=np.float64) for key in "xy")
+                trace["x"], trace["y"] = thin(x, y, points)
+        charts = json.dumps(plain, separators=(",", ":"), default=_plain)
+    return charts
+
+
+def _unpacked(column: Any) -> Any:
+    if isinstance(column, dict):
+        return column["low"] + column["step"] * np.cumsum(column["moves"])
+    return column
 
 
 def _plain(values: Any) -> Any:
@@ -94,7 +116,8 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
         box = {"x0": 0, "x1": 1, "y0": _SPLIT + 0.05, "y1": 1}
         frame = {"type": "rect", "xref": "paper", "yref": "paper", **box}
         layout["shapes"] = [{**frame, "line": {"color": "#8c8c8c", "width": 1}}]
-        layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 6}
+        label = panel.lower_label.replace(" [", "<br>[")
+        layout["yaxis2"] = {**_axis(label), "domain": [0.0, _SPLIT - 0.03], "nticks": 5, "automargin": True}
     return {"data": data, "layout": layout}
 
 
@@ -234,6 +257,7 @@ def _axis(label: str) -> dict[str, Any]:
         "ticks": "outside",
         "ticklen": 3,
         "nticks": 6,
+        "exponentformat": "none",
     }
 
 

@@ -83,10 +83,7 @@ def conditions_table(items: Iterable[Mapping[str, Any]], label: str) -> str:
 
 def figure_html(figure: Figure, *, tall: bool = False) -> str:
     """Small multiples: legend, then one chart a panel, drawn by the page's script."""
-    keys = "".join(
-        f"<li>{_key(role, kind)}{escape(label)}</li>"
-        for role, label, kind in figure.legend
-    )
+    keys = "".join(f"<li>{_key(role, kind)}{escape(label)}</li>" for role, label, kind in figure.legend)
     panels = []
     for panel in figure.panels:
         chart = chart_html(panel_chart(panel), panel.alt, "tall" if tall or panel.split else "")

@@ -24,19 +24,22 @@
     const { data, layout } = descriptions[charts.indexOf(chart)];
     Plotly.newPlot(chart, data, layout, settings);
   };
+  // Nearest to the screen first; the order is found anew after scrolling.
+  let queue = null;
   const away = (chart) => {
     const box = chart.getBoundingClientRect();
     return Math.max(0, box.top - window.innerHeight, -box.bottom);
   };
   const next = () => {
     const begun = performance.now();
-    while (performance.now() - begun < 40) {
+    if (queue === null) {
       const left = charts.filter((one) => !one.dataset.drawn && one.offsetParent !== null);
-      if (!left.length) { root.dataset.ready = "yes"; return; }
-      draw(left.reduce((best, one) => away(one) < away(best) ? one : best));
+      queue = left.map((one) => [away(one), one]).sort((one, other) => other[0] - one[0]).map((pair) => pair[1]);
     }
-    setTimeout(next);
+    while (queue.length && performance.now() - begun < 40) draw(queue.pop());
+    if (queue.length) setTimeout(next); else root.dataset.ready = "yes";
   };
+  window.addEventListener("scroll", () => { if (!root.dataset.ready) queue = null; }, { passive: true });
 
   // A table wider than its place shows each row as a block of named values.
   const tables = [...document.querySelectorAll(".scroll > table")];

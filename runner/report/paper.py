@@ -85,7 +85,9 @@ def width_mm(width: str | float) -> float:
             )
         return WIDTHS_MM[width]
     if not 30.0 <= width <= 400.0:
-        raise ConfigurationError(f"figure: width {width:g} mm is outside 30 to 400 mm; give the column's width")
+        raise ConfigurationError(
+            f"figure: width {width:g} mm is outside 30 to 400 mm; give the column's width"
+        )
     return float(width)
 
 
@@ -342,9 +344,8 @@ def _place(figure: Any, found: NDArray[Any], columns: int, width: float) -> None
         if column == 0:
             y -= 4.5 + heights.sum() + (below[row - 1] if row else 0.0)
         x = sum(room[: column + 1]) + column * (each + 2.0)
-        if pair[1] is None:
-            boxes = [(y, heights.sum())]
-        else:
+        boxes = [(y, heights.sum())]
+        if pair[1] is not None:
             boxes = [(y + heights[1:].sum(), heights[0]), (y, heights[2])]
         for axes, (low, tall) in zip(pair, boxes, strict=False):
             axes.set_position((x / width, low / height, each / width, tall / height))
