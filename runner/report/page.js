@@ -1,5 +1,6 @@
 "use strict";
-// Opens the zipped charts and plotly, then draws: what is on the screen first, then all that is not folded away.
+// Opens the zipped charts and plotly, then draws: what is on the screen first, then all that is not folded away; the
+// rest as soon as it is unfolded.
 (() => {
   const settings = { responsive: true, displaylogo: false, displayModeBar: "hover",
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
@@ -33,11 +34,12 @@
   const next = () => {
     const begun = performance.now();
     if (queue === null) {
-      const left = charts.filter((one) => !one.dataset.drawn && one.offsetParent !== null);
+      const left = charts.filter((one) => !one.dataset.drawn && one.closest("details:not([open])") === null);
       queue = left.map((one) => [away(one), one]).sort((one, other) => other[0] - one[0]).map((pair) => pair[1]);
     }
-    while (queue.length && performance.now() - begun < 40) draw(queue.pop());
-    if (queue.length) setTimeout(next); else root.dataset.ready = "yes";
+    const order = queue;
+    while (order.length && performance.now() - begun < 40) draw(order.pop());
+    if (order.length) setTimeout(next); else root.dataset.ready = "yes";
   };
   window.addEventListener("scroll", () => { if (!root.dataset.ready) queue = null; }, { passive: true });
 
