@@ -27,10 +27,6 @@ SUFFIXES = (".pdf", ".pgf", ".svg", ".png")
 JOINT_WORDS = ("numbers", "names")
 
 _STYLE: Mapping[str, Any] = {
-    "font.family": "serif",
-    "font.serif": [
-        "Times New Roman", "Times", "Nimbus Roman", "TeX Gyre Termes", "Liberation Serif", "STIXGeneral",
-    ],
     "mathtext.fontset": "stix",
     "font.size": 8.0,
     "axes.titlesize": 8.0,
@@ -61,6 +57,8 @@ _STYLE: Mapping[str, Any] = {
     "svg.hashsalt": "lwr-identification",
     "pgf.rcfonts": False,
 }  # fmt: skip
+FONTS = ("Times New Roman", "Times", "Nimbus Roman", "TeX Gyre Termes", "Liberation Serif", "STIXGeneral")
+"""Times and its equals, the font of IEEE and IFAC; the last comes with matplotlib."""
 _MM = 1.0 / 25.4
 _PT_OF_PX = 0.6
 _PANEL_MM = 42.0
@@ -122,8 +120,8 @@ def paper_style() -> Iterator[Any]:
             "figure: matplotlib is not installed; run `pip install 'matplotlib>=3.8,<4'`"
         ) from error
     here = set(font_manager.get_font_names())
-    serif = [name for name in _STYLE["font.serif"] if name in here]
-    with matplotlib.rc_context({**_STYLE, "font.serif": serif}):
+    font = next((name for name in FONTS if name in here), "serif")
+    with matplotlib.rc_context({**_STYLE, "font.family": font}):
         yield matplotlib
 
 
