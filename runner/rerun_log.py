@@ -27,11 +27,15 @@ def layout() -> Any:
             ("position [rad]", "/joint_states/position"),
         )
     ]
-    arm = blueprint.Spatial3DView(origin="/", contents=["/lwr4plus/visual_geometries/**", "/tf"], name="the arm")
+    arm = blueprint.Spatial3DView(
+        origin="/", contents=["/lwr4plus/visual_geometries/**", "/tf"], name="the arm"
+    )
     phase = blueprint.TextDocumentView(origin="/experiment/phase", name="phase")
     return blueprint.Blueprint(
         blueprint.Horizontal(
-            blueprint.Vertical(arm, phase, row_shares=[5, 1]), blueprint.Vertical(*plots), column_shares=[2, 3]
+            blueprint.Vertical(arm, phase, row_shares=[5, 1]),
+            blueprint.Vertical(*plots),
+            column_shares=[2, 3],
         ),
         collapse_panels=True,
     )
@@ -70,7 +74,9 @@ def _rerun(module: str) -> Any:
 
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option("--save", type=click.Path(path_type=Path), help="Write an .rrd file instead of opening the viewer.")
+@click.option(
+    "--save", type=click.Path(path_type=Path), help="Write an .rrd file instead of opening the viewer."
+)
 def main(log: Path, save: Path | None) -> None:
     """Open the session LOG in Rerun with its layout."""
     try:

@@ -258,8 +258,10 @@ def _against(
             for role, label, values in _lines(trace, labels)
         ]
         alt = f"{_shares(pair, trace, labels)} Against {variable}, {_place(trace, names)}{way}."
-        note = f"against {variable}{way}"
-        found.append(Panel(_place(trace, names), axis, "left by each [Nm]", tuple(marks), alt, note))
+        note = f"against {variable}"
+        found.append(
+            Panel(f"{_place(trace, names)}{way}", axis, "left by each [Nm]", tuple(marks), alt, note)
+        )
     return found
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits
+from runner.report.plot import STYLES, Band, Line, Mark, Panel, Points, limits
 
 Floats = NDArray[np.float64]
 
@@ -66,6 +66,8 @@ _PANEL_MM = 42.0
 _LOWER_SHARE = 0.4
 _LINE_MM = 3.3
 """Height of a line of text."""
+_LETTER_MM = 1.3
+"""Width of a letter of a title."""
 _PART_MM = 2.0
 """Gap between a panel and its lower part."""
 _MARKERS = {"circle": "o", "cross": "x", "diamond": "D"}
@@ -208,7 +210,7 @@ def draw_matrix(
         cell_pt = 0.76 * wide / max(len(names), 1) * _MM * 72.0
         step = max(1, math.ceil(3.6 / cell_pt))
         places = np.arange(0, len(names), step)
-        shown_names = [names[k] for k in places]
+        shown_names = [names[k] for k in places.tolist()]
         size = min(7.0, max(3.4, 0.95 * cell_pt * step))
         axes.set_xticks(places, shown_names, rotation=90, fontsize=size)
         axes.set_yticks(places, shown_names, fontsize=size)
@@ -225,7 +227,7 @@ def _draw(figure: Any, panel: Panel, statistics: bool) -> list[Any]:
     upper = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     lower = figure.add_axes((0.0, 0.0, 1.0, 1.0), sharex=upper) if panel.split else None
     upper.tick_params(labelbottom=lower is None)
-    note = f"  {panel.note}" if statistics and panel.note else ""
+    note = f"\n{panel.note}" if statistics and panel.note else ""
     title = f"J{panel.title[1:]}" if panel.title.startswith("joint ") else panel.title
     upper.set_title(_text(title + note))
     span = (0.5, len(panel.x_names) + 0.5) if panel.x_names else limits([m.x for m in panel.marks], pad=0.0)
@@ -255,7 +257,9 @@ def _locator(most: int) -> Any:
 
 def _scale(axes: Any, marks: Sequence[Mark], *, log: bool) -> None:
     halves = [
-        0.5 * np.ptp(mark.interval, axis=1) for mark in marks if getattr(mark, "interval", None) is not None
+        0.5 * np.ptp(mark.interval, axis=1)
+        for mark in marks
+        if isinstance(mark, Points) and mark.interval is not None
     ]
     sizes = np.concatenate([*halves, np.zeros(0)])
     sizes = sizes[np.isfinite(sizes) & (sizes > 0.0)]
@@ -333,15 +337,20 @@ def _place(figure: Any, found: NDArray[Any], columns: int, width: float) -> None
     heights = np.append(heights, [_PART_MM, _LOWER_SHARE * heights[0]]) if lower else heights
     below = [7.5 if any(_bottom(pair).get_xlabel() for pair in found[k * columns :][:columns]) else 4.0
              for k in range(rows)]  # fmt: skip
+    head = 1.2 + _LINE_MM * max(1 + _title(pair[0]).count("\n") for pair in found)
     top = 4.0 * _legend(figure, width) + 0.5
-    height = top + sum(below) + rows * (4.5 + heights.sum())
+    height = top + sum(below) + rows * (head + heights.sum())
     figure.set_size_inches(width * _MM, height * _MM)
     y = height - top
     for index, pair in enumerate(found):
         row, column = divmod(index, columns)
         if column == 0:
-            y -= 4.5 + heights.sum() + (below[row - 1] if row else 0.0)
+            y -= head + heights.sum() + (below[row - 1] if row else 0.0)
         x = sum(room[: column + 1]) + column * (each + 2.0)
+        # A title too long for its panel is set smaller.
+        needed = _LETTER_MM * max(map(len, _title(pair[0]).split("\n")))
+        if needed > each:
+            pair[0].set_title(_title(pair[0]), fontsize=max(4.5, 8.0 * each / needed))
         boxes = [(y, heights.sum())]
         if pair[1] is not None:
             boxes = [(y + heights[1:].sum(), heights[0]), (y, heights[2])]
@@ -349,6 +358,10 @@ def _place(figure: Any, found: NDArray[Any], columns: int, width: float) -> None
             axes.set_position((x / width, low / height, each / width, tall / height))
             edge = _LINE_MM * (1 + axes.get_ylabel().count("\n")) - room[column]
             axes.yaxis.set_label_coords(edge, 0.5 * tall, transform=_from_corner(figure, axes))
+
+
+def _title(axes: Any) -> str:
+    return str(axes.get_title(loc="left"))
 
 
 def _from_corner(figure: Any, axes: Any) -> Any:

@@ -147,7 +147,7 @@ def test_the_caller_gets_axes_with_the_numbers_and_no_statistics_unless_asked() 
     np.testing.assert_array_equal(pair[0].lines[0].get_ydata(), np.sin(x))
     np.testing.assert_array_equal(pair[1].lines[0].get_ydata(), x)
     assert pair[0].get_title(loc="left") == "A1 <b>"
-    assert shown.plot("ieee", statistics=True)[0, 0].get_title(loc="left") == "A1 <b>  0.3 Nm rms"
+    assert shown.plot("ieee", statistics=True)[0, 0].get_title(loc="left") == "A1 <b>\n0.3 Nm rms"
 
 
 def test_intervals_of_very_different_size_are_all_to_be_seen() -> None:
