@@ -30,7 +30,7 @@ VERBS = {
     "plan": "an optimal exciting motion within all limits",
     "check": "every check of an experiment file, without motion",
     "preview": "the planned motion in 3D in the browser",
-    "report": "report.html of a finished experiment, figures as SVG",
+    "report": "report.html of a finished experiment, figures and tables for a paper",
     "emulator": "run the emulated controller and arm until interrupted",
     "identify": "estimate a model from session logs",
     "validate": "test a model on sessions it was not fitted to",

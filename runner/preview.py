@@ -27,9 +27,9 @@ from runner.experiment_file import Experiment, Payload
 from runner.live import phase_at
 from runner.planning import Excitations, checker, excitation_rows, session_motion
 from runner.preflight import Preflight, check_motion_limits, check_path, check_torque
+from runner.report.figure import inline_svg
 from runner.report.markup import conditions_table
 from runner.report.plot import STYLES, Line, Panel, Points
-from runner.report.svg import panel_svg
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
 
 Floats = NDArray[np.float64]
@@ -210,7 +210,7 @@ def preview_html(planned: Planned) -> str:
     verdict = "every condition holds" if ok else "refused: not every condition holds"
     mark = "\N{CHECK MARK}" if ok else "\N{MULTIPLICATION X}"
     tight = planned.tightest
-    joints = "".join(map(panel_svg, _joint_panels(planned)))
+    joints = "".join(map(inline_svg, _joint_panels(planned)))
     conditions = conditions_table(map(vars, planned.preflight.items), "Conditions before the motion")
     return (
         "<!doctype html><html lang=en><head><meta charset=utf-8>"
@@ -225,7 +225,7 @@ def preview_html(planned: Planned) -> str:
         f"<p>{planned.motion.duration_s:.1f} s. Tightest moment: <b>{1000 * tight.distance:.0f} mm</b>, "
         f"{escape(' to '.join(tight.pair))}, at t = {tight.time_s:.2f} s; "
         f"{1000 * planned.margin:.0f} mm must be kept.</p>{conditions}"
-        f"<h2>Clearance</h2>{panel_svg(_clearance_panel(planned))}"
+        f"<h2>Clearance</h2>{inline_svg(_clearance_panel(planned))}"
         f"<h2>Joints within their limits</h2><div class=joints>{joints}</div>"
         "</section></main></body></html>\n"
     )

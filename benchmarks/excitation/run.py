@@ -27,7 +27,7 @@ import click
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from benchmarks.excitation.front_plot import scatter
+from benchmarks.excitation.front_plot import front_figure
 from fri.errors import LwrError
 from ident.excitation import (
     Assembled,
@@ -257,7 +257,7 @@ def front(seeds: int, budget: float) -> dict[str, Any]:
     trade = trade_off(assembled, criteria.rsd_mean, criteria.condition, limits, starts=3, hops=10)
     pairs = [(point.bounded, point.minimised) for point in trade]
     results["condition against mean RSD"] = pairs
-    scatter(
+    front_figure(
         PLOT,
         pairs,
         "condition number, 49 columns",

@@ -144,36 +144,61 @@ def import_command(
 @click.command("report")
 @click.argument("folder", type=PATH)
 @click.option(
-    "--svg",
+    "--figures",
     type=OUTPUT_FOLDER,
     metavar="FOLDER",
-    help="Write the figures as SVG files to this folder instead.",
+    help="Write figures and LaTeX tables for a paper to this folder instead.",
 )
 @click.option(
-    "--columns",
-    default=2,
+    "--format",
+    "suffix",
+    default="pdf",
     show_default=True,
-    type=click.IntRange(1, 7),
-    help="Panels side by side in an SVG.",
+    type=click.Choice(["pdf", "pgf", "svg", "png"]),
+    help="Format of the figures.",
 )
 @click.option(
-    "--width", default=720, show_default=True, type=click.IntRange(200, 3000), help="Width of an SVG [px]."
+    "--width",
+    default="ieee-wide",
+    show_default=True,
+    metavar="NAME|MM",
+    help="Width of the figures: ieee, ifac (one column), ieee-wide, ifac-wide, or mm.",
 )
+@click.option("--columns", type=click.IntRange(1, 7), help="Panels side by side; default: as many as fit.")
+@click.option(
+    "--joints",
+    default="numbers",
+    show_default=True,
+    type=click.Choice(["numbers", "names"]),
+    help="Joints 1 to 7 or the names of the arm.",
+)
+@click.option("--statistics", is_flag=True, help="Write numbers such as the rms beside the titles.")
 @json_option
-def report_command(folder: Path, svg: Path | None, columns: int, width: int, as_json: bool) -> None:
+def report_command(
+    folder: Path,
+    figures: Path | None,
+    suffix: str,
+    width: str,
+    columns: int | None,
+    joints: str,
+    statistics: bool,
+    as_json: bool,
+) -> None:
     """Write report.html for the results in FOLDER, with a verdict on the run at the top.
 
     The page is one file and needs no network. Its plots zoom, its tables can be copied, and it has a print style
     for PDF. All files of the folder are read anew, a diagnosis.json too.
 
+    With --figures FOLDER holds an experiment or a diagnosis; its figures fit the columns of IEEE or IFAC papers.
+
     \b
     lwr-run report experiments/lwr4plus-20260101-120000
-    lwr-run report experiments/lwr4plus-20260101-120000 --svg figures --columns 1 --width 420
+    lwr-run report experiments/lwr4plus-20260101-120000 --figures paper --format pgf --width ifac
     lwr-run report experiments/lwr4plus-20260101-120000 --json          the verdicts, for a script
     """
     from runner.report.folder import ResultFolder
 
-    if svg is None:
+    if figures is None:
         from runner.report.page import write_report
         from runner.report.verdicts import headline, verdicts
 
@@ -184,12 +209,15 @@ def report_command(folder: Path, svg: Path | None, columns: int, width: int, as_
         content = {"report": page, "level": level, "headline": sentence, "verdicts": lines}
         click.echo(to_json(content) if as_json else f"{sentence}\n{page}")
         return
-    from runner.report.figures import every_figure
+    from runner.report.paper_folder import save_for_paper
 
-    results = ResultFolder.load(folder)
-    svg.mkdir(parents=True, exist_ok=True)
-    files = [
-        figure.save(svg / f"{figure.name}.svg", columns=columns, width=float(width))
-        for figure in every_figure(results)
-    ]
+    files = save_for_paper(
+        folder,
+        figures,
+        suffix=f".{suffix}",
+        width=float(width) if width.replace(".", "", 1).isdigit() else width,
+        columns=columns,
+        joints=joints,
+        statistics=statistics,
+    )
     click.echo(to_json({"figures": files}) if as_json else "\n".join(map(str, files)))

@@ -111,27 +111,17 @@ class Study:
         }
 
     def write(self, folder: Path) -> None:
-        """Write everything into `folder`: numbers, model, text, plots, residuals, discriminating experiments."""
-        from runner.report.diagnosis_figures import look_alike_figure, replay_figures, residual_figures
-
+        """Write everything into `folder`: numbers, model, text, residuals, discriminating experiments."""
         folder.mkdir(parents=True, exist_ok=True)
-        kinds = ("residual-*.svg", "look-alike-*.svg", "replay-*.svg", REPLAY)
-        for stale in (path for kind in kinds for path in folder.glob(kind)):
-            stale.unlink()
+        (folder / REPLAY).unlink(missing_ok=True)
         write_json(folder / DIAGNOSIS, self.diagnosis.to_dict())
         write_json(folder / DETAILS, self.details())
         write_model(self.diagnosis.extended_model, folder / EXTENDED)
         (folder / TEXT).write_text(f"{self}\n", encoding="utf-8")
         self.residuals.save(folder / RESIDUALS)
-        names = self.residuals.joint_names
-        figures = [one for side in self.residuals.sides for one in residual_figures(self.residuals, side)]
-        figures += [look_alike_figure(pair, names) for pair in self.pairs]
         write_look_alikes(self.pairs, folder / LOOK_ALIKES)
         if self.replayed is not None:
             self.replayed.save(folder / REPLAY)
-            figures += replay_figures(self.replayed, names)
-        for figure in figures:
-            figure.save(folder / f"{figure.name}.svg")
         for offer in self.offers:
             offer.plan.save(folder / offer.file)
 

@@ -35,10 +35,12 @@ from runner.report.diagnosis_figures import (
     replay_figures,
     residual_figures,
 )
+from runner.report.figure import Figure
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
 from runner.report.markup import Number as Shown
+from runner.report.paper import joint_labels
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,18 @@ class DiagnosisFolder:
         """Look-alikes, empty without their file."""
         entries, file = self.details.get("look_alikes") or [], self.path / LOOK_ALIKES
         return read_look_alikes(file, entries) if entries and file.is_file() else ()
+
+
+def diagnosis_paper_figures(diagnosis: DiagnosisFolder, *, joints: str = "numbers") -> list[Figure]:
+    """Figures of a diagnosis for a paper: held-out residuals, look-alikes, errors of the replay."""
+    names = joint_labels(diagnosis.joint_names, joints)
+    found = [look_alike_figure(pair, names) for pair in diagnosis.look_alikes]
+    if diagnosis.residuals is not None:
+        for side in diagnosis.residuals.sides:
+            found += residual_figures(diagnosis.residuals, side, joints=joints)
+    if diagnosis.replayed is not None:
+        found += replay_figures(diagnosis.replayed, names)
+    return found
 
 
 def diagnosis_section(results: ResultFolder) -> str:
@@ -203,7 +217,9 @@ def _residuals(diagnosis: DiagnosisFolder) -> str:
     residuals = diagnosis.residuals
     if residuals is None:
         return ""
-    figures = (figure for side in residuals.sides for figure in residual_figures(residuals, side))
+    figures = (
+        figure for side in residuals.sides for figure in residual_figures(residuals, side, joints="names")
+    )
     return "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,10 @@ from ident.diagnosis.statements import REPLAYED
 from ident.effects import WEAR, Parameters, find_effect
 from ident.effects.words import joints_text, spoken
 from runner.diagnosis.records import ReplayErrors, Residuals, SideResiduals
+from runner.report.figure import Figure
 from runner.report.figures import bin_means
+from runner.report.paper import joint_labels
 from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
-from runner.report.svg import Figure
 
 Floats = NDArray[np.float64]
 
@@ -39,14 +41,15 @@ _BOTH_WAYS = 0.15
 _MODELS: tuple[tuple[Role, str], ...] = (("backward", "base model"), ("forward", "extended model"))
 
 
-def residual_figures(residuals: Residuals, side: str) -> list[Figure]:
-    """One figure a quantity, one panel a joint."""
-    joints = np.flatnonzero(np.isfinite(residuals.sides[side].base).any(axis=0)).tolist()
+def residual_figures(residuals: Residuals, side: str, *, joints: str = "numbers") -> list[Figure]:
+    """One figure a quantity, one panel a joint; joints as in `runner.report.figures`."""
+    residuals = replace(residuals, joint_names=joint_labels(residuals.joint_names, joints))
+    used = np.flatnonzero(np.isfinite(residuals.sides[side].base).any(axis=0)).tolist()
     return [
         Figure(
             f"residual-{side}-{against.replace(' ', '-')}",
             f"Held-out residual of the {side} torque against {against}",
-            tuple(_panel(residuals, side, joint, against) for joint in joints),
+            tuple(_panel(residuals, side, joint, against) for joint in used),
         )
         for against in AGAINST
     ]
@@ -255,8 +258,10 @@ def _against(
             for role, label, values in _lines(trace, labels)
         ]
         alt = f"{_shares(pair, trace, labels)} Against {variable}, {_place(trace, names)}{way}."
-        note = f"against {variable}{way}"
-        found.append(Panel(_place(trace, names), axis, "left by each [Nm]", tuple(marks), alt, note))
+        note = f"against {variable}"
+        found.append(
+            Panel(f"{_place(trace, names)}{way}", axis, "left by each [Nm]", tuple(marks), alt, note)
+        )
     return found
 
 

@@ -4,20 +4,18 @@
 
     from runner.report.figures import torque_figure
     torque_figure("experiments/lwr4plus-20260101-120000")                 # shows itself in a notebook
-    torque_figure(folder, session="loaded", side="motor").save("torque.svg")
+    torque_figure(folder, side="motor").save("torque.pdf", "ieee")        # one column of an IEEE paper
+    axes = torque_figure(folder, joints="names").plot("ifac-wide")        # matplotlib axes, to be changed
     residual_figure(folder).plotly()                                      # interactive
 
 Every function takes a folder of results, or a `ResultFolder` to share the work between figures.
+joints : `numbers` (1 to n in kinematic order, as papers have them) or `names` of the arm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from html import escape
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +23,10 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import PER_LINK
 from runner.published import TABLE_2
+from runner.report.figure import Figure, MatrixFigure
 from runner.report.folder import Curves, ResultFolder
-from runner.report.interactive import DIVERGING, heatmap_chart, heatmap_figure
+from runner.report.paper import joint_labels
 from runner.report.plot import Band, Line, Mark, Panel, Points, Role, thin
-from runner.report.svg import Figure
 
 Floats = NDArray[np.float64]
 Results = ResultFolder | str | Path
@@ -39,13 +37,11 @@ _MOVING = 0.01
 STRONG = 0.7
 """Correlation of pairs worth a mention."""
 
-_LEVELS = 20
-_FONT = "font-family='Helvetica,Arial,sans-serif'"
-_INK = "#1a1a1a"
-_SCALE_WIDTH = 56.0
+_BESIDE = 0.16
+"""Distance of points of one place that belong to different sources."""
 
 
-def velocity_figure(results: Results, session: str | None = None) -> Figure:
+def velocity_figure(results: Results, session: str | None = None, *, joints: str = "numbers") -> Figure:
     """Figure 2a of the paper: joint velocities as logged and filtered, by joint."""
     one = _choose(results, session, "joint")
 
@@ -55,13 +51,17 @@ def velocity_figure(results: Results, session: str | None = None) -> Figure:
             _line("logged", "differences of the logged positions", one.time, one.raw_velocity[:, k]),
             _line("measured", "filtered", one.time, one.qd[:, k]),
         )
-        alt = f"Velocity of joint {joint} over time, session {one.session}: at most {fastest:.2f} rad/s."
+        alt = f"Velocity of {joint} over time, session {one.session}: at most {fastest:.2f} rad/s."
         return Panel(joint, "time [s]", "velocity [rad/s]", marks, alt, f"at most {fastest:.2f} rad/s")
 
-    return _by_joint(one, f"velocity-{one.session}", f"Joint velocities, session {one.session}", panel)
+    return _by_joint(
+        one, joints, f"velocity-{one.session}", f"Joint velocities, session {one.session}", panel
+    )
 
 
-def motion_figure(results: Results, session: str | None = None, side: str = "joint") -> Figure:
+def motion_figure(
+    results: Results, session: str | None = None, side: str = "joint", *, joints: str = "numbers"
+) -> Figure:
     """Figure 2b of the paper: torque as logged and filtered, by joint."""
     one = _choose(results, session, side)
     title = side.capitalize()
@@ -75,12 +75,13 @@ def motion_figure(results: Results, session: str | None = None, side: str = "joi
         alt = f"{title} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm."
         return Panel(joint, "time [s]", "torque [Nm]", marks, alt, f"mean |τ| {mean:.2f} Nm")
 
-    return _by_joint(
-        one, f"torque-logged-{one.session}-{side}", f"{title} torques, session {one.session}", panel
-    )
+    name = f"torque-logged-{one.session}-{side}"
+    return _by_joint(one, joints, name, f"{title} torques, session {one.session}", panel)
 
 
-def torque_figure(results: Results, session: str | None = None, side: str | None = None) -> Figure:
+def torque_figure(
+    results: Results, session: str | None = None, side: str | None = None, *, joints: str = "numbers"
+) -> Figure:
     """Figure 3 of the paper: measured and computed torque with their difference, by joint.
 
     session : name; by default a held-out one, else the loaded one. side : "joint" (default if present) or
@@ -108,11 +109,16 @@ def torque_figure(results: Results, session: str | None = None, side: str | None
 
     kind = "held-out session" if one.unseen else "session"
     caption = f"Measured and computed {one.side} torque, {kind} {one.session}"
-    return _by_joint(one, f"torque-{one.session}-{one.side}", caption, panel)
+    return _by_joint(one, joints, f"torque-{one.session}-{one.side}", caption, panel)
 
 
 def residual_figure(
-    results: Results, session: str | None = None, side: str | None = None, against: str = "time"
+    results: Results,
+    session: str | None = None,
+    side: str | None = None,
+    against: str = "time",
+    *,
+    joints: str = "numbers",
 ) -> Figure:
     """Residual torque against `time`, `position` or `velocity`, by joint.
 
@@ -137,19 +143,25 @@ def residual_figure(
         return Panel(joint, labels[against], "residual [Nm]", marks, alt, note)
 
     caption = f"Residual {one.side} torque against {against}, session {one.session}"
-    return _by_joint(one, f"residual-{against}-{one.session}-{one.side}", caption, panel)
+    return _by_joint(one, joints, f"residual-{against}-{one.session}-{one.side}", caption, panel)
 
 
 def _line(role: Role, label: str, x: Floats, y: Floats, *, lower: bool = False) -> Line:
     return Line(role, label, *thin(x, y, _POINTS), lower=lower)
 
 
-def _by_joint(one: Curves, name: str, caption: str, panel: Callable[[int, str], Panel]) -> Figure:
-    return Figure(name, caption, tuple(panel(k, joint) for k, joint in enumerate(one.joint_names)))
+def _by_joint(
+    one: Curves, joints: str, name: str, caption: str, panel: Callable[[int, str], Panel]
+) -> Figure:
+    labels = joint_labels(one.joint_names, joints)
+    return Figure(name, caption, tuple(panel(k, joint) for k, joint in enumerate(labels)))
 
 
 def parameter_figure(results: Results) -> Figure:
-    """Base parameters with their 95 % intervals by kind and link, with the published values and any truth."""
+    """Base parameters by kind and link, with the published values and any truth.
+
+    The lower part of each panel has the 95 % intervals around the estimates, too small to be seen beside them.
+    """
     folder = _folder(results)
     entries = folder.summary.get("parameters", [])
     published = {entry.name: entry.estimate for entry in TABLE_2}
@@ -160,48 +172,58 @@ def parameter_figure(results: Results) -> Figure:
         mine = [e for e in entries if _symbol(e["name"]) == symbol and _link(e["name"]) in links]
         if not mine:
             continue
-        x = np.array([1.0 + links.index(_link(e["name"])) for e in mine])
-        estimates = np.array([e["estimate"] for e in mine])
-        intervals = np.array([interval_95(e) for e in mine])
-        said = tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine)
+        place = np.array([1.0 + links.index(_link(e["name"])) for e in mine])
+        value = np.array([e["estimate"] for e in mine])
+        interval = np.array([interval_95(e) for e in mine])
+        texts = tuple(f"{e['name']} {e['estimate']:.4g} ± {e['std']:.2g} {e['unit']}" for e in mine)
+        label = "estimate with 95 % interval"
         marks: list[Mark] = [
-            Points("estimate", "estimate with 95 % interval", x, estimates, intervals, said),
+            Points("estimate", label, place, value, interval, texts),
+            Points("estimate", label, place, 0.0 * value, interval - value[:, None], texts, lower=True),
         ]
-        placed = list(zip(x, mine, strict=True))
-        known = [
-            (p, e["truth"], f"{e['name']} {e['truth']:.4g} {e['unit']}") for p, e in placed if "truth" in e
-        ]
-        printed = [
-            (p, published[e["name"]], f"{e['name']} {published[e['name']]:g}")
-            for p, e in placed
-            if e["name"] in published
-        ]
-        others: tuple[tuple[Role, str, list[Any]], ...] = (
-            ("truth", "true value of the emulated arm", known),
-            ("published", "published (Table 2)", printed),
+        others: tuple[tuple[Role, str, list[float | None], float], ...] = (
+            ("truth", "true value of the emulated arm", [e.get("truth") for e in mine], _BESIDE),
+            ("published", "published (Table 2)", [published.get(e["name"]) for e in mine], -_BESIDE),
         )
-        for role, label, points in others:
-            if points:
-                places, values, texts = zip(*points, strict=True)
-                marks.append(Points(role, label, np.array(places), np.array(values), None, texts))
+        for role, label, values, beside in others:
+            known = np.array([k for k, one in enumerate(values) if one is not None], dtype=np.int64)
+            if not len(known):
+                continue
+            x = place[known] + beside
+            y = np.array([values[k] for k in known], dtype=np.float64)
+            words = tuple(f"{mine[k]['name']} {values[k]:.4g} {mine[k]['unit']}" for k in known)
+            marks.append(Points(role, label, x, y, None, words))
+            if role == "truth":
+                marks.append(Points(role, label, x, y - value[known], None, words, lower=True))
         unit = pretty_unit(mine[0]["unit"])
         listed = ", ".join(f"{e['name']} {e['estimate']:.3g}" for e in mine)
         alt = f"Estimates of {symbol} by link with their 95 % intervals: {listed} {unit}."
-        panels.append(Panel(symbol, "link", unit, tuple(marks), alt, x_names=links))
+        panels.append(
+            Panel(
+                symbol,
+                "link",
+                f"[{unit}]",
+                tuple(marks),
+                alt,
+                lower_label=f"interval [{unit}]",
+                x_names=links,
+                lower_log=True,
+            )
+        )
     return Figure("parameters", "Base parameters with their 95 % intervals", tuple(panels))
 
 
-def every_figure(results: Results) -> list[Figure | MatrixFigure]:
-    """All figures of a folder."""
+def every_figure(results: Results, *, joints: str = "numbers") -> list[Figure | MatrixFigure]:
+    """All figures of a folder of results; those of a diagnosis are in `runner.report.diagnosis_figures`."""
     folder = _folder(results)
     figures: list[Figure | MatrixFigure] = []
     for one in folder.curves:
         if one.side == "joint":
-            figures.append(velocity_figure(folder, one.session))
-        figures.append(motion_figure(folder, one.session, one.side))
-        figures.append(torque_figure(folder, one.session, one.side))
+            figures.append(velocity_figure(folder, one.session, joints=joints))
+        figures.append(motion_figure(folder, one.session, one.side, joints=joints))
+        figures.append(torque_figure(folder, one.session, one.side, joints=joints))
         figures += [
-            residual_figure(folder, one.session, one.side, against)
+            residual_figure(folder, one.session, one.side, against, joints=joints)
             for against in ("time", "position", "velocity")
         ]
     if folder.summary.get("parameters"):
@@ -283,78 +305,6 @@ def _link(name: str) -> str:
     return name.removesuffix("R")[len(_symbol(name)) :]
 
 
-@dataclass(frozen=True, eq=False)
-class MatrixFigure:
-    """A symmetric matrix (n, n) of values from -1 to 1 with its n names. A notebook shows it by itself.
-
-    name : for file names. alt : description in a sentence, for screen readers.
-    """
-
-    name: str
-    caption: str
-    names: tuple[str, ...]
-    values: Floats
-    alt: str
-
-    def strongest(self, count: int) -> list[tuple[str, str, float]]:
-        """The `count` pairs of different parameters with the largest magnitude, largest first."""
-        first, second = np.triu_indices(len(self.names), 1)
-        value = self.values[first, second]
-        order = np.argsort(-np.abs(value), kind="stable")[:count]
-        return [(self.names[first[k]], self.names[second[k]], float(value[k])) for k in order]
-
-    def chart(self) -> dict[str, Any]:
-        """As plotly `data` and `layout`."""
-        return heatmap_chart(self.names, self.values)
-
-    def svg(self, *, columns: int = 1, width: float = 720.0) -> str:
-        """The matrix as a stand-alone SVG text, `width` px wide; `columns` has no effect."""
-        count = max(len(self.names), 1)
-        size = min(9.0, max(2.0, 0.85 * width / (count + 8)))
-        margin = 0.62 * size * max((len(name) for name in self.names), default=1) + 8.0
-        side = max((width - margin - _SCALE_WIDTH) / count, 0.1)
-        span = side * count
-        height = margin + span + 8.0
-        level = np.rint(_LEVELS * np.clip(self.values, -1.0, 1.0)).astype(np.int64)
-        cells: dict[int, list[str]] = {}
-        for row, values in enumerate(level):
-            for start, end, value in _runs(values):
-                if value:
-                    box = f"M{margin + start * side:.2f} {margin + row * side:.2f}h{(end - start) * side:.2f}"
-                    cells.setdefault(value, []).append(f"{box}v{side:.2f}h{-(end - start) * side:.2f}z")
-        parts = [
-            f"<svg xmlns='http://www.w3.org/2000/svg' width='{width:g}' height='{height:.1f}' "
-            f"viewBox='0 0 {width:g} {height:.1f}' role='img'>",
-            f"<title>{escape(self.caption)}</title><desc>{escape(self.alt)}</desc>",
-            "<rect width='100%' height='100%' fill='#ffffff'/>",
-            *(f"<path fill='{_colour(v / _LEVELS)}' d='{''.join(b)}'/>" for v, b in sorted(cells.items())),
-            f"<rect x='{margin:.2f}' y='{margin:.2f}' width='{span:.2f}' height='{span:.2f}' fill='none' "
-            "stroke='#8c8c8c' stroke-width='0.8'/>",
-        ]
-        text = f"{_FONT} font-size='{size:.2f}' fill='{_INK}'"
-        for place, name in enumerate(self.names):
-            at, label = margin + (place + 0.5) * side, escape(name)
-            parts.append(
-                f"<text x='{margin - 4:.2f}' y='{at + 0.35 * size:.2f}' {text} text-anchor='end'>{label}</text>"
-                f"<text transform='translate({at + 0.35 * size:.2f},{margin - 4:.2f}) rotate(-90)' {text}>"
-                f"{label}</text>"
-            )
-        return "".join([*parts, *_scale(margin + span + 14.0, margin, min(span, 240.0)), "</svg>\n"])
-
-    def save(self, path: str | Path, *, columns: int = 1, width: float = 720.0) -> Path:
-        """Write the SVG to a file."""
-        target = Path(path)
-        target.write_text(self.svg(columns=columns, width=width), encoding="utf-8")
-        return target
-
-    def plotly(self, *, columns: int = 1) -> Any:
-        """The matrix as a plotly `Figure`; needs the extra `view`."""
-        return heatmap_figure(self.chart(), self.caption)
-
-    def _repr_svg_(self) -> str:
-        return self.svg()
-
-
 def correlation_figure(results: Results) -> MatrixFigure:
     """Correlation of the base parameters of a folder of results, from the covariance of its model.
 
@@ -370,34 +320,3 @@ def correlation_figure(results: Results) -> MatrixFigure:
     alt = f"Correlation matrix of {len(matrix)} parameters. {strong} pairs are correlated by more than {STRONG}."
     caption = "Correlation of the base parameters"
     return MatrixFigure("correlation", caption, tuple(model.names), np.asarray(matrix), alt)
-
-
-def _scale(x: float, y: float, length: float) -> list[str]:
-    """The colours with their values, from 1 at the top to -1."""
-    each = length / (2 * _LEVELS + 1)
-    boxes = [
-        f"<rect x='{x:.2f}' y='{y + k * each:.2f}' width='10' height='{each + 0.3:.2f}' "
-        f"fill='{_colour(1 - k / _LEVELS)}'/>"
-        for k in range(2 * _LEVELS + 1)
-    ]
-    ticks = [
-        f"<text x='{x + 14:.2f}' y='{y + (1 - value) / 2 * length + 3.5:.2f}' {_FONT} font-size='10' "
-        f"fill='{_INK}'>{text}</text>"
-        for value, text in zip((1, 0.5, 0, -0.5, -1), ("1", "0.5", "0", "−0.5", "−1"), strict=True)
-    ]
-    return [*boxes, *ticks]
-
-
-def _runs(row: NDArray[np.int64]) -> list[tuple[int, int, int]]:
-    """Stretches of equal values: begin, end (exclusive), value."""
-    edges = [0, *(np.flatnonzero(np.diff(row)) + 1).tolist(), len(row)]
-    return [(begin, end, int(row[begin])) for begin, end in pairwise(edges)]
-
-
-def _colour(value: float) -> str:
-    """Colour of a value from -1 to 1, between the stops of the interactive figure."""
-    place = 0.5 * (value + 1.0)
-    stops = np.array([stop for stop, _ in DIVERGING])
-    shades = np.array([[int(text[k : k + 2], 16) for k in (1, 3, 5)] for _, text in DIVERGING])
-    red, green, blue = (round(float(np.interp(place, stops, shade))) for shade in shades.T)
-    return f"#{red:02x}{green:02x}{blue:02x}"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import gzip
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits
+from runner.report.plot import STYLES, Band, Line, Mark, Panel, limits, thin
 
 Floats = NDArray[np.float64]
 
@@ -22,6 +24,12 @@ _SYMBOLS = {"circle": "circle", "cross": "x-thin-open", "diamond": "diamond-open
 _BACKGROUND = {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "#ffffff"}
 _GRID = "#e3e3e3"
 _SPLIT = 0.32
+_SHORT = 60
+"""Columns below this length keep their numbers."""
+_FULL, _FEWEST = 700, 60
+"""Points of a line, and the fewest of a page with very many."""
+_LEVELS = 20_000
+"""Places of the grid between the least and the largest value of a column."""
 DIVERGING: tuple[tuple[float, str], ...] = (
     (0.0, "#d55e00"), (0.25, "#f2b98c"), (0.5, "#ffffff"), (0.75, "#8cbfdd"), (1.0, "#0072b2"),
 )  # fmt: skip
@@ -37,8 +45,51 @@ def plotly_script() -> str:
     return str(get_plotlyjs())
 
 
+def zipped(text: str) -> str:
+    """A text as base64 of gzip; the page's script opens it. The same bytes for the same text."""
+    return base64.b64encode(gzip.compress(text.encode("utf-8"), 9, mtime=0)).decode("ascii")
+
+
+def chart_json(chart: dict[str, Any]) -> str:
+    """A chart as JSON; long columns as steps of a fine grid, which compress to two bytes a value."""
+    return json.dumps(chart, separators=(",", ":"), default=_plain)
+
+
+def lighter_charts(charts: str, budget: int) -> str:
+    """Charts (a JSON list) with fewer points of their lines, until they zip to `budget` bytes at most."""
+    points = _FULL
+    while len(zipped(charts)) > budget and points > _FEWEST:
+        points = int(0.7 * points)
+        plain = json.loads(charts)
+        for trace in (trace for chart in plain for trace in chart["data"]):
+            if trace.get("mode") == "lines" and isinstance(trace.get("y"), dict):
+                x, y = (np.asarray(_unpacked(trace[key]), dtype=np.float64) for key in "xy")
+                trace["x"], trace["y"] = thin(x, y, points)
+        charts = json.dumps(plain, separators=(",", ":"), default=_plain)
+    return charts
+
+
+def _unpacked(column: Any) -> Any:
+    if isinstance(column, dict):
+        return column["low"] + column["step"] * np.cumsum(column["moves"])
+    return column
+
+
+def _plain(values: Any) -> Any:
+    column = np.asarray(values, dtype=np.float64)
+    finite = np.isfinite(column)
+    if column.ndim > 1:
+        return [_plain(row) for row in np.round(column, 4)]
+    if len(column) < _SHORT or not finite.all():
+        return [float(f"{value:.6g}") if good else None for value, good in zip(column, finite, strict=True)]
+    low, span = float(column.min()), float(np.ptp(column))
+    step = float(f"{(span or 1.0) / _LEVELS:.6g}")
+    places = np.rint((column - low) / step).astype(np.int64)
+    return {"low": low, "step": step, "moves": np.diff(places, prepend=0).tolist()}
+
+
 def panel_chart(panel: Panel) -> dict[str, Any]:
-    """A panel as plotly `data` and `layout`; long columns as base64 of float32."""
+    """A panel as plotly `data` and `layout`, columns as arrays."""
     data = [trace for mark in panel.marks for trace in _traces(mark)]
     span = (0.5, len(panel.x_names) + 0.5) if panel.x_names else limits([m.x for m in panel.marks], pad=0.0)
     layout: dict[str, Any] = {
@@ -65,7 +116,8 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
         box = {"x0": 0, "x1": 1, "y0": _SPLIT + 0.05, "y1": 1}
         frame = {"type": "rect", "xref": "paper", "yref": "paper", **box}
         layout["shapes"] = [{**frame, "line": {"color": "#8c8c8c", "width": 1}}]
-        layout["yaxis2"] = {**_axis(panel.lower_label), "domain": [0.0, _SPLIT - 0.03], "nticks": 6}
+        label = panel.lower_label.replace(" [", "<br>[")
+        layout["yaxis2"] = {**_axis(label), "domain": [0.0, _SPLIT - 0.03], "nticks": 5, "automargin": True}
     return {"data": data, "layout": layout}
 
 
@@ -76,7 +128,7 @@ def heatmap_chart(names: tuple[str, ...], matrix: Floats) -> dict[str, Any]:
         "type": "heatmap",
         "x": list(names),
         "y": list(names),
-        "z": {**_packed(values.ravel()), "shape": f"{values.shape[0]}, {values.shape[1]}"},
+        "z": values,
         "zmin": -1,
         "zmax": 1,
         "colorscale": [list(stop) for stop in DIVERGING],
@@ -99,9 +151,7 @@ def heatmap_figure(chart: dict[str, Any], caption: str) -> Any:
         import plotly.graph_objects as go
     except ImportError as error:
         raise ConfigurationError(f"plotly figure: {INSTALL}") from error
-    trace = dict(chart["data"][0])
-    trace["z"] = _unpacked(trace["z"]).reshape(len(trace["y"]), len(trace["x"]))
-    whole = go.Figure(trace, chart["layout"])
+    whole = go.Figure(chart["data"][0], chart["layout"])
     whole.update_layout(title={"text": caption}, margin={"t": 40}, height=900)
     return whole
 
@@ -133,7 +183,7 @@ def plotly_figure(panels: Sequence[Panel], *, columns: int = 2) -> Any:
         row, column = (index // columns) * (2 if split else 1) + 1, index % columns + 1
         for mark in panel.marks:
             for trace in _traces(mark):
-                plain = {k: _unpacked(value) for k, value in trace.items() if k not in ("type", "yaxis")}
+                plain = {k: value for k, value in trace.items() if k not in ("type", "yaxis")}
                 name = str(plain["name"])
                 shown = bool(name) and name not in known
                 known.add(name)
@@ -157,8 +207,8 @@ def _traces(mark: Mark) -> list[dict[str, Any]]:
                 "type": "scatter",
                 "mode": "lines",
                 "name": mark.label,
-                "x": _column(mark.x),
-                "y": _column(mark.y),
+                "x": mark.x,
+                "y": mark.y,
                 "line": {"color": style.colour, "width": style.width, "dash": dash},
                 "hovertemplate": "%{y:.4g}",
                 **axis,
@@ -166,19 +216,19 @@ def _traces(mark: Mark) -> list[dict[str, Any]]:
         ]
     if isinstance(mark, Band):
         line = {"type": "scatter", "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
-        plain = {**line, "x": _column(mark.x)}
+        plain = {**line, "x": mark.x}
         fill = {"fill": "tonexty", "fillcolor": _transparent(style.colour), "name": mark.label}
         return [
-            {**plain, "y": _column(mark.low), "name": "", **axis},
-            {**plain, "y": _column(mark.high), **fill, **axis},
+            {**plain, "y": mark.low, "name": "", **axis},
+            {**plain, "y": mark.high, **fill, **axis},
         ]
     outline = {"width": 1.4, "color": style.colour}
     trace: dict[str, Any] = {
         "type": "scatter",
         "mode": "markers",
         "name": mark.label,
-        "x": _column(mark.x),
-        "y": _column(mark.y),
+        "x": mark.x,
+        "y": mark.y,
         "text": list(mark.texts),
         "marker": {"color": style.colour, "size": 7, "symbol": _SYMBOLS[style.symbol], "line": outline},
         "hovertemplate": "%{text}<extra>" + mark.label + "</extra>" if mark.texts else "%{y:.4g}",
@@ -188,8 +238,8 @@ def _traces(mark: Mark) -> list[dict[str, Any]]:
         trace["error_y"] = {
             "type": "data",
             "symmetric": False,
-            "array": _column(mark.interval[:, 1] - mark.y),
-            "arrayminus": _column(mark.y - mark.interval[:, 0]),
+            "array": mark.interval[:, 1] - mark.y,
+            "arrayminus": mark.y - mark.interval[:, 0],
             "color": style.colour,
             "thickness": 1.4,
             "width": 3,
@@ -207,26 +257,10 @@ def _axis(label: str) -> dict[str, Any]:
         "ticks": "outside",
         "ticklen": 3,
         "nticks": 6,
+        "exponentformat": "none",
     }
 
 
 def _transparent(colour: str) -> str:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
     return f"rgba({red},{green},{blue},0.55)"
-
-
-def _column(values: Floats) -> Any:
-    column = np.asarray(values, dtype=np.float64)
-    return column.tolist() if len(column) < 20 else _packed(column)
-
-
-def _packed(values: Floats) -> dict[str, str]:
-    return {"dtype": "f4", "bdata": base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")}
-
-
-def _unpacked(value: Any) -> Any:
-    if isinstance(value, dict):
-        if "bdata" in value:
-            return np.frombuffer(base64.b64decode(value["bdata"]), dtype="<f4")
-        return {key: _unpacked(entry) for key, entry in value.items()}
-    return value

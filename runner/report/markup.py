@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from runner.report.interactive import panel_chart
-from runner.report.svg import Figure, legend_key
+from runner.report.figure import Figure
+from runner.report.interactive import chart_json, panel_chart
+from runner.report.plot import STYLES, Role
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Number:
 Cell = str | Number
 
 _NUMBER = " class=n"
+_DATA = ("<script type='application/json'>", "</script>")
+_SIGNS = {"circle": "\N{BLACK CIRCLE}", "cross": "\N{MULTIPLICATION SIGN}", "diamond": "\N{WHITE DIAMOND}"}
 
 
 def table(
@@ -80,12 +82,8 @@ def conditions_table(items: Iterable[Mapping[str, Any]], label: str) -> str:
 
 
 def figure_html(figure: Figure, *, tall: bool = False) -> str:
-    """Small multiples: legend, then one chart a panel, drawn by the page's script when it comes into view."""
-    keys = "".join(
-        f"<li><svg width=24 height=12 viewBox='0 -6 24 12' aria-hidden=true>{legend_key(role, kind)}</svg>"
-        f"{escape(label)}</li>"
-        for role, label, kind in figure.legend
-    )
+    """Small multiples: legend, then one chart a panel, drawn by the page's script."""
+    keys = "".join(f"<li>{_key(role, kind)}{escape(label)}</li>" for role, label, kind in figure.legend)
     panels = []
     for panel in figure.panels:
         chart = chart_html(panel_chart(panel), panel.alt, "tall" if tall or panel.split else "")
@@ -95,12 +93,36 @@ def figure_html(figure: Figure, *, tall: bool = False) -> str:
 
 
 def chart_html(chart: dict[str, Any], alt: str, classes: str = "") -> str:
-    """A chart to be drawn by the page's script, with its data beside it."""
-    data = json.dumps(chart, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+    """A chart to be drawn by the page's script; `take_charts` moves its data to one place of the page."""
+    data = chart_json(chart).replace("</", "<\\/")
     return (
         f"<div class='chart {classes}' role=img aria-label='{escape(alt, quote=True)}'></div>"
-        f"<script type='application/json'>{data}</script>"
+        f"{_DATA[0]}{data}{_DATA[1]}"
     )
+
+
+def take_charts(content: str) -> tuple[str, str]:
+    """The content without the data of its charts, and all of them as a JSON list in the order of the charts."""
+    charts: list[str] = []
+    parts = content.split(_DATA[0])
+    kept = [parts[0]]
+    for part in parts[1:]:
+        data, _, rest = part.partition(_DATA[1])
+        charts.append(data)
+        kept.append(rest)
+    return "".join(kept), f"[{','.join(charts)}]"
+
+
+def _key(role: Role, kind: str) -> str:
+    """A sample of a mark, for legends."""
+    style = STYLES[role]
+    if kind == "Points":
+        return f"<i class=key style='color:{style.colour}' aria-hidden=true>{_SIGNS[style.symbol]}</i>"
+    if kind == "Band":
+        look = f"height:10px;background:{style.colour};opacity:0.55"
+    else:
+        look = f"border-top:{max(style.width, 1.5):g}px {'dashed' if style.dash else 'solid'} {style.colour}"
+    return f"<i class=key style='{look}' aria-hidden=true></i>"
 
 
 def section(anchor: str, title: str, *parts: str) -> str:

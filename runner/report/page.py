@@ -12,11 +12,13 @@ from runner.report import sections
 from runner.report.diagnosis import DiagnosisFolder, diagnosis_parts, diagnosis_section
 from runner.report.folder import ResultFolder
 from runner.report.hidden import hidden_section
-from runner.report.interactive import plotly_script
-from runner.report.markup import section
+from runner.report.interactive import lighter_charts, plotly_script, zipped
+from runner.report.markup import section, take_charts
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 
 REPORT = "report.html"
+_LARGEST = 3_900_000
+"""Bytes of a page; the lines of its charts lose points to stay below."""
 
 _MARKS = {"good": "\N{CHECK MARK} good", "look": "! look", "bad": "\N{MULTIPLICATION X} bad"}
 _SECTIONS = (
@@ -116,7 +118,9 @@ def page_html(
 
     subtitle, content : HTML. parts : anchors and titles of possible sections of the content.
     """
-    script = plotly_script()
+    script = zipped(plotly_script())
+    content, charts = take_charts(content)
+    budget = _LARGEST - len(script) - len(content.encode("utf-8"))
     links = "".join(
         f"<a href='#{anchor}'>{title}</a>" for anchor, title in parts if f"<section id='{anchor}'" in content
     )
@@ -132,7 +136,9 @@ def page_html(
         f"<main>{content}</main>"
         f"<footer>Written by {escape(software)}. This file needs no network; print it or keep it beside the logs."
         "</footer>"
-        f"<script>{script}</script><script>{_asset('page.js')}</script></body></html>\n"
+        f"<script type='application/gzip' id=charts>{zipped(lighter_charts(charts, budget))}</script>"
+        f"<script type='application/gzip' id=plotly>{script}</script>"
+        f"<script>{_asset('page.js')}</script></body></html>\n"
     )
 
 

@@ -1,4 +1,4 @@
-"""Panels as data: marks in named roles, drawn as interactive plot or as SVG.
+"""Panels as data: marks in named roles, drawn by plotly for the page and by matplotlib for papers.
 
 The roles carry the colours (Okabe and Ito, distinguishable with every common colour vision) and the line
 styles of the paper: measured solid blue, computed dotted red, error dashed black.
@@ -90,7 +90,8 @@ Mark = Line | Band | Points
 class Panel:
     """One plot. alt : description in a sentence, for screen readers.
 
-    title : short, above the plot; note : a number or two beside the title. lower_label : of the lower part.
+    title : short, above the plot; note : a statistic beside it, on paper only if asked for. lower_label : of the lower
+    part; lower_log : its axis is logarithmic on paper if intervals are too different to be seen otherwise.
     x_names : texts in place of numbers at x = 1, 2, ...
     """
 
@@ -102,6 +103,7 @@ class Panel:
     note: str = ""
     lower_label: str = ""
     x_names: tuple[str, ...] = ()
+    lower_log: bool = False
 
     @property
     def split(self) -> bool:

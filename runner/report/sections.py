@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from runner.published import SOURCE, TABLE_1, TABLE_2
+from runner.published import SOURCE, TABLE_2
+from runner.report import tables
 from runner.report.figures import (
     correlation_figure,
-    interval_95,
     motion_figure,
     parameter_figure,
     pretty_unit,
@@ -83,36 +83,17 @@ def table_1_section(results: ResultFolder) -> str:
     """The paper's Table 1 with this run in it."""
     if not results.summary.get("parameters"):
         return ""
-    excitation = results.summary.get("excitation", {})
-    condition, torque = excitation.get("condition", {}), excitation.get("mean_torque_nm", {})
-    joints = results.joint_names
-    names = {session.path.name: name for name, session in results.sessions.items()}
-    kept = {name: all(item["ok"] for item in items) for name, items in results.preflights.items()}
-    rows: list[list[Cell]] = [
-        [one.name, one.constraints, *(Number(v, ".2f") for v in (one.condition, *one.mean_torque))]
-        for one in TABLE_1
-    ]
-    payloads = {s.path.name: s.metadata.get("payload", "none") for s in results.sessions.values()}
-    for file, means in sorted(torque.items(), key=lambda item: payloads.get(item[0], "none") == "none"):
-        rows.append(
-            [
-                f"This run, {file.removesuffix('.mcap')}",
-                _WORDS[kept.get(names.get(file, ""))],
-                Number(condition.get("paper"), ".2f", "excitation.condition.paper"),
-                *(Number(means.get(j), ".2f", f"excitation.mean_torque_nm.{file}.{j}") for j in joints),
-            ]
-        )
-    torques = (f"|τ{k + 1}| [Nm]" for k in range(len(joints) or 7))
-    head = ("motion", "constraints kept", "condition number", *torques)
-    strong = range(len(TABLE_1), len(rows))
+    condition = results.summary.get("excitation", {}).get("condition", {})
+    shown = tables.table_1(results)
     note = (
         "|τ|: mean magnitude of the joint torque; the published motions were loaded. The condition number belongs "
         "to the unscaled observation matrix of all sessions over the 49 parameters of Table 2, in agreement with "
-        "the published numbers; "
+        "the published numbers. Mean and worst RSD are of the same parameters: a plan may be made for them instead of "
+        "the condition number; the paper states them for its estimate, not by motion."
     )
-    sets = {"base": "all base parameters it is", "essential": "the essential ones of this run"}
-    others = [f"over {of} {condition[key]:.1f}" for key, of in sets.items() if condition.get(key)]
-    note += ", ".join(others) + "." if others else ""
+    sets = {"base": "all base parameters", "essential": "the essential ones of this run"}
+    others = [f"{condition[key]:.1f} over {of}" for key, of in sets.items() if condition.get(key)]
+    note += f" Condition number of this run: {', '.join(others)}." if others else ""
     if _printed_truths(results)[0]:
         note += (
             " Agreement by construction: the emulated arm has the parameters of Table 2, so equal motions give "
@@ -121,7 +102,7 @@ def table_1_section(results: ResultFolder) -> str:
     return section(
         "table-1",
         "Table 1: the exciting motion",
-        table(head, rows, "Table 1 with the published values and this run", strong=list(strong)),
+        table(shown.head, shown.rows, "Table 1 with the published values and this run", strong=shown.strong),
         paragraph(note, "soft"),
     )
 
@@ -133,25 +114,8 @@ def table_2_section(results: ResultFolder) -> str:
     essential = (results.summary.get("essential") or {}).get("parameters", [])
     kept = {entry["name"]: (entry, f"essential.parameters.{i}") for i, entry in enumerate(essential)}
     base = {e["name"]: (e, f"parameters.{i}") for i, e in enumerate(results.summary.get("parameters", []))}
-    rows: list[list[Cell]] = []
-    for printed in TABLE_2:
-        entry, key = kept.get(printed.name) or base.get(printed.name) or (None, "")
-        truth = base.get(printed.name, ({}, ""))[0].get("truth")
-        mark = " *" if kept and entry is not None and printed.name not in kept else ""
-        rows.append(
-            [
-                printed.name + mark,
-                pretty_unit(entry["unit"]) if entry else "",
-                Number(entry["estimate"] if entry else None, ".4f", f"{key}.estimate"),
-                Number(entry["rsd_percent"] if entry else None, ".2f", f"{key}.rsd_percent"),
-                Number(printed.estimate, ".2f"),
-                Number(printed.rsd_percent, ".2f"),
-                Number(100 * (entry["estimate"] / printed.estimate - 1) if entry else None, "+.1f"),
-                *([Number(truth, ".4f")] if "within_3_sigma" in results.summary else []),
-            ]
-        )
-    head = ["parameter", "unit", "this run", "RSD %", "published", "RSD %", "difference %"]
-    head += ["truth"] if "within_3_sigma" in results.summary else []
+    shown = tables.table_2(results)
+    head, rows = shown.head, shown.rows
     half = math.ceil(len(rows) / 2)
     label = "Table 2, estimates of this run and published ones"
     printed_names = {entry.name for entry in TABLE_2}
@@ -221,9 +185,9 @@ def motion_section(results: ResultFolder) -> str:
     parts = []
     for index, one in enumerate(results.curves):
         if one.side == "joint":
-            velocity = figure_html(velocity_figure(results, one.session))
+            velocity = figure_html(velocity_figure(results, one.session, joints="names"))
             parts.append(fold(f"2a, joint velocities, {one.session}", velocity, is_open=not index))
-        torque = figure_html(motion_figure(results, one.session, one.side))
+        torque = figure_html(motion_figure(results, one.session, one.side, joints="names"))
         parts.append(fold(f"2b, {one.side} torques, {one.session}", torque, is_open=not index))
     return section("motion", "Figure 2: velocities and torques of the motion", *parts) if parts else ""
 
@@ -273,7 +237,7 @@ def torque_section(results: ResultFolder) -> str:
         parts.append(
             fold(
                 f"{one.label}: torque error of all joints {100 * one.relative:.2f} %",
-                figure_html(torque_figure(results, one.session, one.side)),
+                figure_html(torque_figure(results, one.session, one.side, joints="names")),
                 table(head, rows, f"Residuals, {one.label}"),
                 is_open=index < 2,
             )
@@ -286,7 +250,7 @@ def residual_section(results: ResultFolder) -> str:
     parts = []
     for index, one in enumerate(results.curves):
         for against in ("time", "position", "velocity"):
-            figure = figure_html(residual_figure(results, one.session, one.side, against))
+            figure = figure_html(residual_figure(results, one.session, one.side, against, joints="names"))
             parts.append(fold(f"against {against}: {one.label}", figure, is_open=index == 0))
     return section("residuals", "Residuals against time, position and velocity", *parts) if parts else ""
 
@@ -335,21 +299,7 @@ def parameter_section(results: ResultFolder) -> str:
     entries = results.summary.get("parameters")
     if not entries:
         return ""
-    truth = "within_3_sigma" in results.summary
-    rows: list[list[Cell]] = []
-    for index, entry in enumerate(entries):
-        key = f"parameters.{index}"
-        rows.append(
-            [
-                entry["name"],
-                pretty_unit(entry["unit"]),
-                *_numbers(entry, {"estimate": ".5g", "std": ".3g"}, key),
-                *(Number(bound, ".5g") for bound in interval_95(entry)),
-                *_numbers(entry, {"rsd_percent": ".2f"}, key),
-                *([Number(entry.get("truth"), ".5g", f"{key}.truth")] if truth else []),
-            ]
-        )
-    head = ["parameter", "unit", "estimate", "std", "95 % from", "to", "RSD %", *(["truth"] if truth else [])]
+    shown = tables.parameters(results)
     counts = results.summary["counts"]
     intro = (
         f"Model {results.summary['model']}: {counts['standard']} parameters, {counts['not_identifiable']} "
@@ -359,7 +309,9 @@ def parameter_section(results: ResultFolder) -> str:
     parts = [
         paragraph(intro),
         figure_html(parameter_figure(results)),
-        fold(f"All {len(rows)} base parameters as a table", table(head, rows, "Base parameters")),
+        fold(
+            f"All {len(entries)} base parameters as a table", table(shown.head, shown.rows, "Base parameters")
+        ),
     ]
     return section("parameters", "Parameters and their intervals", *parts) + _correlation(results)
 
@@ -395,6 +347,9 @@ def provenance_section(results: ResultFolder) -> str:
         robot = f"{meta.get('robot', '')} {meta.get('serial', '')}".strip()
         given = [meta.get(key, "") for key in ("uid", "parent_uid", "utc_start", "motor_torque_source")]
         given[1] = given[1] or "–"
+        if results.lock_step:
+            # The clock of an emulator in lock step starts at a fixed date.
+            given[2] = "emulated clock"
         logs.append([name, robot, *given, str(session.missing)])
     head = ("session", "robot", "uid", "goes on from", "started", "motor torque", "missing")
     parts = ["<div class=halves>", table(("", "version"), rows, "Versions")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -97,3 +98,22 @@ def test_every_path_leads_to_a_field_of_a_log(laboratory: Path) -> None:
                 value = value[int(found[3])]
             assert isinstance(value, (int, float, str)), path["value"]
             assert path["timestampMethod"] == "receiveTime" or hasattr(messages[found[1]], "header")
+
+
+def test_every_curve_of_the_plotjuggler_layout_is_a_joint_of_a_log(laboratory: Path) -> None:
+    names: dict[str, tuple[str, ...]] = {}
+    with (laboratory / "loaded.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages(
+            topics=["/joint_states", "/motor_states", "/joint_command"]
+        ):
+            names.setdefault(channel.topic, tuple(message.name))
+    layout = ElementTree.parse(ROOT / "configs/layouts/plotjuggler.xml").getroot()
+    curves = [str(curve.get("name")) for curve in layout.iter("curve")]
+    assert len(curves) == 4 * 7
+    for curve in curves:
+        topic, joint, field = curve.rsplit("/", 2)
+        assert joint in names[topic]
+        assert field in ("position", "effort")
+    for splitter in layout.iter("DockSplitter"):
+        assert len(splitter.findall("DockArea")) == int(splitter.get("count", "0"))

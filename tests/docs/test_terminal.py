@@ -477,10 +477,12 @@ def test_options_of_commands_for_logs(workplace: Callable[[], Path]) -> None:
     assert (content["metadata"]["payload"], float(content["metadata"]["payload_mass"])) == ("block", 2.5)
     assert 2 in {channel["samples"] for channel in content["channels"]}
     assert "is no range of rows" in run("import", "mapping.yaml", "recording", "x.mcap", "--rows", "3")[1]
-    code, text = run("report", "results", "--svg", "figures", "--columns", "1", "--width", "400", "--json")
+    options = ("--format", "svg", "--columns", "1", "--width", "100", "--joints", "names", "--statistics")
+    code, text = run("report", "results", "--figures", "figures", *options, "--json")
     assert code == 0, text
-    assert all("<svg" in Path(file).read_text() for file in json.loads(text)["figures"])
-    assert "width='400'" in Path(json.loads(text)["figures"][0]).read_text()
+    files = [Path(file) for file in json.loads(text)["figures"]]
+    assert {file.suffix for file in files} == {".svg", ".tex"}
+    assert 'width="283.46' in files[0].read_text()
 
 
 def test_options_of_commands_for_models(workplace: Callable[[], Path]) -> None:

@@ -22,7 +22,7 @@ from runner.diagnosis import Study, asked, study
 from runner.diagnosis.discriminating import Discriminating
 from runner.diagnosis.records import LOOK_ALIKES, read_look_alikes
 from runner.diagnosis.study import replaceable
-from runner.report.diagnosis import DiagnosisFolder
+from runner.report.diagnosis import DiagnosisFolder, diagnosis_paper_figures
 from runner.report.diagnosis_figures import look_alike_figure
 from runner.report.page import diagnosis_html
 
@@ -100,7 +100,8 @@ def test_the_files_and_the_page_hold_the_pairs(found: Study, tmp_path: Path) -> 
     np.testing.assert_allclose(
         folder.look_alikes[0].traces[0].first, found.pairs[0].traces[0].first, atol=1e-6
     )
-    assert len(list(tmp_path.glob("look-alike-*.svg"))) == len(found.pairs)
+    figures = [one.name for one in diagnosis_paper_figures(folder)]
+    assert sum(name.startswith("look-alike-") for name in figures) == len(found.pairs)
     page = diagnosis_html(folder)
     assert page.count("Side by side:") == len(found.pairs)
     assert "To decide" in page

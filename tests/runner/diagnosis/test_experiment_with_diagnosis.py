@@ -25,6 +25,7 @@ from runner.diagnosis.after_run import conclude_run
 from runner.diagnosis.records import QUANTITIES, ReplayErrors, Residuals
 from runner.experiment_file import Experiment
 from runner.planning import Excitations
+from runner.report.diagnosis import DiagnosisFolder, diagnosis_paper_figures
 from runner.report.diagnosis_figures import AGAINST
 from runner.report.folder import ResultFolder
 from runner.report.page import report_html
@@ -138,7 +139,8 @@ def test_errors_of_the_replay_are_kept_over_time_and_drawn(done: Done) -> None:
         # One session was replayed, so what is drawn has the error that is told.
         rms = np.sqrt(np.nanmean(replayed.errors["extended", quantity] ** 2, axis=0))
         np.testing.assert_allclose(rms, error[quantity], rtol=1e-3)
-    text = (folder / "replay-position.svg").read_text()
+    figures = {one.name: one for one in diagnosis_paper_figures(DiagnosisFolder.load(folder))}
+    text = figures["replay-position"].alt
     assert text.count("Measured minus simulated position of") == 7
     assert "mrad rms, extended" in text
     broken = done.folder / "broken_replay.npz"
@@ -169,12 +171,13 @@ def test_base_parameters_that_absorbed_it_are_told(done: Done) -> None:
 def test_residuals_are_drawn_against_everything(done: Done) -> None:
     residuals = Residuals.load(done.folder / "diagnosis" / "residuals.npz")
     assert set(residuals.sides) == {"motor", "joint"}
+    diagnosis = DiagnosisFolder.load(done.folder / "diagnosis")
+    figures = {one.name: one for one in diagnosis_paper_figures(diagnosis)}
     for side in residuals.sides:
         for against in AGAINST:
-            name = f"residual-{side}-{against.replace(' ', '-')}.svg"
-            text = (done.folder / "diagnosis" / name).read_text()
-            assert "extended model, mean" in text
-            assert text.count("Held-out residual of the") >= 7
+            one = figures[f"residual-{side}-{against.replace(' ', '-')}"]
+            assert any("extended model, mean" in label for _, label, _ in one.legend)
+            assert one.alt.count("Held-out residual of the") >= 7
     broken = done.folder / "broken.npz"
     broken.write_bytes(b"PK")
     with pytest.raises(DataError, match="run the diagnosis again"):

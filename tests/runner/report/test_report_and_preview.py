@@ -259,28 +259,65 @@ def test_a_run_that_failed_is_called_bad_and_still_has_a_report(finished: Path, 
     assert "drives <off>" not in text
 
 
-def test_figures_are_written_as_well_formed_svg(finished: Path, tmp_path: Path) -> None:
+def test_figures_and_tables_for_a_paper_are_written(finished: Path, tmp_path: Path) -> None:
     folder = copy(finished, tmp_path / "run")
-    done = CliRunner().invoke(main, ["report", str(folder), "--svg", str(tmp_path / "figures")])
+    command = [
+        "report",
+        str(folder),
+        "--figures",
+        str(tmp_path / "paper"),
+        "--format",
+        "svg",
+        "--width",
+        "ifac",
+    ]
+    done = CliRunner().invoke(main, command)
     assert done.exit_code == 0, done.output
-    files = sorted((tmp_path / "figures").glob("*.svg"))
+    files = sorted((tmp_path / "paper").iterdir())
     assert [str(path) for path in files] == sorted(done.output.split())
     names = {"torque-loaded-joint.svg", "torque-check-motor.svg", "parameters.svg", "correlation.svg"}
-    assert names <= {path.name for path in files}
+    assert names | {"table_1.tex", "table_2.tex", "parameters.tex"} <= {path.name for path in files}
     for path in files:
-        root = ElementTree.parse(path).getroot()
-        assert root.findtext("{http://www.w3.org/2000/svg}desc")
-        assert "nan" not in path.read_text()
+        if path.suffix == ".svg":
+            assert ElementTree.parse(path).getroot().get("width", "").startswith("238.1")  # pt, 84 mm
+            assert "nan" not in path.read_text()
+    assert "This run, loaded" in (tmp_path / "paper" / "table_1.tex").read_text()
+    refused = CliRunner().invoke(main, [*command[:-1], "wide"])
+    assert refused.exit_code == 2
+    assert "width 'wide' is unknown" in refused.output
 
 
 def test_a_figure_is_interactive_in_a_notebook(finished: Path) -> None:
     figure = torque_figure(finished, "loaded", "joint")
-    assert figure._repr_svg_().startswith("<svg")
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    assert [panel.title for panel in figure.panels] == [f"joint {k}" for k in range(1, 8)]
     chart = figure.plotly(columns=3)
     names = [trace.name for trace in chart.data]
     assert names.count("measured") == names.count("computed") == names.count("residual") == 7
     measured = next(trace for trace in chart.data if trace.name == "measured")
     assert np.ptp(measured.y) > 0.1
+
+
+def test_the_page_is_light(finished: Path) -> None:
+    assert (finished / "report.html").stat().st_size <= 4e6
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW])
+def test_no_column_of_a_table_is_cut_off(finished: Path, chrome: Browser, size: tuple[int, int]) -> None:
+    cut = """() => {
+      document.querySelectorAll('details').forEach((part) => { part.open = true; });
+      window.dispatchEvent(new Event('resize'));
+      return [...document.querySelectorAll('.scroll, pre')].filter((box) => box.scrollWidth > box.clientWidth + 1)
+        .map((box) => box.getAttribute('aria-label'));
+    }"""
+    with opened(chrome, finished / "report.html", size) as seen:
+        assert seen.page.evaluate(cut) == []
+
+
+def test_plots_are_drawn_without_scrolling(report: Seen) -> None:
+    blank = "[...document.querySelectorAll('.chart:not([data-drawn])')].filter(c => !c.closest('details:not([open])'))"
+    assert report.page.evaluate("window.scrollY") == 0
+    assert report.page.evaluate(f"{blank}.length") == 0
 
 
 def test_without_the_extra_one_line_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,144 @@
+"""Figures as data with two faces: matplotlib for papers and notebooks, plotly for the page."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.report.interactive import DIVERGING, heatmap_chart, heatmap_figure, plotly_figure
+from runner.report.paper import checked_target, draw_matrix, draw_panels, paper_style, write_figure
+from runner.report.plot import Panel, Role
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Small multiples under one caption. A notebook shows it by itself.
+
+    name : for file names and anchors.
+    """
+
+    name: str
+    caption: str
+    panels: tuple[Panel, ...] = field(repr=False)
+
+    @property
+    def alt(self) -> str:
+        """Description in sentences, for screen readers."""
+        return " ".join(panel.alt for panel in self.panels)
+
+    @property
+    def legend(self) -> tuple[tuple[Role, str, str], ...]:
+        """Role, label and kind (`Line`, `Band`, `Points`) of all marks, each once."""
+        marks = (mark for panel in self.panels for mark in panel.marks if mark.label)
+        return tuple(dict.fromkeys((mark.role, mark.label, type(mark).__name__) for mark in marks))
+
+    def plot(
+        self, width: str | float = "ieee-wide", *, columns: int | None = None, statistics: bool = False
+    ) -> NDArray[Any]:
+        """The matplotlib axes of the n panels, (n,); (n, 2) if panels have a lower part. Change them as you like.
+
+        width : `ieee`, `ieee-wide`, `ifac`, `ifac-wide` or [mm]. columns : panels side by side; default: as many as
+        stay legible. statistics : numbers such as the rms beside the title of each panel.
+        `plot()[0].figure.savefig(...)` writes a changed figure.
+        """
+        return draw_panels(self.panels, width, columns=columns, statistics=statistics, shown=True)
+
+    def save(
+        self,
+        path: str | Path,
+        width: str | float = "ieee-wide",
+        *,
+        columns: int | None = None,
+        statistics: bool = False,
+    ) -> Path:
+        """Write the figure as PDF, PGF, SVG or PNG, by the suffix of the path; arguments as of `plot`.
+
+        ConfigurationError for another suffix, a missing folder or an unknown width.
+        """
+        target = checked_target(path)
+        axes = draw_panels(self.panels, width, columns=columns, statistics=statistics)
+        return write_figure(axes.flat[0].figure, target, self.caption, self.alt)
+
+    def plotly(self, *, columns: int = 2) -> Any:
+        """The figure as a plotly `Figure` with one subplot a panel; needs the extra `view`."""
+        return plotly_figure(self.panels, columns=columns)
+
+    def _repr_png_(self) -> bytes:
+        return _png(draw_panels(self.panels).flat[0].figure)
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixFigure:
+    """A symmetric matrix (n, n) of values from -1 to 1 with its n names. A notebook shows it by itself.
+
+    name : for file names. alt : description in a sentence, for screen readers.
+    """
+
+    name: str
+    caption: str
+    names: tuple[str, ...]
+    values: Floats = field(repr=False)
+    alt: str
+
+    def strongest(self, count: int) -> list[tuple[str, str, float]]:
+        """The `count` pairs of different parameters with the largest magnitude, largest first."""
+        first, second = np.triu_indices(len(self.names), 1)
+        value = self.values[first, second]
+        order = np.argsort(-np.abs(value), kind="stable")[:count]
+        return [(self.names[first[k]], self.names[second[k]], float(value[k])) for k in order]
+
+    def chart(self) -> dict[str, Any]:
+        """As plotly `data` and `layout`."""
+        return heatmap_chart(self.names, self.values)
+
+    def plot(
+        self, width: str | float = "ieee-wide", *, columns: int | None = None, statistics: bool = False
+    ) -> NDArray[Any]:
+        """The matplotlib axes, (1,); width as of `Figure.plot`, the other arguments have no effect."""
+        return np.array([draw_matrix(self.names, self.values, DIVERGING, width, shown=True)], dtype=object)
+
+    def save(
+        self,
+        path: str | Path,
+        width: str | float = "ieee-wide",
+        *,
+        columns: int | None = None,
+        statistics: bool = False,
+    ) -> Path:
+        """Write the matrix, as `Figure.save` writes panels."""
+        target = checked_target(path)
+        axes = draw_matrix(self.names, self.values, DIVERGING, width)
+        return write_figure(axes.figure, target, self.caption, self.alt)
+
+    def plotly(self, *, columns: int = 1) -> Any:
+        """The matrix as a plotly `Figure`; needs the extra `view`."""
+        return heatmap_figure(self.chart(), self.caption)
+
+    def _repr_png_(self) -> bytes:
+        return _png(draw_matrix(self.names, self.values, DIVERGING).figure)
+
+
+def inline_svg(panel: Panel, width: float = 110.0) -> str:
+    """One panel as an SVG element for a page, as wide as its place; width [mm] is that of its texts."""
+    axes = draw_panels([panel], width)
+    stream = io.StringIO()
+    with paper_style():
+        axes.flat[0].figure.savefig(stream, format="svg", metadata={"Date": None})
+    text = stream.getvalue()
+    head = f"<svg role='img' style='width:100%;height:auto' aria-label='{escape(panel.alt, quote=True)}' "
+    return text[text.index("<svg") :].replace("<svg ", head, 1)
+
+
+def _png(figure: Any) -> bytes:
+    stream = io.BytesIO()
+    with paper_style():
+        figure.savefig(stream, format="png", dpi=160)
+    return stream.getvalue()
