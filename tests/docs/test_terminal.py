@@ -66,6 +66,10 @@ def write_settings(place: Path, **content: Any) -> None:
 # One call of each, in the folder that the documents speak of; what it must say, as a path into the JSON.
 REPORTS: dict[str, tuple[str, str]] = {
     "doctor": ("doctor", "findings.0.advice"),
+    "record": ("record my_lab.yaml --seconds 1 --out recorded.mcap", "log"),
+    "hold": ("hold my_lab.yaml --seconds 1 --out held.mcap", "log"),
+    "jog": ("jog A6 -2 my_lab.yaml --out jogged.mcap", "after.6"),
+    "home": ("home my_lab.yaml --out homed.mcap", "done"),
     "experiment": ("experiment --resume results --yes --no-diagnosis", "sessions.0.exit_status"),
     "plan": ("plan --out my.plan.yaml", "margins.0.limit"),
     "check": ("check my_lab.yaml", "loaded.0.limit"),
