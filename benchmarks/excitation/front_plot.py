@@ -10,7 +10,9 @@ import numpy as np
 from runner.report.paper import new_figure, paper_style, write_figure
 
 
-def front_figure(path: Path, points: Sequence[tuple[float, float]], x_label: str, y_label: str, title: str) -> None:
+def front_figure(
+    path: Path, points: Sequence[tuple[float, float]], x_label: str, y_label: str, title: str
+) -> None:
     """Write points joined by a line; the suffix of the path chooses the format. title : in the file's metadata."""
     values = np.array(sorted(points))
     with paper_style():
