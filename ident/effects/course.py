@@ -130,10 +130,8 @@ class Drifting(Effect):
             return [f"{size} from session {values['since'][0]:.0f} on"]
         if form is Course.SINCE_REFERENCE:
             return [f"{size} against the reference"]
-        when = {
-            Course.HEATED: "with the heat of its own friction",
-            Course.CARRIED: "with the heat of its own friction, kept from session to session",
-        }.get(form, "while a session lasts")
+        when = "while a session lasts" if form is Course.WITHIN else "with the heat of its own friction"
+        when += ", kept from session to session" if form is Course.CARRIED else ""
         return [f"{size} {when}, with a time constant of {quantity(values['time_constant'])}"]
 
 

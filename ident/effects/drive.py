@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -505,7 +505,9 @@ class GearRipple(Effect):
 class ScaleError(Effect):
     """A torque is reported `1 + error` times too large."""
 
-    parameters = (Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),)
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),
+    )
     depends_on = "load"
     law = Law("load")
     experiment = Discriminator.STATIC_POSES
