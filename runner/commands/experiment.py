@@ -192,7 +192,9 @@ def _begin(
                 "--hide"
             )
         if not resume.is_dir():
-            raise ConfigurationError(f"{resume} is no folder; name the folder of an aborted experiment")
+            raise ConfigurationError(
+                f"{resume} is no folder and holds no experiment.yaml; name the folder of an aborted experiment"
+            )
         context.with_resource(locked(resume))
         experiment, remarks = go_on(resume.resolve(), rounds=rounds)
         status.say("\n".join([listed(Frozen(resume).files()), *remarks]))
