@@ -42,6 +42,7 @@ _SETTLING = 5.0  # time constants of F after a beginning
 _MOST_CYCLES = 10  # after a longer gap F begins anew
 _BEYOND_FLANGE_M = 0.05
 _FARTHEST_M = 0.6  # of a centre of mass from the wrist
+_MOST_KG = 50.0
 _LEAST_KG = 0.3  # smaller differences of the gravity torque are no payload
 # Jumps between two packets, believed only if the next packet confirms them.
 _JUMP_RAD, _JUMP_SHARE = 5e-3, 0.5
@@ -204,7 +205,7 @@ class ContactWatch:
         mass, *moment = np.linalg.lstsq(columns, load, rcond=0.01)[0]
         centre = usual + np.array(moment) / max(mass, _LEAST_KG)
         # A far centre of mass comes from an arm not at rest, and would have a large inertia.
-        if mass > _LEAST_KG and float(np.linalg.norm(centre)) < _FARTHEST_M:
+        if _LEAST_KG < mass < _MOST_KG and float(np.linalg.norm(centre)) < _FARTHEST_M:
             body = pin.Inertia(mass, centre, np.zeros((3, 3)))
             model.inertias[JOINTS] = self._bare + body
 
