@@ -41,7 +41,9 @@ _LARGEST_ANGLE = 1.2  # of the cutoff frequency, per cycle [rad]
 _SETTLING = 5.0  # time constants of F after a beginning
 _MOST_CYCLES = 10  # after a longer gap F begins anew
 _BEYOND_FLANGE_M = 0.05
-_LEAST_KG = 0.1  # smaller differences of the gravity torque are no payload
+_FARTHEST_M = 0.6  # of a centre of mass from the wrist
+_MOST_KG = 50.0
+_LEAST_KG = 0.3  # smaller differences of the gravity torque are no payload
 # Jumps between two packets, believed only if the next packet confirms them.
 _JUMP_RAD, _JUMP_SHARE = 5e-3, 0.5
 
@@ -201,8 +203,10 @@ class ContactWatch:
         # For the mass, and for the deviation of the first moment from that of the usual place.
         columns[:, 0] += columns[:, 1:] @ usual
         mass, *moment = np.linalg.lstsq(columns, load, rcond=0.01)[0]
-        if mass > _LEAST_KG:
-            body = pin.Inertia(mass, usual + np.array(moment) / mass, np.zeros((3, 3)))
+        centre = usual + np.array(moment) / max(mass, _LEAST_KG)
+        # A far centre of mass comes from an arm not at rest, and would have a large inertia.
+        if _LEAST_KG < mass < _MOST_KG and float(np.linalg.norm(centre)) < _FARTHEST_M:
+            body = pin.Inertia(mass, centre, np.zeros((3, 3)))
             model.inertias[JOINTS] = self._bare + body
 
     def update(
