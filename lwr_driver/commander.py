@@ -98,6 +98,7 @@ class Commander:
         self.ended: tuple[Result, str] = (Result.NONE, "")
         self._period = 0.0
         self.barred = ""
+        self._touched = False  # whether a contact is the reason
         self.external, self.allowed = np.zeros(JOINTS), np.zeros(JOINTS)
         self._guard: Guard
         self._stop: Stop
@@ -226,7 +227,8 @@ class Commander:
         if self.mode is not Mode.HOLD:
             self.ended = (Result.REFUSED, f"a motion cannot begin {self.place()}")
         elif self.barred:
-            self.ended = (Result.REFUSED, f"no motion before `enter_command`: {self.barred}")
+            result = Result.ROBOT if self._touched else Result.REFUSED
+            self.ended = (result, f"no motion before `enter_command`: {self.barred}")
         elif not self._begins_here():
             self.ended = (Result.REFUSED, "the motion does not begin at the commanded position")
         else:
@@ -278,14 +280,14 @@ class Commander:
             self._origin = origin
         if self.barred:
             return
-        self.barred = reason
+        self.barred, self._touched = reason, True
         self._control.write_text(Text.LEFT, reason)
         if self.mode is Mode.STOP and not moving:
             self._pending = (self._pending[0], f"{self._pending[1]}; then {reason}")
 
     def allow(self) -> None:
         """Motions may begin again."""
-        self.barred = ""
+        self.barred, self._touched = "", False
         self._control.write_text(Text.LEFT, "")
 
     def lose(self, result: Result, reason: str) -> None:
@@ -298,7 +300,7 @@ class Commander:
             self.ended = (result, reason)
         elif self.mode is Mode.STOP:
             self.ended = (self._pending[0], f"{self._pending[1]}; then {reason}")
-        self.barred = reason
+        self.barred, self._touched = reason, False
         self._control.write_text(Text.LEFT, reason)
         self.mode, self.index, self.phase = Mode.MIRROR, -1, NO_PHASE
 

@@ -44,8 +44,9 @@ _BEYOND_FLANGE_M = 0.05
 _FARTHEST_M = 0.6  # of a centre of mass from the wrist
 _MOST_KG = 50.0
 _LEAST_KG = 0.3  # smaller differences of the gravity torque are no payload
-# Jumps between two packets, believed only if the next packet confirms them.
-_JUMP_RAD, _JUMP_SHARE = 5e-3, 0.5
+# Jumps between two packets, believed with the second packet: of the position by more than an acceleration makes.
+_JUMP_RAD, _JUMP_RAD_S2, _JUMP_SHARE = 5e-3, 20.0, 0.5
+_FASTEST_RAD_S = 4.0  # a joint is slower
 
 
 @dataclass(frozen=True)
@@ -154,8 +155,11 @@ class ContactWatch:
         self._threshold = np.array(settings.external_nm) + np.array(expected.uncertainty)
         self.external = np.zeros(JOINTS)
         self.allowed = self._threshold.copy()
-        self._jump = np.concatenate([np.full(JOINTS, _JUMP_RAD), *[_JUMP_SHARE * tau_max] * 2])
-        self._now, self._last, self._step, self._change, self._odd = (np.zeros(3 * JOINTS) for _ in range(5))
+        torque, gravity = _JUMP_SHARE * tau_max, _JUMP_SHARE * np.array(EXTERNAL_NM)
+        self._jump = np.concatenate([np.zeros(JOINTS), torque, torque, gravity])
+        # Position, torque, the controller's estimate and gravity torque.
+        self._now, self._last, self._doubtful = (np.zeros(4 * JOINTS) for _ in range(3))
+        self._step, self._change, self._odd = (np.zeros(4 * JOINTS) for _ in range(3))
         # Position and velocity of the low-pass, and its input.
         self._filter, self._next = np.zeros((3, 2 * JOINTS)), np.zeros((2, 2 * JOINTS))
         self._excess = np.full((3, JOINTS), -np.inf)
@@ -178,6 +182,8 @@ class ContactWatch:
         self._lag = 2.0 * _DAMPING / cutoff
         self._closing = np.exp(-0.5 * cutoff * period_s)
         self._settled = int(np.ceil(_SETTLING / (cutoff * period_s)))
+        self._fastest = _FASTEST_RAD_S * period_s
+        self._jump[:JOINTS] = _JUMP_RAD + _JUMP_RAD_S2 * period_s**2
         self._known = False
 
     def carry(self, mass: float, com: Floats, inertia: Floats) -> None:
@@ -187,17 +193,18 @@ class ContactWatch:
         model.inertias[JOINTS] = self._bare + self._flange.act(body)
         self._carried = True
 
-    def weigh(self, q: NDArray[np.float32], gravity: NDArray[np.float32]) -> None:
-        """Mass and centre of mass from the controller's gravity torque (7,) [Nm] at rest in q, unless `carry` told.
+    def weigh(self) -> None:
+        """Mass and centre of mass from the controller's gravity torque in the last packet, unless `carry` told.
 
         What this pose does not show of the centre of mass is taken for `_BEYOND_FLANGE_M` out of the flange.
         """
+        q, gravity = self._last[:JOINTS], self._last[3 * JOINTS :]
         if self._carried or not gravity.any():
             return
         pin, model, zero = self._pin, self._model, np.zeros(JOINTS)
         model.inertias[JOINTS] = self._bare
-        load = gravity - pin.computeGeneralizedGravity(model, self._data, q.astype(np.float64))
-        columns = pin.computeJointTorqueRegressor(model, self._data, q.astype(np.float64), zero, zero)
+        load = gravity - pin.computeGeneralizedGravity(model, self._data, q)
+        columns = pin.computeJointTorqueRegressor(model, self._data, q, zero, zero)
         columns = columns[:, 10 * (JOINTS - 1) :][:, :4]
         usual = self._flange.act(np.array([0.0, 0.0, _BEYOND_FLANGE_M]))
         # For the mass, and for the deviation of the first moment from that of the usual place.
@@ -221,37 +228,64 @@ class ContactWatch:
 
         q [rad], tau [Nm] : measured. estimate, gravity : the controller's external and gravity torques [Nm]; (7,) each
         """
-        now, last, change, odd = self._now, self._last, self._change, self._odd
-        now[:JOINTS], now[JOINTS : 2 * JOINTS], now[2 * JOINTS :] = q, tau, estimate
+        now, last, change = self._now, self._last, self._change
+        now[:JOINTS], now[JOINTS : 2 * JOINTS] = q, tau
+        now[2 * JOINTS : 3 * JOINTS], now[3 * JOINTS :] = estimate, gravity
         if not self._known or not 0 < cycles <= _MOST_CYCLES:
             cycles = 1
-            last[:] = now
-            self._filter[0], self._filter[1] = now[: 2 * JOINTS], 0.0
-            self._step[:] = 0.0
-            self._settling, self._known = self._settled, True
+            self._begin()
         np.subtract(now, last, out=change)
-        np.multiply(self._step, -cycles, out=odd)
-        odd += change
-        np.abs(odd, out=odd)
-        # A flipped bit in one packet is no contact.
-        self._doubted = not self._doubted and bool((odd > self._jump).any())
-        if self._doubted:
-            np.multiply(self._step, cycles, out=change)
-            np.add(last, change, out=now)
-        np.divide(change[:JOINTS], cycles, out=self._step[:JOINTS])
+        self._believe(cycles)
         self._alive = self._alive or bool(now[JOINTS : 2 * JOINTS].any())
         self._low_pass(cycles)
         self._settling = max(self._settling - cycles, 0)
-        self._estimate(gravity)
+        self._estimate(now[3 * JOINTS :])
         self._last, self._now = now, last
         excess = self._excess
-        np.abs(now[JOINTS:].reshape(2, JOINTS), out=excess[:2])
+        np.abs(now[JOINTS : 3 * JOINTS].reshape(2, JOINTS), out=excess[:2])
         excess[0] -= self._most
         excess[1] -= self.allowed
         np.abs(self.external, out=excess[2])
         excess[2] -= self.allowed
         # Also false for NaN.
         return None if excess.max() <= 0.0 else self._contact()
+
+    def _begin(self) -> None:
+        """Begin with this packet, at rest."""
+        self._last[:] = self._now
+        self._filter[0], self._filter[1] = self._now[: 2 * JOINTS], 0.0
+        self._step[:] = 0.0
+        self._doubted = False
+        self._settling, self._known = self._settled, True
+
+    def _believe(self, cycles: int) -> None:
+        """Replace a packet with a jump by what the packets before it let expect: a flipped bit is no contact.
+
+        The packet after it is believed, also if it jumps. Then the step between these two is the one to go on with:
+        one that includes the jump would make the packets to come seem odd, without an end.
+        """
+        now, last, step, change, odd = self._now, self._last, self._step, self._change, self._odd
+        np.multiply(step, -cycles, out=odd)
+        odd += change
+        np.abs(odd, out=odd)
+        # Also true for NaN.
+        jumps = not (odd <= self._jump).all()
+        if jumps and not self._doubted:
+            self._doubted = True
+            self._doubtful[:] = now
+            np.multiply(step, cycles, out=change)
+            np.add(last, change, out=now)
+            return
+        self._doubted = False
+        if not jumps:
+            np.divide(change[:JOINTS], cycles, out=step[:JOINTS])
+            return
+        moved = (now[:JOINTS] - self._doubtful[:JOINTS]) / cycles
+        if self._settling:
+            # The packet that F began with was the damaged one.
+            self._begin()
+            change[:] = 0.0
+        np.clip(moved, -self._fastest, self._fastest, out=step[:JOINTS])
 
     def _low_pass(self, cycles: int) -> None:
         """Advance F from the last packet to this one, with straight lines between them."""
@@ -263,7 +297,7 @@ class ContactWatch:
             np.dot(self._advance, memory, out=self._next)
             memory[:2] = self._next
 
-    def _estimate(self, gravity: NDArray[np.float32]) -> None:
+    def _estimate(self, gravity: Floats) -> None:
         """The own estimate, from the state of the low-pass."""
         if self._settling or not self._alive:
             self.external[:] = 0.0

@@ -403,7 +403,7 @@ class Loop:
             self._let_brake = self._unacceptable = self._bad = 0
             self._alarm = None
             if self._watch is not None:
-                self._watch.weigh(self._q, self._torques[2])
+                self._watch.weigh()
             self._misses_before = misses
             self._counted_before = remote.counters()
             return commander.enter(setpoint, float(remote.msr["safety_limits"]), step)

@@ -102,7 +102,8 @@ def test_an_untold_payload_follows_from_the_controllers_gravity_torque():
     q, qd, qdd = swing(1e-3)
     gravity = torques(model(LOAD), q, 0.0 * qd, 0.0 * qdd)
     made = watch()
-    made.weigh(q[0].astype(np.float32), gravity[0].astype(np.float32))
+    follow(made, q[:1], torques(model(LOAD), q[:1], qd[:1], qdd[:1]), gravity=gravity[:1])
+    made.weigh()
     found, external = follow(made, q, torques(model(LOAD), q, qd, qdd), gravity=gravity)
     assert not any(found)
     assert np.abs(external).max() < 4.0
@@ -167,6 +168,51 @@ def test_a_flipped_bit_in_one_packet_is_no_contact():
     found, external = follow(watch(), q, tau)
     assert not any(found)
     assert np.abs(external).max() < 3.0
+
+
+@pytest.mark.parametrize("period_s", [1e-3, 5e-3])
+@pytest.mark.parametrize("second", [1, 3])
+def test_damaged_packets_in_a_row_are_forgotten(period_s, second):
+    q, qd, qdd = swing(period_s)
+    tau = torques(model(), q, qd, qdd)
+    row = round(0.7 / period_s)
+    q[row, 3] += 0.5
+    q[row + 1, second] += 2.0**-7
+    _, external = follow(watch(period_s=period_s), q, tau)
+    assert np.abs(external[:row]).max() < 3.0
+    assert np.abs(external[row + round(0.1 / period_s) :]).max() < 3.0
+
+
+def test_arm_at_rest_after_damaged_packets_is_quiet():
+    q = np.tile(HOME, (60, 1))
+    q[20:22, 1] += 2.0**-7
+    tau = torques(model(), q, 0.0 * q, 0.0 * q)
+    found, external = follow(watch(period_s=5e-3), q, tau)
+    assert not any(found[35:])
+    assert np.abs(external[40:]).max() < 1.0
+
+
+def test_a_damaged_packet_in_the_beginning_is_no_contact():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(), q, qd, qdd)
+    q[0, 3] += 0.5
+    found, external = follow(watch(), q, tau)
+    assert not any(found)
+    assert np.abs(external).max() < 3.0
+
+
+def test_a_damaged_gravity_torque_is_no_contact_and_no_payload():
+    q, qd, qdd = swing(1e-3)
+    gravity = torques(model(), q, 0.0 * qd, 0.0 * qdd)
+    tau = torques(model(), q, qd, qdd)
+    made = watch()
+    wrong = gravity.copy()
+    wrong[700, 1] -= 40.0
+    found, external = follow(made, q[:701], tau, gravity=wrong)
+    made.weigh()
+    more, later = follow(made, q[701:], tau[701:], gravity=gravity[701:])
+    assert not any(found + more)
+    assert max(np.abs(external).max(), np.abs(later).max()) < 3.0
 
 
 def test_lost_packets_are_bridged():

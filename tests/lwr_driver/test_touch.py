@@ -78,11 +78,11 @@ def check_sent(r: Rig) -> None:
     assert r.arrived.excesses(arm().limits, r.period_s) == []
 
 
-def refused(r: Rig) -> str:
-    """Why another motion is refused."""
+def refused(r: Rig, result: Result = Result.ROBOT) -> str:
+    """Why another motion is refused, after a contact as a fault of the robot."""
     rows = len(r.arrived.rows)
     r.start(move_to(arm(), r.target, r.target + 0.1 * HOP, r.period_s))
-    assert r.until_done() is Result.REFUSED
+    assert r.until_done() is result
     r.cycles(5)
     assert len({row.tobytes() for row in r.arrived.rows[rows:]}) <= 1
     return r.reason
@@ -330,7 +330,7 @@ def test_controller_that_returns_to_command_mode_unasked_gets_no_motion(rig):
     assert r.session.state is State.CMD
     assert r.mode is Mode.HOLD
     assert r.control.text(Text.LEFT) == left
-    assert f"no motion before `enter_command`: {left}" in refused(r)
+    assert f"no motion before `enter_command`: {left}" in refused(r, Result.REFUSED)
     r.session.fri_stop()
     r.cycles(20)
     r.interpreter = program
