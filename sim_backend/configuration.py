@@ -329,6 +329,9 @@ def _resolved(content: dict[str, Any], beside: Path) -> dict[str, Any]:
         place = content.get(section) if section else content
         if isinstance(place, dict) and isinstance(place.get(key), str):
             place[key] = str(find(place[key], beside=beside))
+    link = content.get("fri")
+    if isinstance(link, dict) and str(link.get("program")).lower().endswith(".src"):
+        link["program"] = str(find(link["program"], beside=beside))
     return content
 
 

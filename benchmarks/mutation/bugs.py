@@ -47,7 +47,7 @@ BUGS: tuple[Bug, ...] = (
         "runner/experiment.py",
         "self._mounted, self._rest = plan.payload, self._progress.rest(plan.name, plan.payload)",
         "self._rest = self._progress.rest(plan.name, plan.payload)",
-        (f"{_SESSIONS}::test_a_resumption_knows_the_mounted_payload",),
+        (f"{_SESSIONS}::test_a_resumption_asks_for_the_payload_and_weighs_it",),
     ),
     Bug(
         "a resumption forgets the state at rest",

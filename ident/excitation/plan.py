@@ -34,6 +34,8 @@ _Duration = Annotated[float, within(0.01, LONGEST_EXCITATION_S, "s")]
 _Angle = Annotated[float, within(-20.0, 20.0, "rad")]
 _Angles = Annotated[tuple[_Angle, ...], entries(1, 200)]
 _Table = Annotated[tuple[_Angles, ...], entries(1, 100)]
+# Motions of a diagnosis have a control point each 0.04 s.
+_Controls = Annotated[tuple[_Angle, ...], entries(1, round(LONGEST_EXCITATION_S / 0.02))]
 _Limit = Annotated[float, within(0.0, 1e6, above=True)]
 _Limits = Annotated[tuple[_Limit, ...], entries(1, 100)]
 
@@ -56,7 +58,7 @@ class _Spline:
 
     type: Literal["bspline"]
     duration_s: _Duration
-    points: _Table
+    points: Annotated[tuple[_Controls, ...], entries(1, 100)]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,8 @@ def paper_style() -> Iterator[Any]:
         ) from error
     here = set(font_manager.get_font_names())
     font = next((name for name in FONTS if name in here), "serif")
-    with matplotlib.rc_context({**_STYLE, "font.family": font}):
+    style: Any = {**_STYLE, "font.family": font}
+    with matplotlib.rc_context(style):
         yield matplotlib
 
 
@@ -426,9 +427,10 @@ def _without_latex() -> Iterator[None]:
     if shutil.which(matplotlib.rcParams["pgf.texsystem"]):
         yield
         return
-    measure: Callable[..., Any] = RendererPgf.get_text_width_height_descent
-    RendererPgf.get_text_width_height_descent = RendererBase.get_text_width_height_descent
+    renderer: Any = RendererPgf
+    measure = renderer.get_text_width_height_descent
+    renderer.get_text_width_height_descent = RendererBase.get_text_width_height_descent
     try:
         yield
     finally:
-        RendererPgf.get_text_width_height_descent = measure
+        renderer.get_text_width_height_descent = measure

@@ -146,7 +146,7 @@ def test_every_option_that_a_document_names_exists() -> None:
             for parameter in command.params:
                 known.update((*parameter.opts, *parameter.secondary_opts))
     known.update(("--help", "--version", "-h", "-v", "-vv"))
-    for program in (ROOT / "benchmarks").rglob("*.py"):
+    for program in (*(ROOT / "benchmarks").rglob("*.py"), ROOT / "runner/rerun_log.py"):
         known.update(re.findall(r'"(--[a-z][a-z-]*)"', program.read_text()))
     for document in DOCUMENTS:
         text = re.sub(r"^```.*?^```", "", (ROOT / document).read_text(), flags=re.MULTILINE | re.DOTALL)

@@ -31,7 +31,7 @@ WITH_OUTPUT = (
     "attach no.mcap no.csv --out {}/m.mcap",
     "attach {}/no.mcap no.csv",
     "import no no.csv {}/m.mcap",
-    "report no --svg {}/m",
+    "report no --figures {}/m",
     "report {}",
     "plan --out {}/m.yaml",
     "preview --out {}/m.html",

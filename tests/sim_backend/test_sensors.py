@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import butter, filtfilt
 
 from fri.errors import ConfigurationError
+from lwr_driver.configuration import CONFIGS
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import (
     KrlRealsConfig,
@@ -222,3 +223,28 @@ def test_wrong_configurations_say_what_is_wrong(key, value, message):
 def test_shipped_configurations_load(name):
     config = load_configuration(f"emulator/{name}.yaml")
     assert config.robot.parameters.endswith("table2.yaml")
+
+
+@pytest.mark.parametrize("name", ["default", "poor_link"])
+def test_a_base_in_another_folder_finds_its_files(name, tmp_path):
+    own = tmp_path / "own.yaml"
+    own.write_text(f"base: emulator/{name}.yaml\nseed: 7\n")
+    config = load_configuration(own)
+    assert config.seed == 7
+    assert config.beside(config.robot.parameters) == CONFIGS / "emulator/table2.yaml"
+    assert config.beside(config.limits) == CONFIGS / "lwr4plus.yaml"
+
+
+def test_a_base_names_files_beside_itself(tmp_path):
+    (tmp_path / "cell").mkdir()
+    for name in ("arm.urdf", "truth.yaml", "limits.yaml", "cell.src"):
+        (tmp_path / "cell" / name).touch()
+    (tmp_path / "cell/base.yaml").write_text(
+        "robot: {urdf: arm.urdf, parameters: truth.yaml}\nlimits: limits.yaml\nfri: {program: cell.src}\n"
+    )
+    (tmp_path / "own.yaml").write_text("base: cell/base.yaml\nrobot: {payload: none}\n")
+    config = load_configuration(tmp_path / "own.yaml")
+    named = (config.robot.urdf, config.robot.parameters, config.limits, config.fri.program)
+    assert named == tuple(
+        str(tmp_path / "cell" / n) for n in ("arm.urdf", "truth.yaml", "limits.yaml", "cell.src")
+    )

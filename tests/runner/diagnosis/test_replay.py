@@ -104,7 +104,8 @@ def test_another_tuning_of_the_controller_leaves_the_errors_of_both_models(
     nominal, soft = (errors(models, sessions[name]) for name in ("nominal", "soft"))
     for one, other in zip(nominal, soft, strict=True):
         np.testing.assert_allclose(of(one, "motor"), of(other, "motor"), rtol=0.2)
-        np.testing.assert_allclose(of(one, "position"), of(other, "position"), rtol=0.2)
+        # At the wrist 0.1 mrad is 0.02 Nm, far below the noise of its motor torque.
+        np.testing.assert_allclose(of(one, "position"), of(other, "position"), rtol=0.2, atol=1e-4)
         # The links ring more behind a softer controller.
         np.testing.assert_allclose(of(one, "joint"), of(other, "joint"), rtol=0.5, atol=0.1)
 
