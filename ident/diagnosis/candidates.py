@@ -80,6 +80,8 @@ def _scan(counts: Floats, sums: Floats) -> Iterator[tuple[int, int, float]]:
     for _ in range(_MOST):
         best = (0.0, 0, 0, 0.0)
         for length in (2**k for k in range(int(np.log2(_LONGEST_S / _WINDOW_S)) + 1)):
+            if length > len(counts):
+                break
             starts = np.arange(len(counts) - length + 1)
             rows, chi = (table[starts + length] - table[starts] for table in (number, total))
             level = np.full(len(starts), usual)
@@ -91,8 +93,8 @@ def _scan(counts: Floats, sums: Floats) -> Iterator[tuple[int, int, float]]:
             excess = chi - level * rows
             clear = excess / (level * np.sqrt(2.0 * np.maximum(rows, 1.0)))
             clear[(rows == 0.0) | [not free[k : k + length].all() for k in starts]] = 0.0
-            place = int(np.argmax(clear)) if len(clear) else 0
-            if len(clear) and clear[place] > best[0]:
+            place = int(np.argmax(clear))
+            if clear[place] > best[0]:
                 best = (float(clear[place]), place, length, float(excess[place]))
         if best[0] <= _FAR:
             return

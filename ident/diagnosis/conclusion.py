@@ -14,7 +14,7 @@ from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, nameless_terms, title
 from ident.diagnosis.findings import loss_finding
 from ident.diagnosis.held_out import held_out
-from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
+from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
@@ -28,8 +28,8 @@ from ident.rows.data_quality import sample_loss
 
 # Least confidence of a finding.
 _HARDLY = 0.1
-# Least error of a sensor's gain in the models, in standard deviations.
-_CLEAR = 2.0
+# Least error of a sensor's gain in the models, in its standard deviations and in those from day to day.
+_CLEAR, _MATTERS = 2.0, 0.5
 
 
 def conclude(task: Task, state: State) -> Diagnosis:
@@ -171,7 +171,7 @@ def _gains(nuisance: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
     found = []
     for name, (value, std) in nuisance.items():
         what, _, joint = name.rpartition(" ")
-        if what == GAIN and abs(value) > _CLEAR * std:
+        if what == GAIN and abs(value) > max(_CLEAR * std, _MATTERS * GAIN_STD):
             found.append(entry_of(SENSOR_GAIN, [int(joint)], {"error": (value, std)}))
     return found
 

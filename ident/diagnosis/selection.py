@@ -215,11 +215,14 @@ class _State:
                 if rows:
                     size = share * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
-        if len(nominal.rows) == 2 or ("joint" in nominal.rows and self.evidence.compared):
-            # Without motor torques or a reference a common gain of all sensors is a scale of all masses.
+        # Without all torques of both sides, or a reference, a gain of the sensors may be a scale of masses.
+        both = len(nominal.rows) == 2 and all(mask.any() for mask in self.evidence.mask.values())
+        if both or ("joint" in nominal.rows and self.evidence.compared):
+            size = _HABITUAL * nominal.arm.gain_std
             for joint in range(nominal.arm.chain.n):
                 rows = self.dictionary.rows(Candidate(SENSOR_GAIN, joint), Shape())
-                found.append((f"{GAIN} {joint + 1}", rows, 1.0, _HABITUAL * nominal.arm.gain_std))
+                if rows and self.evidence.mask["joint", joint].any():
+                    found.append((f"{GAIN} {joint + 1}", rows, 1.0, size))
         self._tolerances = found
         return found
 
