@@ -16,12 +16,13 @@ The limit is a threshold, plus the uncertainty of the friction: its sign below `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from fri.quantities import within
 from lwr_driver.arm import JOINTS, Arm
 
 Joints = tuple[float, float, float, float, float, float, float]
@@ -29,6 +30,9 @@ Floats = NDArray[np.float64]
 
 EXTERNAL_NM: Joints = (15.0, 15.0, 8.0, 8.0, 8.0, 3.5, 3.5)
 """Highest thresholds of the external torque [Nm], about a twelfth of the joints' limits."""
+
+_Threshold = Annotated[float, within(0.0, max(EXTERNAL_NM), "Nm", above=True)]
+Thresholds = tuple[_Threshold, _Threshold, _Threshold, _Threshold, _Threshold, _Threshold, _Threshold]
 
 TORQUE_SHARE = 0.9
 """Highest share of a joint's torque limit."""
@@ -57,8 +61,8 @@ class ContactSettings:
     external_nm : thresholds of the external torque [Nm], by the controller's estimate and by the model
     """
 
-    torque_share: float = TORQUE_SHARE
-    external_nm: Joints = EXTERNAL_NM
+    torque_share: Annotated[float, within(0.0, TORQUE_SHARE, above=True)] = TORQUE_SHARE
+    external_nm: Thresholds = EXTERNAL_NM
 
     def __post_init__(self) -> None:
         if not 0.0 < self.torque_share <= TORQUE_SHARE:

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fri.errors import ConfigurationError, DataError
+from fri.quantities import FileName
 from lwr_driver.arm import Arm
 from lwr_driver.configuration import find
 from lwr_driver.contact import ContactSettings, ExpectedArm
@@ -23,7 +24,7 @@ class ContactPlan(ContactSettings):
     model : file of an identified model for the own estimate; None takes the nominal arm.
     """
 
-    model: str | None = None
+    model: FileName | None = None
 
 
 def expected_arm(plan: ContactPlan, arm: Arm, folder: Path) -> ExpectedArm:

@@ -11,6 +11,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -236,7 +237,9 @@ def _command(arguments: list[str], out: Path) -> None:
     os.dup2(stream, 2)
     from runner.cli import main
 
-    main(arguments)
+    # A test runner has put its own streams in place.
+    with open(1, "w", closefd=False) as sys.stdout, open(2, "w", closefd=False) as sys.stderr:
+        main(arguments)
 
 
 def _words(key: str, value: Any) -> list[str]:

@@ -31,14 +31,18 @@ def test_loop_process_loads_only_what_it_runs():
     ours = {name.removeprefix("lwr_driver.") for name in loaded if name.startswith("lwr_driver.")}
     assert ours == {
         "arm",
+        "arm.ceilings",
         "arm.description",
         "commander",
         "configuration",
+        "contact",
         "control",
         "guard",
         "loop",
         "loop_process",
+        "pace",
         "realtime",
+        "references",
         "ring",
     }
 

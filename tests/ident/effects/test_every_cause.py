@@ -35,8 +35,8 @@ NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 JOINT, DT = 3, 1e-3
 VISCOUS, COULOMB = 2.0, 1.5
 
-# A count of a session log has the name of a cause.
-WORDS_OF_LOGS = ("lost_samples",)
+# A count and a phase of a session log have the names of causes.
+WORDS_OF_LOGS = ("lost_samples", "contact")
 # Sizes of coefficients by unit: small enough for what is linearised.
 SIZES = {"rad": 1e-3, "rad/Nm": 1e-4, "kg": 0.5, "kg m": 0.05, "N": 5.0, "1": 0.1}
 # Columns that are smoothed, or taken between samples, agree less well.

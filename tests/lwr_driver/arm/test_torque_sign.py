@@ -19,5 +19,5 @@ def written(folder: Path, entry: str) -> Path:
 def test_the_sign_of_a_torque_sensor_is_in_the_arm_file(tmp_path: Path) -> None:
     assert Arm.load().torque_sign.tolist() == [1.0] * 7
     assert Arm.load(written(tmp_path, "torque_sign: -1")).torque_sign.tolist() == [1, -1, 1, 1, 1, 1, 1]
-    with pytest.raises(ConfigurationError, match="joint A2: torque_sign is 2; it must be 1 or -1"):
+    with pytest.raises(ConfigurationError, match="torque_sign`: 2 is outside -1 to 1"):
         Arm.load(written(tmp_path, "torque_sign: 2"))

@@ -116,12 +116,12 @@ def test_nan_that_is_held_is_no_change():
     ("keys", "message"),
     [
         ({"reals": [1, 2, 3, 4, 5, 6, 6]}, "different variable for each joint"),
-        ({"reals": [1, 2, 3, 4, 5, 6, 17]}, "numbered 1 to 16"),
-        ({"counter_int": 0}, "numbered 1 to 16"),
+        ({"reals": [1, 2, 3, 4, 5, 6, 17]}, "outside 1 to 16 .KRL variables are numbered from 1"),
+        ({"counter_int": 0}, "outside 1 to 16 .KRL variables are numbered from 1"),
         ({"reals": [1, 2]}, "have 2, 7 and 7"),
         ({"sign": [1, 1, 1, 0, 1, 1, 1]}, "must be 1 or -1"),
         ({"scale": [1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0]}, "finite and not zero"),
-        ({"counter_modulus": 1}, "not within 2 to"),
+        ({"counter_modulus": 1}, "outside 2 to"),
         ({"realls": [1]}, "did you mean `reals`"),
     ],
 )

@@ -59,6 +59,9 @@ class Stand:
         """Arguments of the calls of this name."""
         return [call[1:] for call in self.calls if call[0] == name]
 
+    def expect_load(self, *load: Any) -> None:
+        """The payload of the contact watch."""
+
     # -- driver ----------------------------------------------------------------------------------------------
 
     def state(self) -> SimpleNamespace:

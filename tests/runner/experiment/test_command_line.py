@@ -85,7 +85,7 @@ def test_check_refuses_a_motion_that_comes_too_near(tmp_path: Path) -> None:
 def test_home_outside_the_limits_is_refused(tmp_path: Path) -> None:
     moves = {"home": [0.0, 2.5, 0.0, -1.3, 0.0, 0.8, 0.0]}
     done = run("check", str(experiment_file(tmp_path, moves=moves)))
-    assert done.code == 3
+    assert done.code == 2
     assert "A2 2.5" in done.text
 
 
