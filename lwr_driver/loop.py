@@ -412,10 +412,7 @@ class Loop:
             self._held_back = True
             self._react(touched, elapsed, sent)
             if commander.mode is Mode.MOTION and self.pace is not None and self.pace.too_fast:
-                commander.stop(
-                    Result.NETWORK,
-                    f"the controller's packets run ahead of time {commander.place()}: {self.pace}; see its friOpen",
-                )
+                commander.stop(Result.NETWORK, self._too_fast())
             return None
         commander.watch(elapsed, setpoint, self._q)
         self._react(touched, elapsed, sent)
@@ -461,11 +458,18 @@ class Loop:
                 f"{self._bad * self._period:.3f} s below OK, {self._misses - self._misses_before} answers missed "
                 f"{commander.place()}"
             )
+            if self.pace is not None and self.pace.hasty:
+                # Packets ahead of their time get no answer, and that is what the controller rates.
+                reason = self._too_fast()
             self._alarm = partial(commander.stop, Result.NETWORK, reason)
         moves = commander.mode is Mode.MOTION or (self._job is Job.MOTION and not self._begun)
         if self._alarm is not None and not (sent and moves):
             self._alarm()
             self._alarm = None
+
+    def _too_fast(self) -> str:
+        where = self._commander.place()
+        return f"the controller's packets run ahead of time {where}: {self.pace}; see its friOpen"
 
     def _step(self) -> NDArray[np.float64] | None:
         """Step of the controller's set point per cycle (7,) [rad], zero at rest; None if unknown.

@@ -15,6 +15,7 @@ _SLEW = 0.002
 _EARLY_SHARE, _EARLY_S = 0.75, 0.5e-3
 # Held-back packets weigh 1, others take off so much; beyond the limit the sender is too fast.
 _FORGET, _TOO_MANY = 0.05, 20.0
+_SEVERAL = 5.0
 _MEAN = 0.02
 # A clock that differs by more from the packets' period says nothing about their number.
 _CREDIBLE = 0.25
@@ -76,6 +77,11 @@ class Pace:
     def too_fast(self) -> bool:
         """Whether far too many of the last packets came ahead of their time."""
         return self._score > _TOO_MANY
+
+    @property
+    def hasty(self) -> bool:
+        """Whether several of the last packets came ahead of their time."""
+        return self._score > _SEVERAL
 
     def __str__(self) -> str:
         ms = self._period_ns * 1e-6

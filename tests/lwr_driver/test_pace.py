@@ -118,7 +118,7 @@ def timed(monkeypatch):
     for name in ("monotonic", "monotonic_ns"):
         monkeypatch.setattr(f"fri.remote.{name}", getattr(clock, name))
     # A controller that never minds missing answers shows what the driver does by itself.
-    rig = Rig(5, lock_step=False, policy={"bridged_cycles": 10**6, "hold_quality": Quality.UNACCEPTABLE})
+    rig = Rig(5, lock_step=False, policy={"bridged_cycles": 10**5, "hold_quality": Quality.UNACCEPTABLE})
     rig.loop.pace = Pace()
     advance = rig.cycle
 
