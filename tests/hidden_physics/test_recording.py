@@ -13,11 +13,10 @@ from tests.hidden_physics.motions import exciting_motion
 from tests.hidden_physics.recording import Order, begin_s, record, record_by_processes
 from tests.hidden_physics.robots import Day, Setting, session_settings
 
-WITH_EVERYTHING = Setting(
+WITH_MUCH = Setting(
     traits={"stribeck": {2: 0.2}, "cable": {6: 0.3}, "stiffness": {4: 0.5}},
     faults={"play": {3: 0.3}, "motor_late": dict.fromkeys(range(1, 8), 3e-3)},
     leak={2: {4: 0.02}},
-    held={"every_s": 0.5, "length_s": 0.03, "what": "packet"},
     tilt=(0.01, -0.004),
     contacts=({"start_s": 2.0, "length_s": 0.5, "link": 6, "force": [10.0, 0.0, 5.0]},),
     load={"mass": -0.2, "from_s": 4.0},
@@ -29,11 +28,9 @@ def order(tmp_path_factory: pytest.TempPathFactory) -> Order:
     return Order(
         motion=exciting_motion("A2", periods=1),
         path=tmp_path_factory.mktemp("hidden") / "short.mcap",
-        settings=session_settings(Day(3), WITH_EVERYTHING),
+        settings=session_settings(Day(3), WITH_MUCH),
         uid="7",
         seed=11,
-        payload="paper_load",
-        payload_mass=3.34,
     )
 
 

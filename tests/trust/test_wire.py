@@ -96,7 +96,7 @@ def test_one_damaged_packet_that_would_end_command_mode_does_not_jerk_the_arm(st
 
 
 def test_set_point_that_was_lost_in_motion_is_brought_to_rest_within_the_limits(stand):
-    forgiving = {"bridged_cycles": 10**6, "hold_quality": 0}
+    forgiving = {"bridged_cycles": 100_000, "hold_quality": 0}
     s = stand(period_ms=10, policy=forgiving)
     in_motion(s, 30)
     moving = s.session.setpoint
