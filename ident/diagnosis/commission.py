@@ -14,14 +14,21 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
-from ident.diagnosis.bench import ArmData, every_joint_moves, mean_delay, nominal_arm, prepare_bench
+from ident.diagnosis.bench import (
+    ArmData,
+    DiagnosisBench,
+    every_joint_moves,
+    mean_delay,
+    nominal_arm,
+    prepare_bench,
+)
 from ident.diagnosis.candidates import Trial
-from ident.diagnosis.evidence import Evidence, Floats
+from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference, habit, shared
-from ident.diagnosis.selection import GAIN, Claim, gains, select
+from ident.diagnosis.selection import Claim, gain_rows, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
@@ -343,10 +350,9 @@ def _day(
         )
     evidence = bench.evidence
     # `select` adds the tolerated deviations to the base.
-    # Any gain within the tolerance of these days belongs to the healthy arm.
-    nuisance = select(bench.dictionary, evidence, settings, None).nuisance
-    p = evidence.base_count
-    return _Day(
+    selection = select(bench.dictionary, evidence, settings, None)
+    nuisance, p = selection.nuisance, evidence.base_count
+    day = _Day(
         bench.nominal.base,
         bench.nominal.masses,
         evidence.full.values[:p].copy(),
@@ -356,8 +362,20 @@ def _day(
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
         {side: mean_delay(nuisance, side) for side in _CHANNELS},
-        np.array([nuisance.get(f"{GAIN} {j + 1}", (np.nan, np.nan)) for j in range(arm.chain.n)]).T,
+        np.full((2, arm.chain.n), np.nan),
     )
+    return replace(day, gains=_gains(bench, selection.nuisance_rows)) if len(bench.nominal.rows) == 2 else day
+
+
+def _gains(bench: DiagnosisBench, nuisance: Sequence[Rows]) -> Floats:
+    """Errors (2, n) of the torque sensors' gains with standard deviations, beside tolerated deviations."""
+    found = np.full((2, bench.nominal.arm.chain.n), np.nan)
+    columns = gain_rows(bench.dictionary)
+    bench.evidence.replace([*columns.values(), *nuisance])
+    std = np.sqrt(np.maximum(np.diag(bench.evidence.covariance()), 0.0))[bench.evidence.base_count :]
+    for k, (joint, value) in enumerate(zip(columns, bench.evidence.coefficients(), strict=False)):
+        found[:, joint] = value[0], std[k]
+    return found
 
 
 def _reference(

@@ -119,6 +119,14 @@ def select(
     return Selection(claims, state.nuisance, first, state.nuisance_rows)
 
 
+def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
+    """Rows of an error of the torque sensor's gain, by joint from 0, where the sensor shows anything."""
+    mask = dictionary.evidence.mask
+    joints = [j for side, j in mask if side == "joint" and mask[side, j].any()]
+    found = {j: dictionary.rows(Candidate(SENSOR_GAIN, j), Shape()) for j in joints}
+    return {j: rows for j, rows in found.items() if rows}
+
+
 def gains(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> dict[tuple[str, int], float]:
@@ -215,14 +223,10 @@ class _State:
                 if rows:
                     size = share * float(nominal.arm.compliance[joint])
                     found.append((f"compliance {joint + 1}", rows, 1.0, size))
-        # Without all torques of both sides, or a reference, a gain of the sensors may be a scale of masses.
-        both = len(nominal.rows) == 2 and all(mask.any() for mask in self.evidence.mask.values())
-        if both or ("joint" in nominal.rows and self.evidence.compared):
+        if self.evidence.compared:
+            # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
             size = _HABITUAL * nominal.arm.gain_std
-            for joint in range(nominal.arm.chain.n):
-                rows = self.dictionary.rows(Candidate(SENSOR_GAIN, joint), Shape())
-                if rows and self.evidence.mask["joint", joint].any():
-                    found.append((f"{GAIN} {joint + 1}", rows, 1.0, size))
+            found += [(f"{GAIN} {j + 1}", rows, 1.0, size) for j, rows in gain_rows(self.dictionary).items()]
         self._tolerances = found
         return found
 
