@@ -6,9 +6,9 @@
 
 Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms`
 (their folder). The weights of `ident/diagnosis/confidence.yaml` are those of a logistic regression with the signs of
-`ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and a ridge chosen by cross-validation over
-whole cases. The reliability printed for the fit is that of cross-validation too. `--check` judges the confidence as
-the diagnoses stated it.
+`ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and a pull to `START` chosen by
+cross-validation over whole cases. The reliability printed for the fit is that of cross-validation too. `--check`
+judges the confidence as the diagnoses stated it.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 
 _RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)
 _PARTS = 10
+_INTERCEPT = -1.5
 _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 1.0001)
 
 
@@ -92,18 +93,17 @@ def fit(points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:
     """Intercept and weights (1 + k,) of the logistic regression; points (n, k) from 0 to 1."""
     signs = [stored.SIGNS[name] for name in stored.LIMITS]
     columns = np.column_stack([np.ones(len(points)), points])
+    start = np.array([_INTERCEPT, *(stored.START[name] for name in stored.LIMITS)])
 
     def loss(theta: Floats) -> tuple[float, Floats]:
         odds = columns @ theta
-        value = float(weight @ (np.logaddexp(0.0, odds) - right * odds)) + 0.5 * ridge * float(
-            theta[1:] @ theta[1:]
-        )
-        slope = columns.T @ (weight * (1.0 / (1.0 + np.exp(-odds)) - right))
-        slope[1:] += ridge * theta[1:]
+        away = theta - start
+        value = float(weight @ (np.logaddexp(0.0, odds) - right * odds)) + 0.5 * ridge * float(away @ away)
+        slope = columns.T @ (weight * (1.0 / (1.0 + np.exp(-odds)) - right)) + ridge * away
         return value, slope
 
     bounds = [(None, None), *((0.0 if s > 0 else None, 0.0 if s < 0 else None) for s in signs)]
-    return np.asarray(minimize(loss, np.zeros(columns.shape[1]), jac=True, bounds=bounds).x)
+    return np.asarray(minimize(loss, start, jac=True, bounds=bounds).x)
 
 
 def held_back(said: Sequence[Said], points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:

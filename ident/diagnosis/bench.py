@@ -14,7 +14,7 @@ from ident.diagnosis.noise import noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, NominalArm, structure_of
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference
-from ident.diagnosis.selection import Selection
+from ident.diagnosis.selection import Selection, gain_rows
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
@@ -143,7 +143,11 @@ def _evidence(
     """Evidence with the noise floor of a first fit. A prior that is not `compared` keeps base parameters with weak
     excitation near the drawing; repeated periods make their uncertainty known, so it is left out."""
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
-    sigma, inflation, floor, repeatable = _noise(nominal, Evidence(nominal, settings, one, one).residuals())
+    first = Evidence(nominal, settings, one, one)
+    if compared and len(nominal.rows) == 2:
+        # Gains of other days are no noise.
+        first.replace(list(gain_rows(Dictionary(nominal, first, ())).values()))
+    sigma, inflation, floor, repeatable = _noise(nominal, first.residuals())
     if repeatable and not compared:
         prior = None
     return Evidence(nominal, settings, sigma, inflation, prior, compared=compared, floor=floor), repeatable

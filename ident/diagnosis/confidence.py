@@ -87,6 +87,23 @@ SIGNS: Mapping[str, int] = {
 """Sign of each weight, 0 where both are possible."""
 
 
+START: Mapping[str, float] = {
+    "gain": 2.0,
+    "significance": 1.0,
+    "rivals": 2.0,
+    "held_out": 2.5,
+    "untested": 1.5,
+    "felt": 2.5,
+    "one_block": -1.0,
+    "worse": -1.0,
+    "rest": -3.0,
+    "replaceable": -1.5,
+    "habitual": -1.0,
+    "company": -0.5,
+}
+"""Weights before any finding, by judgement; a fit to few findings stays near them. Their intercept is -1.5."""
+
+
 def scaled(grounds: Mapping[str, float]) -> np.ndarray[Any, np.dtype[np.float64]]:
     """The grounds (12,) from 0 to 1 over their ranges, in the order of `LIMITS`."""
     return np.array(
