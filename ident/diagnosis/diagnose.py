@@ -29,7 +29,7 @@ from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.recording import record, settled
-from ident.diagnosis.reference import Reference
+from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Diagnosis
 from ident.diagnosis.selection import Claim, Selection, best_candidate
 from ident.diagnosis.settings import DiagnosisSettings
@@ -51,8 +51,6 @@ _UNIT_S = 1e-3
 _MOST_ALONE = 3
 # Largest remaining delay after a shift, as a share of the tolerance for delays.
 _IN_PLACE = 0.2
-# Largest effect of the samples' phase on a drive's inertia, as a share of it.
-_INERTIA_BY_PHASE = 0.05
 
 
 def diagnose(
@@ -220,7 +218,7 @@ def _at_another_phase(reference: Reference | None) -> Reference | None:
     the delay they see another phase. With inertias held at their healthy values, a further error of the viscous
     friction would compensate for it.
     """
-    return None if reference is None else reference.loosened("Ia", _INERTIA_BY_PHASE)
+    return None if reference is None else reference.loosened("Ia", INERTIA_BY_PHASE)
 
 
 def _unknown_delay(task: Task, claim: Claim) -> float:

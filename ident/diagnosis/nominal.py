@@ -49,6 +49,8 @@ _RELAXATION_S = 2e-3
 _LEAST_MASS = 1e-3
 # A joint within this range carries no information on its friction, gears and cables.
 TRAVEL_RAD = 0.1
+# Least period of motor samples over that of positions, for a clock of their own.
+_OWN_CLOCK = 1.5
 # Usual standard deviation of a torque sensor's gain from day to day: within a per cent, evenly.
 GAIN_STD = 0.01 / np.sqrt(3.0)
 
@@ -253,6 +255,12 @@ class Nominal:
             loaded=recording.payload is not None or all(r.payload is None for r in self.recordings),
             begun_s=recording.begun_s,
         )
+
+    @property
+    def slow_motor_samples(self) -> bool:
+        """Whether motor torques come with a clock of their own, slower than that of the positions."""
+        found = [s for _, s in self.stretches if len(s.motor_time) > 1]
+        return any(_step(s.motor_time) > _OWN_CLOCK * _step(s.time) for s in found)
 
     @property
     def masses(self) -> dict[str, float | None]:

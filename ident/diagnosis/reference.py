@@ -28,6 +28,8 @@ from ident.model import DynamicModel, write_model
 
 DELAY_STD_S = 2e-4
 """Usual standard deviation [s] of a healthy channel's delay from day to day."""
+INERTIA_BY_PHASE = 0.05
+"""Largest effect of the phase of slow motor samples on a drive's inertia, as a share of it."""
 USUAL_DAYS = 4
 """Weight of the usual deviation of a delay, in days."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.held_out import HeldOut
-from ident.diagnosis.reference import Reference
+from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim
 from ident.effects import FRICTION_TEMPERATURE, WEAR
@@ -65,6 +65,10 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
             continue
         change = values[places] - healthy[places]
         own = covariance[np.ix_(places, places)] + spread[np.ix_(places, places)]
+        if nominal.slow_motor_samples:
+            # The phase of slow samples differs from day to day, evenly.
+            drive = np.array([nominal.base.names[k].startswith("Ia") for k in places])
+            own = own + np.diag(np.where(drive, INERTIA_BY_PHASE * healthy[places], 0.0) ** 2 / 3.0)
         square = float(change @ np.linalg.solve(own, change))
         freedom = max(float(reference.sets * len(moving)), 2.0)
         p_value = min(1.0, len(moving) * fisher_tail(square / len(places), len(places), freedom))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ident.diagnosis import Diagnosis, Reference, commission, diagnose
-from ident.diagnosis.reference import habit
+from ident.diagnosis.reference import INERTIA_BY_PHASE, habit
 from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 
@@ -103,3 +104,27 @@ def test_habit_of_an_offset_is_measured_by_the_torque_of_its_rows() -> None:
     rms = {"motor": np.array([10.0]), "joint": np.array([20.0])}
     found = habit(names, [np.zeros(2)], [np.eye(2) * 1e-8], rms)
     assert np.sqrt(found) == pytest.approx([0.1, 0.2])
+
+
+def test_slow_motor_samples_leave_a_drive_inertia_uncertain_by_their_phase(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def heavier(s: Signals) -> None:
+        inertia = reference.model.value("Ia2")
+        s["motor"][:, 1] += 0.4 * inertia * np.gradient(s["qd"][:, 1], s["time"])
+
+    def slow(session: Session) -> Session:
+        assert session.motor is not None
+        fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+        kept = {name: getattr(session.motor, name)[::3] for name in fields}
+        return replace(session, motor=replace(session.motor, **kept))
+
+    fast = pair(make, heavier)
+    std = []
+    for sessions in (fast, [slow(s) for s in fast]):
+        found = diagnose(sessions, chain, reference=reference)
+        (finding,) = [f for f in found.findings if f.cause == "wear" and f.joints == (2,)]
+        inertia = finding.parameters["inertia"]
+        assert inertia.value == pytest.approx(0.4, abs=4.0 * inertia.std)
+        std.append(inertia.std)
+    assert std[1] ** 2 > std[0] ** 2 + 0.9 * INERTIA_BY_PHASE**2 / 3.0
