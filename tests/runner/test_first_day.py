@@ -115,7 +115,7 @@ def test_there_are_ten_steps_each_with_something_to_see() -> None:
     assert len(re.findall(r"^\*See:\*", text, re.MULTILINE)) == 10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_first_day_goes_as_the_document_says(day: Day) -> None:
     folder, pendant = day.folder, day.pendant
     assert sorted(day.steps) == list(range(1, 11))
