@@ -31,6 +31,8 @@ _FELT = 0.05
 # The same for a brief event in the rows of its session, and for a remainder without a name: power over the noise of
 # 2 % of the error.
 FELT_POWER = 0.98**-2 - 1.0
+# Largest share of a sure claim's gain replaceable by unnamed functions of other variables.
+_REPLACEABLE = 0.8
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
 _EXCITED = 0.1
 
@@ -92,7 +94,8 @@ def doubted(
         )
         # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
         like = one.finding.mode == "between" and bool(unnamed & mine)
-        most = min(one.most, claim.confidence, _OPEN if like else 1.0)
+        open_ = like or grounds.replaceable > _REPLACEABLE
+        most = min(one.most, claim.confidence, _OPEN if open_ else 1.0)
         findings.append(
             replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())
         )

@@ -170,7 +170,8 @@ def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bo
     alone = diagnose(sessions, chain)
     assert alone.claims == ()
     assert any("no reference" in note for note in alone.notes)
-    reference = commission([pair(make, seed=1)], chain)
+    # Two days tell that the gains of these sensors do not change from day to day.
+    reference = commission([pair(make, seed=1), pair(make, seed=3)], chain)
     found = diagnose(sessions, chain, reference=reference)
     assert found.claims[0].cause == "payload_error"
 

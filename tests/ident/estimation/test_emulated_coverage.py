@@ -38,7 +38,8 @@ def test_stated_intervals_hold_the_truth_in_95_of_100_cases(pairs: list[Identifi
         for shares, kind in ((inside, None), (textbook, "textbook")):
             low, high = found.estimate.interval(0.95, covariance=kind).T
             shares.append((low < truth) & (truth < high))
-    assert 0.90 <= np.mean(inside) <= 0.98
+    # Three pairs of correlated parameters: the share scatters by some per cent.
+    assert 0.88 <= np.mean(inside) <= 0.98
     assert np.mean(textbook) < np.mean(inside)
 
 

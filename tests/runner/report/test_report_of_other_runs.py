@@ -95,7 +95,7 @@ def test_the_summary_of_logs_is_that_of_an_experiment(imported: Path) -> None:
 def test_results_go_into_an_empty_folder_only(imported: Path) -> None:
     done = CliRunner().invoke(main, ["identify", "none.mcap", "--results", str(imported)])
     assert done.exit_code == 2
-    assert "not an empty folder" in done.output
+    assert "is not empty" in done.output
 
 
 def test_a_session_that_was_tested_was_not_fitted(finished: Path) -> None:
