@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
+from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, doubted
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, nameless_terms, title
@@ -26,8 +27,6 @@ from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.data_quality import sample_loss
 
-# Least confidence of a finding.
-_HARDLY = 0.1
 # Least error of a sensor's gain in the models, in its standard deviations and in those from day to day.
 _CLEAR, _MATTERS = 2.0, 0.5
 
@@ -42,10 +41,10 @@ def conclude(task: Task, state: State) -> Diagnosis:
     evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     findings = doubted(task, state, kept, remainders)
-    if any(finding.confidence < _HARDLY for finding in findings):
-        # A name hardly believed is no finding; what it explained is left to the remainders.
-        kept = [one for one, f in zip(kept, findings, strict=True) if f.confidence >= _HARDLY]
-        findings = [f for f in findings if f.confidence >= _HARDLY]
+    if not all(believable(f.grounds) for f in findings):
+        # A name less likely than not is no finding; what it explained is left to the remainders.
+        kept = [one for one, f in zip(kept, findings, strict=True) if believable(f.grounds)]
+        findings = [f for f in findings if believable(f.grounds)]
         evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
         remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     worn = []

@@ -111,6 +111,11 @@ def scaled(grounds: Mapping[str, float]) -> np.ndarray[Any, np.dtype[np.float64]
     )
 
 
+def believable(grounds: Mapping[str, float]) -> bool:
+    """Whether a finding with these grounds is more likely right than not."""
+    return not grounds or probability(Grounds(**grounds)) >= 0.5
+
+
 def probability(grounds: Grounds) -> float:
     """Probability of a finding with these grounds to be right."""
     intercept, weights = _fitted()

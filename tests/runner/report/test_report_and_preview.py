@@ -204,9 +204,10 @@ def test_every_chart_shows_a_line(report: Seen) -> None:
 
 
 def test_charts_that_are_folded_away_are_drawn_when_opened(report: Seen) -> None:
-    part = report.page.locator("#torque details:not([open])").first
-    part.locator("summary").click()
-    part.locator(".chart .js-line").first.wait_for(state="attached", timeout=60_000)
+    # A handle: the locator of a closed part would leave it once it is open.
+    part = report.page.locator("#torque details:not([open])").first.element_handle()
+    part.query_selector("summary").click()
+    part.wait_for_selector(".chart .js-line", state="attached", timeout=60_000)
 
 
 def test_pictures_have_alternative_texts_with_numbers(report: Seen) -> None:
@@ -314,10 +315,11 @@ def test_no_column_of_a_table_is_cut_off(finished: Path, chrome: Browser, size: 
         assert seen.page.evaluate(cut) == []
 
 
-def test_plots_are_drawn_without_scrolling(report: Seen) -> None:
+def test_plots_are_drawn_without_scrolling(finished: Path, chrome: Browser) -> None:
     blank = "[...document.querySelectorAll('.chart:not([data-drawn])')].filter(c => !c.closest('details:not([open])'))"
-    assert report.page.evaluate("window.scrollY") == 0
-    assert report.page.evaluate(f"{blank}.length") == 0
+    with opened(chrome, finished / "report.html", WIDE) as seen:
+        seen.page.wait_for_function(f"{blank}.length === 0", timeout=120_000)
+        assert seen.page.evaluate("window.scrollY") == 0
 
 
 def test_without_the_extra_one_line_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
