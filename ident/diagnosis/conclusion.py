@@ -42,7 +42,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     findings = doubted(task, state, kept, remainders)
     if not all(believable(f.grounds) for f in findings):
-        # A name less likely than not is no finding; what it explained is left to the remainders.
+        # A name hardly believed is no finding; what it explained is left to the remainders.
         kept = [one for one, f in zip(kept, findings, strict=True) if believable(f.grounds)]
         findings = [f for f in findings if believable(f.grounds)]
         evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])

@@ -20,6 +20,8 @@ import yaml
 from fri.errors import ConfigurationError
 
 WEIGHTS = "confidence.yaml"
+# Least probability of a finding.
+_HARDLY = 0.1
 
 
 @dataclass(frozen=True)
@@ -112,8 +114,8 @@ def scaled(grounds: Mapping[str, float]) -> np.ndarray[Any, np.dtype[np.float64]
 
 
 def believable(grounds: Mapping[str, float]) -> bool:
-    """Whether a finding with these grounds is more likely right than not."""
-    return not grounds or probability(Grounds(**grounds)) >= 0.5
+    """Whether a finding with these grounds is worth telling, as a name to test."""
+    return not grounds or probability(Grounds(**grounds)) >= _HARDLY
 
 
 def probability(grounds: Grounds) -> float:
