@@ -33,12 +33,12 @@ from benchmarks.discovery.tally import read_results
 from ident.diagnosis.settings import DiagnosisSettings
 from tests.hidden_physics.cases import Store, draw
 from tests.hidden_physics.engine import commissioned, diagnosed
+from tests.hidden_physics.verdict import SURE
 
 FACTORS = (0.5, 2.0)
 _SETTINGS = "settings"
 # Not decisions: seeds, and what only the text shows.
 _LEFT_OUT = ("seed", "SCHEMA_VERSION", "_WIDTH", "_REPR_LINES")
-_SURE = 0.8
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def verdict(findings: Sequence[dict[str, Any]]) -> str:
     if not findings:
         return "silent"
     first = findings[0]
-    sure = "" if first["confidence"] >= _SURE else "?"
+    sure = "" if first["confidence"] >= SURE else "?"
     return f"{first['cause']}({','.join(map(str, first['joints']))}){sure}"
 
 

@@ -63,9 +63,10 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
         finding = finding_of(claim, bench, without, after, seed)
         weights = {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
         fallen = fall(without, after, weights, seed)
-        if _refuted(claim, finding, bench, fallen):
+        hardly = _excitation(claim, bench) < _EXCITED
+        if _refuted(claim, finding, bench, fallen, hardly):
             continue
-        untested = _untested(claim, finding) or _excitation(claim, bench) < _EXCITED
+        untested = _untested(claim, finding) or hardly
         grounds = _grounds(claim, finding, bench, without, after, fallen, untested, seed)
         grounds = replace(grounds, company=float(len(claims) - 1))
         most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
@@ -120,8 +121,7 @@ def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, f
         _grounds(claim, finding, bench, before, now, (low, high), False, seed),
         company=float(len(selection.claims)),
     )
-    plain = low > 0.0 and grounds.felt >= _FELT and not grounds.one_block and not grounds.worse
-    confidence = min(claim.confidence, probability(grounds), 1.0 if plain else _OPEN)
+    confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else _OPEN)
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())
 
 
@@ -131,11 +131,13 @@ def _untested(claim: Claim, finding: Finding) -> bool:
     return finding.mode == "between" or effect.repeats or effect.seen_in_samples(claim.trial.shape)
 
 
-def _refuted(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float]) -> bool:
+def _refuted(
+    claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tuple[float, float], hardly: bool
+) -> bool:
     """Whether the held-out rows contradict a claim.
 
-    fallen : interval of the fall of their chi-square by it; above zero it confirms the claim. If the held-out sessions
-    hardly excite the cause, they need only not contradict it. A cause with ample evidence in the rows fitted, or almost
+    fallen : interval of the fall of their chi-square by it; above zero it confirms the claim. hardly : the held-out
+    sessions hardly excite the cause, so they need only not contradict it. A cause with ample evidence in the rows fitted, or almost
     confirmed by the others, may be this one or another. A weak claim has to be confirmed.
     """
     low, high = fallen
@@ -143,7 +145,6 @@ def _refuted(claim: Claim, finding: Finding, bench: DiagnosisBench, fallen: tupl
         return False
     if claim.weak:
         return True
-    hardly = _excitation(claim, bench) < _EXCITED
     least = claim.trial.candidate.effect.evidence_factor * bench.evidence.settings.least_gain
     shown = low + high > 0.0 and claim.gain > _TO_SPARE * least
     silent = hardly and high > -_ALL_BUT * claim.gain
@@ -161,8 +162,12 @@ def _plain(
         return _power(claim, bench) > FELT_POWER
     if _untested(claim, finding):
         return True
-    certain = not claim.weak and fallen[0] > 0.0
-    return certain and grounds.felt >= _FELT and not grounds.one_block and not grounds.worse
+    return not claim.weak and _seen(fallen[0], grounds)
+
+
+def _seen(low: float, grounds: Grounds) -> bool:
+    """Whether the gain on held-out rows, at least `low`, is certain, felt, spread over blocks, and free of harm."""
+    return low > 0.0 and grounds.felt >= _FELT and not grounds.one_block and not grounds.worse
 
 
 def _grounds(
