@@ -137,8 +137,8 @@ def _refuted(
     """Whether the held-out rows contradict a claim.
 
     fallen : interval of the fall of their chi-square by it; above zero it confirms the claim. hardly : the held-out
-    sessions hardly excite the cause, so they need only not contradict it. A cause with ample evidence in the rows fitted, or almost
-    confirmed by the others, may be this one or another. A weak claim has to be confirmed.
+    sessions hardly excite the cause, so they need only not contradict it. A cause with ample evidence in the rows
+    fitted, or almost confirmed by the others, may be this one or another. A weak claim has to be confirmed.
     """
     low, high = fallen
     if _untested(claim, finding) or low > 0.0:
