@@ -210,6 +210,29 @@ class Bench:
     status: StatusLine = field(default_factory=StatusLine)
     onlooker: Onlooker | None = None
 
+    def cycles(self, seconds: float) -> int:
+        """Controller cycles in a time [s], at least 10."""
+        return max(10, round(seconds / self.driver.state().period_s))
+
+    def metadata(
+        self, experiment: Experiment, payload: Payload | None, uid: str, parent_uid: str = ""
+    ) -> dict[str, str]:
+        """Metadata of a log recorded here with a payload mounted; lock step has the epoch of its clock."""
+        epoch = datetime.fromtimestamp(LOCK_STEP_EPOCH_NS * 1e-9, UTC)
+        return session_metadata(
+            robot=self.arm.name,
+            serial=experiment.serial,
+            payload="none" if payload is None else payload.name,
+            payload_mass=None if payload is None else payload.mass,
+            experiment=experiment.name,
+            uid=uid,
+            parent_uid=parent_uid,
+            motor_torque_source="krl_reals" if experiment.motor_torque.source == "krl_reals" else "none",
+            software=software(),
+            git_commit=git_commit(),
+            utc_start=epoch.isoformat() if self.driver.link.lock_step else None,
+        )
+
 
 class Run:
     """One run of an experiment into one folder.
@@ -257,7 +280,7 @@ class Run:
 
     def _session(self, plan: SessionPlan, path: Path) -> Record:
         bench, driver = self.bench, self.bench.driver
-        driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
+        driver.wait_quality(cycles=bench.cycles(self.experiment.link.quality_s))
         self._swap(plan)
         driver.expect_load(*load_data(bench.arm, plan.payload))
         here = self._at_rest(plan.payload)
@@ -274,7 +297,11 @@ class Run:
                     # The controller moved its set point at the start of command mode.
                     motion, preflight = self._prepare(plan, here)
                 uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
-                driver.record(path, self._metadata(plan, *uids), self._attachments(motion, preflight))
+                driver.record(
+                    path,
+                    bench.metadata(self.experiment, plan.payload, *uids),
+                    self._attachments(motion, preflight),
+                )
                 outcome = self._still_loaded(plan, here, self._drive(plan, motion))
                 recorded = driver.end_record(outcome.status, outcome.reason)
             finally:
@@ -361,7 +388,7 @@ class Run:
         bench.status.say(check.summary())
 
     def _at_rest(self, payload: Payload | None) -> Rest:
-        measured = self.bench.driver.monitor(self._cycles(_REST_S))
+        measured = self.bench.driver.monitor(self.bench.cycles(_REST_S))
         return Rest(measured.q, measured.tau, payload)
 
     def _drive(self, plan: SessionPlan, motion: Motion) -> Outcome:
@@ -390,28 +417,6 @@ class Run:
         if self.bench.operator.save_trace(trace):
             text = str(import_trace(path, trace))
         self.bench.status.say(text)
-
-    def _cycles(self, seconds: float) -> int:
-        return max(10, round(seconds / self.bench.driver.state().period_s))
-
-    def _metadata(self, plan: SessionPlan, uid: str, parent_uid: str) -> dict[str, str]:
-        experiment = self.experiment
-        payload = plan.payload
-        source = experiment.motor_torque.source
-        epoch = datetime.fromtimestamp(LOCK_STEP_EPOCH_NS * 1e-9, UTC)
-        return session_metadata(
-            robot=self.bench.arm.name,
-            serial=experiment.serial,
-            payload="none" if payload is None else payload.name,
-            payload_mass=None if payload is None else payload.mass,
-            experiment=experiment.name,
-            uid=uid,
-            parent_uid=parent_uid,
-            motor_torque_source="krl_reals" if source == "krl_reals" else "none",
-            software=software(),
-            git_commit=git_commit(),
-            utc_start=epoch.isoformat() if experiment.lock_step else None,
-        )
 
     def _named_files(self) -> dict[str, bytes]:
         """Arm and cell file, and the manifest of all files, for the log."""

@@ -19,12 +19,11 @@ import numpy.typing as npt
 
 from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
 from lwr_driver.arm.collision import Clearance
-from lwr_driver.driver import LOCK_STEP_EPOCH_NS, LinkState, MotionProgress, Outcome
+from lwr_driver.driver import LinkState, MotionProgress, Outcome
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.realtime import Rights
-from lwr_driver.session import read_session, session_metadata
+from lwr_driver.session import read_session
 from lwr_driver.session.recording import Recorded
-from runner.computer import git_commit, software
 from runner.experiment import Bench
 from runner.experiment_file import Experiment, Payload
 from runner.planning import checker, dwell
@@ -93,7 +92,7 @@ class Steps:
     def record(self, path: Path, seconds: float | None) -> Step:
         """Log what the controller sends for `seconds`, or until Ctrl-C; nothing is commanded."""
         bench, driver = self.bench, self.bench.driver
-        Preflight((check_disk(path.parent, self._cycles(seconds or _LOG_S)),)).enforce()
+        Preflight((check_disk(path.parent, self.bench.cycles(seconds or _LOG_S)),)).enforce()
         before = driver.state()
         driver.record(path, self._metadata("record"))
         with Interrupts(driver.request_stop, driver.drop_link):
@@ -171,8 +170,8 @@ class Steps:
     ) -> Step:
         """A step in command mode: checks, load data, command mode, log, and back to monitor mode."""
         bench, driver = self.bench, self.bench.driver
-        driver.wait_quality(cycles=self._cycles(self.experiment.link.quality_s))
-        measured = driver.monitor(self._cycles(_REST_S))
+        driver.wait_quality(cycles=self.bench.cycles(self.experiment.link.quality_s))
+        measured = driver.monitor(self.bench.cycles(_REST_S))
         self._mean = Rest(measured.q, measured.tau, self.payload)
         preflight = self._prepare(plan, path)
         if driver.sets_load:
@@ -226,8 +225,8 @@ class Steps:
     ) -> tuple[str, str, LwrError | None]:
         """Let cycles pass; status, reason and error of the end. objection : to the state, ends the step."""
         driver, status = self.bench.driver, self.bench.status
-        wanted = None if seconds is None else self._cycles(seconds)
-        cycles, slice_ = 0, self._cycles(_SLICE_S)
+        wanted = None if seconds is None else self.bench.cycles(seconds)
+        cycles, slice_ = 0, self.bench.cycles(_SLICE_S)
         began = time.monotonic()
         while wanted is None or cycles < wanted:
             try:
@@ -281,27 +280,9 @@ class Steps:
             )
         return ""
 
-    def _cycles(self, seconds: float) -> int:
-        return max(10, round(seconds / self.bench.driver.state().period_s))
-
     def _metadata(self, name: str) -> dict[str, str]:
-        experiment, payload = self.experiment, self.payload
-        source = experiment.motor_torque.source
-        lock_step = self.bench.driver.link.lock_step
-        now = datetime.now(UTC)
-        epoch = datetime.fromtimestamp(LOCK_STEP_EPOCH_NS * 1e-9, UTC)
-        return session_metadata(
-            robot=self.bench.arm.name,
-            serial=experiment.serial,
-            payload="none" if payload is None else payload.name,
-            payload_mass=None if payload is None else payload.mass,
-            experiment=experiment.name,
-            uid=f"{experiment.uid}-{name}-{now:%Y%m%d%H%M%S%f}",
-            motor_torque_source="krl_reals" if source == "krl_reals" else "none",
-            software=software(),
-            git_commit=git_commit(),
-            utc_start=epoch.isoformat() if lock_step else None,
-        )
+        uid = f"{self.experiment.uid}-{name}-{datetime.now(UTC):%Y%m%d%H%M%S%f}"
+        return self.bench.metadata(self.experiment, self.payload, uid)
 
     def _attachments(self, preflight: Preflight) -> dict[str, bytes]:
         buffer, motion = io.BytesIO(), self._planned
