@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 # Obvious evidence, over the usual one.
 _PLAIN = 10.0
+# Least share of a claim's gain taken away by a rival's columns.
+_TAKEN = 0.5
 # Number of foremost trials with refined shapes.
 _CONTEST = 4
 # Least share of a claim's power in the rows of a rival.
@@ -408,7 +410,7 @@ class _State:
                 contest = [t for t in rivals[:3] if again is None or _gain(t) > 0.9 * _gain(again)]
                 contest = [self.dictionary.refine(t, self.choices(t)) for t in contest]
                 if again is not None:
-                    contest.append(again)
+                    contest = [*self.competing(again, contest, rest), again]
                 best = max(contest, key=_gain) if contest else None
                 if best is None or not self.carried(best):
                     accepted = rest
@@ -421,6 +423,22 @@ class _State:
             if not changed:
                 break
         return accepted
+
+    def competing(self, here: Trial, rivals: Sequence[Trial], rest: Sequence[Trial]) -> list[Trial]:
+        """The rivals of a trial beside the rest: with one of them in the model, most of the trial's gain is gone.
+
+        Two causes may act in the same rows and explain different parts of them, so gains alone say nothing about a
+        competition.
+        """
+        found = []
+        for rival in rivals:
+            self.tolerate([*rest, rival])
+            again = self.dictionary.trial(here.candidate, here.shape, self.choices(here))
+            if again is None or again.score.gain < (1.0 - _TAKEN) * here.score.gain:
+                found.append(rival)
+        if rivals:
+            self.tolerate(rest)
+        return found
 
     # ---- claims ----
 
@@ -461,7 +479,7 @@ class _State:
         least = _SAME_ROWS * sum(mine.values())
         rivals = [t for t in rivals if sum(mine.get(key, 0.0) for key in t.rows) > least]
         close = [t for t in rivals[:6] if _gain(t) > 0.6 * _gain(again)]
-        close = [self.dictionary.refine(t, self.choices(t)) for t in close]
+        close = self.competing(again, [self.dictionary.refine(t, self.choices(t)) for t in close], rest)
         scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
         sure = confidence(_gain(again), [g for _, g in scores])
         alike = tuple((c, g) for c, g in scores if _gain(again) - g < margin(_gain(again)))

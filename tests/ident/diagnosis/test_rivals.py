@@ -1,0 +1,36 @@
+"""Rivals of a cause explain its part of the error, not merely another part of the same rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ident.diagnosis import DiagnosisSettings
+from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.selection import _State
+from ident.diagnosis.signatures import signature_bench
+from ident.dynamics.kinematics import Chain
+from ident.effects import EFFECTS, Shape
+from lwr_driver.session import Session
+
+
+def test_two_causes_in_the_same_rows_do_not_compete(make: Callable[..., Session], chain: Chain) -> None:
+    def rough(s: dict[str, np.ndarray]) -> None:
+        q, v = s["q"][:, 1], s["qd"][:, 1]
+        s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15) + 0.6 * np.sin(12.0 * q)
+
+    bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
+    state = _State(bench.dictionary, bench.evidence, DiagnosisSettings(), {})
+
+    def trial(cause: str, **shape: float) -> Trial:
+        found = bench.dictionary.trial(Candidate(EFFECTS[cause], 1), Shape(**shape))
+        assert found is not None
+        return found
+
+    state.tolerate([])
+    here = trial("stribeck", velocity=0.15, exponent=1.0)
+    other_form = trial("stribeck", velocity=0.25, exponent=1.0)
+    ripple = trial("gear_ripple", cycles_per_turn=12.0, gear_ratio=1.0)
+    assert ripple.score.gain > here.score.gain > 0.0
+    assert state.competing(here, [ripple, other_form], []) == [other_form]
