@@ -15,6 +15,7 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import ast
 import dataclasses
 import importlib
 import json
@@ -69,12 +70,9 @@ def numbers() -> Iterator[Number]:
 
 def _is_own(module: Any, name: str) -> bool:
     """Whether a module assigns the name, unlike an imported one."""
-    text = Path(module.__file__).read_text(encoding="utf-8")
-    return any(
-        line.split("=")[0].replace(" ", "").split(",").count(name)
-        for line in text.splitlines()
-        if "=" in line
-    )
+    tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
+    targets = (t for node in tree.body if isinstance(node, ast.Assign) for t in node.targets)
+    return any(isinstance(n, ast.Name) and n.id == name for t in targets for n in ast.walk(t))
 
 
 def verdict(findings: Sequence[dict[str, Any]]) -> str:

@@ -352,7 +352,7 @@ def _day(
     # `select` adds the tolerated deviations to the base.
     selection = select(bench.dictionary, evidence, settings, None)
     nuisance, p = selection.nuisance, evidence.base_count
-    day = _Day(
+    return _Day(
         bench.nominal.base,
         bench.nominal.masses,
         evidence.full.values[:p].copy(),
@@ -362,14 +362,17 @@ def _day(
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
         {side: mean_delay(nuisance, side) for side in _CHANNELS},
-        np.full((2, arm.chain.n), np.nan),
+        _gains(bench, selection.nuisance_rows),
     )
-    return replace(day, gains=_gains(bench, selection.nuisance_rows)) if len(bench.nominal.rows) == 2 else day
 
 
 def _gains(bench: DiagnosisBench, nuisance: Sequence[Rows]) -> Floats:
-    """Errors (2, n) of the torque sensors' gains with standard deviations, beside tolerated deviations."""
+    """Errors (2, n) of the torque sensors' gains with standard deviations, beside tolerated deviations; NaN without
+    both torques.
+    """
     found = np.full((2, bench.nominal.arm.chain.n), np.nan)
+    if len(bench.nominal.rows) < 2:
+        return found
     columns = gain_rows(bench.dictionary)
     bench.evidence.replace([*columns.values(), *nuisance])
     std = np.sqrt(np.maximum(np.diag(bench.evidence.covariance()), 0.0))[bench.evidence.base_count :]

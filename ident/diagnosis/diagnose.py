@@ -28,7 +28,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
-from ident.diagnosis.recording import record, settled
+from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Diagnosis
 from ident.diagnosis.selection import Claim, Selection, best_candidate
@@ -229,10 +229,8 @@ def _unknown_delay(task: Task, claim: Claim) -> float:
     """
     if task.arm.encoder_known or claim.trial.candidate.effect.channel != "motor":
         return 0.0
-    stretches = [s for r in task.recordings for s in r.stretches if len(s.motor_time) > 1]
-    own = max(float(np.median(np.diff(s.motor_time))) for s in stretches)
-    positions = max(float(np.median(np.diff(s.time))) for s in stretches)
-    return own + positions if own > 1.5 * positions else 0.0
+    stretches = [s for r in task.recordings for s in r.stretches if s.own_clock]
+    return max((usual_step(s.motor_time) + usual_step(s.time) for s in stretches), default=0.0)
 
 
 def _own_delay(claim: Claim, limit: float) -> str:

@@ -22,7 +22,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
 
 from ident.diagnosis.broken_data import unseen
-from ident.diagnosis.recording import RecordStretch, SessionRecord
+from ident.diagnosis.recording import RecordStretch, SessionRecord, usual_step
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
@@ -49,8 +49,6 @@ _RELAXATION_S = 2e-3
 _LEAST_MASS = 1e-3
 # A joint within this range carries no information on its friction, gears and cables.
 TRAVEL_RAD = 0.1
-# Least period of motor samples over that of positions, for a clock of their own.
-_OWN_CLOCK = 1.5
 # Usual standard deviation of a torque sensor's gain from day to day: within a per cent, evenly.
 GAIN_STD = 0.01 / np.sqrt(3.0)
 
@@ -259,8 +257,7 @@ class Nominal:
     @property
     def slow_motor_samples(self) -> bool:
         """Whether motor torques come with a clock of their own, slower than that of the positions."""
-        found = [s for _, s in self.stretches if len(s.motor_time) > 1]
-        return any(_step(s.motor_time) > _OWN_CLOCK * _step(s.time) for s in found)
+        return any(s.own_clock for _, s in self.stretches)
 
     @property
     def masses(self) -> dict[str, float | None]:
@@ -280,8 +277,8 @@ class Nominal:
             dt = float(stretch.time[1] - stretch.time[0])
             return stretch.time, self.arm.joint_delay_s, max(1, round(self.bin_s / dt))
         width, stamp = 1, stretch.motor_time
-        if len(stamp) > 1 and _step(stamp) < 0.6 * self.bin_s:
-            width = max(1, round(self.bin_s / _step(stamp)))
+        if len(stamp) > 1 and usual_step(stamp) < 0.6 * self.bin_s:
+            width = max(1, round(self.bin_s / usual_step(stamp)))
         return stamp, self.arm.motor_delay_s, width
 
     def reduce(self, side: str, values: Sequence[Floats]) -> Floats:
@@ -302,7 +299,7 @@ class Nominal:
         if key not in self._operators:
             stamp, _, width = self._sampling(side, stretch)
             count = len(stamp) // width
-            place = (stamp[: count * width] - delay - stretch.time[0]) / _step(stretch.time)
+            place = (stamp[: count * width] - delay - stretch.time[0]) / usual_step(stretch.time)
             nearest = np.rint(place)
             place = np.where(np.abs(place - nearest) < 1e-4, nearest, place)
             place = np.clip(place, 0.0, len(stretch.time) - 1.000001)
@@ -312,7 +309,7 @@ class Nominal:
             weights = np.concatenate([1.0 - share, share]) / width
             places = np.concatenate([row, row]), np.concatenate([low, low + 1])
             matrix = csr_array((weights, places), shape=(count, len(stretch.time)))
-            self._operators[key] = matrix, width * _step(stamp) if len(stamp) > 1 else 0.0
+            self._operators[key] = matrix, width * usual_step(stamp) if len(stamp) > 1 else 0.0
         return self._operators[key]
 
     @cached_property
@@ -339,7 +336,7 @@ class Nominal:
     def _stamps(self, side: str, stretch: RecordStretch) -> Floats:
         """Times (m,) [s] of all rows of a stretch."""
         stamp, _, width = self._sampling(side, stretch)
-        return self._slow(side, bins(stamp[:, None], width)[:, 0], width * _step(stamp), smooth=False)
+        return self._slow(side, bins(stamp[:, None], width)[:, 0], width * usual_step(stamp), smooth=False)
 
     def _windows(self, recording: SessionRecord, stamps: Floats) -> NDArray[np.bool_]:
         """Rows (m,) to use. Of a long session: the beginning, two periods at least, and windows spread evenly, so
@@ -375,7 +372,7 @@ class Nominal:
             moves = (np.abs(_at(stretch.time, speed, at)) > self.settings.standstill_rad_s) & (
                 _at(stretch.time, self._steady(speed, stretch), at) > 0.999
             )
-            dt = width * _step(stamp)
+            dt = width * usual_step(stamp)
             wide = self._matrix(side, motion, recording, stretch.time, at, width)
             matrix = np.stack([self._slow(side, table, dt) for table in wide])
             torque = self._slow(side, bins(target, width), dt)
@@ -432,12 +429,6 @@ class Nominal:
 
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
     return side in recording.sides and (side == "joint" or len(stretch.motor_time) > 1)
-
-
-def _step(time: Floats) -> float:
-    """Usual distance [s] of stamps, from those around the middle of a long record."""
-    middle = len(time) // 2
-    return float(np.median(np.diff(time[max(middle - 500, 0) : middle + 500])))
 
 
 def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:

@@ -24,6 +24,9 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
+# Least period of motor samples over that of positions, for a clock of their own.
+_OWN_CLOCK = 1.5
+
 
 @dataclass(frozen=True, eq=False)
 class RecordStretch:
@@ -43,6 +46,19 @@ class RecordStretch:
     motor_time: Floats
     motor: Floats
     motor_usable: NDArray[np.bool_]
+
+    @property
+    def own_clock(self) -> bool:
+        """Whether motor torques come with a clock of their own, slower than that of the positions."""
+        if len(self.motor_time) < 2:
+            return False
+        return usual_step(self.motor_time) > _OWN_CLOCK * usual_step(self.time)
+
+
+def usual_step(time: Floats) -> float:
+    """Usual distance [s] of stamps, from those around the middle of a long record."""
+    middle = len(time) // 2
+    return float(np.median(np.diff(time[max(middle - 500, 0) : middle + 500])))
 
 
 @dataclass(frozen=True, eq=False)
