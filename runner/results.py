@@ -7,13 +7,13 @@ import json
 import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from fri.errors import ConfigurationError, LwrError
+from fri.errors import LwrError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.choice import compared
@@ -26,7 +26,8 @@ from ident.model.model_file import write_model
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
-from runner.computer import software, versions
+from runner.computer import versions
+from runner.estimation import named_model
 from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
@@ -238,15 +239,6 @@ def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     return {name: link[name] for name in names if name in kept and name in link}
 
 
-def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None = None) -> DynamicModel:
-    """The identified model with the name of the robot, and this software in its provenance.
-
-    files : SHA-256 of the files of the experiment by path, for the provenance.
-    """
-    origin = {"software": software()} | ({"files": dict(files)} if files else {})
-    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, **origin})
-
-
 def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
     columns = {
         "name": estimate.names,
@@ -291,16 +283,6 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
 
 
 _ANNOUNCED = ("payload", "payload_mass")
-
-
-def new_folder(folder: Path, advice: str = "choose another --results") -> None:
-    """Make an empty folder for results. ConfigurationError, with the advice, if this is impossible."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigurationError(f"{folder} is not empty, or no folder; {advice}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; {advice}") from error
 
 
 def write_log_results(
