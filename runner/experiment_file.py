@@ -100,6 +100,7 @@ class Excitation:
     periods: Periods = 2
     speed_scale: Share = 1.0
     plan: FileName | None = None
+    validation_plan: FileName | None = None
     seed: Annotated[int, within(0, 2**32 - 2)] = 1
 
     def __post_init__(self) -> None:
