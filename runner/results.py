@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,8 +39,16 @@ from sim_backend.robot import robot_file, truth
 log = logging.getLogger(__name__)
 
 
-def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
-    """Identify the arm from the finished sessions of an experiment, those for validation left out."""
+def estimate(
+    experiment: Experiment,
+    arm: Arm,
+    records: Sequence[Record],
+    tell: Callable[[str], None] | None = None,
+) -> Identification:
+    """Identify the arm from the finished sessions of an experiment, those for validation left out.
+
+    tell : is told the estimate in a sentence as soon as it stands; the comparison of estimators follows.
+    """
     wanted = experiment.identification
     settings = IdentificationSettings(
         model=wanted.model,
@@ -56,10 +64,27 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     kept = [r.path for r in records if r.status == "success" and r.name not in unseen]
     sessions = [read_session(path, status=False) for path in kept]
     found = identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    if tell is not None:
+        tell(_in_a_sentence(found))
     if found.choice is not None:
         return found
     # Beside the experiment's own estimator, what the others would predict.
     return dataclasses.replace(found, choice=compared(found, sessions, used=str(wanted.estimator)))
+
+
+def _in_a_sentence(found: Identification) -> str:
+    spread = float(np.median(found.estimate.rsd_percent))
+    return (
+        f"estimate: {len(found.estimate.names)} base parameters, condition number {found.condition_normalised:.1f}, "
+        f"median standard deviation {spread:.2g} %"
+    )
+
+
+def held_out_errors(summary: Mapping[str, Any], folder: Path) -> str:
+    """The torque errors of the held-out sessions, or else of those of the estimate, and the place of the model."""
+    scores = summary.get("validation") or summary.get("fit") or ()
+    lines = [f"torque error of {score['session']}: {by_side(score['torque_error'])}" for score in scores]
+    return "\n".join([*lines, f"model: {folder / 'model.yaml'}"])
 
 
 def unseen_sessions(experiment: Experiment) -> frozenset[str]:

@@ -101,7 +101,7 @@ def command(
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
     from runner.replanning import Rounds, rounds_begun
-    from runner.results import estimate, summarise, write_results
+    from runner.results import estimate, held_out_errors, summarise, write_results
 
     status = StatusLine()
     experiment, folder = _begin(file, out, resume, hide, replan or 0, status)
@@ -118,10 +118,12 @@ def command(
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
     done = all(record.status == "success" for record in records)
-    found = estimate(experiment, arm, records) if done else None
+    found = estimate(experiment, arm, records, status.say) if done else None
     summary = summarise(experiment, records, found)
     summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
     text = write_results(folder, experiment, arm, summary, found)
+    if found is not None:
+        status.say(held_out_errors(summary, folder))
     if done and experiment.diagnosis.run and not no_diagnosis:
         from runner.diagnosis.after_run import conclude_run
 
