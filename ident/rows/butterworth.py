@@ -88,7 +88,7 @@ def spectrum(signal: Floats, dt: float, segment: int) -> tuple[Floats, Floats]:
     mean = parts.mean(axis=1, keepdims=True)
     slope = (parts @ time)[:, np.newaxis] / (time @ time)
     angle = 2.0 * np.pi * np.arange(segment) / segment
-    window = sum((-1) ** k * a * np.cos(k * angle) for k, a in enumerate(_WINDOW))
-    power = (np.abs(np.fft.rfft((parts - mean - slope * time) * window)) ** 2).mean(axis=0)
+    window = np.array(_WINDOW) * (1.0, -1.0, 1.0, -1.0) @ np.cos(np.arange(4)[:, np.newaxis] * angle)
+    power: Floats = (np.abs(np.fft.rfft((parts - mean - slope * time) * window)) ** 2).mean(axis=0)
     power[1 : len(power) - (segment % 2 == 0)] *= 2.0
-    return np.fft.rfftfreq(segment, dt), power
+    return np.asarray(np.fft.rfftfreq(segment, dt), dtype=np.float64), power

@@ -29,7 +29,9 @@ def test_the_filter_of_order_four_is_that_of_scipy_to_the_last_bit(cutoff: float
 def test_filters_of_other_orders_are_those_of_scipy(order: int) -> None:
     values = np.random.default_rng(1).normal(size=(3000, 2)).cumsum(axis=0)
     theirs = sosfiltfilt(butter(order, 0.05, output="sos"), values, axis=0, padlen=100)
-    np.testing.assert_allclose(forward_and_back(sections(order, 0.05), values, 100), theirs, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        forward_and_back(sections(order, 0.05), values, 100), theirs, rtol=1e-9, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("segment", [256, 301, 2000])

@@ -32,7 +32,9 @@ def test_the_default_experiment_plans_nothing_and_its_motions_pass(monkeypatch: 
 
 
 @pytest.mark.parametrize("period_s", [0.001, 0.002, 0.007, 0.01, 0.05])
-def test_an_attached_plan_has_its_ends_and_a_hundred_rows_a_second_at_most(period_s: float, tmp_path: Path) -> None:
+def test_an_attached_plan_has_its_ends_and_a_hundred_rows_a_second_at_most(
+    period_s: float, tmp_path: Path
+) -> None:
     time = np.arange(round(2.0 / period_s) + 2) * period_s
     motion = Motion(np.sin(time)[:, None] * np.ones(7), period_s, ((0, "period 1"),))
     with np.load(io.BytesIO(planning.attached_plan(motion))) as plan:
