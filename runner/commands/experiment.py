@@ -97,6 +97,7 @@ def command(
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
     from lwr_driver.references import Frozen
+    from runner.ahead import import_ahead
     from runner.experiment import Run
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
@@ -114,6 +115,8 @@ def command(
     experiment = _sealed(experiment, arm, motions, folder, hide)
     laboratory = partial(Laboratory, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
     with laboratory(experiment) as bench, _watched(bench, experiment, live_port if live else None) as watched:
+        if experiment.hosted:
+            import_ahead("runner.diagnosis.after_run", "runner.report.page")
         first = Run(experiment, folder, watched, motions.rows)
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
