@@ -11,7 +11,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 help:
 	@echo "make experiment   set up and run the whole experiment against the built-in emulator"
 	@echo "make test         set up and run ruff, mypy and the tests"
-	@echo "make quick        run ruff and the tests nearest to the changed files, within 60 s of CPU"
+	@echo "make quick        run ruff and the tests nearest to the changed files, within seconds"
 	@echo "make test-long    run the tests marked long, minutes each"
 	@echo "make hooks        install the checks made at each commit"
 	@echo "make screenshot   take the pictures of the documents again"

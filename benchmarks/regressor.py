@@ -40,6 +40,11 @@ def cpu_s(run: Callable[[], Any], repeats: int = 3) -> float:
     return best
 
 
+def call_us(run: Callable[[], Any], calls: int = 2000) -> float:
+    """Least CPU time of one call, over nine rounds of `calls` [us]."""
+    return 1e6 * cpu_s(lambda: [run() for _ in range(calls)], repeats=9) / calls
+
+
 def pinocchio_loop(model: Any, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
     data = model.createData()
     stacked = np.empty((model.nv, len(q), 10 * model.nv))
@@ -99,6 +104,23 @@ def main() -> None:
     print(f"largest difference from pinocchio: {error:.1e}")
     inertial = np.ones((7, 10))
     report("torque (inverse dynamics)", cpu_s(lambda: torque(chain, q, qd, qdd, inertial)))
+
+    print(ROW.format("single calls, one sample each", "us", "", "pin = 1"))
+    now, data = (q[0].copy(), qd[0].copy(), qdd[0].copy()), model.createData()
+    for label, mine, peer in (
+        (
+            "torque / pinocchio rnea",
+            lambda: torque(chain, *now, inertial),
+            lambda: pin.rnea(model, data, *now),
+        ),
+        (
+            "rigid_regressor / pinocchio computeJointTorqueRegressor",
+            lambda: rigid_regressor(chain, *now),
+            lambda: pin.computeJointTorqueRegressor(model, data, *now),
+        ),
+    ):
+        own, other = (call_us(one) for one in (mine, peer))
+        print(ROW.format(label, f"{own:.2f} / {other:.2f}", "", f"{own / other:.1f}"))
 
     print(ROW.format("", "CPU ms", "", ""))
     for label, run in (

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from time import monotonic
 
 from fri.errors import NetworkError
+from fri.in_process import Network, Port
 from fri.krc import KrcSession, Sample, Setpoint
 from fri.states import State
 
@@ -31,23 +32,26 @@ class ControllerEnd:
     remote : address and port of the PC; other datagrams are counted in `foreign` and dropped. `refused` counts its
     answers that the port is closed
     local : address and port to send from; port 0 is any free one, as in ``friSetup(..., 0)``
+    network : a network inside this process instead of UDP; `receive` never waits there
 
     Raises NetworkError if the local address cannot be bound.
     """
 
-    def __init__(self, remote: tuple[str, int], local: tuple[str, int] = ("127.0.0.1", 0)) -> None:
+    def __init__(
+        self,
+        remote: tuple[str, int],
+        local: tuple[str, int] = ("127.0.0.1", 0),
+        network: Network | None = None,
+    ) -> None:
         self.remote = remote
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket: socket.socket | Port
         try:
-            self._socket.bind(local)
+            self._socket = _bound(local) if network is None else network.bind(*local)
         except OSError as error:
-            self._socket.close()
             raise NetworkError(
                 f"cannot bind UDP {local[0]}:{local[1]} for the controller: {error.strerror}; "
                 "choose a free port or 0"
             ) from error
-        self._socket.setblocking(False)
-        self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
         self.address: tuple[str, int] = self._socket.getsockname()
         self.foreign = 0
         self.send_errors = 0
@@ -56,6 +60,11 @@ class ControllerEnd:
     def fileno(self) -> int:
         """File descriptor, for waiting for several sockets at once."""
         return self._socket.fileno()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a datagram is there, on a network inside this process."""
+        return isinstance(self._socket, Port) and bool(self._socket.waiting)
 
     def send(self, datagram: bytes) -> None:
         """Send one datagram to the PC; refusals of the network are counted in `send_errors`."""
@@ -75,7 +84,7 @@ class ControllerEnd:
         """Empty the queue of errors from the network."""
         self.refused += 1
         with contextlib.suppress(OSError):
-            while True:
+            while not isinstance(self._socket, Port):
                 self._socket.recvmsg(_BUFFER_SIZE, _BUFFER_SIZE, socket.MSG_ERRQUEUE)
 
     def receive(self, timeout_s: float) -> bytes | None:
@@ -87,7 +96,7 @@ class ControllerEnd:
                 datagram, source = self._socket.recvfrom(_BUFFER_SIZE)
             except BlockingIOError:
                 remaining = deadline - monotonic()
-                if remaining <= 0.0:
+                if remaining <= 0.0 or isinstance(self._socket, Port):
                     return None
                 select.select((self._socket,), (), (), remaining)
                 continue
@@ -163,3 +172,15 @@ class ControllerEnd:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _bound(local: tuple[str, int]) -> socket.socket:
+    end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        end.bind(local)
+    except OSError:
+        end.close()
+        raise
+    end.setblocking(False)
+    end.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
+    return end

@@ -54,6 +54,9 @@ def _joints() -> np.ndarray:
     return np.zeros(JOINTS)
 
 
+_JNTPOS = int(CommandFlag.JNTPOS)
+
+
 @dataclass(slots=True)
 class Sample:
     """Measurements of the arm in the units of `MSR`; written in place, read by ``KrcSession.packet``."""
@@ -551,24 +554,24 @@ class KrcSession:
         """The setpoint of the answer, and the objection to it."""
         command, judge, held = self._command, self._judge, self._track.target
         objection = judge.flags(command, self._monitor_flags, self.control)
-        if objection is not None or not command.cmd_flags & CommandFlag.JNTPOS:
+        if objection is not None or not command.cmd_flags & _JNTPOS:
             return held, objection
         if self.power == 0:
             return held, judge.mirror(command, held, "the command with the drives off")
         # Through a list: numpy warns of a signalling NaN, left to the judge.
-        target = np.array(command.jnt_pos.tolist())
+        commanded = command.jnt_pos.tolist()
+        target = np.array(commanded)
         soft = self.control is Control.JNT_IMP
         if self._first_command:
             objection = judge.mirror(command, held, "the first command", soft=soft)
         objection = (
-            objection
-            or (judge.springs(command) if soft else None)
-            or judge.position(command.jnt_pos.tolist(), "commanded")
+            objection or (judge.springs(command) if soft else None) or judge.position(commanded, "commanded")
         )
         if objection is None and not (soft and self._first_command):
             # A spring takes the way from its setpoint to the arm without a motion.
-            step = self._track.change_of_step(target)
-            objection = judge.velocity(command, held) or judge.acceleration(*step)
+            objection = judge.velocity(command, held)
+            if objection is None and self.policy.acceleration_factor is not None:
+                objection = judge.acceleration(*self._track.change_of_step(target))
         self._first_command = False
         return target, objection
 

@@ -28,6 +28,7 @@ from fri.krl_system import (
     NoMachinery,
     Path,
     System,
+    duplicate,
     first_value,
     get,
     positions,
@@ -140,6 +141,9 @@ class KrlProgram:
         self._ticks = 0
         self._nested = 0
         self._line = 0
+        # Statements that never wait, and places of variables without indices, by their identity.
+        self._plain: dict[int, bool] = {}
+        self._places: dict[int, tuple[str, Path]] = {}
         self._flow: Flow | None = None
         self._motion: _Motion | None = None
         self._frames = [_Frame(0, {})]
@@ -221,38 +225,115 @@ class KrlProgram:
 
     def _enter(self, title: str, arguments: list[Any]) -> Flow:
         """Run the subprogram `title` with the values of its arguments; its frame holds the result."""
-        module, subprogram = self._programs[title]
-        if len(self._frames) > _DEEPEST:
-            raise RobotError(f"{title} calls itself without end")
-        frame = _Frame(module, self._first_values(subprogram.declarations))
-        for (name, _), value in zip(subprogram.parameters, arguments, strict=False):
-            frame.values[name] = copy.deepcopy(value)
-        self._frames.append(frame)
+        frame = self._frame(title, arguments)
         try:
-            yield from self._block(subprogram.body)
+            yield from self._block(self._programs[title][1].body)
         finally:
             self._frames.pop()
             self._last = frame
         return ""
 
+    def _frame(self, title: str, arguments: list[Any]) -> _Frame:
+        """The frame of a subprogram that begins with the values of its arguments."""
+        module, subprogram = self._programs[title]
+        if len(self._frames) > _DEEPEST:
+            raise RobotError(f"{title} calls itself without end")
+        frame = _Frame(module, self._first_values(subprogram.declarations))
+        for (name, _), value in zip(subprogram.parameters, arguments, strict=False):
+            frame.values[name] = duplicate(value)
+        self._frames.append(frame)
+        return frame
+
     def _call(self, call: tree.Call) -> Flow:
         """Run a subprogram of the program; changed arguments by reference go back to the caller."""
-        _, subprogram = self._programs[call.name]
         yield from self._enter(call.name, [self._value(argument) for argument in call.arguments])
+        self._give_back(call)
+        return ""
+
+    def _give_back(self, call: tree.Call) -> None:
+        _, subprogram = self._programs[call.name]
         frame = self._last
         for (name, by_value), argument in zip(subprogram.parameters, call.arguments, strict=False):
             if not by_value and isinstance(argument, tree.Name):
                 self._write(argument, frame.values[name])
         self._last = frame
-        return ""
+
+    def _call_at_once(self, call: tree.Call) -> None:
+        """As `_call`, for a subprogram that never waits."""
+        frame = self._frame(call.name, [self._value(argument) for argument in call.arguments])
+        try:
+            self._run_at_once(self._programs[call.name][1].body)
+        finally:
+            self._frames.pop()
+            self._last = frame
+        self._give_back(call)
 
     def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
         """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
         for statement in statements:
             self._line = statement.line
-            left = yield from self._statement(statement)
+            if self._is_plain(statement):
+                left = self._do(statement)
+            else:
+                left = yield from self._statement(statement)
             if left:
                 return left
+        return ""
+
+    def _is_plain(self, statement: tree.Statement) -> bool:
+        """Whether the statement takes no time and never waits: it needs no `Flow` then."""
+        plain = self._plain.get(id(statement))
+        if plain is None:
+            self._plain[id(statement)] = False  # for a subprogram that calls itself
+            self._plain[id(statement)] = plain = self._statement_ms == 0.0 and self._cannot_wait(statement)
+        return plain
+
+    def _cannot_wait(self, statement: tree.Statement) -> bool:
+        blocks: list[tuple[tree.Statement, ...]] = []
+        if isinstance(statement, (tree.Assign, tree.Call)):
+            call = statement.value if isinstance(statement, tree.Assign) else statement
+            if isinstance(call, tree.Call) and call.name in self._programs:
+                blocks.append(self._programs[call.name][1].body)
+        elif isinstance(statement, tree.Branch):
+            blocks += [statement.then, statement.otherwise]
+        elif isinstance(statement, tree.Switch):
+            blocks += [statement.default, *(block for _, block in statement.cases)]
+        elif not isinstance(statement, tree.Leave):
+            return False
+        return all(self._is_plain(part) for block in blocks for part in block)
+
+    def _run_at_once(self, statements: tuple[tree.Statement, ...]) -> str:
+        """As `_block`, for statements that never wait."""
+        for statement in statements:
+            self._line = statement.line
+            left = self._do(statement)
+            if left:
+                return left
+        return ""
+
+    def _do(self, statement: tree.Statement) -> str:
+        """As `_statement`, for one that never waits."""
+        if isinstance(statement, tree.Assign):
+            value = statement.value
+            if isinstance(value, tree.Call) and value.name in self._programs:
+                self._call_at_once(value)
+                self._write(statement.target, self._last.result)
+            else:
+                self._write(statement.target, self._value(value))
+        elif isinstance(statement, tree.Branch):
+            chosen = statement.then if self._value(statement.condition) else statement.otherwise
+            return self._run_at_once(chosen)
+        elif isinstance(statement, tree.Switch):
+            return self._run_at_once(self._case(statement))
+        elif isinstance(statement, tree.Leave):
+            if statement.value is not None:
+                self._frames[-1].result = copy.deepcopy(self._value(statement.value))
+            return statement.what
+        elif isinstance(statement, tree.Call):
+            if statement.name in self._programs:
+                self._call_at_once(statement)
+            else:
+                self._value(statement)
         return ""
 
     def _statement(self, statement: tree.Statement) -> Flow:
@@ -413,6 +494,10 @@ class KrlProgram:
 
     def _place(self, name: tree.Name) -> tuple[str, Path, dict[str, Any] | None]:
         """Name, path, and owner of a variable; None for the controller."""
+        known = self._places.get(id(name))
+        if known is not None:
+            title, fixed = known
+            return title, fixed, self._owner(title)
         title, fields = split(name.name)
         path: list[str | int | tuple[int, ...]] = list(fields)
         indices: list[int] = []
@@ -424,11 +509,17 @@ class KrlProgram:
             else:
                 indices.append(int(self._value(step)))
         path += [tuple(indices) if len(indices) > 1 else indices[0]] if indices else []
+        steps = ((name.index,) if name.index is not None else ()) + name.rest
+        if all(isinstance(step, (str, tree.Constant)) for step in steps):
+            self._places[id(name)] = title, tuple(path)
+        return title, tuple(path), self._owner(title)
+
+    def _owner(self, title: str) -> dict[str, Any] | None:
         frame = self._frames[-1]
-        for owner in (frame.values, self._globals[frame.module]):
-            if title in owner:
-                return title, tuple(path), owner
-        return title, tuple(path), None
+        if title in frame.values:
+            return frame.values
+        known = self._globals[frame.module]
+        return known if title in known else None
 
     def _read(self, name: tree.Name) -> Any:
         title, path, owner = self._place(name)

@@ -194,7 +194,7 @@ _MATHEMATICS: dict[str, Callable[..., float]] = {
 
 def first_value(kind: str, size: int) -> Any:
     """First value of a variable of the type `kind`; `size` for an array."""
-    template = copy.deepcopy(_EMPTY[kind] if kind in _EMPTY else STRUCTURES.get(kind, {}))
+    template = duplicate(_EMPTY[kind] if kind in _EMPTY else STRUCTURES.get(kind, {}))
     return Table(template, size) if size and kind != "CHAR" else template
 
 
@@ -215,7 +215,7 @@ def get(value: Any, path: Path, what: str) -> Any:
 def put(value: Any, path: Path, new: Any, what: str) -> Any:
     """`value` with `new` at `path`; structures change in place."""
     if not path:
-        return copy.deepcopy(new)
+        return duplicate(new)
     step, *rest = path
     if isinstance(value, Table):
         _bound(value, step, what)
@@ -224,6 +224,11 @@ def put(value: Any, path: Path, new: Any, what: str) -> Any:
     inner = value[step] if isinstance(value, Table) or step in value else {}
     value[step] = put(inner, tuple(rest), new, what)
     return value
+
+
+def duplicate(value: Any) -> Any:
+    """A copy that shares nothing."""
+    return value if isinstance(value, (int, float, str)) else copy.deepcopy(value)
 
 
 def _bound(table: Table, step: Step, what: str) -> None:
@@ -261,6 +266,8 @@ class System:
         self._message: dict[str, Any] = {"VALID": False}
         # A stopped timer's value [ms], a running timer's time of zero.
         self._timers: dict[int, tuple[float, bool]] = {}
+        # Load data read last, and their structure; never changed.
+        self._load_seen: tuple[tuple[float, ...] | None, dict[str, Any]] = None, {}
 
     @staticmethod
     def template(title: str) -> Any:
@@ -295,7 +302,10 @@ class System:
             setpoint = title in ("$AXIS_ACT_CMD", "$AXIS_ACT")
             return get(axes(self._need().setpoint if setpoint else self.machinery.position), path, title)
         if title == "$LOAD":
-            return get(_load(self.machinery.load), path, title)
+            load = self.machinery.load
+            if load is not self._load_seen[0]:
+                self._load_seen = load, _load(load)
+            return get(self._load_seen[1], path, title)
         if title == "$STIFFNESS":
             return get(self.stiffness, path, title)
         if title == "$MSG_T":
@@ -389,7 +399,7 @@ class System:
             if bool(value) != stopped:
                 self._timers[number] = (self.clock_ms - value_now, bool(value))
         elif title == "$FRI_TO_INT":
-            session.to_int[place] = np.clip(int(value), -(2**31), 2**31 - 1)
+            session.to_int[place] = min(max(int(value), -(2**31)), 2**31 - 1)
         elif title == "$FRI_TO_REA":
             session.to_real[place] = float(value)
         else:

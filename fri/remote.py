@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fri.errors import ConfigurationError, NetworkError
+from fri.in_process import Network, Port
 from fri.packets import CMD_OFFSETS, JOINT_NAMES, JOINTS, Fault, MsrBuffer, new_cmd
 from fri.sequence import Arrival, SequenceTracker
 from fri.states import FLAGS, Control, State
@@ -89,6 +90,8 @@ class RemoteEnd:
         IPv4 address of the controller. With None the sender of the first valid packet is taken.
     first_sequence : int
         Counter of the first answer.
+    network : Network or None
+        A network inside this process instead of UDP; ``receive`` never waits there.
 
     Attributes
     ----------
@@ -127,24 +130,22 @@ class RemoteEnd:
         port: int = DEFAULT_PORT,
         controller: str | None = None,
         first_sequence: int = 1,
+        network: Network | None = None,
     ) -> None:
         host = _ip(address, "PC address")
         if not 0 <= port <= 65535:
             raise ConfigurationError(f"port {port} is outside 0..65535; FRI uses {DEFAULT_PORT} by default")
         self._controller_ip = None if controller is None else _ip(controller, "controller address")
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket: socket.socket | Port
         try:
-            self._socket.bind((host, port))
+            self._socket = _bound(host, port) if network is None else network.bind(host, port)
         except OSError as error:
-            self._socket.close()
             raise NetworkError(
                 f"cannot bind UDP {host}:{port}: {error.strerror}; check that the address is this PC's "
                 "and that no other FRI client is running"
             ) from error
         self.address: tuple[str, int] = self._socket.getsockname()
         self.controller: tuple[str, int] | None = None
-        self._poll = select.poll()
-        self._poll.register(self._socket, select.POLLIN)
         self._receive_timeout = -1.0
 
         self._msr = MsrBuffer()
@@ -321,7 +322,9 @@ class RemoteEnd:
 
     def pending(self) -> bool:
         """Whether another datagram is waiting; the present packet is stale then."""
-        return bool(self._poll.poll(0))
+        if isinstance(self._socket, Port):
+            return bool(self._socket.waiting)
+        return bool(select.select((self._socket,), (), (), 0.0)[0])
 
     def answer(
         self,
@@ -424,7 +427,7 @@ class RemoteEnd:
 
     def _set_timeout(self, timeout_s: float) -> int:
         """Arm the receive timeout; returns the flags for the receive call."""
-        if timeout_s <= 0.0:
+        if timeout_s <= 0.0 or isinstance(self._socket, Port):
             return socket.MSG_DONTWAIT
         if timeout_s != self._receive_timeout:
             # Zero would mean for ever, so at least a microsecond.
@@ -530,6 +533,16 @@ class RemoteEnd:
 
     def _event(self, kind: LinkEventKind, text: str) -> None:
         self.events.append(LinkEvent(self.sequence, kind, text))
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        end.bind((host, port))
+    except OSError:
+        end.close()
+        raise
+    return end
 
 
 def _check_finite(values: np.ndarray, subject: str, unit: str) -> None:

@@ -176,7 +176,7 @@ class Commander:
         limit = self._tracking_limit
         subject, distance = "measured position", error
         away = np.abs(setpoint - self.target)
-        if away.max() > limit:
+        if np.maximum.reduce(away) > limit:
             subject, distance = "set point of the controller", away
         joint = int(distance.argmax())
         if distance[joint] > limit:

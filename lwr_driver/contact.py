@@ -163,9 +163,13 @@ class ContactWatch:
         self._jump = np.concatenate([np.zeros(JOINTS), torque, torque, gravity])
         # Position, torque, the controller's estimate and gravity torque.
         self._now, self._last, self._doubtful = (np.zeros(4 * JOINTS) for _ in range(3))
+        # Views of the two buffers that take turns as the packet of now: its four parts, and both joint torques.
+        self._parts = tuple(_parts(packet) for packet in (self._now, self._last))
         self._step, self._change, self._odd = (np.zeros(4 * JOINTS) for _ in range(3))
+        self._calm = np.zeros(4 * JOINTS, dtype=bool)
         # Position and velocity of the low-pass, and its input.
         self._filter, self._next = np.zeros((3, 2 * JOINTS)), np.zeros((2, 2 * JOINTS))
+        self._state, self._input = self._filter[:2], self._filter[2]
         self._excess = np.full((3, JOINTS), -np.inf)
         self._known = False
         self._open = np.ones(JOINTS)  # share of the friction of uncertain sign
@@ -233,26 +237,27 @@ class ContactWatch:
         q [rad], tau [Nm] : measured. estimate, gravity : the controller's external and gravity torques [Nm]; (7,) each
         """
         now, last, change = self._now, self._last, self._change
-        now[:JOINTS], now[JOINTS : 2 * JOINTS] = q, tau
-        now[2 * JOINTS : 3 * JOINTS], now[3 * JOINTS :] = estimate, gravity
+        parts, others = self._parts
+        parts[0][:], parts[1][:], parts[2][:], parts[3][:] = q, tau, estimate, gravity
         if not self._known or not 0 < cycles <= _MOST_CYCLES:
             cycles = 1
             self._begin()
         np.subtract(now, last, out=change)
         self._believe(cycles)
-        self._alive = self._alive or bool(now[JOINTS : 2 * JOINTS].any())
+        self._alive = self._alive or bool(parts[1].any())
         self._low_pass(cycles)
         self._settling = max(self._settling - cycles, 0)
-        self._estimate(now[3 * JOINTS :])
+        self._estimate(parts[3])
         self._last, self._now = now, last
+        self._parts = others, parts
         excess = self._excess
-        np.abs(now[JOINTS : 3 * JOINTS].reshape(2, JOINTS), out=excess[:2])
+        np.abs(parts[4], out=excess[:2])
         excess[0] -= self._most
         excess[1] -= self.allowed
         np.abs(self.external, out=excess[2])
         excess[2] -= self.allowed
         # Also false for NaN.
-        return None if excess.max() <= 0.0 else self._contact()
+        return None if np.maximum.reduce(excess, axis=None) <= 0.0 else self._contact()
 
     def _begin(self) -> None:
         """Begin with this packet, at rest."""
@@ -273,7 +278,7 @@ class ContactWatch:
         odd += change
         np.abs(odd, out=odd)
         # Also true for NaN.
-        jumps = not (odd <= self._jump).all()
+        jumps = not np.logical_and.reduce(np.less_equal(odd, self._jump, out=self._calm))
         if jumps and not self._doubted:
             self._doubted = True
             self._doubtful[:] = now
@@ -293,13 +298,14 @@ class ContactWatch:
 
     def _low_pass(self, cycles: int) -> None:
         """Advance F from the last packet to this one, with straight lines between them."""
-        memory, ends = self._filter, 2 * JOINTS
+        source, ends = self._input, 2 * JOINTS
+        change, last = self._change[:ends], self._last[:ends]
         for part in range(cycles):
-            np.multiply(self._change[:ends], (2 * part + 1) / cycles, out=memory[2])
-            memory[2] += self._last[:ends]
-            memory[2] += self._last[:ends]
-            np.dot(self._advance, memory, out=self._next)
-            memory[:2] = self._next
+            np.multiply(change, (2 * part + 1) / cycles, out=source)
+            np.add(source, last, out=source)
+            np.add(source, last, out=source)
+            self._advance.dot(self._filter, self._next)
+            self._state[:] = self._next
 
     def _estimate(self, gravity: Floats) -> None:
         """The own estimate, from the state of the low-pass."""
@@ -314,7 +320,7 @@ class ContactWatch:
         if not self._carried and gravity.any():
             expected = expected + gravity - pin.computeGeneralizedGravity(model, data, q)
         if self._friction:
-            sign = np.clip(qd / _SIGN_SPEED, -1.0, 1.0)
+            sign = np.minimum(np.maximum(qd / _SIGN_SPEED, -1.0), 1.0)
             expected = expected + self._viscous * qd + self._coulomb * sign + self._offset
             # A change of sign passes the low-pass gradually.
             turns = qd * (qd + self._lag * qdd) <= 0.0
@@ -327,3 +333,9 @@ class ContactWatch:
         kind, joint = divmod(int(np.argmax(excess)), JOINTS)
         limit = float((self._most if kind == 0 else self.allowed)[joint])
         return Contact(_QUANTITIES[kind], joint, float(self._excess[kind, joint]) + limit, limit)
+
+
+def _parts(packet: Floats) -> tuple[Floats, ...]:
+    """Views of a buffer: position, torque, the controller's estimate, gravity torque; torque and estimate as rows."""
+    rows = packet.reshape(4, JOINTS)
+    return rows[0], rows[1], rows[2], rows[3], rows[1:3]

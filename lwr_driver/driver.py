@@ -37,6 +37,7 @@ from lwr_driver.commander import BRAKE, CONTACT, HOLD, RETREAT
 from lwr_driver.configuration import as_path, expect
 from lwr_driver.contact import ContactSettings, ExpectedArm
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
+from lwr_driver.hosted_loop import HostedLoop, LoopHost
 from lwr_driver.link import (
     LinkSettings,
     LinkState,
@@ -95,6 +96,7 @@ class Driver:
     notify : called with a Waiting about twice a second while a step waits
     motor_torque : places of the motor torques in the KRL variables; None records none
     contact : limits of torque and contact; expected : the arm of the own estimate, None for the nominal one
+    host : in lock step, the emulator's process that takes the loop in; None starts a process for it
 
     A waiting step raises OperatorError after `request_stop` or `drop_link`, NetworkError if the link or a
     process is gone, RobotError if the controller does not follow a request. Errors carry the last cycles as
@@ -110,17 +112,18 @@ class Driver:
         motor_torque: KrlMotorTorque | None = None,
         contact: ContactSettings | None = None,
         expected: ExpectedArm | None = None,
+        host: LoopHost | None = None,
     ) -> None:
         expect(arm, Arm, "arm of the driver", "give `Arm.load()`")
         expect(link, LinkSettings, "link of the driver", 'give `LinkSettings(address="192.168.0.100")`')
         self.arm, self.link, self.motor_torque = arm, link, motor_torque
         self.contact = ContactSettings() if contact is None else contact
-        self._expected = expected
+        self._expected, self._host = expected, host
         self.rights: Rights | None = None
         self._notify = notify
         self._control: Control | None = None
         self._ring: Ring | None = None
-        self._loop: LoopProcess | None = None
+        self._loop: LoopProcess | HostedLoop | None = None
         self._recorder: Recorder | None = None
         self._recording = False
         self._stops_seen = 0
@@ -168,7 +171,11 @@ class Driver:
             expected = ExpectedArm.nominal(self.arm) if self._expected is None else self._expected
             limits = ContactSettings(self.contact.torque_share, self.contact.external_nm)
             watch = (expected, limits, self.arm.tau_max)
-            self._loop = LoopProcess(settings, self.arm.limits, self._control, self._ring, scheduling, watch)
+            parts = settings, self.arm.limits, self._control, self._ring
+            if self._host is not None:
+                self._loop = HostedLoop(self._host, *parts, watch)
+            else:
+                self._loop = LoopProcess(*parts, scheduling, watch)
             self.rights = self._loop.rights
             for shortage in (*self.rights.missing, *self.rights.advice):
                 log.warning("%s", shortage)

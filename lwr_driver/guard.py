@@ -123,7 +123,7 @@ class Guard:
         excess -= self._bounds
         excess -= errors
         # Also false for NaN.
-        if not excess.max() <= _SLACK:
+        if not np.maximum.reduce(excess, axis=None) <= _SLACK:
             return self._violation(x)
         if not remember:
             return None

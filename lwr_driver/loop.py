@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.handshake import IdentificationHandshake, find_handshake
+from fri.in_process import Network
 from fri.remote import LinkEvent, RemoteEnd
 from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
@@ -120,6 +121,7 @@ class Loop:
 
     control : the shared memory; ring : rows for the recorder, None keeps none
     watch : of torque and contact, None watches nothing
+    network : shared with the other side in this process, for `turn`; None uses UDP
     turnaround : waits actively for the next packet, with its answer and those to the following packets ready;
         it costs up to 1.35 ms of a processor in each cycle, 0.55 ms at 1 kHz; None to sleep instead
     pace : keeps rows from passing faster than this computer's clock; None where packets have no such clock, as in
@@ -133,13 +135,14 @@ class Loop:
         control: Control,
         ring: Ring | None = None,
         watch: ContactWatch | None = None,
+        network: Network | None = None,
     ) -> None:
         self._settings, self._control, self._ring, self._watch = settings, control, ring, watch
         self.turnaround: Turnaround | None = None
         self.pace: Pace | None = None
         self._ready_in = Mode.MIRROR  # mode of the prepared answers
         self._handshake = find_handshake(settings.handshake)
-        self.remote = RemoteEnd(settings.address, settings.port, settings.controller)
+        self.remote = RemoteEnd(settings.address, settings.port, settings.controller, network=network)
         self.remote.set_torque_sign(settings.torque_sign)
         self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
         self._words = control.words
@@ -192,8 +195,7 @@ class Loop:
         if not self._settings.lock_step:
             # Packets that came while this process was being set up.
             self.remote.drain()
-        if self._ring is not None:
-            self._ring.start_writing()
+        self.begin()
         try:
             while True:
                 if (self._words[Word.QUIT] or os.getppid() != parent) and self._up_to_date():
@@ -203,9 +205,30 @@ class Loop:
                         commander.stop(Result.ABORTED, f"the driver ended {commander.place()}")
                 self._serve()
         finally:
-            if self._ring is not None:
-                self._ring.stop_writing()
-            self.remote.close()
+            self.end()
+
+    def begin(self) -> None:
+        """Declare this process the writer of the rows."""
+        if self._ring is not None:
+            self._ring.start_writing()
+
+    def end(self) -> None:
+        """Declare an intended end, and close the link."""
+        if self._ring is not None:
+            self._ring.stop_writing()
+        self.remote.close()
+
+    def turn(self) -> bool:
+        """In lock step, one step of `run` without waiting; False if no packet was handled."""
+        self._take_request()
+        if self._job is Job.NONE:
+            self._idle()
+            return False
+        self._wait_for_ring()
+        if self.cycle(0.0):
+            return True
+        self.remind()
+        return False
 
     def cycle(self, timeout_s: float) -> bool:
         """Handle the next packet; False if none came within `timeout_s` [s]."""
@@ -262,6 +285,9 @@ class Loop:
                 self.remind()
             return
         time.sleep(_IDLE_S)
+        self._idle()
+
+    def _idle(self) -> None:
         if self._commander.mode is not Mode.MIRROR:
             self.remind()
         if self._ring is not None:

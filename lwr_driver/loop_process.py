@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from fri import interpreter
 from fri.errors import ConfigurationError, LwrError, NetworkError
+from fri.in_process import Network
 from lwr_driver import realtime
 from lwr_driver.arm import ArmLimits
 from lwr_driver.contact import ContactSettings, ContactWatch, ExpectedArm
@@ -70,15 +71,13 @@ class LoopProcess:
         control: Control,
         ring: Ring,
         scheduling: Scheduling,
-        watch: tuple[ExpectedArm, ContactSettings, NDArray[np.float64]],
+        watch: Watch,
     ) -> None:
         self._control = control
         order = {
-            "settings": asdict(settings),
-            "limits": {name: np.asarray(value).tolist() for name, value in asdict(limits).items()},
+            **order_of(settings, limits, control, watch),
             "scheduling": asdict(scheduling),
-            "watch": [asdict(watch[0]), asdict(watch[1]), watch[2].tolist()],
-            "control": [control.descriptor, control.plan_rows],
+            "control": control.descriptor,
             "ring": ring.inherited,
             "parent": os.getpid(),
         }
@@ -165,21 +164,38 @@ class LoopProcess:
         return ""
 
 
+Watch = tuple[ExpectedArm, ContactSettings, NDArray[np.float64]]
+
+
+def order_of(settings: LoopSettings, limits: ArmLimits, control: Control, watch: Watch) -> dict[str, Any]:
+    """Everything a `Loop` is made of, as plain data, except for the shared memory itself."""
+    return {
+        "settings": asdict(settings),
+        "limits": {name: np.asarray(value).tolist() for name, value in asdict(limits).items()},
+        "watch": [asdict(watch[0]), asdict(watch[1]), watch[2].tolist()],
+        "plan_rows": control.plan_rows,
+    }
+
+
+def loop_of(order: dict[str, Any], control: Control, ring: Ring, network: Network | None = None) -> Loop:
+    """The loop of an order."""
+    settings = dict(order["settings"])
+    settings["joint_names"] = tuple(settings["joint_names"])
+    limits = ArmLimits(**{name: np.array(value) for name, value in order["limits"].items()})
+    expected, contact, tau_max = order["watch"]
+    watch = ContactWatch(ExpectedArm(**expected), ContactSettings(**contact), np.array(tau_max))
+    return Loop(LoopSettings(**settings), limits, control, ring, watch, network)
+
+
 def main(arguments: Sequence[str]) -> None:
     """Entry of the loop process: one argument, the order as JSON."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     order = json.loads(arguments[0])
     try:
         scheduling = Scheduling(**order["scheduling"])
-        settings = dict(order["settings"])
-        settings["joint_names"] = tuple(settings["joint_names"])
-        limits = ArmLimits(**{name: np.array(value) for name, value in order["limits"].items()})
-        control = Control(*order["control"])
-        expected, contact, tau_max = order["watch"]
-        watch = ContactWatch(ExpectedArm(**expected), ContactSettings(**contact), np.array(tau_max))
-        loop_settings = LoopSettings(**settings)
-        loop = Loop(loop_settings, limits, control, Ring.attach(order["ring"]), watch)
-        if not loop_settings.lock_step:
+        control = Control(order["control"], order["plan_rows"])
+        loop = loop_of(order, control, Ring.attach(order["ring"]))
+        if not order["settings"]["lock_step"]:
             loop.pace = Pace()
         rights = _become_real_time(loop, control, scheduling) if scheduling.apply else Rights()
         if scheduling.required:

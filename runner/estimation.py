@@ -11,13 +11,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fri.errors import ConfigurationError
+from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coulomb, Coupling
 from ident.estimation.essential import EssentialSettings
 from ident.estimation.identify import AUTO, IdentificationSettings, estimator_factory
 from ident.estimators import ESTIMATORS, CovarianceSettings
+from ident.model import DynamicModel
 from ident.rows.filters import SignalSettings
+from lwr_driver.arm import Arm
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.session import Session
+from runner.computer import software
 
 
 @dataclass(frozen=True)
@@ -283,3 +287,20 @@ def announced(sessions: Sequence[Session], payloads: Sequence[str]) -> list[Sess
                 raise ConfigurationError(f"--payload {text!r}: {mass!r} is no mass in kg") from None
         corrected[places[0]] = dataclasses.replace(session, metadata=metadata)
     return corrected
+
+
+def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None = None) -> DynamicModel:
+    """The identified model with the name of the robot, and this software in its provenance.
+
+    files : SHA-256 of the files of the experiment by path, for the provenance.
+    """
+    origin = {"software": software()} | ({"files": dict(files)} if files else {})
+    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, **origin})
+
+
+def known_arm(name: str | None, chain: Chain) -> Arm | None:
+    """The arm file called `name`; without a name the default one, if its joints are those of the chain."""
+    if name is not None:
+        return Arm.load(name)
+    arm = Arm.load()
+    return arm if arm.joint_names == chain.joint_names else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
 import json
 import os
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from lwr_driver.session.motor_torque import match_torques
 from lwr_driver.session.trace import import_trace
 from runner.computer import git_commit, software
 from runner.experiment_file import Experiment, Payload, SessionPlan
-from runner.planning import session_motion
+from runner.planning import attached_plan, session_motion
 from runner.preflight import (
     Preflight,
     Rest,
@@ -426,14 +425,10 @@ class Run:
         return files | ({"files.json": frozen.manifest} if frozen.there else {})
 
     def _attachments(self, motion: Motion, preflight: Preflight) -> dict[str, bytes]:
-        buffer, time = io.BytesIO(), np.arange(len(motion)) * motion.period_s
-        qd = np.gradient(motion.q, motion.period_s, axis=0)
-        qdd = np.gradient(qd, motion.period_s, axis=0)
-        np.savez_compressed(buffer, time=time, q=motion.q, qd=qd, qdd=qdd)
         return {
             "experiment.yaml": self.experiment.text.encode(),
             **self._named_files(),
             "robot.urdf": self.bench.arm.urdf.encode(),
-            "plan.npz": buffer.getvalue(),
+            "plan.npz": attached_plan(motion),
             "preflight.json": preflight.to_json(),
         }

@@ -100,6 +100,7 @@ class Excitation:
     periods: Periods = 2
     speed_scale: Share = 1.0
     plan: FileName | None = None
+    validation_plan: FileName | None = None
     seed: Annotated[int, within(0, 2**32 - 2)] = 1
 
     def __post_init__(self) -> None:
@@ -219,6 +220,7 @@ class Experiment:
     emulator: FileName = "emulator/default.yaml"
     emulator_settings: dict[str, Any] = field(default_factory=dict)
     lock_step: bool = True
+    transport: Literal["in_process", "udp"] = "in_process"
     serial: Annotated[str, entries(0, 64)] = ""
     link: Link = field(default_factory=Link)
     motor_torque: MotorTorque = field(default_factory=MotorTorque)
@@ -272,6 +274,11 @@ class Experiment:
         sealed = self.sealed if sealed is None else sealed
         vars(other).update(source=self.source, folder=self.folder, text=self.text, sealed=sealed)
         return other
+
+    @property
+    def hosted(self) -> bool:
+        """Whether the emulator's process takes the driver's loop in."""
+        return self.backend == "emulator" and self.lock_step and self.transport == "in_process"
 
     @property
     def emulator_path(self) -> Path:

@@ -47,8 +47,9 @@ def gather(experiment: Experiment, rounds: int = 0) -> list[Reference]:
         Cell.load(experiment.cell, beside=beside)
         for payload in experiment.payloads().values():
             check_load(*load_data(arm, payload))
-        if experiment.excitation.plan is not None:
-            read_plan(find(experiment.excitation.plan, beside=beside), arm)
+        for plan in (experiment.excitation.plan, experiment.excitation.validation_plan):
+            if plan is not None:
+                read_plan(find(plan, beside=beside), arm)
         if experiment.diagnosis.reference is not None:
             read_model(find(experiment.diagnosis.reference, beside=beside))
         _examine_problem(experiment, needed=max(rounds, experiment.replan.rounds) > 0)

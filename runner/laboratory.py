@@ -150,6 +150,7 @@ class Laboratory:
                 fri_host=experiment.link.address,
                 fri_port=port,
                 settings={"fri.program": experiment.link.handshake, **experiment.emulator_settings},
+                hosting=experiment.hosted,
             )
             self.emulator = stack.enter_context(emulator)
             known = robot_file(
@@ -166,6 +167,7 @@ class Laboratory:
             motor_torque=krl,
             contact=contact,
             expected=expected,
+            host=None if self.emulator is None else self.emulator.host,
         )
         stack.enter_context(driver)
         driver.connect()

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from fri.errors import FileError
+from fri.errors import ConfigurationError, FileError
 
 _BLOCK = bytes(4096)
 
@@ -71,3 +71,13 @@ class OutputFolder(OutputFile):
 
 
 OUTPUT_FILE, OUTPUT_FOLDER = OutputFile(), OutputFolder()
+
+
+def new_folder(folder: Path, advice: str = "choose another --results") -> None:
+    """Make an empty folder for results. ConfigurationError, with the advice, if this is impossible."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigurationError(f"{folder} is not empty, or no folder; {advice}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; {advice}") from error

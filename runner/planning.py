@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ from runner.preflight import (
 
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"
+_PLAN_PERIOD_S = 0.01  # between the rows of a plan attached to a log
 Vector = npt.NDArray[np.float64]
 
 
@@ -121,7 +123,10 @@ def plan_excitation(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationP
 
 
 def _plan_unseen(experiment: Experiment, arm: Arm, cell: Cell) -> ExcitationPlan:
-    """Another motion than the exciting one, from the next seed."""
+    """Another motion than the exciting one: that of `excitation.validation_plan`, or one from the next seed."""
+    stored = experiment.excitation.validation_plan
+    if stored is not None:
+        return read_plan(find(stored, beside=experiment.folder), arm)
     return _simple(experiment, arm, cell, experiment.excitation.seed + 1, 1)
 
 
@@ -149,6 +154,20 @@ def excitation_rows(plan: ExcitationPlan, periods: int) -> Callable[[float], Mot
         return Motion(q, period_s, phases)
 
     return rows
+
+
+def attached_plan(motion: Motion) -> bytes:
+    """The planned motion for its log: arrays time [s], q [rad], qd, qdd of `plan.npz`, at 100 Hz at most.
+
+    The log has every row anyway: `/joint_command` is the plan as it was sent.
+    """
+    qd = np.gradient(motion.q, motion.period_s, axis=0)
+    qdd = np.gradient(qd, motion.period_s, axis=0)
+    last = len(motion) - 1
+    rows = np.append(np.arange(0, last, max(1, round(_PLAN_PERIOD_S / motion.period_s))), last)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, time=rows * motion.period_s, q=motion.q[rows], qd=qd[rows], qdd=qdd[rows])
+    return buffer.getvalue()
 
 
 def dwell(q: Vector, duration_s: float, period_s: float, phase: str) -> Motion:

@@ -8,16 +8,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fri.errors import ConfigurationError, DataError
-from ident.dynamics.session_chain import recorded_rests
-from ident.import_log import Guess, Known, guess_mapping, import_log, read_recording
-from ident.import_log.bag import bag_files
-from ident.import_log.guess import RESTING_RAD
-from lwr_driver.session import Session, read_session
+
+if TYPE_CHECKING:
+    from ident.import_log import Guess
+    from lwr_driver.session import Session
 
 GUESSED = ("yes", "joints", "rate_hz", "torque", "torque_constant", "gear_ratio")
 """Parameters of `guess_options`."""
@@ -87,6 +86,11 @@ def read_recordings(
     folder : for `NAME.mapping.yaml` and the session logs of recordings that need a mapping. The first of these gives
         the columns of all. Raises ConfigurationError without a URDF, or without a confirmation.
     """
+    from ident.dynamics.session_chain import recorded_rests
+    from ident.import_log import Guess, Known, guess_mapping, import_log, read_recording
+    from ident.import_log.bag import bag_files
+    from lwr_driver.session import read_session
+
     foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
     if not foreign:
         if joints or rate_hz or torque_constant or gear_ratio:
@@ -134,6 +138,8 @@ def read_recordings(
 
 def _same_rests(first: Mapping[str, float], other: Mapping[str, float], path: Path) -> None:
     """Refuse recordings with joints at rest elsewhere than in the first: their kinematics differ."""
+    from ident.import_log.guess import RESTING_RAD
+
     for name in first.keys() | other.keys():
         places = [rests.get(name) for rests in (first, other)]
         if None in places or abs(float(places[0] or 0.0) - float(places[1] or 0.0)) > RESTING_RAD:
@@ -175,6 +181,8 @@ def _clear(target: Path) -> None:
     """Remove an earlier import; ConfigurationError for any other file of that name."""
     if not target.exists():
         return
+    from lwr_driver.session import read_session
+
     try:
         imported = read_session(target, status=False).metadata.get("experiment") == "import"
     except DataError:

@@ -7,13 +7,13 @@ import json
 import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from fri.errors import ConfigurationError, LwrError
+from fri.errors import LwrError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.choice import compared
@@ -26,7 +26,8 @@ from ident.model.model_file import write_model
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
-from runner.computer import software, versions
+from runner.computer import versions
+from runner.estimation import named_model
 from runner.experiment import Record
 from runner.experiment_file import Experiment
 from runner.published import characteristics
@@ -38,8 +39,16 @@ from sim_backend.robot import robot_file, truth
 log = logging.getLogger(__name__)
 
 
-def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Identification:
-    """Identify the arm from the finished sessions of an experiment, those for validation left out."""
+def estimate(
+    experiment: Experiment,
+    arm: Arm,
+    records: Sequence[Record],
+    tell: Callable[[str], None] | None = None,
+) -> Identification:
+    """Identify the arm from the finished sessions of an experiment, those for validation left out.
+
+    tell : is told the estimate in a sentence as soon as it stands; the comparison of estimators follows.
+    """
     wanted = experiment.identification
     settings = IdentificationSettings(
         model=wanted.model,
@@ -55,10 +64,27 @@ def estimate(experiment: Experiment, arm: Arm, records: Sequence[Record]) -> Ide
     kept = [r.path for r in records if r.status == "success" and r.name not in unseen]
     sessions = [read_session(path, status=False) for path in kept]
     found = identify(sessions, Chain.from_urdf(arm.urdf), settings)
+    if tell is not None:
+        tell(_in_a_sentence(found))
     if found.choice is not None:
         return found
     # Beside the experiment's own estimator, what the others would predict.
     return dataclasses.replace(found, choice=compared(found, sessions, used=str(wanted.estimator)))
+
+
+def _in_a_sentence(found: Identification) -> str:
+    spread = float(np.median(found.estimate.rsd_percent))
+    return (
+        f"estimate: {len(found.estimate.names)} base parameters, condition number {found.condition_normalised:.1f}, "
+        f"median standard deviation {spread:.2g} %"
+    )
+
+
+def held_out_errors(summary: Mapping[str, Any], folder: Path) -> str:
+    """The torque errors of the held-out sessions, or else of those of the estimate, and the place of the model."""
+    scores = summary.get("validation") or summary.get("fit") or ()
+    lines = [f"torque error of {score['session']}: {by_side(score['torque_error'])}" for score in scores]
+    return "\n".join([*lines, f"model: {folder / 'model.yaml'}"])
 
 
 def unseen_sessions(experiment: Experiment) -> frozenset[str]:
@@ -238,15 +264,6 @@ def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     return {name: link[name] for name in names if name in kept and name in link}
 
 
-def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None = None) -> DynamicModel:
-    """The identified model with the name of the robot, and this software in its provenance.
-
-    files : SHA-256 of the files of the experiment by path, for the provenance.
-    """
-    origin = {"software": software()} | ({"files": dict(files)} if files else {})
-    return dataclasses.replace(model, robot=robot, provenance={**model.provenance, **origin})
-
-
 def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
     columns = {
         "name": estimate.names,
@@ -291,16 +308,6 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
 
 
 _ANNOUNCED = ("payload", "payload_mass")
-
-
-def new_folder(folder: Path, advice: str = "choose another --results") -> None:
-    """Make an empty folder for results. ConfigurationError, with the advice, if this is impossible."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigurationError(f"{folder} is not empty, or no folder; {advice}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; {advice}") from error
 
 
 def write_log_results(

@@ -6,7 +6,6 @@ Nothing resumes by itself: after an abort or a fault the same step begins anew a
 from __future__ import annotations
 
 import contextlib
-import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from lwr_driver.session import read_session
 from lwr_driver.session.recording import Recorded
 from runner.experiment import Bench
 from runner.experiment_file import Experiment, Payload
-from runner.planning import checker, dwell
+from runner.planning import attached_plan, checker, dwell
 from runner.preflight import (
     Preflight,
     Rest,
@@ -285,12 +284,10 @@ class Steps:
         return self.bench.metadata(self.experiment, self.payload, uid)
 
     def _attachments(self, preflight: Preflight) -> dict[str, bytes]:
-        buffer, motion = io.BytesIO(), self._planned
-        np.savez_compressed(buffer, time=np.arange(len(motion)) * motion.period_s, q=motion.q)
         return {
             "experiment.yaml": self.experiment.text.encode(),
             "robot.urdf": self.bench.arm.urdf.encode(),
-            "plan.npz": buffer.getvalue(),
+            "plan.npz": attached_plan(self._planned),
             "preflight.json": preflight.to_json(),
         }
 

@@ -15,7 +15,6 @@ from types import FrameType
 from typing import Any, Self, TextIO
 
 import click
-import numpy as np
 
 from fri.errors import DataError
 
@@ -64,7 +63,7 @@ def plain(value: Any) -> Any:
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (np.ndarray, np.generic)):
+    if type(value).__module__ == "numpy":  # help pages do without its import
         return plain(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(item) for item in value]

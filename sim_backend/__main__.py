@@ -32,6 +32,7 @@ from sim_backend.service import Service
 @click.option("--follow-stdin", is_flag=True, help="End when standard input ends.")
 @click.option("--announce", is_flag=True, help="Print the pendant's port as one line of JSON.")
 @click.option("--once", is_flag=True, help="Lock step: end when the client has left.")
+@click.option("--seat", type=int, hidden=True, help="Descriptor for the driver's loop in this process.")
 @click.option("-v", "--verbose", count=True, help="Tell the session's events; twice: finer changes too.")
 def main(
     config: str,
@@ -45,6 +46,7 @@ def main(
     follow_stdin: bool,
     announce: bool,
     once: bool,
+    seat: int | None,
     verbose: int,
 ) -> None:
     """Emulate a KUKA LWR4+ and its controller: talks FRI over UDP to the PC, and has a pendant."""
@@ -60,6 +62,7 @@ def main(
             pendant_port,
             follow=follow,
             once=once,
+            seat=seat if lock_step else None,
         )
         try:
             signal.signal(signal.SIGTERM, lambda *_: service.stop())

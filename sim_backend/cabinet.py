@@ -96,6 +96,7 @@ class Cabinet:
         self._model_age = 0
         self._commanding = False
         self._load_turn = (0.0, 0.0, 0.0)
+        self._load_told: tuple[LoadData | None, tuple[float, ...], tuple[float, ...]] = None, (), ()
         self._zero = np.zeros(self.joints)
         self._begin(np.array(config.robot.start_position))
         self._compile(
@@ -211,11 +212,15 @@ class Cabinet:
         [kg m2].
         """
         load = self.model.load
+        if self._load_told[0] is load and self._load_told[1] is self._load_turn:
+            return self._load_told[2]
         centre = (1000.0 * value - origin for value, origin in zip(load.com, FLANGE_MM, strict=True))
         turn = _turn(*self._load_turn)
         xx, xy, xz, yy, yz, zz = load.inertia
         moments = np.diag(turn.T @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn).tolist()
-        return (load.mass, *centre, *self._load_turn, *moments)
+        told = (load.mass, *centre, *self._load_turn, *moments)
+        self._load_told = load, self._load_turn, told
+        return told
 
     def set_load(self, load: tuple[float, ...]) -> None:
         """Load data from KRL, as `load` gives them; A B C turn the axes of the inertia against the flange."""

@@ -19,6 +19,7 @@ from typing import IO, Any
 from fri import interpreter
 from fri.errors import ConfigurationError, LwrError, NetworkError, RobotError
 from lwr_driver.configuration import CONFIGS, find
+from lwr_driver.hosted_loop import LoopHost
 from lwr_driver.realtime import undisturbed
 from sim_backend.pendant import Pendant
 
@@ -40,6 +41,7 @@ class Emulator:
     once : in lock step, end when the client has left
     verbosity : None keeps messages for `messages`; otherwise they go to the terminal: 0 what must be seen, 1 events of
     the session, 2 finer changes
+    hosting : in lock step, take the loop of this process's driver in, `Driver(..., host=emulator.host)`; no UDP then
     start_s : time limit for the start of the emulator [s]
 
     The child ends with `stop`, with the `with` block, and with this process: it watches a pipe from its parent.
@@ -59,6 +61,7 @@ class Emulator:
         settings: Mapping[str, Any] | None = None,
         once: bool = False,
         verbosity: int | None = None,
+        hosting: bool = False,
         start_s: float = 60.0,
     ) -> None:
         self.config = find(config)
@@ -70,6 +73,10 @@ class Emulator:
         self.fri_port = _whole("fri_port", fri_port, 1, 65535)
         self.pendant_port = _whole("pendant_port", pendant_port, 0, 65535)
         self.start_s = start_s
+        if hosting and not lock_step:
+            raise ConfigurationError("hosting needs lock step; in real time the driver talks UDP")
+        self._hosting = hosting
+        self.host: LoopHost | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
         self._pendant: Pendant | None = None
@@ -97,6 +104,7 @@ class Emulator:
         """Configuration, state and addresses."""
         state = f"running (process {self.pid})" if self.running else "not running; `start` it or use `with`"
         clock = "lock step" if self.lock_step else "real time"
+        clock += ", in one process" if self._hosting else ""
         lines = [
             f"Emulator {self.config.name}: {state}",
             f"  FRI      to {self.fri_host}:{self.fri_port} in {clock}",
@@ -158,13 +166,19 @@ class Emulator:
         self._errors = None
         if not self._shown:
             self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
+        if self._hosting:
+            self.host = LoopHost()
+            command.append(f"--seat={self.host.descriptor}")
         self._process = subprocess.Popen(
             command,
+            pass_fds=() if self.host is None else (self.host.descriptor,),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             env=interpreter.environment(),
         )
+        if self.host is not None:
+            self.host.started(self._process.pid)
         try:
             self.pendant_port = self._announced()
             self._pendant = Pendant(self.pendant_port)
@@ -220,6 +234,9 @@ class Emulator:
         if self._process is None:
             return None
         process, self._process = self._process, None
+        if self.host is not None:
+            self.host.close()
+            self.host = None
         # Closing the pipe is the child's sign to end.
         for stream in (process.stdin, process.stdout):
             if stream is not None:

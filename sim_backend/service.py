@@ -11,7 +11,9 @@ import time
 from collections.abc import Callable
 
 from fri.controller_end import ControllerEnd
+from fri.in_process import Network, Port
 from fri.states import State
+from lwr_driver.hosted_loop import Seat
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig
 from sim_backend.faults import FaultyWire, Parcel
@@ -25,6 +27,7 @@ _RESEND_S = 0.2
 # After an answer the PC may think for long; a restarted PC waits for its first packet.
 _RESEND_HEARD_S = 2.0
 _IDLE_S = 0.2
+_TURN_S = 0.0005  # pause between the turns of an idle loop
 # A damaged datagram is answered at once or not at all.
 _PERHAPS_S = 0.02
 _PACED_AFTER = 2000
@@ -36,6 +39,7 @@ class Service:
 
     follow : file descriptor of a pipe from the parent; its end of file ends the emulator
     once : in lock step, end when the client has left
+    seat : descriptor for a `Seat` of the driver's loop in this process, in lock step; None talks UDP
     """
 
     def __init__(
@@ -46,14 +50,18 @@ class Service:
         *,
         follow: int | None = None,
         once: bool = False,
+        seat: int | None = None,
     ) -> None:
         self.config = config
         self.cabinet = Cabinet(config)
         self.wire = FaultyWire(self.cabinet.wire_seed, self.cabinet.period_ms * CYCLE_S)
         self.operator = Operator(self.cabinet, self.wire)
-        self.end = ControllerEnd(remote, (config.fri.local_host, config.fri.local_port))
+        self._network = None if seat is None else Network()
+        self._seat = None if seat is None or self._network is None else Seat(seat, self._network)
+        self.end = ControllerEnd(remote, (config.fri.local_host, config.fri.local_port), self._network)
         self.pendant = PendantServer(pendant_port, self.operator.handle)
-        self._foreign: dict[str, socket.socket] = {}
+        self._foreign: dict[str, socket.socket | Port] = {}
+        self._turns = 0
         self._follow = follow
         self._parent = os.getppid()
         self._ended = False
@@ -67,7 +75,7 @@ class Service:
         self._absent = False
         self._refused = 0
         self._poller = select.poll()
-        self._fri = self.end.fileno()
+        self._fri = self.end.fileno() if self._seat is None else self._seat.descriptor
         self._poller.register(self._fri, select.POLLIN)
         self._poller.register(self.pendant.socket.fileno(), select.POLLIN)
         if follow is not None:
@@ -84,6 +92,8 @@ class Service:
 
     def close(self) -> None:
         """Release the sockets."""
+        if self._seat is not None:
+            self._seat.close()
         self.end.close()
         self.pendant.close()
         for other in self._foreign.values():
@@ -105,6 +115,31 @@ class Service:
 
         FRI goes first: a command sent before a request to the pendant acts before it.
         """
+        if self._seat is not None:
+            return self._take_turns(self._seat, timeout_s)
+        return self._look(timeout_s)
+
+    def _take_turns(self, seat: Seat, timeout_s: float) -> bool:
+        """As `_serve`, with the loop of the driver in this process."""
+        end, deadline = self.end, 0.0
+        while True:
+            if end.waiting:
+                return True
+            if seat.turn():
+                self._turns += 1
+                if self._turns % _PENDANT_EVERY == 0:
+                    self._look(0.0)
+                if end.waiting:
+                    return True
+            now = time.monotonic()
+            deadline = deadline or now + timeout_s
+            if not self.running or now >= deadline:
+                return False
+            if self._look(min(_TURN_S, deadline - now)):
+                return False
+
+    def _look(self, timeout_s: float) -> bool:
+        """Wait at most `timeout_s`, serve pendant and parent; True if an FRI datagram, or anything here, was there."""
         ready = self._poller.poll(timeout_s * 1000.0)
         if not ready:
             # A forked child of a dead parent may hold the pipe open.
@@ -112,13 +147,15 @@ class Service:
                 self._ended = True
             return False
         if any(descriptor == self._fri for descriptor, _ in ready):
+            if self._seat is not None and not self._seat.serve():
+                self._ended = True
             return True
         for descriptor, _ in ready:
             if descriptor != self._follow:
                 self.pendant.serve()
             elif not os.read(descriptor, 4096):
                 self._ended = True
-        return False
+        return self._seat is not None
 
     def _lock_step(self) -> None:
         cabinet, operator = self.cabinet, self.operator
@@ -185,9 +222,11 @@ class Service:
 
     def _send_foreign(self, host: str, datagram: bytes, to: tuple[str, int]) -> None:
         if host not in self._foreign:
-            other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            other.bind((host, 0))
-            self._foreign[host] = other
+            if self._network is not None:
+                self._foreign[host] = self._network.bind(host)
+            else:
+                self._foreign[host] = other = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                other.bind((host, 0))
         self._foreign[host].sendto(datagram, to)
 
     def _take(self, age_s: float) -> bytes | None:

@@ -351,6 +351,13 @@ class Chain(Tabular):
         """cos and sin of alpha, exactly 0 and 1 at right angles."""
         return exact_cos_sin(self.alpha)
 
+    @cached_property
+    def table(self) -> Floats:
+        """(6, n) read-only: cos and sin of alpha, d, theta, r, and 1 for a prismatic joint."""
+        rows = np.array([*self.cos_sin_alpha, self.d, self.theta, self.r, self.prismatic], dtype=np.float64)
+        rows.setflags(write=False)
+        return rows
+
     def placement(self, joint: int, position: float = 0.0) -> Floats:
         """(4, 4) pose of frame `joint` (counted from 0) in the frame before it at a joint position."""
         theta = self.theta[joint] + (0.0 if self.prismatic[joint] else position)

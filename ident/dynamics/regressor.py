@@ -51,6 +51,21 @@ def check_states(chain: Chain, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> t
     return checked[0], checked[1], checked[2]
 
 
+def _is_plain(array: Any, shape: tuple[int, ...]) -> bool:
+    return (
+        type(array) is np.ndarray
+        and array.dtype == np.float64
+        and array.shape == shape
+        and array.flags.carray  # contiguous and writeable: numba compiles for one kind of argument
+    )
+
+
+def _is_instant(n: int, q: Any, qd: Any, qdd: Any) -> bool:
+    """Whether all are plain arrays (n,), as a controller has them: what is left to check is checked in the kernel."""
+    shape = (n,)
+    return _is_plain(q, shape) and _is_plain(qd, shape) and _is_plain(qdd, shape)
+
+
 def all_columns(chain: Chain) -> NDArray[np.int64]:
     """(n, 10) column map of all inertial parameters, link after link: 0, 1, ..., 10 n - 1."""
     return np.arange(10 * chain.n, dtype=np.int64).reshape(chain.n, 10)
@@ -76,6 +91,10 @@ def rigid_regressor(
     The result is a view of memory ordered (column, joint, sample): `result.reshape(n * N, C)` makes no copy
     and is Fortran-ordered, as LAPACK expects.
     """
+    if columns is None and out is None and _is_instant(chain.n, q, qd, qdd):
+        instant = np.zeros((10 * chain.n, chain.n, 1))
+        if _fill_at(q, qd, qdd, chain.table, chain.gravity, instant):
+            return instant.transpose(1, 2, 0)
     states = check_states(chain, q, qd, qdd)
     wanted = all_columns(chain) if columns is None else np.ascontiguousarray(columns, dtype=np.int64)
     if wanted.shape != (chain.n, 10):
@@ -138,12 +157,13 @@ def _cos_sin(angle, cosine, sine, size):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy")
 def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  # type: ignore[no-untyped-def]
     samples, n = q.shape
+    block = min(_BLOCK, samples)
     # Rows of the scratch: 0-2 omega, 3-5 alpha, 6-8 acceleration, 9-14 the products of omega.
-    body = np.zeros((15, _BLOCK))
+    body = np.zeros((15, block))
     # Six numbers (v, w) for each joint below or at the link.
-    twist = np.zeros((n, 6, _BLOCK))
+    twist = np.zeros((n, 6, block))
     # cos and sin of theta, r, qd, qdd, theta of the link at hand.
-    joint = np.zeros((6, _BLOCK))
+    joint = np.zeros((6, block))
     for start in range(0, samples, _BLOCK):
         size = min(_BLOCK, samples - start)
         for s in range(size):
@@ -171,6 +191,20 @@ def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  #
                 twist[k, 5, s] = turning
             for j in range(k + 1):
                 _columns_of_link(body, twist[j], columns[k], out, j, start, size)
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_at(q, qd, qdd, table, gravity, out):  # type: ignore[no-untyped-def]
+    """`_fill` for one sample (n,), all columns, `out` (10 n, n, 1); False for a value that is not finite."""
+    n = q.shape[0]
+    if not np.isfinite(q.sum() + qd.sum() + qdd.sum()):
+        return False
+    columns = np.arange(10 * n).reshape(n, 10)
+    states = q.reshape(1, n), qd.reshape(1, n), qdd.reshape(1, n)
+    ca, sa, d, theta, r, prismatic = table[0], table[1], table[2], table[3], table[4], table[5]
+    whole = out.reshape(10 * n, 1, n, 1)
+    _fill(states[0], states[1], states[2], ca, sa, d, theta, r, prismatic, gravity, columns, whole)
+    return True
 
 
 @njit(cache=True, inline="always")
@@ -297,8 +331,12 @@ def _columns_of_link(body, twist, column, out, joint, start, size):  # type: ign
 def torque(chain: Chain, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, inertial: ArrayLike) -> Floats:
     """Rigid inverse dynamics (N, n) [Nm, N] from the inertial parameters (n, 10), by recursive Newton-Euler.
 
-    Batches cost 0.4 us a sample on one core; a call for a single sample costs 15 us, most of it checks.
+    Batches cost least by far; a single sample is quickest as three plain arrays (n,), see `benchmarks.regressor`.
     """
+    if _is_instant(chain.n, q, qd, qdd) and _is_plain(inertial, (chain.n, 10)):
+        instant = np.empty((1, chain.n))
+        if _torque_at(q, qd, qdd, chain.table, chain.gravity, inertial, instant):
+            return instant
     position, speed, acceleration = check_states(chain, q, qd, qdd)
     bodies = np.ascontiguousarray(inertial, dtype=np.float64)
     if bodies.shape != (chain.n, 10):
@@ -406,3 +444,25 @@ def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, ou
             force[k - 1, 3] += m0 + py * f2 - pz * f1
             force[k - 1, 4] += m1 + pz * f0 - px * f2
             force[k - 1, 5] += m2 + px * f1 - py * f0
+
+
+@njit(cache=True, error_model="numpy")
+def _torque_at(q, qd, qdd, table, gravity, bodies, out):  # type: ignore[no-untyped-def]
+    """`_newton_euler` for one sample (n,), `out` (1, n); False for a value that is not finite."""
+    n = q.shape[0]
+    if not np.isfinite(q.sum() + qd.sum() + qdd.sum()):
+        return False
+    prismatic = table[5]
+    motion = np.empty((3, 1, n))
+    for k in range(n):
+        angle = table[3, k] + (1.0 - prismatic[k]) * q[k]
+        motion[0, 0, k] = np.cos(angle)
+        motion[1, 0, k] = np.sin(angle)
+        motion[2, 0, k] = table[4, k] + prismatic[k] * q[k]
+    turned = prismatic > 0.0
+    ca, sa, d = table[0], table[1], table[2]
+    states = qd.reshape(1, n), qdd.reshape(1, n)
+    _newton_euler(
+        motion[0], motion[1], motion[2], states[0], states[1], ca, sa, d, turned, gravity, bodies, out
+    )
+    return True

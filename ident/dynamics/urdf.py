@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
@@ -217,6 +216,8 @@ class Urdf:
 
 def held(text: str, positions: Mapping[str, float]) -> str:
     """The URDF with joints fixed at positions [rad or m]. ConfigurationError for joints that cannot move."""
+    from scipy.spatial.transform import Rotation  # on use: its import is slow
+
     urdf = read_urdf(text)
     urdf.require(positions)
     tree = ElementTree.fromstring(text)

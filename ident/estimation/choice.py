@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
@@ -41,7 +40,7 @@ from ident.estimation.identify import (
 from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
 from ident.estimation.parts import beside, held_back_parts
 from ident.estimators.covariance import CovarianceSettings, effective_rows
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, chi_square_tail
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
@@ -430,7 +429,7 @@ class _Comparison:
         place = slice(len(self.problem.names), len(self.problem.names) + 2)
         tilt = values[place]
         square = float(tilt @ np.linalg.solve(covariance[place, place], tilt))
-        return bool(chi2.sf(square, 2) < _UPRIGHT)
+        return chi_square_tail(square, 2) < _UPRIGHT
 
     def _gains(self, kind: Kind) -> tuple[Floats, Floats]:
         """Errors of the sensors' scale of a candidate from all rows, and their standard deviations."""

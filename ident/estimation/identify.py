@@ -23,6 +23,7 @@ from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
 from ident.estimators.estimate import Estimate, Estimator
+from ident.estimators.names import AUTO
 from ident.estimators.physical import cad_prior
 from ident.estimators.problem import Problem
 from ident.model.dynamic_model import DynamicModel
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
-
-AUTO = "auto"
-"""In place of the name of an estimator: the one that predicts best, see `ident.estimation.choice`."""
 
 
 @dataclass(frozen=True)

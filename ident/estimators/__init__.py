@@ -1,32 +1,38 @@
 """Estimators of the stacked linear regression: one interface, one results object.
 
-Each takes its settings in the constructor and has `fit(problem) -> Estimate`.
+Each takes its settings in the constructor and has `fit(problem) -> Estimate`. Names are imported on first use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
-from ident.estimators.estimate import (
-    ClassFit,
-    Covariance,
-    Estimate,
-    Estimator,
-    chi_square_tail,
-    fisher_limit,
-    fisher_tail,
-    normal_tail,
-    student_tail,
-)
-from ident.estimators.least_squares import OrdinaryLeastSquares, RobustLeastSquares, WeightedLeastSquares
-from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior, nearest_consistent
-from ident.estimators.prior import MaximumAPosteriori, Prior
-from ident.estimators.problem import Nuisance, Problem, RowClass, RowGroup, TriangularFactor
-from ident.estimators.recursive import RecursiveFilter, RecursiveLeastSquares, RegressorExtensionMixing, Track
+if TYPE_CHECKING:
+    from ident.estimators.covariance import CovarianceSettings, correlation_time
+    from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
+    from ident.estimators.estimate import (
+        ClassFit,
+        Covariance,
+        Estimate,
+        Estimator,
+        chi_square_tail,
+        fisher_limit,
+        fisher_tail,
+        normal_tail,
+        student_tail,
+    )
+    from ident.estimators.least_squares import OrdinaryLeastSquares, RobustLeastSquares, WeightedLeastSquares
+    from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior, nearest_consistent
+    from ident.estimators.prior import MaximumAPosteriori, Prior
+    from ident.estimators.problem import Nuisance, Problem, RowClass, RowGroup, TriangularFactor
+    from ident.estimators.recursive import (
+        RecursiveFilter,
+        RecursiveLeastSquares,
+        RegressorExtensionMixing,
+        Track,
+    )
+    from ident.estimators.registry import ESTIMATORS, EstimatorKind
 
 __all__ = [
     "ESTIMATORS",
@@ -64,63 +70,64 @@ __all__ = [
     "student_tail",
 ]
 
-
-@dataclass(frozen=True)
-class EstimatorKind:
-    """An estimator that can be chosen by name.
-
-    summary : one line for help and documents. options : names of its settings.
-    make : from `covariance` and any of the options, with `body_prior` also from `prior`, the `BodyPrior` of the
-        arm. body_prior : the estimate starts from the inertials of the URDF.
-    """
-
-    summary: str
-    make: Callable[..., Estimator]
-    options: tuple[str, ...] = ()
-    body_prior: bool = False
-
-
-def _map(
-    prior: BodyPrior,
-    covariance: CovarianceSettings,
-    prior_strength: Any = 1.0,
-    prior_metric: Any = "pullback",
-) -> Estimator:
-    return MaximumAPosteriori(prior.prior(prior_metric), prior_strength, covariance)
-
-
-def _physical(
-    prior: BodyPrior,
-    covariance: CovarianceSettings,
-    prior_strength: Any = 1.0,
-    prior_metric: Any = "pullback",
-) -> Estimator:
-    return PhysicallyConsistent(prior, prior_metric, prior_strength, covariance=covariance)
-
-
-def _robust(loss: Any) -> Callable[..., Estimator]:
-    return lambda **settings: RobustLeastSquares(loss, **settings)
-
-
-_PRIOR = ("prior_strength", "prior_metric", "prior_std")
-
-ESTIMATORS: dict[str, EstimatorKind] = {
-    "ols": EstimatorKind("ordinary least squares, for comparison", OrdinaryLeastSquares),
-    "wls": EstimatorKind("least squares weighted by joint and side", WeightedLeastSquares),
-    "huber": EstimatorKind("robust: linear loss for large residuals", _robust("huber"), ("tuning",)),
-    "tukey": EstimatorKind("robust: constant loss for large residuals", _robust("tukey"), ("tuning",)),
-    "tls": EstimatorKind(
-        "total least squares: noise in the regressor too", TotalLeastSquares, ("relative_noise",)
+_HOMES = {
+    "covariance": ("CovarianceSettings", "correlation_time"),
+    "errors_in_variables": (
+        "InstrumentalVariables",
+        "TotalLeastSquares",
     ),
-    "recursive": EstimatorKind("recursive, for parameters that drift", RecursiveLeastSquares, ("memory_s",)),
-    "mixing": EstimatorKind(
-        "one scalar regression per parameter, for weak excitation", RegressorExtensionMixing, ("memory_s",)
+    "estimate": (
+        "ClassFit",
+        "Covariance",
+        "Estimate",
+        "Estimator",
+        "chi_square_tail",
+        "fisher_limit",
+        "fisher_tail",
+        "normal_tail",
+        "student_tail",
     ),
-    "map": EstimatorKind("least squares with the URDF's inertials as prior", _map, _PRIOR, True),
-    "physical": EstimatorKind(
-        "`map` over physically consistent bodies, for prediction", _physical, _PRIOR, True
+    "least_squares": (
+        "OrdinaryLeastSquares",
+        "RobustLeastSquares",
+        "WeightedLeastSquares",
     ),
-    # `identify` compares this weighted estimate with that of `InstrumentalVariables`.
-    "iv": EstimatorKind("instrumental variables from the commanded motion", WeightedLeastSquares),
+    "physical": (
+        "BodyPrior",
+        "PhysicallyConsistent",
+        "cad_prior",
+        "nearest_consistent",
+    ),
+    "prior": (
+        "MaximumAPosteriori",
+        "Prior",
+    ),
+    "problem": (
+        "Nuisance",
+        "Problem",
+        "RowClass",
+        "RowGroup",
+        "TriangularFactor",
+    ),
+    "recursive": (
+        "RecursiveFilter",
+        "RecursiveLeastSquares",
+        "RegressorExtensionMixing",
+        "Track",
+    ),
+    "registry": (
+        "ESTIMATORS",
+        "EstimatorKind",
+    ),
 }
-"""The estimators by name."""
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -27,7 +27,6 @@ from typing import Literal
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
 from ident.dynamics.parameters import Floats
@@ -235,6 +234,8 @@ def moderated(variance: Floats, plain: Floats, freedom: float) -> tuple[Floats, 
     if excess <= polygamma(1, 0.5 * _MOST_FREEDOM):
         own = _MOST_FREEDOM
     else:
+        from scipy.optimize import brentq  # on use: its import is slow
+
         own = 2.0 * float(brentq(lambda x: float(polygamma(1, x)) - excess, 1e-3, 0.5 * _MOST_FREEDOM))
     common = np.exp(centre + digamma(0.5 * own) - np.log(0.5 * own)) * plain
     return (own * common + freedom * variance) / (own + freedom), own + freedom

@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
@@ -267,6 +266,8 @@ class MaximumAPosteriori:
     def _scale(self, problem: Problem, prior: Prior, tempered: Floats) -> float:
         if isinstance(self.strength, (int, float)):
             return float(self.strength)
+        from scipy.optimize import minimize_scalar  # on use: its import is slow
+
         if self.strength == "evidence":
             cost = _evidence_cost(problem, prior, tempered)
         else:

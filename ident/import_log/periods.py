@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.special import comb
 
@@ -25,6 +25,9 @@ from fri.errors import DataError
 from ident.import_log.mapping import PeriodMarks
 from ident.import_log.tables import Floats
 from ident.rows.binned import bins
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 # Deviation of the motion from period to period over the motion; identified torques err by one to two per cent.
 EPS = 5e-3
@@ -136,6 +139,8 @@ class _Motion:
         step = float(np.median(np.diff(seconds)))
         grid_s = max(_GRID_S, step, seconds[-1] / _MOST_GRID)
         grid = np.arange(seconds[0], seconds[-1] + 1e-9, grid_s)
+        from scipy.interpolate import CubicSpline  # on use: its import is slow
+
         curve = CubicSpline(seconds, q)
         return cls(grid, curve(grid), noise, step, curve)
 

@@ -18,6 +18,7 @@ from scipy.ndimage import correlate1d
 
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import Floats
+from ident.rows.butterworth import forward_and_back, sections, spectrum
 
 # The paper's filters, section 5, and a time beside reversals that covers the turning of a strain-wave drive.
 CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
@@ -143,12 +144,8 @@ def low_pass(values: Floats, dt: float, cutoff_hz: float, order: int = 4) -> Flo
         raise ConfigurationError(
             f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate, {nyquist:g} Hz; lower `cutoff_hz`"
         )
-    # Imported on first use: the import takes a second.
-    from scipy.signal import butter, sosfiltfilt
-
-    sos = butter(order, cutoff_hz / nyquist, output="sos")
     pad = min(len(values) - 1, int(np.ceil(3.0 / (cutoff_hz * dt))))
-    return sosfiltfilt(sos, values, axis=0, padlen=pad)
+    return forward_and_back(sections(order, cutoff_hz / nyquist), values, pad)
 
 
 def differentiate(values: Floats, dt: float) -> tuple[Floats, Floats]:
@@ -383,11 +380,7 @@ def advice(
 
 
 def _spectrum(signal: Floats, dt: float) -> tuple[Floats, Floats]:
-    from scipy.signal import welch
-
-    segment = min(len(signal), max(256, round(30.0 / dt)))
-    frequency, power = welch(signal, fs=1.0 / dt, nperseg=segment, detrend="linear", window="blackmanharris")
-    return frequency, power
+    return spectrum(signal, dt, min(len(signal), max(256, round(30.0 / dt))))
 
 
 def moving(position: Floats, names: Sequence[str], threshold: float = 1e-2) -> tuple[str, ...]:

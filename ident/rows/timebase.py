@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d
 
 from fri.errors import DataError
@@ -88,11 +87,15 @@ def _uniform(times: Floats, values: Floats, dt: float) -> Stretch:
         bridged = np.ones(count, dtype=bool)
         bridged[steps] = False
         if bridged.any():
+            from scipy.interpolate import CubicSpline  # on use: its import is slow
+
             gaps, known = np.flatnonzero(bridged).astype(float), values
             values = np.empty((count, known.shape[1]))
             values[steps] = known
             values[bridged] = CubicSpline(steps.astype(float), known)(gaps)
         return Stretch(float(times[0]), step, values, bridged, False)
+    from scipy.interpolate import CubicSpline
+
     count = int(np.floor((times[-1] - times[0]) / dt)) + 1
     grid = times[0] + dt * np.arange(count)
     after = np.searchsorted(times, grid)

@@ -8,24 +8,20 @@ from contextlib import contextmanager
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from fri.errors import ConfigurationError, DataError, LwrError, OperatorError, RobotError
-from lwr_driver.arm import Arm
-from lwr_driver.arm.cell import Cell
-from lwr_driver.references import Frozen
-from runner.diagnosis.after_run import conclude_run
-from runner.experiment import Bench, Record, Run
-from runner.experiment_file import DEFAULT, Experiment
-from runner.files import begin, gather, go_on, listed, locked
-from runner.hiding.effect import HiddenEffect, emulated_arm, with_effect
-from runner.laboratory import Laboratory
-from runner.output import OUTPUT_FOLDER
-from runner.planning import Excitations
-from runner.replanning import Rounds, rounds_begun
-from runner.results import estimate, new_folder, summarise, write_results
+from runner.output import OUTPUT_FOLDER, new_folder
 from runner.terminal import PATH, StatusLine, json_option, to_json
+
+# Everything else is imported on use: the help page needs none of it.
+if TYPE_CHECKING:
+    from lwr_driver.arm import Arm
+    from runner.experiment import Bench, Record
+    from runner.experiment_file import Experiment
+    from runner.planning import Excitations
 
 
 @click.command("experiment")
@@ -98,6 +94,16 @@ def command(
             raise ConfigurationError("--reveal shows a finished run; leave FILE, --out, --resume and --hide")
         _reveal(Path(reveal) if reveal else None, as_json)
         return
+    from lwr_driver.arm import Arm
+    from lwr_driver.arm.cell import Cell
+    from lwr_driver.references import Frozen
+    from runner.ahead import import_ahead
+    from runner.experiment import Run
+    from runner.laboratory import Laboratory
+    from runner.planning import Excitations
+    from runner.replanning import Rounds, rounds_begun
+    from runner.results import estimate, held_out_errors, summarise, write_results
+
     status = StatusLine()
     experiment, folder = _begin(file, out, resume, hide, replan or 0, status)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
@@ -109,15 +115,21 @@ def command(
     experiment = _sealed(experiment, arm, motions, folder, hide)
     laboratory = partial(Laboratory, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
     with laboratory(experiment) as bench, _watched(bench, experiment, live_port if live else None) as watched:
+        if experiment.hosted:
+            import_ahead("runner.diagnosis.after_run", "runner.report.page")
         first = Run(experiment, folder, watched, motions.rows)
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
     done = all(record.status == "success" for record in records)
-    found = estimate(experiment, arm, records) if done else None
+    found = estimate(experiment, arm, records, status.say) if done else None
     summary = summarise(experiment, records, found)
     summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
     text = write_results(folder, experiment, arm, summary, found)
+    if found is not None:
+        status.say(held_out_errors(summary, folder))
     if done and experiment.diagnosis.run and not no_diagnosis:
+        from runner.diagnosis.after_run import conclude_run
+
         status.show("diagnosis", 0.0, "")
         concluded = conclude_run(
             experiment, arm, cell, motions, folder, records, laboratory=laboratory, decide=decide
@@ -158,6 +170,8 @@ def _sealed(
     experiment: Experiment, arm: Arm, motions: Excitations, folder: Path, seed: int | None
 ) -> Experiment:
     """The experiment with its hidden effect: drawn now, or in an earlier run of the folder."""
+    from runner.hiding.effect import HiddenEffect, with_effect
+
     effect = HiddenEffect.unseal(folder)
     if effect is None:
         if seed is None:
@@ -184,6 +198,10 @@ def _begin(
     file: str | None, out: Path | None, resume: Path | None, hide: int | None, rounds: int, status: StatusLine
 ) -> tuple[Experiment, Path]:
     """The experiment of frozen files and its folder, held until the end of the command."""
+    from lwr_driver.references import Frozen
+    from runner.experiment_file import DEFAULT, Experiment
+    from runner.files import begin, gather, go_on, listed, locked
+
     context = click.get_current_context()
     if resume is not None:
         if file is not None or out is not None or hide is not None:
@@ -201,6 +219,8 @@ def _begin(
         return experiment, resume
     experiment = Experiment.load(file if file is not None else DEFAULT)
     if hide is not None:
+        from runner.hiding.effect import emulated_arm
+
         emulated_arm(experiment)
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     folder = out if out is not None else Path("experiments") / f"{experiment.name}-{stamp}"

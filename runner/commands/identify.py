@@ -9,23 +9,14 @@ from typing import Any
 import click
 
 from fri.errors import ConfigurationError
-from ident.dynamics.session_chain import session_chain
-from ident.estimation.choice import choose
-from ident.estimation.identify import AUTO, identify
-from ident.estimation.mounting import find_mounting
-from ident.estimation.validate import validate
-from ident.estimators import ESTIMATORS
-from ident.model.model_file import write_model
-from runner.diagnosis import known_arm
-from runner.estimation import IdentifySettings, announced, couplings, recorded_couplings
-from runner.output import OUTPUT_FILE, OUTPUT_FOLDER
+from ident.estimators.names import AUTO, SUMMARIES
+from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, new_folder
 from runner.recordings import GUESSED, guess_options, read_recordings
-from runner.results import named_model, new_folder, write_log_results
 from runner.terminal import GroupedCommand, json_option, to_json
 
 _SUMMARIES = {
     AUTO: "of wls and physical, base upright or leaning, the best on held-back motion",
-    **{name: kind.summary for name, kind in ESTIMATORS.items()},
+    **SUMMARIES,
 }
 _EPILOG = "\b\nEstimators:\n" + "\n".join(f"  {name:<10} {text}" for name, text in _SUMMARIES.items())
 
@@ -57,7 +48,7 @@ _GROUPS = {
 )
 @click.option(
     "--estimator",
-    type=click.Choice((AUTO, *ESTIMATORS)),
+    type=click.Choice((AUTO, *SUMMARIES)),
     default=AUTO,
     show_default=True,
     help="See below. The paper's is wls.",
@@ -137,6 +128,19 @@ def command(
     lwr-run identify unloaded.mcap loaded.mcap --essential --settings my_settings.yaml
     lwr-run identify data.csv --urdf arm.urdf --results first      another arm, columns guessed
     """
+    # Imported on use: the help page needs none of them.
+    from ident.dynamics.session_chain import session_chain
+    from ident.estimation.identify import identify
+    from ident.model.model_file import write_model
+    from runner.estimation import (
+        IdentifySettings,
+        announced,
+        couplings,
+        known_arm,
+        named_model,
+        recorded_couplings,
+    )
+
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
     wanted = read.identification(model or 2, estimator, file=settings or "")
     wanted = replace(wanted, without=(*wanted.without, *without))
@@ -161,8 +165,12 @@ def command(
         wanted = replace(wanted, signals=replace(wanted.signals, stiffness_nm_rad=stiffness))
     mounting = None
     if estimator == AUTO:
+        from ident.estimation.choice import choose
+
         found = choose(logs, chain, wanted, tilt=tilt or None)
     elif tilt:
+        from ident.estimation.mounting import find_mounting
+
         mounting = find_mounting(logs, chain, wanted)
         found = mounting.identification
     else:
@@ -176,7 +184,11 @@ def command(
     # The model first: nothing in a test session may cost it.
     if out is not None:
         write_model(result, out)
-    validation = None if not tested else validate(result, tested, keep_going=True)
+    validation = None
+    if tested:
+        from ident.estimation.validate import validate
+
+        validation = validate(result, tested, keep_going=True)
     if validation is not None:
         whole = validation.to_dict()
         content |= {"validation": whole["sessions"], "unscored": whole["unscored"]}
@@ -185,6 +197,8 @@ def command(
     if out is not None:
         click.echo(str(out), err=as_json)
     if results is not None:
+        from runner.results import write_log_results
+
         page = write_log_results(results, found, logs, tested, result, text=text)
         click.echo(str(page), err=as_json)
     if validation is not None:

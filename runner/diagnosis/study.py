@@ -260,14 +260,6 @@ def chain_of(sessions: Sequence[Session], urdf: Path | None) -> Chain:
     return session_chain(sessions[0], urdf)
 
 
-def known_arm(name: str | None, chain: Chain) -> Arm | None:
-    """The arm file called `name`; without a name the default one, if its joints are those of the chain."""
-    if name is not None:
-        return Arm.load(name)
-    arm = Arm.load()
-    return arm if arm.joint_names == chain.joint_names else None
-
-
 def arm_data(
     arm: Arm | None, chain: Chain, coupling: Sequence[str] = (), gear_ratio: str | None = None
 ) -> ArmData:

@@ -191,3 +191,11 @@ def test_hooks_run_tools_of_the_project_only() -> None:
     for program, *arguments in entries.values():
         assert program.startswith(".venv/bin/")
         assert all((ROOT / word).is_file() for word in arguments if word.startswith(".ci/"))
+
+
+def test_processes_share_the_tests_evenly_and_numerics_are_checked_soonest() -> None:
+    cost = {"a": 6.0, "b": 5.0, "c": 2.0, "d": 1.0}
+    assert quick.shares(["d", "c", "b", "a"], cost) == [["d", "a"], ["c", "b"]]
+    assert quick.shares(["a"], cost) == [["a"]]
+    assert quick.limit_s({"ident/rows/build.py", "tests/fri/test_wire.py"}) == quick.NEAR_S
+    assert quick.limit_s({"ident/rows/build.py", "runner/cli.py"}) == quick.FAR_S

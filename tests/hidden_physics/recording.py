@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fri.controller_end import ControllerEnd
+from fri.in_process import Network
 from fri.states import Quality, State
 from lwr_driver.arm import Arm
 from lwr_driver.commander import BRAKE, HOLD
@@ -103,7 +104,7 @@ class Order:
 
 
 class _Bench:
-    """Cabinet and loop, joined by two sockets of one process."""
+    """Cabinet and loop, joined by a network inside this process."""
 
     def __init__(self, order: Order, arm: Arm) -> None:
         config = load_configuration("emulator/default.yaml", order.cabinet_settings())
@@ -113,6 +114,7 @@ class _Bench:
         self.cabinet.start_program()
         link = LinkSettings(address="127.0.0.1", port=0, lock_step=True)
         self.control = Control.create(len(order.motion))
+        network = Network()
         self.ring = Ring.create(_RING_ROWS)
         self.loop = Loop(
             LoopSettings(
@@ -128,8 +130,9 @@ class _Bench:
             arm.limits,
             self.control,
             self.ring,
+            network=network,
         )
-        self.end = ControllerEnd(self.loop.remote.address)
+        self.end = ControllerEnd(self.loop.remote.address, network=network)
         self.recording: Recording | None = None
         self._sent = False
 

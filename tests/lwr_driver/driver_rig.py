@@ -1,4 +1,4 @@
-"""A loop and a controller's session in one thread: one call is one FRI cycle, over real sockets, no clock."""
+"""A loop and a controller's session in one thread: one call is one FRI cycle; sockets out of lock step only."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.controller_end import ControllerEnd
+from fri.in_process import Network
 from fri.krc import KrcSession, Sample, Setpoint
 from fri.krl import Interpreter
 from fri.packets import CMD, CMD_SIZE
@@ -105,8 +106,9 @@ class Rig:
         self.settings = LoopSettings(
             "127.0.0.1", 0, None, lock_step, program, 0.1, tracking_limit_rad, self.arm.joint_names
         )
-        self.loop = Loop(self.settings, self.arm.limits, self.control, ring, watch)
-        self.end = ControllerEnd(self.loop.remote.address)
+        self.network = Network() if lock_step else None  # in real time the loop waits at its socket
+        self.loop = Loop(self.settings, self.arm.limits, self.control, ring, watch, self.network)
+        self.end = ControllerEnd(self.loop.remote.address, network=self.network)
         self.arrived = Arrived()
         self.sent_by_loop: list[NDArray[np.float64]] = []
         self.cycle_number = 0
@@ -120,7 +122,7 @@ class Rig:
         port = self.loop.remote.address[1]
         self.loop.remote.close()
         settings = dataclasses.replace(self.settings, port=port)
-        self.loop = Loop(settings, self.arm.limits, self.control)
+        self.loop = Loop(settings, self.arm.limits, self.control, network=self.network)
 
     def close(self) -> None:
         self.end.close()

@@ -18,7 +18,10 @@ def test_load_data_reach_the_controller_and_too_heavy_ones_do_not() -> None:
     settings = {"fri.program": "lwr_identification", "fri.period_ms": 5}
     link = LinkSettings(address="127.0.0.1", port=port, lock_step=True, handshake="lwr_identification")
     payload = Payload("block", 3.34, (0.0, -0.066, 0.144), (0.01, 0.0, 0.0, 0.02, 0.0, 0.03))
-    with EmulatorProcess(fri_port=port, settings=settings) as emulator, Driver(arm(), link) as driver:
+    with (
+        EmulatorProcess(fri_port=port, settings=settings, hosting=True) as emulator,
+        Driver(arm(), link, host=emulator.host) as driver,
+    ):
         driver.connect()
         driver.set_load(*load_data(arm(), payload))
         load = emulator.status()["load"]

@@ -142,3 +142,20 @@ def test_bad_samples_are_named():
         regressor.torque(chain, q, q, q, bodies(6))
     with pytest.raises(ConfigurationError, match="C-contiguous"):
         regressor.rigid_regressor(chain, q, q, q, out=np.zeros((70, 7, 4)))
+
+
+def test_a_plain_single_sample_is_a_batch_of_one():
+    chain = lwr()
+    q, qd, qdd = states(chain, 20)
+    inertial = bodies(7)
+    torque = regressor.torque(chain, q, qd, qdd, inertial)
+    whole = regressor.rigid_regressor(chain, q, qd, qdd)
+    for k in range(20):
+        now = q[k].copy(), qd[k].copy(), qdd[k].copy()
+        assert np.array_equal(regressor.torque(chain, *now, inertial), torque[k : k + 1])
+        assert np.array_equal(regressor.rigid_regressor(chain, *now), whole[:, k : k + 1])
+    now[1][2] = np.inf
+    with pytest.raises(DataError, match="`qd` of joint E1 is inf at sample 0"):
+        regressor.torque(chain, *now, inertial)
+    with pytest.raises(DataError, match="`qd` of joint E1 is inf at sample 0"):
+        regressor.rigid_regressor(chain, *now)

@@ -50,10 +50,12 @@ class Lab:
 
     def __init__(self) -> None:
         self.arm = Arm.load()
-        self.emulator = EmulatorProcess(lock_step=True, fri_port=free_port("127.0.0.1"), period_ms=PERIOD_MS)
+        self.emulator = EmulatorProcess(
+            lock_step=True, fri_port=free_port("127.0.0.1"), period_ms=PERIOD_MS, hosting=True
+        )
         self.emulator.start()
         settings = LinkSettings("127.0.0.1", self.emulator.fri_port, lock_step=True, lock_step_patience_s=3.0)
-        self.driver = Driver(self.arm, settings)
+        self.driver = Driver(self.arm, settings, host=self.emulator.host)
         self.driver.connect()
 
     def close(self) -> None:
