@@ -229,7 +229,7 @@ class Bench:
             motor_torque_source="krl_reals" if experiment.motor_torque.source == "krl_reals" else "none",
             software=software(),
             git_commit=git_commit(),
-            utc_start=epoch.isoformat() if self.driver.link.lock_step else None,
+            utc_start=epoch.isoformat() if experiment.lock_step else None,
         )
 
 
