@@ -18,6 +18,7 @@ from ident.import_log import Guess, Known, guess_mapping, import_log, read_recor
 from ident.import_log.bag import bag_files
 from ident.import_log.guess import RESTING_RAD
 from lwr_driver.session import Session, read_session
+from runner.terminal import ask
 
 GUESSED = ("yes", "joints", "rate_hz", "torque", "torque_constant", "gear_ratio")
 """Parameters of `guess_options`."""
@@ -158,7 +159,7 @@ def _confirm(guess: Guess, yes: bool) -> None:
         )
     else:
         click.echo(str(guess), err=True)
-        if not click.confirm("Is this right?", err=True):
+        if not ask("Is this right?"):
             raise ConfigurationError(f"correct this mapping file and use `lwr-run import`:\n\n{guess.text}")
 
 
