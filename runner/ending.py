@@ -51,7 +51,7 @@ class Ending:
         for text in self.advice:
             status.write(text, stream=out)
         if self.next_step:
-            status.write(self.next_step, "bold", stream=out)
+            status.write(self.next_step, "bold", stream=out, command=True)
 
 
 def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -319,6 +319,11 @@ class Run:
             bench.status.say(warning)
         if outcome.status == "success":
             self._rest = self._at_rest(plan.payload)
+            worst = 1000.0 * float(np.max(link.worst_tracking_error_rad))
+            bench.status.say(
+                f"{plan.name}: logged {recorded.samples} samples, {link.missed} cycles missed, tracking within "
+                f"{worst:.1f} mrad"
+            )
             self._progress.finish(plan.name, self._rest, recorded.samples)
         return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error, warnings)
 

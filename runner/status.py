@@ -38,8 +38,11 @@ def console(stream: TextIO) -> Console:
     return Console(file=stream, highlight=False, markup=False, emoji=False)
 
 
-def write(text: str, style: str = "", *, stream: TextIO | None = None) -> None:
-    """Write `text` above the live line, by default to standard error; on a terminal wrapped and in colour."""
+def write(text: str, style: str = "", *, stream: TextIO | None = None, command: bool = False) -> None:
+    """Write `text` above the live line, by default to standard error; on a terminal wrapped and in colour.
+
+    command : for the shell; a broken line goes on behind a backslash.
+    """
     stream = sys.stderr if stream is None else stream
     if not watched(stream):
         stream.write(text + "\n")
@@ -50,7 +53,7 @@ def write(text: str, style: str = "", *, stream: TextIO | None = None) -> None:
         clear()
     place = console(stream) if above is None or above.console is None else above.console
     for line in text.split("\n"):
-        place.print(_hung(line, place.width, style))
+        place.print(_hung(line, place.width, style, command))
 
 
 def clear() -> None:
@@ -59,30 +62,29 @@ def clear() -> None:
         status.clear()
 
 
-def _hung(line: str, width: int, style: str) -> Text:
+def _hung(line: str, width: int, style: str, command: bool) -> Text:
     """A line broken between words, continued under its indentation; a path is broken behind a slash."""
     from rich.text import Text
 
     indent = len(line) - len(line.lstrip())
     hang = " " * min(indent + 2, width // 4)
+    width -= 2 if command else 0
     rows, row = [], line[:indent]
-    begun = False
-    for word in line[indent:].split(" "):
-        glue = " " if begun else ""
-        if len(row) + len(glue) + len(word) <= width:
-            row += glue + word
-        else:
-            if begun:
-                rows.append(row)
-                row = hang
-            for piece in _pieces(word, width - len(hang) - 1):
-                if len(row) + len(piece) > width - 1 and row.strip():
-                    # A shell takes the two lines as one word.
-                    rows.append(row + "\\" if "/" in word else row)
-                    row = ""
-                row += piece
-        begun = True
-    return Text("\n".join([*rows, row]), style=style, no_wrap=True, overflow="ignore")
+    for number, word in enumerate(line[indent:].replace(" %", "\u00a0%").split(" ")):
+        glued = f"{row} {word}" if number else row + word
+        if len(glued) <= width:
+            row = glued
+            continue
+        if number:
+            rows.append(row + " " * command)
+            row = hang
+        *whole, word = _pieces(word, width - len(hang))
+        for piece in whole:
+            rows.append(row + piece)
+            row = ""
+        row += word
+    text = ("\\\n" if command else "\n").join([*rows, row]).replace("\u00a0", " ")
+    return Text(text, style=style, no_wrap=True, overflow="ignore")
 
 
 def _pieces(word: str, width: int) -> Iterator[str]:

@@ -245,10 +245,9 @@ def _begin(
 
 
 def _tell_files(status: StatusLine, folder: Path, remarks: Sequence[str] = ()) -> None:
-    """Name the experiment, its folder and its frozen files; `--verbose` has their hashes."""
+    """Name the experiment and its folder; `--verbose` lists its files with their hashes."""
     files = Frozen(folder).files()
-    named = f"{len(files)} files frozen in {folder}/files, with their SHA-256"
-    status.say(listed(files) if verbosity() else f"experiment {files[0].path}: {named}")
+    status.say(listed(files) if verbosity() else f"experiment {files[0].path}, results in {folder}")
     for remark in remarks:
         status.say(remark)
 
