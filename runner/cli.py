@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 _AS_JSON = "runner.as_json"
 
 VERBS = {
+    "init": "a new laboratory: experiment file, arm, cell, KRL program",
     "doctor": "examine this computer, the link and the controller",
     "record": "log what the controller sends, nothing is commanded",
     "hold": "enter command mode, hold the pose, leave it",
