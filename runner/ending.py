@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
 from ident.diagnosis.statements import Statements
@@ -39,7 +38,7 @@ class Ending:
         """Write the end to standard output, the last line being the next step."""
         out = sys.stdout
         if verbosity() and self.tables:
-            click.echo(f"{self.tables.rstrip()}\n")
+            status.write(f"{self.tables.rstrip()}\n", stream=out)
         status.write(self.sentence, f"bold {status.STYLES[self.level]}", stream=out)
         for verdict in self.look:
             wanted = f" (wanted: {verdict.wanted})" if verdict.wanted else ""

@@ -17,6 +17,12 @@ if TYPE_CHECKING:  # rich is imported on the first use at a terminal: help pages
 STYLES = {"good": "green", "look": "yellow", "bad": "red"}
 """Colour by verdict."""
 
+# Verdict words of the tables: at the beginning of a line, or as a column.
+_WORDS = {
+    r"^\s*(ok|good)(?= )|(?<= )holds(?= )": "green",
+    r"^\s*(look|note|hint)(?= )": "yellow",
+    r"^\s*(FAIL|bad)(?= )|(?<= )VIOLATED(?= )": "bold red",
+}
 _WIDE = 60
 _BARS = (6, 24)
 _GAP = 2
@@ -84,7 +90,10 @@ def _hung(line: str, width: int, style: str, command: bool) -> Text:
             row = ""
         row += word
     text = ("\\\n" if command else "\n").join([*rows, row]).replace("\u00a0", " ")
-    return Text(text, style=style, no_wrap=True, overflow="ignore")
+    shown = Text(text, style=style, no_wrap=True, overflow="ignore")
+    for words, colour in _WORDS.items() if not style else ():
+        shown.highlight_regex(words, colour)
+    return shown
 
 
 def _pieces(word: str, width: int) -> Iterator[str]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 import click
 
 from fri.errors import ConfigurationError
+from lwr_driver.configuration import CONFIGS
 from runner.output import OUTPUT_FOLDER
 from runner.terminal import json_option, to_json, verb
 
@@ -39,7 +39,7 @@ def command(folder: Path, as_json: bool) -> None:
         if target.is_dir():
             raise ConfigurationError(f"{target} is a folder; choose another FOLDER")
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(files("configs").joinpath(source).read_bytes())
+        target.write_bytes((CONFIGS / source).read_bytes())
     if as_json:
         click.echo(to_json({"folder": folder, "files": list(FILES)}))
         return

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
 
 from lwr_driver.configuration import CONFIGS
+from runner import status
 from runner.output import OUTPUT_FILE, default_output
 from runner.status import StatusLine
 from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb
@@ -34,9 +36,9 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
 
     problem = PlanProblem.load(file)
     target = out if out is not None else default_output(Path(f"{problem.name}.plan.yaml"), forced())
-    status = StatusLine()
-    found = plan(problem, lambda now: show_search(status, now))
-    status.clear()
+    progress = StatusLine()
+    found = plan(problem, lambda now: show_search(progress, now))
+    progress.clear()
     found.save(target)
     if as_json:
         keys = ("constraint", "subject", "value", "limit")
@@ -75,7 +77,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     experiment = Experiment.load(file)
     files = examine(experiment)
     if not as_json:
-        click.echo(listed(files))
+        status.write(listed(files), stream=sys.stdout)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     motions = Excitations.of(experiment, arm, cell)
@@ -85,8 +87,8 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
         rows = motions.rows(plan, period_ms / 1000)
         motion, found[plan.name] = session_motion(experiment, arm, cell, plan, rows, home)
         if not as_json:
-            click.echo(f"\nsession {plan.name}: {motion.duration_s:.1f} s")
-            click.echo(str(found[plan.name]))
+            text = f"\nsession {plan.name}: {motion.duration_s:.1f} s\n{found[plan.name]}"
+            status.write(text, stream=sys.stdout)
     if as_json:
         hold_json({name: list_.items for name, list_ in found.items()})
     for preflight in found.values():

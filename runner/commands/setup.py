@@ -11,7 +11,7 @@ from click.shell_completion import get_completion_class
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
-from runner.status import StatusLine
+from runner.status import StatusLine, write
 from runner.terminal import NAMED_FILE, default_file, json_option, to_json, verb
 
 
@@ -97,7 +97,10 @@ def doctor_command(
         stack.callback(status.clear)
         found = examine(patient, link_s=seconds if link else None, wait_s=wait_s, report=status.show)
         status.clear()
-    click.echo(to_json(found.to_dict()) if as_json else str(found))
+    if as_json:
+        click.echo(to_json(found.to_dict()))
+    else:
+        write(str(found), stream=sys.stdout)
     sys.exit(found.exit_code)
 
 
