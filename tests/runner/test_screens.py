@@ -11,7 +11,6 @@ import struct
 import subprocess
 import sys
 import termios
-import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +23,7 @@ from runner.status import StatusLine
 from tests.runner.experiment.experiment_rig import experiment_file
 
 LWR_RUN = str(Path(sys.executable).parent / "lwr-run")
-WIDTHS = (40, 80, 200)
+WIDTHS = (40, *(pytest.param(width, marks=pytest.mark.long) for width in (80, 200)))
 HEIGHT = 200
 PLAIN = {"NO_COLOR": "", "CI": "", "COLUMNS": "", "LINES": ""}
 
@@ -86,54 +85,40 @@ def watch(columns: int, command: list[str], place: Path, **environment: str) -> 
     return seen
 
 
-@pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Seen]:
-    """A short experiment at each width, at the same time."""
-    found: dict[int, Seen] = {}
-
-    def run(columns: int) -> None:
-        place = tmp_path_factory.mktemp(f"at{columns}")
-        name = str(experiment_file(place).name)
-        found[columns] = watch(columns, [LWR_RUN, "experiment", name, "--yes", "--out", "results"], place)
-
-    threads = [threading.Thread(target=run, args=(columns,)) for columns in WIDTHS]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return found
+@pytest.fixture(scope="module", params=WIDTHS)
+def seen(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    """A short experiment at one width."""
+    place = tmp_path_factory.mktemp("screens")
+    name = experiment_file(place, identification={"model": 1}).name
+    return watch(request.param, [LWR_RUN, "experiment", name, "--yes", "--out", "results"], place)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("columns", WIDTHS)
-def test_no_line_of_an_experiment_is_broken_by_the_margin(seen: dict[int, Seen], columns: int) -> None:
-    one = seen[columns]
-    assert one.code == 0, one.text
-    assert one.screen.broken == []
+def test_no_line_of_an_experiment_is_broken_by_the_margin(seen: Seen) -> None:
+    assert seen.code == 0, seen.text
+    assert seen.screen.broken == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("columns", WIDTHS)
-def test_one_live_line_has_phase_bar_and_time(seen: dict[int, Seen], columns: int) -> None:
-    live = [line for line in seen[columns].lines() if "━" in line or "─" in line]
+def test_one_live_line_has_phase_bar_and_time(seen: Seen) -> None:
+    live = [line for line in seen.lines() if "━" in line or "─" in line]
     assert any(line.startswith("loaded: period 1") for line in live), live
-    assert all(sum("━" in line for line in frame) <= 1 for frame in seen[columns].frames)
-    assert any("estimating the model" in line for line in seen[columns].lines())
+    assert all(sum("━" in line for line in frame) <= 1 for frame in seen.frames)
+    assert any("estimating the model" in line for line in seen.lines())
     # Nothing of it stays.
-    assert not any("━" in line or "─" in line for line in seen[columns].text)
+    assert not any("━" in line or "─" in line for line in seen.text)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("columns", WIDTHS)
-def test_the_screen_ends_with_verdict_numbers_and_the_next_step(seen: dict[int, Seen], columns: int) -> None:
-    text = seen[columns].text
+def test_the_screen_ends_with_verdict_numbers_and_the_next_step(seen: Seen) -> None:
+    text = seen.text
     assert text[-1] == "open results/report.html"
     end = "\n".join(text[-30:])
     assert "run" in end
     for number in ("torque error", "parameters", "payload mass"):
         assert number in end
     assert "RSD" not in end  # tables are in report.txt
-    assert not seen[columns].screen.cursor.hidden
+    assert not seen.screen.cursor.hidden
 
 
 def test_a_line_fits_every_width() -> None:
@@ -141,7 +126,8 @@ def test_a_line_fits_every_width() -> None:
     for width in range(40, 201):
         text = line.text(width).plain
         assert len(text) < width
-        assert ("validation: m" in text) and "━" in text
+        assert "validation: m" in text
+        assert "━" in text
     assert line.text(40).plain.rstrip().endswith("-:--")
     assert "missed 0" in line.text(120).plain
 
