@@ -69,10 +69,10 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     if counts:
         text = f"{counts['base']} estimated"
         if essential:
-            text += f", {essential['count']} of them essential"
+            text += f", {essential['count']} essential"
         listed = (essential or {}).get("parameters") or summary.get("parameters", ())
         rsd = [one["rsd_percent"] for one in listed if one.get("rsd_percent") is not None]
-        text += f", median relative deviation {float(np.median(rsd)):.2g} %" if rsd else ""
+        text += f", median relative std {float(np.median(rsd)):.2g} %" if rsd else ""
         found.append(("parameters", text))
     masses = [one for one in summary.get("parameters", ()) if _is_mass(one["name"])]
     if masses:
