@@ -179,12 +179,14 @@ class StatusLine:
     def show(self, task: str, fraction: float | None = None, *details: str, phase: str = "") -> None:
         """Show progress. task : such as a session; phase : of it; fraction : of the task, 0 to 1, None if unknown.
 
+        Where nobody watches, a task with a fraction is told once.
+
         details : the most important first; those without room are left out.
         """
         if task != self._task:
             self._task, self._told = task, set()
             self._line = _Line(first=fraction or 0.0)
-            if not self._watched:
+            if not self._watched and fraction is not None:
                 self.say(task)
         if self._watched:
             heading = f"{task}: {phase}" if phase else task

@@ -88,6 +88,7 @@ def command(
     from runner.diagnosis import arm_data, chain_of, known_arm
     from runner.experiment_file import Experiment
     from runner.files import locked
+    from runner.status import StatusLine
 
     if sessions and file is not None:
         raise ConfigurationError(
@@ -107,9 +108,12 @@ def command(
         folder.mkdir(parents=True, exist_ok=True)
         click.get_current_context().with_resource(locked(folder))
         paths = record_sets(experiment, folder, count, assume_yes=yes, allow_non_realtime=allow_non_realtime)
+    status = StatusLine()
+    status.show("estimating the healthy arm")
     parts = [[read_recording(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
     found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
+    status.clear()
     found.save(out)
     if as_json:
         click.echo(to_json(_content(found, paths, out)))

@@ -14,6 +14,7 @@ import click
 from fri.errors import ConfigurationError, DataError, LwrError, OperatorError, RobotError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
+from lwr_driver.configuration import CONFIGS
 from lwr_driver.references import Frozen
 from runner.diagnosis.after_run import conclude_run
 from runner.ending import of_folder, open_page
@@ -247,9 +248,17 @@ def _begin(
 def _tell_files(status: StatusLine, folder: Path, remarks: Sequence[str] = ()) -> None:
     """Name the experiment and its folder; `--verbose` lists its files with their hashes."""
     files = Frozen(folder).files()
-    status.say(listed(files) if verbosity() else f"experiment {files[0].path}, results in {folder}")
+    status.say(listed(files) if verbosity() else f"experiment {_short(files[0].path)}, results in {folder}")
     for remark in remarks:
         status.say(remark)
+
+
+def _short(path: Path) -> Path:
+    """The path within the working folder or this software, else the whole."""
+    for folder in (Path.cwd(), CONFIGS.parent):
+        if path.is_relative_to(folder):
+            return path.relative_to(folder)
+    return path
 
 
 def _failure(record: Record, folder: Path) -> LwrError:

@@ -209,9 +209,13 @@ def report_command(
         from runner.ending import of_folder
         from runner.report.page import write_report
         from runner.report.verdicts import headline, verdicts
+        from runner.status import StatusLine
 
         check_folder(folder)
+        status = StatusLine()
+        status.show("writing the report")
         page = write_report(folder)
+        status.clear()
         lines = verdicts(ResultFolder.load(folder))
         level, sentence = headline(lines)
         content = {"report": page, "level": level, "headline": sentence, "verdicts": lines}

@@ -191,7 +191,7 @@ def test_a_pipe_gets_each_message_once_and_no_control_characters() -> None:
     line.say("done")
     line.show("estimating the model")
     line.clear()
-    assert stream.getvalue() == "unloaded\ndone\nestimating the model\n"
+    assert stream.getvalue() == "unloaded\ndone\n"
 
 
 def test_the_time_left_follows_the_pace(monkeypatch: pytest.MonkeyPatch) -> None:
