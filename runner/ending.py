@@ -20,10 +20,10 @@ from runner.terminal import verbosity
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of a command. numbers : name and value. look : verdicts to look at. next_step : a shell command.
-    advice : sentences before it.
+    """The end of a command.
 
-    tables : the whole text, for `--verbose`.
+    numbers : name and value. look : verdicts to look at. advice : sentences before the next step. next_step : a shell
+    command. tables : the whole text, for `--verbose`.
     """
 
     level: Level

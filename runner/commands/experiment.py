@@ -125,7 +125,8 @@ def command(
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
     done = all(record.status == "success" for record in records)
-    status.show("estimating the model")
+    if done:
+        status.show("estimating the model")
     found = estimate(experiment, arm, records) if done else None
     summary = summarise(experiment, records, found)
     summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
