@@ -179,8 +179,8 @@ class StatusLine:
     def show(self, task: str, fraction: float | None = None, *details: str, phase: str = "") -> None:
         """Show progress. task : such as a session; phase : of it; fraction : of the task, 0 to 1, None if unknown.
 
-        details : the most important first; those without room are left out. Where nobody watches, a task with a fraction
-        is told once.
+        details : the most important first; those without room are left out. In a pipe, a task with a fraction is told
+        once.
         """
         if task != self._task:
             self._task, self._told = task, set()
