@@ -167,7 +167,7 @@ MEANINGS = {
     "--json": "boolean",
     "--yes": "boolean",
     "--force": "boolean",
-    "--arm": "text",
+    "--arm": "path",
     "--urdf": "path",
     "--port": "integer range",
     "--period-ms": "float range",
