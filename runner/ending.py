@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -70,13 +71,15 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         text = f"{counts['base']} estimated"
         if essential:
             text += f", {essential['count']} essential"
-        listed = (essential or {}).get("parameters") or summary.get("parameters", ())
+        listed = (essential or {}).get("parameters") or [
+            one for one in summary["parameters"] if not essential or one["name"] in essential["names"]
+        ]
         rsd = [one["rsd_percent"] for one in listed if one.get("rsd_percent") is not None]
         text += f", median relative std {float(np.median(rsd)):.2g} %" if rsd else ""
         found.append(("parameters", text))
     masses = [one for one in summary.get("parameters", ()) if _is_mass(one["name"])]
     if masses:
-        text = ", ".join(f"{one['estimate']:.4g} ± {one['std']:.1g} kg" for one in masses)
+        text = ", ".join(_spread(one["estimate"], one["std"]) for one in masses)
         found.append(("payload mass", text))
     elif "condition" in summary:
         found.append(("condition number", f"{summary['condition']:.4g}"))
@@ -107,6 +110,11 @@ def of_diagnosis(said: Statements, page: Path | None, folder: Path, tables: str)
 
 def _is_mass(name: str) -> bool:
     return name[:1] == "M" and name[1:].isdigit()
+
+
+def _spread(mass: float, std: float) -> str:
+    digits = max(0, -math.floor(math.log10(std))) if std > 0.0 and math.isfinite(std) else 4
+    return f"{mass:.{digits}f} ± {std:.{digits}f} kg"
 
 
 def open_page(page: Path) -> str:
