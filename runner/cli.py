@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import importlib
 import logging
 import os
-import sys
 import traceback
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,13 +14,17 @@ from typing import Any, NoReturn
 import click
 
 from fri.errors import FileError, LwrError, OperatorError
+from runner import status
 
 # Before the import of numpy: for small matrices a second BLAS thread costs time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 log = logging.getLogger(__name__)
 
+_AS_JSON = "runner.as_json"
+
 VERBS = {
+    "init": "a new laboratory: experiment file, arm, cell, KRL program",
     "doctor": "examine this computer, the link and the controller",
     "record": "log what the controller sends, nothing is commanded",
     "hold": "enter command mode, hold the pose, leave it",
@@ -77,6 +81,26 @@ class Verbs(click.Group):
         command: click.Command = getattr(module, "command" if family == cmd_name else f"{cmd_name}_command")
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of the first word; the nearest one is suggested for a misspelt word."""
+        name = args[0]
+        if name not in VERBS and not name.startswith("-"):
+            near = difflib.get_close_matches(name, VERBS, n=1)
+            advice = f"did you mean {near[0]!r}?" if near else "`lwr-run -h` lists the commands."
+            raise click.UsageError(f"no command {name!r}; {advice}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the command line; note whether JSON is wanted, for errors come as JSON then."""
+        ctx.meta[_AS_JSON] = "--json" in args
+        try:
+            return super().parse_args(ctx, args)
+        except click.UsageError as error:
+            _answer(ctx, error.format_message(), "UsageError", error.exit_code)
+            raise
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs without importing them."""
         with formatter.section("Commands"):
@@ -85,13 +109,20 @@ class Verbs(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; every error becomes one message and an exit code."""
         try:
-            return super().invoke(ctx)
+            result = super().invoke(ctx)
+            _answer(ctx)
+            return result
         except LwrError as error:
             _complain(ctx, error)
         except (KeyboardInterrupt, click.Abort):
+            status.clear()
             click.echo("aborted", err=True)
+            _answer(ctx, "aborted", OperatorError.__name__, OperatorError.exit_code)
             ctx.exit(OperatorError.exit_code)
-        except (click.ClickException, click.exceptions.Exit, BrokenPipeError):
+        except click.ClickException as error:
+            _answer(ctx, error.format_message(), type(error).__name__, error.exit_code)
+            raise
+        except (click.exceptions.Exit, BrokenPipeError):
             raise
         except OSError as error:
             _complain(ctx, FileError.of(error))
@@ -107,16 +138,42 @@ class Verbs(click.Group):
                     f"{place.lineno}). Please report it with what `lwr-run -vv` prints"
                 ),
             )
+        finally:
+            status.clear()
 
 
 def _complain(ctx: click.Context, error: LwrError) -> NoReturn:
-    click.secho(f"{type(error).__name__}: {error}", fg="red", err=True)
+    status.write(f"{type(error).__name__}: {error}", "red")
     log.debug("raised here", exc_info=error)
+    _answer(ctx, str(error), type(error).__name__, error.exit_code)
     ctx.exit(error.exit_code)
 
 
+def _answer(ctx: click.Context, error: str = "", kind: str = "", exit_code: int = 0) -> None:
+    """Print the JSON object held back, with the error; an error alone if JSON is wanted and none was held."""
+    if not ctx.meta.get(_AS_JSON):
+        return
+    from runner.terminal import held_json, to_json
+
+    content = held_json(ctx)
+    if error:
+        content |= {"error": error, "kind": kind, "exit_code": exit_code}
+    if content:
+        click.echo(to_json(content))
+
+
+class _Screen(logging.Handler):
+    """Log records on standard error, above the live line."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record."""
+        status.write(self.format(record))
+
+
 @click.group(cls=Verbs, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-v", "--verbose", count=True, help="Log more: -v progress, -vv every detail.")
+@click.option(
+    "-v", "--verbose", count=True, help="Tables on the screen and more in the log; -vv every detail."
+)
 @click.version_option(package_name="lwr-identification", prog_name="lwr-run")
 def main(verbose: int) -> None:
     """Identify the dynamics of a KUKA LWR4+: drive the arm, log the motion, estimate the model.
@@ -127,7 +184,7 @@ def main(verbose: int) -> None:
     lwr-run identify a.mcap b.mcap       a model from logs
     """
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_Screen()])
 
 
 if __name__ == "__main__":

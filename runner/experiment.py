@@ -39,7 +39,8 @@ from runner.preflight import (
     load_data,
     set_load,
 )
-from runner.terminal import Interrupts, StatusLine
+from runner.status import StatusLine
+from runner.terminal import Interrupts
 
 Vector = npt.NDArray[np.float64]
 Status = Literal["success", "abort", "fail"]
@@ -317,6 +318,11 @@ class Run:
             bench.status.say(warning)
         if outcome.status == "success":
             self._rest = self._at_rest(plan.payload)
+            worst = 1000.0 * float(np.max(link.worst_tracking_error_rad))
+            bench.status.say(
+                f"{plan.name}: logged {recorded.samples} samples, {link.missed} cycles missed, tracking within "
+                f"{worst:.1f} mrad"
+            )
             self._progress.finish(plan.name, self._rest, recorded.samples)
         return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error, warnings)
 
@@ -396,10 +402,13 @@ class Run:
         def progress(now: MotionProgress) -> None:
             error = 1000 * float(np.max(now.state.tracking_error))
             self.bench.status.show(
-                f"{plan.name}: {now.phase}",
+                plan.name,
                 now.row / max(now.rows, 1),
-                f"{now.time_s:6.1f} of {motion.duration_s:.1f} s  {now.state.state} {now.state.quality}  "
-                f"tracking {error:.1f} mrad  missed {now.state.miss_counter}",
+                f"missed {now.state.miss_counter}",
+                f"tracking {error:.1f} mrad",
+                f"{now.state.state} {now.state.quality}",
+                f"{now.time_s:.1f} of {motion.duration_s:.1f} s",
+                phase=now.phase.replace("_", " "),
             )
 
         if self.bench.onlooker is not None:
@@ -411,7 +420,7 @@ class Run:
         trace = path.with_suffix(".trace.csv")
         text = (
             f"{trace.name} is not there: {path.name} has no motor torques and serves Model 1; "
-            f"`lwr-run attach {path} TRACE` adds them later"
+            f"`lwr-run attach {path} TRACE --force` adds them later"
         )
         if self.bench.operator.save_trace(trace):
             text = str(import_trace(path, trace))

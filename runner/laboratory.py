@@ -6,8 +6,6 @@ import socket
 from contextlib import ExitStack
 from pathlib import Path
 
-import click
-
 from fri.errors import OperatorError
 from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
@@ -16,7 +14,8 @@ from lwr_driver.driver import Driver, LinkSettings, Waiting
 from runner.contact import expected_arm
 from runner.experiment import Bench, Operator
 from runner.experiment_file import Experiment, Payload
-from runner.terminal import StatusLine
+from runner.status import StatusLine
+from runner.terminal import ask
 from sim_backend.configuration import load_configuration
 from sim_backend.pendant import Pendant
 from sim_backend.process import EmulatorProcess
@@ -60,7 +59,7 @@ class Person:
         return path.exists()
 
     def _confirm(self, question: str) -> None:
-        if not self._assume_yes and not click.confirm(question, default=False, err=True):
+        if not self._assume_yes and not ask(question):
             raise OperatorError(f"not confirmed: {question.rsplit('. ', 1)[0]}; nothing moved")
 
 
@@ -189,11 +188,9 @@ class Laboratory:
         )
 
     def _notify(self, waiting: Waiting) -> None:
-        self.status.show(
-            f"waiting for {waiting.awaited}",
-            0.0,
-            f"{waiting.since_s:.0f} s; seen: {waiting.seen}. {waiting.advice}",
-        )
+        # Nobody stands at the pendant of the built-in emulator.
+        advice = "" if self.experiment.backend == "emulator" else waiting.advice
+        self.status.wait(waiting.awaited, waiting.since_s, waiting.seen, advice)
 
 
 def free_port(address: str) -> int:

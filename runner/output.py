@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,51 @@ def _refusal(number: int, path: Path) -> FileError:
     return FileError.of(OSError(number, os.strerror(number)), f"{path} cannot be written")
 
 
-class OutputFile(click.Path):
-    """A file to be written, tried as the command line is read."""
+def check_replacement(path: Path, kind: OutputFile, forced: bool) -> None:
+    """Raise ConfigurationError for a file, or a folder with files, that exists and may not be replaced."""
+    if forced or not path.exists() or (isinstance(kind, OutputFolder) and not kind.replaces):
+        return
+    if not isinstance(kind, OutputFolder):
+        advice = "choose another name" + (", or replace it with --force" if kind.replaces else "")
+        raise ConfigurationError(f"{path} exists; {advice}")
+    if not path.is_dir() or any(path.iterdir()):
+        raise ConfigurationError(
+            f"{path} is not empty, or no folder; choose another one, or replace its files with --force"
+        )
 
-    def __init__(self) -> None:
+
+def default_output(path: Path, forced: bool) -> Path:
+    """`path`, the place of an output without a name, if it can be written."""
+    check_file(path)
+    check_replacement(path, OUTPUT_FILE, forced)
+    return path
+
+
+@contextlib.contextmanager
+def set_aside(path: Path) -> Iterator[None]:
+    """Move an existing file away for the work; it comes back if the work fails, else it is removed."""
+    if not path.exists():
+        yield
+        return
+    kept = path.with_name(f"{path.name}.replaced")
+    path.replace(kept)
+    try:
+        yield
+    except BaseException:
+        kept.replace(path)
+        raise
+    kept.unlink()
+
+
+class OutputFile(click.Path):
+    """A file to be written, tried as the command line is read.
+
+    replaces : `--force` replaces an existing one.
+    """
+
+    def __init__(self, *, replaces: bool = True) -> None:
         super().__init__(path_type=Path)
+        self.replaces = replaces
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path, after `check_file`."""
@@ -71,6 +112,7 @@ class OutputFolder(OutputFile):
 
 
 OUTPUT_FILE, OUTPUT_FOLDER = OutputFile(), OutputFolder()
+NEW_FILE, NEW_FOLDER = OutputFile(replaces=False), OutputFolder(replaces=False)
 
 
 def new_folder(folder: Path, advice: str = "choose another --results") -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fri.errors import ConfigurationError, DataError
+from runner.terminal import ask
 
 if TYPE_CHECKING:
     from ident.import_log import Guess
@@ -164,7 +165,7 @@ def _confirm(guess: Guess, yes: bool) -> None:
         )
     else:
         click.echo(str(guess), err=True)
-        if not click.confirm("Is this right?", err=True):
+        if not ask("Is this right?"):
             raise ConfigurationError(f"correct this mapping file and use `lwr-run import`:\n\n{guess.text}")
 
 

@@ -31,7 +31,7 @@ from runner.experiment_file import Experiment, Payload, SessionPlan
 from runner.planning import excitation_rows, store_plan, stored_plan
 from runner.preflight import check_start
 from runner.results import estimate, named_model, summarise, unseen_sessions, write_results
-from runner.terminal import StatusLine
+from runner.status import StatusLine
 
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"
@@ -47,7 +47,7 @@ def rounds_begun(folder: Path) -> int:
 def show_search(status: StatusLine, now: SearchProgress) -> None:
     """The progress of a search on the status line."""
     best = "none yet" if now.best is None else f"{now.best:.4g}"
-    status.show(now.stage, now.done / max(now.total, 1), f"best feasible {best}, {now.elapsed_s:.0f} s")
+    status.show(now.stage, now.done / max(now.total, 1), f"best feasible {best}")
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,14 @@ class Rounds:
         if stored is not None:
             return stored
         status = self.status
-        status.show(f"estimate before round {number}", 0.0, "")
+        status.show(f"estimate before round {number}")
         found = estimate(self.experiment, self.arm, records)
         summary = summarise(self.experiment, records, found)
         write_results(self.folder, self.experiment, self.arm, summary, found)
         model = self.folder / MODEL.format(number - 1)
         write_model(named_model(found.model, self.arm.name), model)
         problem = next_problem(self.experiment, self.cell, records, found, model)
-        hint = "Ctrl-C ends the search and keeps the best motion so far"
-        status.show(f"planning round {number}", 0.0, hint)
+        status.show(f"planning round {number}", None, "Ctrl-C keeps the best motion so far")
         motion = planned_near_home(self.experiment, self.arm, problem, lambda now: show_search(status, now))
         store_plan(self.folder, name, motion)
         status.clear()

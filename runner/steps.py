@@ -241,17 +241,20 @@ class Steps:
                 return "fail", reason, RobotError(reason)
             passed = cycles * state.period_s if seconds is not None else time.monotonic() - began
             positions = " ".join(f"{degrees:.1f}" for degrees in np.degrees(state.q))
-            share = 0.0 if wanted is None else cycles / wanted
-            end = "" if seconds is not None else "  Ctrl-C ends it"
-            status.show(what, share, f"{passed:.0f} s  {state.state} {state.quality}  [{positions}] deg{end}")
+            share = None if wanted is None else cycles / wanted
+            end = () if seconds is not None else ("Ctrl-C ends it",)
+            details = (f"{passed:.0f} s", *end, f"{state.state} {state.quality}", f"[{positions}] deg")
+            status.show(what, share, *details)
         return "success", "", None
 
     def _progress(self, now: MotionProgress) -> None:
         error = 1000.0 * float(np.max(now.state.tracking_error))
         self.bench.status.show(
-            now.phase,
+            now.phase.replace("_", " "),
             now.row / max(now.rows, 1),
-            f"{now.time_s:.1f} s  {now.state.quality}  tracking {error:.1f} mrad",
+            f"tracking {error:.1f} mrad",
+            now.state.quality,
+            f"{now.time_s:.1f} s",
         )
 
     def _end_record(self, status: Any, reason: str) -> Recorded:

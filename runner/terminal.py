@@ -1,25 +1,158 @@
-"""The terminal: shared options, results as JSON, the status line, Ctrl-C."""
+"""The terminal: commands and their shared options, results as JSON, Ctrl-C."""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
+import logging
 import math
 import signal
-import sys
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, Self, TextIO
+from typing import Any, Self
 
 import click
 
-from fri.errors import DataError
+from fri.errors import ConfigurationError, DataError, FileError
+from lwr_driver.configuration import CONFIGS
+from runner import status
+from runner.output import OutputFile, check_replacement
 
-PATH = click.Path(path_type=Path)
-_BAR = 24
+_FORCE = "runner.force"
+_HELD = "runner.held"
+_LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+
+
+class InputPath(click.Path):
+    """A file or folder to be read. It must exist when the command runs; the shell completes it."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def require(self, path: Path) -> None:
+        """Raise ConfigurationError, with a name that is near, unless `path` exists."""
+        try:
+            path.stat()
+        except FileNotFoundError:
+            folder = path.parent
+            there = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+            near = difflib.get_close_matches(path.name, there, n=1)
+            if near:
+                advice = f"did you mean {folder / near[0]}?"
+            else:
+                advice = (
+                    "correct the path"
+                    if folder.is_dir()
+                    else f"there is no folder {folder}; correct the path"
+                )
+            raise ConfigurationError(f"{path}: no such file or folder; {advice}") from None
+        except OSError as error:
+            raise FileError.of(error, f"{path} cannot be read") from error
+
+
+PATH = InputPath()
+NAMED_FILE = click.Path()
+"""A file of that path, or of that name in `configs/`; the shell completes files."""
+
+
+def default_file() -> str:
+    """The `experiment.yaml` of a laboratory in the working folder, else the default one, on the emulator."""
+    here = Path("experiment.yaml")
+    # A folder of results has one too: it is a record, not a laboratory.
+    if here.is_file() and not Path("progress.json").exists():
+        return str(here)
+    return str(CONFIGS / "experiments/default.yaml")
+
+
+def verbosity() -> int:
+    """How often `-v` was given, before the command or behind it."""
+    context = click.get_current_context(silent=True)
+    return 0 if context is None else int(context.find_root().params.get("verbose") or 0)
+
+
+def log_more(times: int) -> None:
+    """Set the level of the log by the number of `-v`."""
+    logging.getLogger().setLevel(_LEVELS[min(times, 2)])
+
+
+def _verbose(context: click.Context, parameter: click.Parameter, value: int) -> None:
+    if value:
+        root = context.find_root()
+        root.params["verbose"] = int(root.params.get("verbose") or 0) + value
+        log_more(root.params["verbose"])
+
+
+def _force(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    context.meta[_FORCE] = value
+
+
+def forced() -> bool:
+    """Whether existing files may be replaced, by `--force`."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(_FORCE))
+
+
+def hold_json(content: Mapping[str, Any]) -> None:
+    """Print this JSON object at the end of the command; an error until then is added to it."""
+    click.get_current_context().meta[_HELD] = dict(content)
+
+
+def held_json(context: click.Context) -> dict[str, Any]:
+    """The content of `hold_json`, once; empty without any."""
+    found: dict[str, Any] = context.meta.pop(_HELD, {})
+    return found
+
+
+def ask(question: str) -> bool:
+    """Ask a person; the sentences before the question are wrapped above it."""
+    status.clear()
+    said, _, last = question.rpartition(". ")
+    if said:
+        status.write(f"{said}.")
+    return click.confirm(last, default=False, err=True)
+
+
+class Verb(click.Command):
+    """A command whose inputs must exist and whose outputs must not, checked before its work.
+
+    `--verbose` belongs to each, `--force` to those with outputs.
+    """
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        if any(isinstance(one.type, OutputFile) and one.type.replaces for one in self.params):
+            about = "Replace what exists."
+            self.params.append(
+                click.Option(["--force"], is_flag=True, expose_value=False, callback=_force, help=about)
+            )
+        about = "Tables on the screen and more in the log; -vv every detail."
+        self.params.append(
+            click.Option(["-v", "--verbose"], count=True, expose_value=False, callback=_verbose, help=about)
+        )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, after a look at its files."""
+        for parameter, path in self._paths(ctx):
+            if isinstance(parameter.type, OutputFile):
+                check_replacement(path, parameter.type, forced())
+            elif isinstance(parameter.type, InputPath):
+                parameter.type.require(path)
+        return super().invoke(ctx)
+
+    def _paths(self, ctx: click.Context) -> Iterator[tuple[click.Parameter, Path]]:
+        # Outputs first: a wrong place is told whatever the inputs are.
+        for parameter in sorted(self.params, key=lambda one: not isinstance(one.type, OutputFile)):
+            value = ctx.params.get(parameter.name or "")
+            for path in value if isinstance(value, tuple) else (value,):
+                if isinstance(path, Path):
+                    yield parameter, path
+
+
+verb = partial(click.command, cls=Verb)
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Machine-readable output.")
@@ -33,7 +166,7 @@ gear_ratio_option = click.option(
 )
 
 
-class GroupedCommand(click.Command):
+class GroupedCommand(Verb):
     """A command with its options under headings in the help.
 
     groups : heading -> parameter names of the options; all others follow under "Options".
@@ -95,50 +228,6 @@ def write_json(path: Path, content: Any) -> None:
             raise DataError("the content read back differs from that written")
 
     write_checked(path, to_json(content) + "\n", check)
-
-
-class StatusLine:
-    """One line, rewritten in place on a terminal; elsewhere one line per phase.
-
-    stream : standard error by default; results go to standard output. interval_s : shortest time between rewrites.
-    """
-
-    def __init__(self, stream: TextIO | None = None, interval_s: float = 0.2) -> None:
-        self._stream = stream if stream is not None else sys.stderr
-        self._interval = interval_s
-        self._live = self._stream.isatty()
-        self._next = 0.0
-        self._heading = ""
-        self._width = 0
-
-    def show(self, heading: str, fraction: float, detail: str) -> None:
-        """Show progress: `heading` (session and phase), `fraction` of the motion from 0 to 1, `detail`."""
-        now = time.monotonic()
-        if self._live and (now >= self._next or fraction >= 1.0 or heading != self._heading):
-            filled = round(_BAR * min(max(fraction, 0.0), 1.0))
-            bar = "█" * filled + "░" * (_BAR - filled)
-            text = f"{heading:<26} {bar} {100 * fraction:3.0f} %  {detail}"
-            self._write("\r" + text.ljust(self._width))
-            self._width = len(text)
-            self._next = now + self._interval
-        elif not self._live and heading != self._heading:
-            self._write(f"{heading}  {detail}\n")
-        self._heading = heading
-
-    def say(self, text: str) -> None:
-        """Print a permanent line above the status line."""
-        self.clear()
-        self._write(text + "\n")
-
-    def clear(self) -> None:
-        """Remove the status line."""
-        if self._live and self._width:
-            self._write("\r" + " " * self._width + "\r")
-        self._width, self._heading = 0, ""
-
-    def _write(self, text: str) -> None:
-        self._stream.write(text)
-        self._stream.flush()
 
 
 class Interrupts:

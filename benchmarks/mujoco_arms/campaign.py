@@ -126,6 +126,7 @@ def diagnosed(folder: Path, again: bool, home: Path | None = None) -> float:
         "--no-simulation",
         "--out",
         str(out),
+        "--force",
     ]
     _command(command, folder / "diagnose.txt")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -133,7 +133,7 @@ class Comparison(Tabular):
             lines.append(
                 f"{d.name:<10}{d.first:>11.5g} {_std(d.first_std):<10}"
                 f"{d.second:>9.5g} {_std(d.second_std):<10}"
-                f"{d.percent:>8.1f}{d.z:>8.1f}{mark}{d.unit}" + (f"  ({d.note})" if d.note else "")
+                f"{d.percent:>z8.1f}{d.z:>z8.1f}{mark}{d.unit}" + (f"  ({d.note})" if d.note else "")
             )
         lines.append("")
         if math.isfinite(self.p):

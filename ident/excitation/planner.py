@@ -190,7 +190,8 @@ def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate
             stage = int((search.hops - left) / share + 1e-9)
             lanes = _ranked(lanes)[: max(1, search.lanes >> min(stage, 30))]
     except KeyboardInterrupt:
-        _log.warning("search interrupted; the best motion so far is kept")
+        kept = "no motion was found yet" if tracker.best is None else "the best motion so far is kept"
+        _log.warning("search interrupted; %s", kept)
         tracker.interrupted = True
         if tracker.best is not None:
             found.append(tracker.best)

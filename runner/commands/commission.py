@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.output import OUTPUT_FILE
-from runner.terminal import coupling_option, gear_ratio_option, json_option, to_json
+from runner.terminal import (
+    NAMED_FILE,
+    PATH,
+    coupling_option,
+    default_file,
+    gear_ratio_option,
+    json_option,
+    to_json,
+    verb,
+    verbosity,
+)
 
 if TYPE_CHECKING:
     from ident.diagnosis import Reference
@@ -21,10 +31,13 @@ _FIRST_SEED = 1001
 """Seed of the emulator's noise in the first set; other runs begin at 1, so no noise comes twice."""
 
 
-@click.command("commission")
-@click.argument("sessions", nargs=-1, type=click.Path(path_type=Path))
+@verb("commission")
+@click.argument("sessions", nargs=-1, type=PATH)
 @click.option(
-    "--experiment", "file", help="Experiment whose sessions are recorded; default: on the built-in emulator."
+    "--experiment",
+    "file",
+    type=NAMED_FILE,
+    help="Experiment whose sessions are recorded; default: on the built-in emulator.",
 )
 @click.option(
     "--sets",
@@ -32,10 +45,12 @@ _FIRST_SEED = 1001
     help="Number of sets: to record (default 3), or in SESSIONS, set after set (default 1).",
 )
 @click.option("--out", required=True, type=OUTPUT_FILE, help="Model file of the healthy arm.")
-@click.option("--arm", help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.")
 @click.option(
-    "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
+    "--arm",
+    type=NAMED_FILE,
+    help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.",
 )
+@click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session.")
 @coupling_option
 @gear_ratio_option
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
@@ -71,8 +86,9 @@ def command(
     from ident.diagnosis import commission
     from ident.import_log import read_recording
     from runner.diagnosis import arm_data, chain_of, known_arm
-    from runner.experiment_file import DEFAULT, Experiment
+    from runner.experiment_file import Experiment
     from runner.files import locked
+    from runner.status import StatusLine
 
     if sessions and file is not None:
         raise ConfigurationError(
@@ -87,14 +103,17 @@ def command(
         size = len(sessions) // count
         paths = [list(sessions[k : k + size]) for k in range(0, len(sessions), size)]
     else:
-        experiment = Experiment.load(file if file is not None else DEFAULT)
+        experiment = Experiment.load(file if file is not None else default_file())
         folder, count = out.with_name(f"{out.stem}_sessions"), sets or _RECORDED_SETS
         folder.mkdir(parents=True, exist_ok=True)
         click.get_current_context().with_resource(locked(folder))
         paths = record_sets(experiment, folder, count, assume_yes=yes, allow_non_realtime=allow_non_realtime)
+    status = StatusLine()
+    status.show("estimating the healthy arm")
     parts = [[read_recording(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
     found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
+    status.clear()
     found.save(out)
     if as_json:
         click.echo(to_json(_content(found, paths, out)))
@@ -123,7 +142,7 @@ def record_sets(
     from runner.files import begin, check_finished, gather, go_on, listed
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
-    from runner.terminal import StatusLine
+    from runner.status import StatusLine
 
     frozen = Frozen(folder.resolve())
     remarks: list[str] = []
@@ -141,7 +160,9 @@ def record_sets(
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     status = StatusLine()
-    status.say("\n".join([listed(frozen.files()), *remarks]))
+    status.say(
+        "\n".join([listed(frozen.files()) if verbosity() else f"files frozen in {frozen.folder}", *remarks])
+    )
     motions = Excitations.of(experiment, arm, cell, folder)
     motions.save(folder)
     found = []

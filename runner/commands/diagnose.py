@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from runner.output import OUTPUT_FOLDER
-from runner.terminal import GroupedCommand, coupling_option, gear_ratio_option, json_option
+from runner.terminal import (
+    NAMED_FILE,
+    PATH,
+    GroupedCommand,
+    coupling_option,
+    gear_ratio_option,
+    hold_json,
+    json_option,
+)
 
 _GROUPS = {
     "Sessions": ("test", "model", "reference"),
@@ -17,25 +24,23 @@ _GROUPS = {
 
 
 @click.command("diagnose", cls=GroupedCommand, groups=_GROUPS)
-@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("sessions", nargs=-1, required=True, type=PATH)
 @click.option(
     "--test",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="SESSION",
     help="Held-out session, never fitted (repeatable).",
 )
-@click.option(
-    "--model", type=click.Path(path_type=Path), help="Present model, the baseline of the simulation."
-)
-@click.option(
-    "--reference", type=click.Path(path_type=Path), help="Model of `lwr-run commission`, arm healthy."
-)
+@click.option("--model", type=PATH, help="Present model, the baseline of the simulation.")
+@click.option("--reference", type=PATH, help="Model of `lwr-run commission`, arm healthy.")
 @click.option("--out", required=True, type=OUTPUT_FOLDER, help="Folder of the results.")
-@click.option("--arm", help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.")
 @click.option(
-    "--urdf", type=click.Path(path_type=Path), help="Kinematics; default: the one in the first session."
+    "--arm",
+    type=NAMED_FILE,
+    help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.",
 )
+@click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session.")
 @coupling_option
 @gear_ratio_option
 @click.option(
@@ -84,11 +89,15 @@ def command(
     from runner.diagnosis import arm_data, asked, chain_of, known_arm, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
+    from runner.ending import of_diagnosis
     from runner.estimation import recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
+    from runner.status import StatusLine
 
     replaceable(out)
+    status = StatusLine()
+    status.show("diagnosing model errors")
     logs = [read_recording(path) for path in sessions]
     held = [read_recording(path) for path in test]
     chain = chain_of(logs, urdf)
@@ -110,9 +119,14 @@ def command(
     found = found.with_offers(offers_after_logs(found.diagnosis, experiment))
     found.write(out)
     content = {**found.diagnosis.to_dict(), "look_alikes": [pair.to_dict() for pair in found.pairs]}
-    click.echo(json.dumps(content, indent=1, allow_nan=False) if as_json else str(found))
+    status.show("writing the report")
+    page = None
     try:
-        click.echo(str(write_diagnosis_report(out)), err=as_json)
+        page = write_diagnosis_report(out)
     except ConfigurationError as error:
-        click.echo(f"no report.html: {error}", err=True)
-    click.echo(str(out), err=as_json)
+        status.say(f"no report.html: {error}")
+    status.clear()
+    if as_json:
+        hold_json(content)
+    else:
+        of_diagnosis(found.said, page, out, str(found)).tell()

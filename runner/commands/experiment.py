@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from functools import partial
@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import click
 
 from fri.errors import ConfigurationError, DataError, LwrError, OperatorError, RobotError
-from runner.output import OUTPUT_FOLDER, new_folder
-from runner.terminal import PATH, StatusLine, json_option, to_json
+from runner.output import NEW_FOLDER, new_folder
+from runner.status import StatusLine
+from runner.terminal import NAMED_FILE, default_file, hold_json, json_option, to_json, verb, verbosity
 
 # Everything else is imported on use: the help page needs none of it.
 if TYPE_CHECKING:
@@ -24,11 +25,16 @@ if TYPE_CHECKING:
     from runner.planning import Excitations
 
 
-@click.command("experiment")
-@click.argument("file", required=False)
-@click.option("--out", type=OUTPUT_FOLDER, help="Folder of the results; default: experiments/NAME-STAMP.")
+@verb("experiment")
+@click.argument("file", required=False, type=NAMED_FILE)
+@click.option("--out", type=NEW_FOLDER, help="Folder of the results; default: experiments/NAME-STAMP.")
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
-@click.option("--resume", type=PATH, metavar="FOLDER", help="Continue the aborted experiment in FOLDER.")
+@click.option(
+    "--resume",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Continue the aborted experiment in FOLDER.",
+)
 @click.option(
     "--allow-non-realtime", is_flag=True, help="Command a real arm without real-time rights; may stutter."
 )
@@ -54,6 +60,7 @@ if TYPE_CHECKING:
     "--reveal",
     is_flag=False,
     flag_value="",
+    type=click.Path(),
     metavar="[FOLDER]",
     help="Show the effect hidden in the run of FOLDER (default: the latest) beside the findings.",
 )
@@ -73,10 +80,13 @@ def command(
     reveal: str | None,
     as_json: bool,
 ) -> None:
-    """Run the experiment FILE; without one the default, against the built-in emulator.
+    """Run the experiment FILE; by default against the built-in emulator.
 
     Plans and checks an exciting motion, drives the arm and logs it, has the payload swapped and checked, drives
-    again, estimates the model, and diagnoses its errors. The last line of the output is the folder of the results.
+    again, estimates the model, and diagnoses its errors. Ends with the verdict, its numbers, and the command that
+    opens the report; report.txt and --verbose have the tables.
+
+    Without FILE it takes the experiment.yaml of `lwr-run init` in this folder, else the default experiment.
 
     Ctrl-C once stops the arm within its limits, twice drops the link.
 
@@ -98,6 +108,7 @@ def command(
     from lwr_driver.arm.cell import Cell
     from lwr_driver.references import Frozen
     from runner.ahead import import_ahead
+    from runner.ending import of_folder
     from runner.experiment import Run
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
@@ -108,7 +119,7 @@ def command(
     experiment, folder = _begin(file, out, resume, hide, replan or 0, status)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
-    status.show("planning the excitation", 0.0, "")
+    status.show("checking the planned motion" if experiment.excitation.plan else "planning the excitation")
     motions = Excitations.of(experiment, arm, cell, folder)
     status.clear()
     motions.save(folder)
@@ -121,37 +132,55 @@ def command(
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
     done = all(record.status == "success" for record in records)
+    if done:
+        status.show("estimating the model")
     found = estimate(experiment, arm, records, status.say) if done else None
     summary = summarise(experiment, records, found)
     summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
     text = write_results(folder, experiment, arm, summary, found)
     if found is not None:
         status.say(held_out_errors(summary, folder))
+    more, advice = [], []
     if done and experiment.diagnosis.run and not no_diagnosis:
         from runner.diagnosis.after_run import conclude_run
 
-        status.show("diagnosis", 0.0, "")
+        status.show("diagnosing model errors")
         concluded = conclude_run(
             experiment, arm, cell, motions, folder, records, laboratory=laboratory, decide=decide
         )
-        status.clear()
         summary |= concluded.to_dict()
         text = f"{text}\n{concluded.text(folder)}"
+        more = [] if concluded.study is None else [concluded.study.said.headline]
+        advice = concluded.advice(folder)
     if experiment.sealed:
-        text = f"{text}\nAn effect is hidden in the emulated arm; `lwr-run experiment --reveal {folder}` shows it."
-    from runner.report.page import write_report
-
-    try:
-        click.echo(str(write_report(folder)), err=as_json)
-    except LwrError as error:
-        click.echo(f"no report.html: {error}", err=True)
-    click.echo(to_json({**summary, "folder": str(folder)}) if as_json else f"{text}\n{folder}")
+        advice.append(
+            f"An effect is hidden in the emulated arm; `lwr-run experiment --reveal {folder}` shows it."
+        )
+    (folder / "report.txt").write_text(f"{text.rstrip()}\n", encoding="utf-8")
+    status.show("writing the report")
+    page = _page(folder, status)
+    status.clear()
+    if as_json:
+        hold_json({**summary, "folder": str(folder)})
+    else:
+        of_folder(folder, page, text, more, advice).tell()
     if not done:
         raise _failure(records[-1], folder)
     if summary.get("unscored"):
         raise DataError(
             "; ".join(f"{one['session']} was not scored: {one['reason']}" for one in summary["unscored"])
         )
+
+
+def _page(folder: Path, status: StatusLine) -> Path | None:
+    """The report of a folder, None with a message where it cannot be written."""
+    from runner.report.page import write_report
+
+    try:
+        return write_report(folder)
+    except LwrError as error:
+        status.say(f"no report.html: {error}")
+        return None
 
 
 @contextmanager
@@ -184,23 +213,27 @@ def _sealed(
 
 
 def _reveal(folder: Path | None, as_json: bool) -> None:
+    from runner.ending import open_page
     from runner.hiding.reveal import hidden_run, reveal
-    from runner.report.page import write_report
 
+    status = StatusLine()
     folder = hidden_run(folder)
     shown = reveal(folder)
     shown.save(folder)
-    click.echo(str(write_report(folder)), err=as_json)
+    status.show("writing the report")
+    page = _page(folder, status)
+    status.clear()
     click.echo(to_json(shown.to_dict()) if as_json else str(shown))
+    if page is not None and not as_json:
+        click.echo(open_page(page))
 
 
 def _begin(
     file: str | None, out: Path | None, resume: Path | None, hide: int | None, rounds: int, status: StatusLine
 ) -> tuple[Experiment, Path]:
     """The experiment of frozen files and its folder, held until the end of the command."""
-    from lwr_driver.references import Frozen
-    from runner.experiment_file import DEFAULT, Experiment
-    from runner.files import begin, gather, go_on, listed, locked
+    from runner.experiment_file import Experiment
+    from runner.files import begin, gather, go_on, locked
 
     context = click.get_current_context()
     if resume is not None:
@@ -215,9 +248,9 @@ def _begin(
             )
         context.with_resource(locked(resume))
         experiment, remarks = go_on(resume.resolve(), rounds=rounds)
-        status.say("\n".join([listed(Frozen(resume).files()), *remarks]))
+        _tell_files(status, resume, remarks)
         return experiment, resume
-    experiment = Experiment.load(file if file is not None else DEFAULT)
+    experiment = Experiment.load(file if file is not None else default_file())
     if hide is not None:
         from runner.hiding.effect import emulated_arm
 
@@ -228,8 +261,29 @@ def _begin(
     new_folder(folder, "choose another --out, or go on there with --resume")
     context.with_resource(locked(folder))
     experiment = begin(experiment, references, folder.resolve())
-    status.say(listed(Frozen(folder).files()))
+    _tell_files(status, folder)
     return experiment, folder
+
+
+def _tell_files(status: StatusLine, folder: Path, remarks: Sequence[str] = ()) -> None:
+    """Name the experiment and its folder; `--verbose` lists its files with their hashes."""
+    from lwr_driver.references import Frozen
+    from runner.files import listed
+
+    files = Frozen(folder).files()
+    status.say(listed(files) if verbosity() else f"experiment {_short(files[0].path)}, results in {folder}")
+    for remark in remarks:
+        status.say(remark)
+
+
+def _short(path: Path) -> Path:
+    """The path within the working folder or this software, else the whole."""
+    from lwr_driver.configuration import CONFIGS
+
+    for folder in (Path.cwd(), CONFIGS.parent):
+        if path.is_relative_to(folder):
+            return path.relative_to(folder)
+    return path
 
 
 def _failure(record: Record, folder: Path) -> LwrError:

@@ -10,9 +10,10 @@ import click
 
 from fri.errors import ConfigurationError
 from ident.estimators.names import AUTO, SUMMARIES
-from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, new_folder
+from runner.output import NEW_FOLDER, OUTPUT_FILE, new_folder
 from runner.recordings import GUESSED, guess_options, read_recordings
-from runner.terminal import GroupedCommand, json_option, to_json
+from runner.status import StatusLine
+from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_option
 
 _SUMMARIES = {
     AUTO: "of wls and physical, base upright or leaning, the best on held-back motion",
@@ -39,7 +40,7 @@ _GROUPS = {
 
 
 @click.command("identify", epilog=_EPILOG, cls=GroupedCommand, groups=_GROUPS)
-@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("sessions", nargs=-1, required=True, type=PATH)
 @click.option(
     "--model",
     type=click.IntRange(1, 3),
@@ -59,7 +60,7 @@ _GROUPS = {
     metavar="FILE=NAME[:KG]",
     help="Payload of a session, in place of its metadata; `none`: the bare arm.",
 )
-@click.option("--urdf", type=click.Path(path_type=Path), help="Kinematics; default: from the first session.")
+@click.option("--urdf", type=PATH, help="Kinematics; default: from the first session.")
 @click.option("--base", metavar="LINK", help="First link of the arm; gravity points down in its axes.")
 @click.option("--tip", metavar="LINK", help="Last link of the arm; default: behind the last measured joint.")
 @click.option(
@@ -72,19 +73,20 @@ _GROUPS = {
 @click.option(
     "--test",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="SESSION",
     help="Held-out session to validate the model (repeatable).",
 )
 @click.option(
     "--settings",
+    type=NAMED_FILE,
     metavar="FILE",
     help="YAML file of filters, covariance and more; see docs/identify_settings.md.",
 )
 @click.option("--out", type=OUTPUT_FILE, help="Model file to write, e.g. model.yaml.")
 @click.option(
     "--results",
-    type=OUTPUT_FOLDER,
+    type=NEW_FOLDER,
     metavar="FOLDER",
     help="Folder for summary.json, model.yaml and report.html, as of an experiment.",
 )
@@ -132,6 +134,7 @@ def command(
     from ident.dynamics.session_chain import session_chain
     from ident.estimation.identify import identify
     from ident.model.model_file import write_model
+    from runner.ending import of_estimate, of_folder
     from runner.estimation import (
         IdentifySettings,
         announced,
@@ -151,6 +154,7 @@ def command(
     if results is not None:
         new_folder(results)
     folder = results if results is not None else Path() if out is None else out.parent
+    status = StatusLine()
     logs = read_recordings((*sessions, *test), urdf=urdf, folder=folder, base=base, tip=tip, **known)
     logs = announced(logs, payload)
     if model is None and all(log.motor is None for log in logs):
@@ -164,6 +168,7 @@ def command(
         stiffness = tuple(arm.stiffness.tolist())
         wanted = replace(wanted, signals=replace(wanted.signals, stiffness_nm_rad=stiffness))
     mounting = None
+    status.show("estimating the model")
     if estimator == AUTO:
         from ident.estimation.choice import choose
 
@@ -184,6 +189,7 @@ def command(
     # The model first: nothing in a test session may cost it.
     if out is not None:
         write_model(result, out)
+    status.show("testing the model")
     validation = None
     if tested:
         from ident.estimation.validate import validate
@@ -193,13 +199,18 @@ def command(
         whole = validation.to_dict()
         content |= {"validation": whole["sessions"], "unscored": whole["unscored"]}
         text = f"{text}\n\n{validation}"
-    click.echo(to_json(content) if as_json else text)
-    if out is not None:
-        click.echo(str(out), err=as_json)
+    page = None
     if results is not None:
         from runner.results import write_log_results
 
+        status.show("writing the report")
         page = write_log_results(results, found, logs, tested, result, text=text)
-        click.echo(str(page), err=as_json)
+    status.clear()
+    if as_json:
+        hold_json(content)
+    elif results is not None:
+        of_folder(results, page, text).tell()
+    else:
+        of_estimate(content, out, text).tell()
     if validation is not None:
         validation.require_all()

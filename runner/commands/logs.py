@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
-from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, check_file, check_folder
-from runner.terminal import PATH, json_option, to_json
+from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, check_file, check_folder, default_output, set_aside
+from runner.terminal import NAMED_FILE, PATH, forced, json_option, to_json, verb
 
 
-@click.command("info")
+@verb("info")
 @click.argument("session", type=PATH)
 @json_option
 def info_command(session: Path, as_json: bool) -> None:
@@ -26,7 +26,7 @@ def info_command(session: Path, as_json: bool) -> None:
     click.echo(to_json(summary.as_dict()) if as_json else str(summary))
 
 
-@click.command("recover")
+@verb("recover")
 @click.argument("session", type=PATH)
 @click.option("--out", type=OUTPUT_FILE, help="Recovered file; default: SESSION.recovered.mcap.")
 @json_option
@@ -40,15 +40,16 @@ def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
     """
     from lwr_driver.session import recover
 
-    target = out if out is not None else check_file(session.with_suffix(".recovered.mcap"))
-    done = recover(session, target)
+    target = out if out is not None else default_output(session.with_suffix(".recovered.mcap"), forced())
+    with set_aside(target):
+        done = recover(session, target)
     click.echo(to_json(done) if as_json else str(done))
 
 
-@click.command("attach")
+@verb("attach")
 @click.argument("session", type=PATH)
 @click.argument("trace", type=PATH)
-@click.option("--out", type=OUTPUT_FILE, help="New file; default: replace SESSION in one step.")
+@click.option("--out", type=OUTPUT_FILE, help="New file; default with --force: SESSION itself.")
 @click.option(
     "--tolerance-ms", type=click.FloatRange(min=0.0, min_open=True), help="Largest accepted timing error."
 )
@@ -65,12 +66,17 @@ def attach_command(
     q_A1 ... q_A6 [rad].
 
     \b
-    lwr-run attach loaded.mcap loaded.trace.csv
+    lwr-run attach loaded.mcap loaded.trace.csv --out traced.mcap
+    lwr-run attach loaded.mcap loaded.trace.csv --force
     """
     from lwr_driver.session.trace import import_trace
 
     if out is None:
         check_file(session)
+        if not forced():
+            raise ConfigurationError(
+                f"attach would change {session}; name a new file with --out, or change it with --force"
+            )
     tolerance = None if tolerance_ms is None else tolerance_ms / 1000.0
     done = import_trace(session, trace, out, tolerance_s=tolerance)
     click.echo(to_json(done) if as_json else str(done))
@@ -85,8 +91,8 @@ def _rows(context: click.Context, parameter: click.Parameter, value: str | None)
     return int(first), int(last)
 
 
-@click.command("import")
-@click.argument("mapping")
+@verb("import")
+@click.argument("mapping", type=NAMED_FILE)
 @click.argument("source", type=PATH)
 @click.argument("output", type=OUTPUT_FILE)
 @click.option("--rows", callback=_rows, metavar="A:B", help="Rows A to B-1 only, counted from 0.")
@@ -125,23 +131,24 @@ def import_command(
 
     if output.suffix != ".mcap":
         raise ConfigurationError(f"output {output}: a session log ends in .mcap")
-    done = import_log(
-        LogMapping.load(mapping),
-        source,
-        output,
-        rows=rows,
-        payload=payload,
-        payload_mass=payload_mass,
-        serial=serial,
-        urdf=urdf,
-        base=base,
-        tip=tip,
-        beside=mapping_path(mapping).parent,
-    )
+    with set_aside(output):
+        done = import_log(
+            LogMapping.load(mapping),
+            source,
+            output,
+            rows=rows,
+            payload=payload,
+            payload_mass=payload_mass,
+            serial=serial,
+            urdf=urdf,
+            base=base,
+            tip=tip,
+            beside=mapping_path(mapping).parent,
+        )
     click.echo(to_json(done) if as_json else str(done))
 
 
-@click.command("report")
+@verb("report")
 @click.argument("folder", type=PATH)
 @click.option(
     "--figures",
@@ -199,15 +206,23 @@ def report_command(
     from runner.report.folder import ResultFolder
 
     if figures is None:
+        from runner.ending import of_folder
         from runner.report.page import write_report
         from runner.report.verdicts import headline, verdicts
+        from runner.status import StatusLine
 
         check_folder(folder)
+        status = StatusLine()
+        status.show("writing the report")
         page = write_report(folder)
+        status.clear()
         lines = verdicts(ResultFolder.load(folder))
         level, sentence = headline(lines)
         content = {"report": page, "level": level, "headline": sentence, "verdicts": lines}
-        click.echo(to_json(content) if as_json else f"{sentence}\n{page}")
+        if as_json:
+            click.echo(to_json(content))
+        else:
+            of_folder(folder, page, "\n".join(map(str, lines))).tell()
         return
     from runner.report.paper_folder import save_for_paper
 

@@ -8,12 +8,11 @@ from typing import Any
 
 import click
 
-from fri.errors import ConfigurationError
 from runner.output import OUTPUT_FILE
-from runner.terminal import PATH, json_option, to_json
+from runner.terminal import NAMED_FILE, PATH, forced, json_option, to_json, verb
 
 
-@click.command("validate")
+@verb("validate")
 @click.argument("model", type=PATH)
 @click.argument("sessions", nargs=-1, required=True, type=PATH)
 @json_option
@@ -24,7 +23,10 @@ from runner.terminal import PATH, json_option, to_json
 @click.option("--forward", is_flag=True, help="Simulate along the commanded motion too.")
 @click.option("--cross", is_flag=True, help="Cross-validate over the sessions too.")
 @click.option(
-    "--settings", metavar="FILE", help="Settings of `identify`; its `signals` replace those of the model."
+    "--settings",
+    type=NAMED_FILE,
+    metavar="FILE",
+    help="Settings of `identify`; its `signals` replace those of the model.",
 )
 @click.option(
     "--estimate-delay", is_flag=True, help="Estimate the motor channel's delay anew in each session."
@@ -84,7 +86,7 @@ def validate_command(
     click.echo(to_json(content) if as_json else "\n\n".join(texts))
 
 
-@click.command("compare")
+@verb("compare")
 @click.argument("first", type=PATH)
 @click.argument("second", type=PATH)
 @json_option
@@ -111,7 +113,7 @@ def compare_command(first: Path, second: Path, as_json: bool, level: float) -> N
     click.echo(to_json(result.to_dict()) if as_json else str(result))
 
 
-@click.command("payload")
+@verb("payload")
 @click.argument("model", type=PATH)
 @click.argument("sessions", nargs=-1, required=True, type=PATH)
 @click.option("--free-offsets", is_flag=True, help="Estimate the torque offsets anew.")
@@ -133,8 +135,6 @@ def payload_command(
     from ident.import_log import read_recording
     from ident.model.model_file import read_model, write_model
 
-    if out is not None and out.exists():
-        raise ConfigurationError(f"file {out} exists; choose another name")
     arm = read_model(model)
     found = identify_payload(arm, [read_recording(path) for path in sessions], free_offsets=free_offsets)
     click.echo(to_json(found.to_dict()) if as_json else str(found))
@@ -143,15 +143,14 @@ def payload_command(
         click.echo(str(out), err=as_json)
 
 
-@click.command("export")
+@verb("export")
 @click.argument("model", type=PATH)
 @click.argument("outputs", nargs=-1, required=True, type=OUTPUT_FILE)
 @click.option("--payload", help="Payload of the model to mount; default: the bare arm.")
 @click.option("--name", default="arm", show_default=True, help="Name in the file; prefix of the C functions.")
-@click.option("--force", is_flag=True, help="Replace existing files.")
 @json_option
 def export_command(
-    model: Path, outputs: tuple[Path, ...], payload: str | None, name: str, force: bool, as_json: bool
+    model: Path, outputs: tuple[Path, ...], payload: str | None, name: str, as_json: bool
 ) -> None:
     """Write a model in other formats, chosen by the endings of OUTPUTS.
 
@@ -169,10 +168,7 @@ def export_command(
     """
     from ident.formats import FORMATS, export
 
-    for output in outputs:
-        if output.suffix in FORMATS and output.exists() and not force:
-            raise ConfigurationError(f"output {output} exists; choose another name or give --force")
-    done = export(model, *outputs, payload=payload, name=name, overwrite=force)
+    done = export(model, *outputs, payload=payload, name=name, overwrite=forced())
     if as_json:
         files = [{"file": output, "format": FORMATS[output.suffix]} for output in outputs]
         click.echo(to_json({"files": files, "title": done.title, "notes": done.notes}))

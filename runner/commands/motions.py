@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
 
-from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
-from runner.output import OUTPUT_FILE, check_file
-from runner.terminal import PATH, StatusLine, json_option, to_json
+from runner import status
+from runner.output import OUTPUT_FILE, default_output
+from runner.status import StatusLine
+from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb
 
-_EXPERIMENT = str(CONFIGS / "experiments/default.yaml")
 
-
-@click.command("plan")
-@click.argument("file", default=str(CONFIGS / "plans/default.yaml"))
+@verb("plan")
+@click.argument("file", type=NAMED_FILE, default=str(CONFIGS / "plans/default.yaml"))
 @click.option("--out", type=OUTPUT_FILE, help="Plan file; default: NAME.plan.yaml here.")
-@click.option("--force", is_flag=True, help="Replace an existing plan file.")
 @json_option
-def plan_command(file: str, out: Path | None, force: bool, as_json: bool) -> None:
+def plan_command(file: str, out: Path | None, as_json: bool) -> None:
     """Plan the exciting motion of the problem FILE; by default the one of the stored plan.
 
     The plan file has coefficients, margins of all limits on the continuous motion, objective values, predicted
@@ -36,12 +35,10 @@ def plan_command(file: str, out: Path | None, force: bool, as_json: bool) -> Non
     from runner.replanning import show_search
 
     problem = PlanProblem.load(file)
-    target = out if out is not None else check_file(Path(f"{problem.name}.plan.yaml"))
-    if target.exists() and not force:
-        raise ConfigurationError(f"{target} exists; choose another --out, or replace it with --force")
-    status = StatusLine()
-    found = plan(problem, lambda now: show_search(status, now))
-    status.clear()
+    target = out if out is not None else default_output(Path(f"{problem.name}.plan.yaml"), forced())
+    progress = StatusLine()
+    found = plan(problem, lambda now: show_search(progress, now))
+    progress.clear()
     found.save(target)
     if as_json:
         keys = ("constraint", "subject", "value", "limit")
@@ -57,8 +54,8 @@ def plan_command(file: str, out: Path | None, force: bool, as_json: bool) -> Non
     click.echo(str(target), err=as_json)
 
 
-@click.command("check")
-@click.argument("file", default=_EXPERIMENT)
+@verb("check")
+@click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option("--period-ms", default=5.0, show_default=True, type=click.FloatRange(1, 100), help="FRI cycle.")
 @json_option
 def check_command(file: str, period_ms: float, as_json: bool) -> None:
@@ -80,7 +77,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     experiment = Experiment.load(file)
     files = examine(experiment)
     if not as_json:
-        click.echo(listed(files))
+        status.write(listed(files), stream=sys.stdout)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     motions = Excitations.of(experiment, arm, cell)
@@ -90,23 +87,23 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
         rows = motions.rows(plan, period_ms / 1000)
         motion, found[plan.name] = session_motion(experiment, arm, cell, plan, rows, home)
         if not as_json:
-            click.echo(f"\nsession {plan.name}: {motion.duration_s:.1f} s")
-            click.echo(str(found[plan.name]))
+            text = f"\nsession {plan.name}: {motion.duration_s:.1f} s\n{found[plan.name]}"
+            status.write(text, stream=sys.stdout)
     if as_json:
-        click.echo(to_json({name: list_.items for name, list_ in found.items()}))
+        hold_json({name: list_.items for name, list_ in found.items()})
     for preflight in found.values():
         preflight.enforce()
 
 
-@click.command("preview")
-@click.argument("file", default=_EXPERIMENT)
+@verb("preview")
+@click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option("--session", metavar="NAME", help="Session of the experiment; default: the heaviest payload.")
-@click.option("--out", type=PATH, default=Path("preview.html"), show_default=True, help="The page to write.")
+@click.option("--out", type=OUTPUT_FILE, help="The page to write; default: preview.html.")
 @click.option("--serve", "serving", is_flag=True, help="Serve an interactive scene until Ctrl-C instead.")
 @click.option("--port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of --serve.")
 @json_option
 def preview_command(
-    file: str, session: str | None, out: Path, serving: bool, port: int, as_json: bool
+    file: str, session: str | None, out: Path | None, serving: bool, port: int, as_json: bool
 ) -> None:
     """Show a planned motion in 3D. FILE is an experiment file, a folder of results or a plan file.
 
@@ -121,7 +118,7 @@ def preview_command(
     from runner.preview import planned_motion, preview_html, serve
 
     if not serving:
-        check_file(out)
+        out = out if out is not None else default_output(Path("preview.html"), forced())
     planned = planned_motion(file, session=session)
 
     def tell(place: str) -> None:
@@ -134,7 +131,7 @@ def preview_command(
                 click.echo(str(item))
         click.echo(place)
 
-    if serving:
+    if out is None:
         serve(planned, port, tell)
         return
     out.write_text(preview_html(planned), encoding="utf-8")

@@ -11,11 +11,12 @@ from click.shell_completion import get_completion_class
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
-from runner.terminal import StatusLine, json_option, to_json
+from runner.status import StatusLine, write
+from runner.terminal import NAMED_FILE, default_file, json_option, to_json, verb
 
 
-@click.command("doctor")
-@click.argument("file", default=str(CONFIGS / "experiments/default.yaml"))
+@verb("doctor")
+@click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option("--link", is_flag=True, help="Test the link too: answer the controller in monitor mode.")
 @click.option(
     "--seconds", default=10.0, show_default=True, type=click.FloatRange(0.5), help="Length of the test."
@@ -96,7 +97,10 @@ def doctor_command(
         stack.callback(status.clear)
         found = examine(patient, link_s=seconds if link else None, wait_s=wait_s, report=status.show)
         status.clear()
-    click.echo(to_json(found.to_dict()) if as_json else str(found))
+    if as_json:
+        click.echo(to_json(found.to_dict()))
+    else:
+        write(str(found), stream=sys.stdout)
     sys.exit(found.exit_code)
 
 
@@ -104,15 +108,15 @@ def _is_error(record: logging.LogRecord) -> bool:
     return record.levelno > logging.WARNING
 
 
-@click.command("emulator")
-@click.argument("config", default=str(CONFIGS / "emulator/default.yaml"))
+@verb("emulator")
+@click.argument("config", type=NAMED_FILE, default=str(CONFIGS / "emulator/default.yaml"))
 @click.option("--fri-host", default="127.0.0.1", show_default=True, help="Address of the commanding PC.")
 @click.option("--fri-port", default=49938, show_default=True, type=click.IntRange(1, 65535), help="Its port.")
 @click.option(
     "--pendant-port", default=0, type=click.IntRange(0, 65535), help="Port of the pendant; 0: any free port."
 )
 @click.option("--period-ms", type=click.FloatRange(1, 100), help="FRI cycle; default: as configured.")
-@click.option("--program", help="KRL program: a name of configs/krl, or a .src file.")
+@click.option("--program", type=NAMED_FILE, help="KRL program: a name of configs/krl, or a .src file.")
 @click.option(
     "--set",
     "settings",
@@ -178,7 +182,7 @@ def emulator_command(
     sys.exit(status)
 
 
-@click.command("completion")
+@verb("completion")
 @click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
 @click.pass_context
 def completion_command(context: click.Context, shell: str) -> None:

@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fri.errors import ConfigurationError, OperatorError
-from runner.output import OUTPUT_FILE, check_folder
-from runner.terminal import PATH, StatusLine, json_option, to_json
+from runner.output import NEW_FILE, check_folder
+from runner.status import StatusLine
+from runner.terminal import NAMED_FILE, PATH, ask, default_file, json_option, to_json, verb
 
 if TYPE_CHECKING:
     from runner.experiment_file import Experiment
     from runner.steps import Pose, Step, Steps
 
-_EXPERIMENT = "experiments/default.yaml"
 _FOLDER = Path("steps")
 _SPEED = 0.1
 _SILENCE_S = 60.0
 """A recording survives so much silence: another KRL program is selected meanwhile."""
 
-out_option = click.option("--out", type=OUTPUT_FILE, help="Session log; default: steps/NAME-STAMP.mcap.")
+out_option = click.option("--out", type=NEW_FILE, help="Session log; default: steps/NAME-STAMP.mcap.")
 payload_option = click.option(
     "--payload", metavar="NAME", help="Mounted payload, of FILE; default: the empty flange."
 )
@@ -74,7 +74,7 @@ def _run(order: _Order, work: Callable[[Steps, Path], Step]) -> Step:
     status = StatusLine()
     if order.question and experiment.backend == "fri" and not order.yes:
         question = f"{order.question} Keep people away and a hand on the emergency stop. Ready?"
-        if not click.confirm(question, default=False, err=True):
+        if not ask(question):
             raise OperatorError(f"{order.name} was not confirmed; nothing moved")
     path.parent.mkdir(parents=True, exist_ok=True)
     laboratory = Laboratory(experiment, allow_non_realtime=order.allow_non_realtime, status=status)
@@ -91,8 +91,6 @@ def _log(order: _Order) -> Path:
         return _FOLDER / f"{order.name}-{stamp}.mcap"
     if order.out.suffix != ".mcap":
         raise ConfigurationError(f"--out {order.out}: a session log ends in .mcap")
-    if order.out.exists():
-        raise ConfigurationError(f"{order.out} exists; choose another --out")
     return order.out
 
 
@@ -113,14 +111,14 @@ def _tell(order: _Order, step: Step, *more: str) -> None:
     click.echo(str(step))
 
 
-@click.command("record")
-@click.argument("file", default=_EXPERIMENT)
+@verb("record")
+@click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option("--seconds", type=click.FloatRange(0.1), help="Length; default: until Ctrl-C.")
 @out_option
 @click.option(
     "--poses",
     "poses",
-    type=OUTPUT_FILE,
+    type=NEW_FILE,
     metavar="YAML",
     help="Write the poses at rest to this file, for `home`.",
 )
@@ -139,8 +137,6 @@ def record_command(
     lwr-run record my_lab.yaml --out guided.mcap --poses poses.yaml
     """
     order = _Order("record", file, out, as_json=as_json)
-    if poses is not None and poses.exists():
-        raise ConfigurationError(f"{poses} exists; choose another --poses")
     step = _run(order, lambda steps, path: steps.record(path, seconds))
     lines = [f"{pose.name} at {pose.time_s:.1f} s: {_row(pose)} rad" for pose in step.poses]
     if poses is not None:
@@ -162,8 +158,8 @@ def _write_poses(path: Path, step: Step) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-@click.command("hold")
-@click.argument("file", default=_EXPERIMENT)
+@verb("hold")
+@click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option(
     "--seconds",
     default=5.0,
@@ -198,10 +194,10 @@ def hold_command(
     _tell(order, _run(order, lambda steps, path: steps.hold(path, seconds)))
 
 
-@click.command("jog", context_settings={"ignore_unknown_options": True})
+@verb("jog", context_settings={"ignore_unknown_options": True})
 @click.argument("joint", callback=_no_option)
 @click.argument("degrees", type=float)
-@click.argument("file", default=_EXPERIMENT, callback=_no_option)
+@click.argument("file", type=NAMED_FILE, default=default_file, callback=_no_option)
 @speed_option
 @payload_option
 @out_option
@@ -239,8 +235,8 @@ def jog_command(
     _tell(order, _run(order, lambda steps, path: steps.jog(path, joint, degrees, speed)))
 
 
-@click.command("home")
-@click.argument("file", default=_EXPERIMENT)
+@verb("home")
+@click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option(
     "--poses", type=PATH, metavar="YAML", help="Poses of `lwr-run record`; default: `moves.home` of FILE."
 )

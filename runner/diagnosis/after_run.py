@@ -102,14 +102,15 @@ class Conclusion:
     asked: bool = False
 
     def text(self, folder: Path) -> str:
-        """For the screen. folder : of the experiment."""
+        """The diagnosis and `advice`. folder : of the experiment."""
+        return "\n".join([*([] if self.study is None else [str(self.study)]), *self.advice(folder)])
+
+    def advice(self, folder: Path) -> list[str]:
+        """A failure, answers, and what to do next. folder : of the experiment."""
         if self.study is None:
-            return f"No diagnosis: {self.failure}. The results of the experiment stand."
+            return [f"No diagnosis: {self.failure}. The results of the experiment stand."]
         names = self.study.diagnosis.base_model.structure.chain.joint_names
-        lines = [
-            str(self.study),
-            *(f"{answer_statement(answer.to_dict(), names)}." for answer in self.answers),
-        ]
+        lines = [f"{answer_statement(answer.to_dict(), names)}." for answer in self.answers]
         if self.failure:
             lines.append(
                 f"The discriminating experiments failed: {self.failure}. The diagnosis above stands."
@@ -120,7 +121,7 @@ class Conclusion:
             lines.append(f"No discriminating experiment was run: {reason}.")
         elif self.study.offers and not self.answers:
             lines.append(run_advice(str(folder)))
-        return "\n".join(lines)
+        return lines
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content: the diagnosis, the decision, the failure."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
 from ident.diagnosis.look_alikes import LookAlikes, Place, look_alikes
-from ident.diagnosis.statements import SURE, statements
+from ident.diagnosis.statements import SURE, Statements, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect
@@ -82,9 +82,14 @@ class Study:
     sure: float = SURE
     torque_errors: tuple[Mapping[str, Any], ...] = ()
 
-    def __str__(self) -> str:
+    @property
+    def said(self) -> Statements:
+        """All that the diagnosis says."""
         content, details = self.diagnosis.to_dict(), self.details()
-        return statements(content, details, details["joints"]).text()
+        return statements(content, details, details["joints"])
+
+    def __str__(self) -> str:
+        return self.said.text()
 
     def with_offers(self, offers: Sequence[Discriminating]) -> Study:
         """The same with discriminating experiments and their expected effect."""

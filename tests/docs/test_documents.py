@@ -40,6 +40,13 @@ def run(command: Command) -> None:
         Path(command.output).write_text(result.stdout)
 
 
+def clear_outputs(document: Path) -> None:
+    """Remove the files that the commands of a document write themselves."""
+    for command in commands(document):
+        if "--out" in command.words and not command.slow:
+            Path(command.words[command.words.index("--out") + 1]).unlink(missing_ok=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("document", WITH_COMMANDS, ids=str)
 def test_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]) -> None:
@@ -52,6 +59,7 @@ def test_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]
         # A log that has no motor torques yet, and the controller's recording of the same motion.
         (place / "other" / "loaded.trace.csv").rename(place / "loaded.trace.csv")
         (place / "other" / "loaded.plain.mcap").replace(place / "loaded.mcap")
+    clear_outputs(document)
     for command in commands(document):
         if not command.slow:
             run(command)

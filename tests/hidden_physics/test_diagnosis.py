@@ -24,7 +24,7 @@ def by_command(store: Store, case: Case) -> dict[str, Any]:
     sessions = store.sessions(case)
     out = store.folder / "diagnosis"
     arguments = [*map(str, sessions.train), "--test", str(sessions.test[0])]
-    arguments += ["--reference", str(REFERENCE), "--no-simulation", "--out", str(out)]
+    arguments += ["--reference", str(REFERENCE), "--no-simulation", "--out", str(out), "--force"]
     result = CliRunner().invoke(main, ["diagnose", *arguments], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return dict(json.loads((out / "diagnosis.json").read_text()))

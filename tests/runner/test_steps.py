@@ -18,7 +18,7 @@ from lwr_driver.session import read_session
 from runner.cli import main
 from runner.commands.steps import jog_command
 from runner.experiment import Bench
-from runner.experiment_file import Experiment
+from runner.experiment_file import DEFAULT, Experiment
 from runner.laboratory import Laboratory
 from runner.steps import LARGEST_JOG_DEG, Steps, jogged, standstills
 
@@ -227,7 +227,7 @@ def test_a_jog_names_its_joint() -> None:
 def test_negative_degrees_are_no_option(line: str) -> None:
     context = jog_command.make_context("jog", line.split())
     assert (context.params["joint"], context.params["degrees"]) == ("A6", -5.0)
-    assert context.params["file"] == ("lab.yaml" if "lab" in line else "experiments/default.yaml")
+    assert context.params["file"] == ("lab.yaml" if "lab" in line else str(DEFAULT))
     assert context.params["speed"] == (0.05 if "speed" in line else 0.1)
     with pytest.raises(click.UsageError):
         jog_command.make_context("jog", ["A6", "-5", "--unknown"])

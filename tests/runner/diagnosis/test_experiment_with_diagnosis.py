@@ -89,10 +89,12 @@ def test_the_experiment_ends_with_the_hidden_cause(done: Done) -> None:
     # Without a reference it is what every such drive has.
     finding = found["character"][0]
     assert (finding["cause"], finding["joints"]) == ("presliding_hysteresis", [2])
-    assert (done.folder / "diagnosis" / "diagnosis.txt").read_text() in done.text
-    assert "Presliding hysteresis, joint A2 [presliding_hysteresis]" in done.text
-    assert "no reference of the healthy arm" in done.text
-    assert done.text.strip().splitlines()[-1] == str(done.folder)
+    report = (done.folder / "report.txt").read_text()
+    assert (done.folder / "diagnosis" / "diagnosis.txt").read_text() in report
+    assert "Presliding hysteresis, joint A2 [presliding_hysteresis]" in report
+    assert "no reference of the healthy arm" in report
+    assert "No cause found beyond the character of such an arm" in done.text.splitlines()[0]
+    assert done.text.strip().splitlines()[-1] == f"open {done.folder / 'report.html'}"
 
 
 def test_diagnosis_json_keeps_the_contract(done: Done) -> None:

@@ -24,7 +24,7 @@ from lwr_driver.link import (
 )
 from runner.experiment_file import Experiment, Payload
 from runner.laboratory import Laboratory, Person
-from runner.terminal import StatusLine
+from runner.status import StatusLine
 
 ADVICE = (
     advise_command,
@@ -73,16 +73,26 @@ def test_advice_fits_what_is_seen(advise: Any, state: dict[str, Any], words: str
     assert words in advise(link(**state))
 
 
-def test_the_status_line_says_what_is_awaited_since_when_what_is_seen_and_what_to_do() -> None:
+def test_waiting_says_once_what_is_awaited_and_what_to_do() -> None:
     shown = io.StringIO()
-    laboratory = Laboratory(Experiment.load(), status=StatusLine(shown))
-    laboratory._notify(Waiting("command mode with drives on", "state MON, quality BAD", 12.0, "Do this"))
-    assert shown.getvalue() == (
-        "waiting for command mode with drives on  12 s; seen: state MON, quality BAD. Do this\n"
-    )
+    experiment = Experiment.load().changed(backend="fri", lock_step=False)
+    laboratory = Laboratory(experiment, status=StatusLine(shown))
+    for since in (1.0, 1.5, 12.0):
+        laboratory._notify(Waiting("command mode with drives on", "state MON", since, "Do this"))
+    laboratory._notify(Waiting("command mode with drives on", "state CMD", 13.0, "Do that"))
+    said = "waiting for command mode with drives on. "
+    assert shown.getvalue() == f"{said}Do this\n{said}Do that\n"
 
 
-def test_the_person_is_asked_for_the_payload_with_its_load_data(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_is_sent_to_the_pendant_of_the_emulator() -> None:
+    shown = io.StringIO()
+    Laboratory(Experiment.load(), status=StatusLine(shown))._notify(Waiting("x", "y", 12.0, "Do this"))
+    assert shown.getvalue() == ""
+
+
+def test_the_person_is_asked_for_the_payload_with_its_load_data(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked: list[str] = []
 
     def confirm(question: str, **named: Any) -> bool:
@@ -92,10 +102,12 @@ def test_the_person_is_asked_for_the_payload_with_its_load_data(monkeypatch: pyt
     monkeypatch.setattr(click, "confirm", confirm)
     with pytest.raises(OperatorError, match="nothing moved"):
         Person(False).swap(None, Payload("block", 2.0, (0.0, -0.066, 0.144)))
-    assert asked == [
+    assert asked == ["Ready?"]
+    assert " ".join(capsys.readouterr().err.split()) == (
         "Mount the payload 'block', 2 kg, then enter its load data on the controller: 2 kg, centre of mass "
-        "(0, -66, 144) mm in the frame of link 7. Stay clear of the arm. Ready?"
-    ]
+        "(0, -66, 144) mm in the frame of link 7. Stay clear of the arm."
+    )
     with pytest.raises(OperatorError):
         Person(False).start_trace()
-    assert asked[1].startswith("Start the controller's trace")
+    assert asked[1] == "Running?"
+    assert "Start the controller's trace" in capsys.readouterr().err

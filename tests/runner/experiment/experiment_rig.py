@@ -47,7 +47,12 @@ def run(*arguments: str) -> Finished:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     lines = result.stdout.strip().splitlines()
-    return Finished(result.exit_code, result.output, Path(lines[-1]) if lines else Path())
+    return Finished(result.exit_code, result.output, _folder(lines[-1]) if lines else Path())
+
+
+def _folder(last: str) -> Path:
+    """The folder of the results, from `open FOLDER/report.html`, the last line of the output."""
+    return Path(last.removeprefix("open ")).parent
 
 
 def messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:

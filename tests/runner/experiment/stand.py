@@ -19,7 +19,7 @@ from lwr_driver.ring import ROW
 from runner.experiment import Bench, Run
 from runner.experiment_file import Experiment, MotorTorque, Moves, Payload, SessionPlan
 from runner.preflight import gravity_torque
-from runner.terminal import StatusLine
+from runner.status import StatusLine
 
 PERIOD_S = 0.01
 HOME = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
@@ -172,7 +172,7 @@ def run_of(stand: Stand, folder: Path, *sessions: SessionPlan, source: str = "no
         Cell.load(find("cell.yaml")),
         stand,  # type: ignore[arg-type]
         stand,
-        StatusLine(stand.text, interval_s=0.0),
+        StatusLine(stand.text),
         stand,
     )
     return Run(experiment(*sessions, source=source, **changes), folder, bench, excite)

@@ -34,7 +34,9 @@ def test_the_folder_holds_everything(finished: Finished) -> None:
         "report.txt",
         "summary.json",
     }
-    assert (finished.folder / "report.txt").read_text() in finished.text
+    assert "parameter      estimate" in (finished.folder / "report.txt").read_text()
+    assert "parameter      estimate" not in finished.text
+    assert finished.text.rstrip().endswith(f"open {finished.folder / 'report.html'}")
 
 
 def test_summary_has_counts_parameters_truth_link_and_versions(finished: Finished) -> None:

@@ -119,7 +119,7 @@ def test_reveal_shows_the_truth_in_terminal_and_report(hidden: Finished) -> None
     assert f"[{effect.cause}]" in shown.text
     assert "verdict  the diagnosis is missing" in shown.text
     assert f"[{effect.cause}]" in report_html(ResultFolder.load(hidden.folder))
-    content = json.loads(run("experiment", "--reveal", str(hidden.folder), "--json").text.split("\n", 1)[1])
+    content = json.loads(run("experiment", "--reveal", str(hidden.folder), "--json").text)
     assert content["effect"]["cause"] == effect.cause
     assert run("experiment", "--reveal", str(hidden.folder), "--hide", "1").code == 2
 

@@ -25,7 +25,7 @@ def interrupted(tmp_path: Path) -> tuple[int, str, Session]:
         seen = []
         for line in process.stderr:
             seen.append(line)
-            if "period 1" in line:
+            if line == "unloaded\n":
                 process.send_signal(signal.SIGINT)
         process.wait()
     return process.returncode, "".join(seen), read_session(out / "unloaded.mcap")

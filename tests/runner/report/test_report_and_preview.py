@@ -283,7 +283,7 @@ def test_figures_and_tables_for_a_paper_are_written(finished: Path, tmp_path: Pa
             assert ElementTree.parse(path).getroot().get("width", "").startswith("238.1")  # pt, 84 mm
             assert "nan" not in path.read_text()
     assert "This run, loaded" in (tmp_path / "paper" / "table_1.tex").read_text()
-    refused = CliRunner().invoke(main, [*command[:-1], "wide"])
+    refused = CliRunner().invoke(main, [*command[:-1], "wide", "--force"])
     assert refused.exit_code == 2
     assert "width 'wide' is unknown" in refused.output
 

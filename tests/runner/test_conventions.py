@@ -1,0 +1,244 @@
+"""What holds for every command: missing inputs, existing outputs, JSON of errors, completion, suggestions."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from runner.cli import VERBS, main
+from runner.output import OutputFile, set_aside
+from runner.terminal import NAMED_FILE, InputPath
+
+LWR_RUN = str(Path(sys.executable).parent / "lwr-run")
+
+# One call of each command with a missing input.
+MISSING = (
+    "doctor none.yaml",
+    "record none.yaml",
+    "hold none.yaml",
+    "jog A6 2 none.yaml",
+    "home none.yaml",
+    "home --poses none.yaml",
+    "experiment none.yaml",
+    "experiment --resume none",
+    "experiment --reveal none",
+    "plan none.yaml",
+    "check none.yaml",
+    "preview none.yaml",
+    "report none",
+    "report none --figures paper",
+    "emulator none.yaml",
+    "identify none.mcap",
+    "validate none.yaml none.mcap",
+    "commission none.mcap --out m.yaml",
+    "commission --experiment none.yaml --out m.yaml",
+    "diagnose none.mcap --out d",
+    "compare none.yaml none.yaml",
+    "payload none.yaml none.mcap",
+    "export none.yaml m.urdf",
+    "info none.mcap",
+    "recover none.mcap",
+    "attach none.mcap none.csv --force",
+    "import none.yaml none.csv m.mcap",
+)
+
+
+def lwr_run(line: str) -> tuple[int, str, str]:
+    done = CliRunner().invoke(main, line.split())
+    return done.exit_code, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("line", MISSING)
+def test_a_missing_file_is_code_2_and_json_says_so(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, said = lwr_run(line)
+    assert code == 2, said
+    assert "none" in said
+    assert out == ""
+    code, out, again = lwr_run(f"{line} --json")
+    assert (code, again) == (2, said)
+    answer = json.loads(out)
+    assert answer["exit_code"] == 2
+    assert answer["kind"] in ("ConfigurationError", "FileError")
+    assert f"{answer['kind']}: {answer['error']}\n" == said
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_every_command_with_an_input_was_tried() -> None:
+    tried = {line.split()[0] for line in MISSING}
+    assert set(VERBS) - tried == {"init", "completion"}
+
+
+def test_a_near_name_of_a_missing_file_is_suggested(tmp_path: Path) -> None:
+    (tmp_path / "loaded.mcap").write_bytes(b"")
+    assert f"did you mean {tmp_path / 'loaded.mcap'}?" in lwr_run(f"info {tmp_path}/laoded.mcap")[2]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("indentify a.mcap", "did you mean 'identify'?"),
+        ("fly", "`lwr-run -h` lists the commands"),
+        ("identify --estimatr wls a.mcap", "--estimator"),
+        ("experiment --ot results", "--out"),
+    ],
+)
+def test_a_misspelt_word_is_told_with_the_nearest_one(line: str, words: str) -> None:
+    code, out, said = lwr_run(line)
+    assert (code, out) == (2, "")
+    assert words in said
+    code, out, _ = lwr_run(f"{line} --json")
+    answer = json.loads(out)
+    assert (code, answer["exit_code"]) == (2, 2)
+    assert words in answer["error"] or answer["kind"] == "NoSuchOption"
+
+
+# The output is looked at first, so the inputs need not be there.
+REPLACING = (
+    "identify none.mcap --out {}",
+    "commission none.mcap --out {}",
+    "payload none.yaml none.mcap --out {}",
+    "export none.yaml {}",
+    "recover none.mcap --out {}",
+    "attach none.mcap none.csv --out {}",
+    "import none.yaml none.csv {}",
+    "plan none.yaml --out {}",
+    "preview none.yaml --out {}",
+    "diagnose none.mcap --out {}/..",
+    "report . --figures {}/..",
+    "init {}/..",
+)
+
+
+@pytest.mark.parametrize("line", REPLACING)
+def test_nothing_that_exists_is_replaced_without_force(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    place = tmp_path / "out" / "kept"
+    place.write_text("mine")
+    code, _, said = lwr_run(line.format(place).replace("/kept/..", ""))
+    assert code == 2
+    assert "--force" in said
+    assert place.read_text() == "mine"
+    name = line.split()[0]
+    if name != "init":
+        assert "--force" not in lwr_run(f"{line.format(place).replace('/kept/..', '')} --force")[2]
+        assert place.read_text() == "mine"
+
+
+def test_every_command_with_an_output_was_tried() -> None:
+    tried = {line.split()[0] for line in REPLACING}
+    for name in VERBS:
+        command = main.get_command(click.Context(main), name)
+        assert command is not None
+        replaces = any(isinstance(one.type, OutputFile) and one.type.replaces for one in command.params)
+        assert replaces == (name in tried), name
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["record --out {}", "record --poses {}", "hold --out {}", "jog A6 1 --out {}", "home --out {}"],
+)
+def test_a_log_of_the_arm_is_never_replaced(line: str, tmp_path: Path) -> None:
+    place = tmp_path / "kept.mcap"
+    place.write_text("mine")
+    code, _, said = lwr_run(line.format(place))
+    assert (code, place.read_text()) == (2, "mine")
+    assert "exists; choose another name" in said
+
+
+@pytest.mark.parametrize("line", ["plan", "preview"])
+def test_a_default_output_that_exists_is_not_replaced_either(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "default.plan.yaml").write_text("mine")
+    (tmp_path / "preview.html").write_text("mine")
+    monkeypatch.setattr("ident.excitation.planner.plan", lambda *arguments: pytest.fail("planned"))
+    code, _, said = lwr_run(line)
+    assert code == 2
+    assert "exists; choose another name, or replace it with --force" in said
+
+
+def test_a_file_set_aside_comes_back_after_a_failure(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_text("old")
+
+    def fail() -> None:
+        with set_aside(path):
+            path.write_text("half of the new one")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert path.read_text() == "old"
+    with set_aside(path):
+        path.write_text("new")
+    assert (path.read_text(), os.listdir(tmp_path)) == ("new", ["a.mcap"])
+
+
+def complete(words: list[str]) -> list[str]:
+    environment = os.environ | {
+        "_LWR_RUN_COMPLETE": "bash_complete",
+        "COMP_WORDS": " ".join(words),
+        "COMP_CWORD": str(len(words) - 1),
+    }
+    done = subprocess.run([LWR_RUN], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()
+
+
+def test_a_shell_completes_files() -> None:
+    assert complete(["lwr-run", "experiment", "my"]) == ["file,my"]
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_every_path_is_completed_as_a_file(name: str) -> None:
+    command = main.get_command(click.Context(main), name)
+    assert command is not None
+    words = ("FILE", "SESSION", "MODEL", "FOLDER", "SOURCE", "OUTPUT", "TRACE", "CONFIG", "MAPPING", "URDF")
+    context = click.Context(command)
+    for one in command.params:
+        shown = one.make_metavar(context).strip("[].").upper()
+        path = isinstance(one.type, click.Path)
+        assert path == isinstance(one.type, (InputPath, OutputFile, type(NAMED_FILE)))
+        if isinstance(one, click.Argument) and shown.rstrip("S") in words:
+            assert path, f"{name} {shown}"
+        if path:
+            (item,) = one.shell_complete(context, "my")
+            assert item.type == "file"
+
+
+def test_one_json_value_is_printed_when_checks_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fast.yaml").write_text(
+        "name: fast\nmoves: {clearance_m: 0.5}\nexcitation: {plan: plans/default.plan.yaml}\n"
+    )
+    code, out, said = lwr_run("check fast.yaml --json")
+    answer = json.loads(out)
+    assert (code, answer["exit_code"], answer["kind"]) == (3, 3, "RefusedError")
+    assert answer["unloaded"]
+    assert answer["error"] in said
+
+
+def test_verbose_stands_before_or_behind_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen: list[int] = []
+    command = main.get_command(click.Context(main), "completion")
+    assert command is not None
+    from runner.terminal import verbosity
+
+    monkeypatch.setattr(command, "callback", lambda **named: seen.append(verbosity()))
+    for line in ("completion bash", "-v completion bash", "completion bash -v", "-v completion -v bash"):
+        assert lwr_run(line)[0] == 0
+    assert seen == [0, 1, 1, 2]
