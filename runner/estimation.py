@@ -66,7 +66,7 @@ class IdentifySettings:
         """Read a settings file. ConfigurationError with file, key, value, limit and advice."""
         path = find(name)
         content = read_mapping(path)
-        settings = parse(cls, content, str(path))
+        settings = parse(cls, content, path)
         for key in KEYS:
             key.check(content, path)
         return settings

@@ -26,6 +26,7 @@ from ident.excitation.motions import (
 from ident.model.model_file import write_checked
 from lwr_driver.configuration import parse, read_mapping
 from lwr_driver.extent import LONGEST_EXCITATION_S, Periods
+from lwr_driver.places import Place
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
@@ -184,20 +185,21 @@ class ExcitationPlan:
     @classmethod
     def load(cls, path: Path) -> ExcitationPlan:
         """Read a plan file; ConfigurationError with path and fault otherwise."""
-        return cls.from_mapping(read_mapping(path), str(path))
+        return cls.from_mapping(read_mapping(path), path)
 
     @classmethod
-    def from_mapping(cls, content: Any, path: str) -> ExcitationPlan:
+    def from_mapping(cls, content: Any, path: str | Path) -> ExcitationPlan:
         """The plan of a file's content; ConfigurationError with path and fault otherwise."""
+        place = Place.of(path)
         if not isinstance(content, Mapping) or content.get("kind") != "excitation plan":
             raise ConfigurationError(
                 f"{path}: `kind` is not that of an excitation plan of schema_version {_SCHEMA}"
             )
         keys = ("schema_version", "kind", "joint_names", "periods")
-        head = parse(_PlanFile, {key: content[key] for key in keys if key in content}, path)
+        head = parse(_PlanFile, {key: content[key] for key in keys if key in content}, place)
         try:
             plan = cls(
-                motion=_motion_from_mapping(content.get("motion"), f"{path}: `motion`"),
+                motion=_motion_from_mapping(content.get("motion"), place.key("motion")),
                 joint_names=head.joint_names,
                 periods=head.periods,
                 objectives=content.get("objectives", {}),
@@ -207,10 +209,10 @@ class ExcitationPlan:
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             reason = str(error) if isinstance(error, ConfigurationError) else f"not readable: {error!r:.200}"
-            raise ConfigurationError(reason if reason.startswith(path) else f"{path}: {reason}") from error
+            raise ConfigurationError(reason if reason.startswith(str(path)) else f"{path}: {reason}") from error
         if not plan.duration_s <= LONGEST_EXCITATION_S:
             raise ConfigurationError(
-                f"{path}: {plan.periods} periods of {plan.period_s:g} s last {plan.duration_s:g} s, limit "
+                f"{place.line_of('periods')}: {plan.periods} periods of {plan.period_s:g} s last {plan.duration_s:g} s, limit "
                 f"{LONGEST_EXCITATION_S:g} s; lower `periods`"
             )
         return plan
@@ -231,7 +233,7 @@ def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
     raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
 
 
-def _motion_from_mapping(content: Any, where: str) -> ParametricMotion:
+def _motion_from_mapping(content: Any, where: Place) -> ParametricMotion:
     forms = {"fourier": _Fourier, "bspline": _Spline, "point to point": _Points}
     kind = content.get("type") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in forms:

@@ -333,7 +333,7 @@ class LogMapping:
     def load(cls, name: str | Path) -> LogMapping:
         """Read a mapping file, looked for as given, in `configs/` and in `configs/imports/`."""
         path = mapping_path(name)
-        return parse(cls, read_mapping(path), str(path))
+        return parse(cls, read_mapping(path), path)
 
 
 def _plain(value: Any) -> Any:
