@@ -158,9 +158,7 @@ def parse(cls: type[T], content: Any, where: str | Path | Place) -> T:
         if key not in fields:
             near = difflib.get_close_matches(_shown(str(key)), fields, n=1, cutoff=0.5)
             advice = f"did you mean `{near[0]}`?" if near else f"known keys: {', '.join(fields)}"
-            raise ConfigurationError(
-                f"{place.line_of(str(key))}: unknown key `{_shown(str(key))}`; {advice}"
-            )
+            raise ConfigurationError(f"{place.line_of(str(key))}: unknown key `{_shown(str(key))}`; {advice}")
     values = {}
     for name, field in fields.items():
         if name in content:

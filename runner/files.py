@@ -63,9 +63,10 @@ def _check_home(experiment: Experiment, arm: Arm) -> None:
     home = experiment.home(len(arm.joint_names))
     for joint, q, low, high in zip(arm.joint_names, home, arm.q_low, arm.q_high, strict=True):
         if not low <= q <= high:
+            where = Place.of(experiment.source).line_of("moves").line_of("home")
             raise ConfigurationError(
-                f"{Place.of(experiment.source).line_of('moves').line_of('home')}: moves.home: {joint} {q:.4g} rad is outside {low:.4f} to {high:.4f} rad; choose "
-                "a position within the limits"
+                f"{where}: moves.home: {joint} {q:.4g} rad is outside {low:.4f} to {high:.4f} rad; choose a position "
+                "within the limits"
             )
 
 

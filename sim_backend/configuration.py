@@ -261,7 +261,7 @@ class EmulatorConfig:
     """
 
     schema_version: Version = 1
-    seed: Annotated[int, within(0, 2**63)] = 1
+    seed: Annotated[int, within(0, 2**63 - 1)] = 1
     robot: RobotConfig = field(default_factory=RobotConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)

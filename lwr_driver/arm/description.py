@@ -64,7 +64,7 @@ class _JointEntry:
 
 
 @dataclass(frozen=True)
-class _ArmFile:
+class ArmFile:
     """The arm file as written; units are in the key names."""
 
     schema_version: Version
@@ -196,16 +196,14 @@ class Arm:
         """
         path = find(name, beside=beside)
         place = Place.of(path)
-        content = parse(_ArmFile, read_mapping(path), place)
+        content = parse(ArmFile, read_mapping(path), place)
         urdf_path = find(content.urdf, beside=path.parent)
         urdf = read_text(urdf_path)
         joints = content.joints
         position = np.radians([joint.position_deg for joint in joints])
         margin = float(np.radians(content.position_margin_deg))
         if np.any(position[:, 1] - position[:, 0] <= 2.0 * margin):
-            raise ConfigurationError(
-                f"{place.key('position_margin_deg')} leaves no range; lower it"
-            )
+            raise ConfigurationError(f"{place.key('position_margin_deg')} leaves no range; lower it")
         values: dict[str, Any] = dict(  # noqa: C408
             name=content.name,
             joint_names=tuple(joint.name for joint in joints),
@@ -232,7 +230,7 @@ class Arm:
         return arm
 
 
-def _place(error: ConfigurationError, place: Place, content: _ArmFile) -> Place:
+def _place(error: ConfigurationError, place: Place, content: ArmFile) -> Place:
     """The line of the joint, and of its key, that an error names."""
     said = str(error).split()
     for number, joint in enumerate(content.joints):

@@ -105,7 +105,7 @@ def test_a_text_that_only_resembles_a_number_stays_text(text: str, tmp_path: Pat
     [
         ("margin: 1\nmodus: fast\n", "cell.yaml:2: unknown key `modus`"),
         ("mode: fast\nmargin: wide\n", "cell.yaml:2: `margin`: expected a number"),
-        ("margin: 1\nboxes:\n  - size: [1, 1, 1]\n  - size:\n      - 1\n      - two\n      - 3\n", "cell.yaml:6: `boxes`[1]"),
+        ("margin: 1\nboxes:\n  - size:\n      - 1\n      - two\n      - 3\n", "cell.yaml:5: `boxes`[0]"),
         ("mode: fast\nmargin: -1\n", "cell.yaml:2: margin -1.0 m is negative"),
         ("margin: 1\nboxes:\n  - size: [1, 1, 1]\n  - name: b\n", "cell.yaml:4: `boxes`[b]: key `size` is missing"),
         ("margin: 1\ntable:\n  a: 1\n  b: x\n", "cell.yaml:4: `table`.b: expected a number"),
