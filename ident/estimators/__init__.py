@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from ident.estimators.covariance import CovarianceSettings
+from ident.estimators.covariance import CovarianceSettings, correlation_time
 from ident.estimators.errors_in_variables import InstrumentalVariables, TotalLeastSquares
 from ident.estimators.estimate import (
     ClassFit,
