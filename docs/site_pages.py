@@ -112,7 +112,10 @@ def _kind(option: click.Option, context: click.Context) -> str:
 
 def api_page() -> str:
     """The public names of the packages, from their docstrings."""
-    parts = ["# Python API\n", "A script needs [the face](#ident) alone; [python.md](python.md) shows it at work.\n"]
+    parts = [
+        "# Python API\n",
+        "A script needs [the face](#ident) alone; [python.md](python.md) shows it at work.\n",
+    ]
     for name, meaning in API.items():
         module = importlib.import_module(name)
         names = sorted(getattr(module, "__all__", [])) or [
@@ -175,7 +178,9 @@ def messages_page() -> str:
         "[troubleshooting.md](troubleshooting.md) explains the frequent ones.\n"
     )
     for kind, who in WHO.items():
-        lines = sorted({m.text.strip().removeprefix("...: ") for m in found if m.error == kind}, key=str.lower)
+        lines = sorted(
+            {m.text.strip().removeprefix("...: ") for m in found if m.error == kind}, key=str.lower
+        )
         if lines:
             text += [f"## {who}\n", *(f"- {_code(line)}" for line in lines), ""]
     return "\n".join(text)
@@ -187,13 +192,18 @@ def _code(line: str) -> str:
 
 def pictures_page() -> str:
     """Every picture of the documents with its words, and the page that shows it."""
-    parts = ["# Pictures\n", "Each is made by a command: `make pictures`, or `make screenshot` for those of a browser.\n"]
+    parts = [
+        "# Pictures\n",
+        "Each is made by a command: `make pictures`, or `make screenshot` for those of a browser.\n",
+    ]
     seen = set()
     for page in sorted((ROOT / "docs").glob("*.md")):
         for words, file in re.findall(r"!\[([^\]]*)\]\((images/[^)]+)\)", page.read_text(encoding="utf-8")):
             if file not in seen:
                 seen.add(file)
-                parts.append(f"![{words}]({file})\n\n{words} ([{page.stem.replace('_', ' ')}]({page.name}))\n")
+                parts.append(
+                    f"![{words}]({file})\n\n{words} ([{page.stem.replace('_', ' ')}]({page.name}))\n"
+                )
     return "\n".join(parts)
 
 
@@ -221,4 +231,6 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Turn the links of a page."""
     text = turned(markdown, page.file.src_uri)
     # Blocks that take long are marked for the tests; pictures of the README lie in docs/.
-    return re.sub(r"^```(\w+) slow$", r"```\1", text, flags=re.MULTILINE).replace("](docs/images/", "](images/")
+    return re.sub(r"^```(\w+) slow$", r"```\1", text, flags=re.MULTILINE).replace(
+        "](docs/images/", "](images/"
+    )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import site
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -33,8 +35,19 @@ def build(what: str, source: Path, out: Path) -> Path:
 
 def pip(python: Path, *words: str) -> None:
     command = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check", *words]
-    done = subprocess.run(command, capture_output=True, text=True)
+    # Of this environment nothing is to be seen.
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
+
+
+def dependencies() -> Iterator[str]:
+    """Folders of the present environment's packages, without this project's own."""
+    for folder in map(Path, site.getsitepackages()):
+        yield str(folder)
+        for path in folder.glob("*.pth"):
+            # A plain import is of a module that adds folders.
+            yield from re.findall(r"^import \w+$", path.read_text(), re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +81,9 @@ def test_the_wheel_runs_an_experiment_and_leaves_only_a_cache(wheel: Path, tmp_p
     python = venv / "bin/python"
     packages = next((venv / "lib").glob("python*/site-packages"))
     before = set(packages.iterdir())
-    # The dependencies come from the present environment.
-    lines = (f"import site; site.addsitedir({path!r})\n" for path in site.getsitepackages())
-    (packages / "dependencies.pth").write_text("".join(lines))
     pip(python, "install", "--no-deps", "--no-index", str(wheel))
+    # The dependencies come from the present environment.
+    (packages / "dependencies.pth").write_text("\n".join(dependencies()) + "\n")
     environment = {"HOME": str(home), "PATH": str(venv / "bin"), "OPENBLAS_NUM_THREADS": "1"}
 
     def lwr_run(*words: str) -> str:
@@ -107,7 +119,9 @@ def test_every_python_of_this_computer_imports_the_wheel(name: str, wheel: Path,
     program = shutil.which(name)
     if program is None:
         pytest.skip(f"no {name} here")
-    with subprocess.Popen([program, "-c", "import numpy, pinocchio, msgspec"], stderr=subprocess.PIPE) as probe:
+    with subprocess.Popen(
+        [program, "-c", "import numpy, pinocchio, msgspec"], stderr=subprocess.PIPE
+    ) as probe:
         if probe.wait() != 0:
             pytest.skip(f"{name} has no dependencies installed")
     target = tmp_path / "packages"
