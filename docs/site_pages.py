@@ -207,14 +207,20 @@ def pictures_page() -> str:
     return "\n".join(parts)
 
 
+MADE = {
+    "commands.md": commands_page,
+    "api.md": api_page,
+    "messages.md": messages_page,
+    "pictures.md": pictures_page,
+}
+"""Pages made from the code, by name."""
+
+
 def generated() -> dict[str, str]:
     """Text of each page that is not a file of docs/."""
     return {
         **{page: (ROOT / file).read_text(encoding="utf-8") for page, file in PAGES.items()},
-        "commands.md": commands_page(),
-        "api.md": api_page(),
-        "messages.md": messages_page(),
-        "pictures.md": pictures_page(),
+        **{page: make() for page, make in MADE.items()},
     }
 
 

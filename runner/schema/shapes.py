@@ -62,7 +62,7 @@ def shape(hint: Any, changed: Mapping[str, Any], made: dict[type, type]) -> Any:
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return made[hint] if hint in made else _struct(hint, changed, made)
     if origin is Annotated:
-        return Annotated[(shape(arguments[0], changed, made), *arguments[1:])]
+        return cast(Any, Annotated)[(shape(arguments[0], changed, made), *arguments[1:])]
     inner = tuple(part if part is Ellipsis else shape(part, changed, made) for part in arguments)
     if origin in (Union, types.UnionType):
         return _union(inner)
@@ -92,7 +92,7 @@ def _struct(cls: type, changed: Mapping[str, Any], made: dict[type, type]) -> ty
         inner = shape(hint, changed, made)
         if value is msgspec.UNSET:
             inner = _union([inner, msgspec.UnsetType])
-        described = Annotated[inner, msgspec.Meta(description=text)]
+        described = cast(Any, Annotated)[inner, msgspec.Meta(description=text)]
         if dataclasses.is_dataclass(value) or isinstance(value, dict):
             value = msgspec.field(default_factory=type(value))
         fields.append((key, described, value) if value is not msgspec.NODEFAULT else (key, described))

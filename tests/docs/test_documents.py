@@ -25,6 +25,7 @@ from tests.docs.markdown import DOCUMENTS, ROOT, Command, blocks, commands
 
 WITH_COMMANDS = [document for document in DOCUMENTS if any(not c.slow for c in commands(document))]
 WITH_PYTHON = [d for d in DOCUMENTS if any(not block.slow for block in blocks(d, "python"))]
+MADE = runpy.run_path(str(ROOT / "docs/site_pages.py"))["MADE"]
 SLOW = [(document, command) for document in DOCUMENTS for command in commands(document) if command.slow]
 
 
@@ -128,7 +129,7 @@ def test_yaml_files_in_documents_are_valid(document: Path, tmp_path: Path) -> No
 def test_links_and_files_that_are_named_exist(document: Path) -> None:
     text = (ROOT / document).read_text()
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", text):
-        if "://" not in target:
+        if "://" not in target and target not in MADE:
             assert ((ROOT / document).parent / target).exists(), f"{document}: {target}"
     for name in re.findall(
         r"`((?:configs|benchmarks|tests|fri|ident|runner|lwr_driver|sim_backend|docs)/[\w./]+)`", text

@@ -111,20 +111,3 @@ def test_the_wheel_runs_an_experiment_and_leaves_only_a_cache(wheel: Path, tmp_p
     files = {path.relative_to(home) for path in home.rglob("*") if path.is_file()}
     assert {"/".join(path.parts[:2]) for path in files} <= CACHES
     assert any(path.suffix == ".nbi" for path in files)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["python3.11", "python3.12", "python3.13"])
-def test_every_python_of_this_computer_imports_the_wheel(name: str, wheel: Path, tmp_path: Path) -> None:
-    program = shutil.which(name)
-    if program is None:
-        pytest.skip(f"no {name} here")
-    with subprocess.Popen(
-        [program, "-c", "import numpy, pinocchio, msgspec"], stderr=subprocess.PIPE
-    ) as probe:
-        if probe.wait() != 0:
-            pytest.skip(f"{name} has no dependencies installed")
-    target = tmp_path / "packages"
-    pip(Path(program), "install", "--no-deps", "--no-index", "--target", str(target), str(wheel))
-    command = [program, "-m", "runner.cli", "schema", "cell"]
-    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(target)}, check=True, cwd=tmp_path)
