@@ -35,7 +35,8 @@ def command(name: str | None, out: Path | None, files: tuple[str, ...], as_json:
     lwr-run schema --refer my_lab.yaml           my_lab.yaml is a copy of a template
     lwr-run schema cell --refer my_cell.yaml     my_cell.yaml is written by hand
     """
-    from runner.schema import FILES, refer, schema_text
+    from runner.editor import refer
+    from runner.schema import FILES, schema_text
 
     if out is not None and name is None:
         raise ConfigurationError(f"--out {out} needs the NAME of a schema: {', '.join(FILES)}")

@@ -1,14 +1,12 @@
 """JSON Schemas (draft 7) of the YAML files, for editors: completion, and a check as one types.
 
 A schema has keys, types, ranges, words, defaults and meanings, from the dataclasses that read the files. Rules
-between keys are the readers' alone. An editor finds a schema by the first line of a file,
-`# yaml-language-server: $schema=FILE`.
+between keys are the readers' alone.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +21,7 @@ from ident.excitation.problem import PlanProblem
 from ident.import_log import LogMapping
 from lwr_driver.arm.cell import Cell
 from lwr_driver.arm.description import ArmFile
-from lwr_driver.configuration import CONFIGS, read_text
+from runner.editor import FOLDER
 from runner.estimation import IdentifySettings
 from runner.experiment_file import Experiment
 from runner.schema.shapes import shape, title
@@ -31,10 +29,6 @@ from sim_backend.configuration import EmulatorConfig
 from sim_backend.faults import WireFault
 from sim_backend.operator import ScheduleEntry
 from sim_backend.robot import RobotFile
-
-FOLDER = CONFIGS / "schemas"
-_MARK = "# yaml-language-server: $schema="
-_REFERENCE = re.compile(rf"^{re.escape(_MARK)}(\S+)[^\n]*\n", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -130,36 +124,3 @@ def write_schemas(folder: Path = FOLDER) -> list[Path]:
         files.append(folder / f"{name}.json")
         files[-1].write_text(schema_text(name), encoding="utf-8")
     return files
-
-
-def referring(text: str, schema_file: str | Path) -> str:
-    """The text of a YAML file with a reference to its schema in the first line, in place of an older one."""
-    return f"{_MARK}{schema_file}\n{_REFERENCE.sub('', text)}"
-
-
-def reference(text: str) -> str | None:
-    """The schema file that a YAML file refers to, None without one."""
-    found = _REFERENCE.search(text)
-    return None if found is None else found[1]
-
-
-def kind_of(text: str) -> str | None:
-    """The kind of a YAML file by its reference to a schema, None without one."""
-    name = Path(reference(text) or "").stem
-    return name if name in FILES else None
-
-
-def refer(path: Path, name: str | None = None) -> Path:
-    """Let a copy of a template refer to the schema of this installation; returns the schema's file.
-
-    name : kind of the file, by default that of the reference it came with. ConfigurationError without either.
-    """
-    text = read_text(path)
-    kind = name or kind_of(text)
-    if kind is None:
-        raise ConfigurationError(
-            f"{path}: the file refers to no schema; name its kind, one of {', '.join(SCHEMAS)}"
-        )
-    target = FOLDER / f"{kind}.json"
-    path.write_text(referring(text, target), encoding="utf-8")
-    return target

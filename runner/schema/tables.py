@@ -14,7 +14,8 @@ import msgspec
 
 from fri.quantities import described, metas
 from lwr_driver.configuration import yaml_text
-from runner.schema.schemas import FILES, FOLDER, referring
+from runner.editor import FOLDER, referring
+from runner.schema.schemas import FILES
 from runner.schema.shapes import default, hints, meanings, plain, title
 
 SHOWN = 60  # characters of a default in a table

@@ -23,10 +23,10 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import CONFIGS, parse, read_yaml
 from runner.cli import main
+from runner.editor import FOLDER, hand_out, kind_of, refer, reference
 from runner.estimation import IdentifySettings
 from runner.experiment_file import Experiment
-from runner.schema import FILES, kind_of, refer, schema, schema_text
-from runner.schema.schemas import FOLDER, reference
+from runner.schema import FILES, schema, schema_text
 from runner.schema.shapes import hints, meanings, title
 from runner.schema.tables import TEMPLATE, renewed, settings_template
 from sim_backend.configuration import load_configuration
@@ -221,6 +221,22 @@ def test_a_copy_of_a_template_finds_its_schema_again(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="refers to no schema"):
         refer(own)
     assert refer(own, "cell") == FOLDER / "cell.json"
+
+
+def test_a_folder_of_copies_keeps_its_schemas_wherever_it_goes(tmp_path: Path) -> None:
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    for name, source in (("experiment", "experiments/default"), ("cell", "cell"), ("arm", "lwr4plus")):
+        shutil.copy(CONFIGS / f"{source}.yaml", folder / f"{name}.yaml")
+    (folder / "notes.yaml").write_text("a: 1\n")
+    assert [path.stem for path in hand_out(folder)] == ["arm", "cell", "experiment"]
+    moved = folder.rename(tmp_path / "elsewhere")
+    for name in ("experiment", "cell", "arm"):
+        text = (moved / f"{name}.yaml").read_text()
+        found = json.loads((moved / str(reference(text))).read_text())
+        assert found == schema(name)
+        READERS[name](moved / f"{name}.yaml")
+    assert (moved / "notes.yaml").read_text() == "a: 1\n"
 
 
 def test_the_command_prints_lists_and_writes(tmp_path: Path) -> None:
