@@ -57,6 +57,9 @@ def turned(text: str, page: str) -> str:
         if "://" in target or not target:
             return found[0]
         there = (source.parent / target).resolve()
+        if re.fullmatch(r"[\w./]+\.md", label):
+            # A page has no ending.
+            label = Path(label).stem.replace("_", " ")
         for name, file in PAGES.items():
             if there == ROOT / file:
                 return f"[{label}]({name}{anchor})"
@@ -194,7 +197,7 @@ def pictures_page() -> str:
     """Every picture of the documents with its words, and the page that shows it."""
     parts = [
         "# Pictures\n",
-        "Each is made by a command: `make pictures`, or `make screenshot` for those of a browser.\n",
+        "Made by `make pictures`, by `make screenshot` in a browser, and by the benchmarks.\n",
     ]
     seen = set()
     for page in sorted((ROOT / "docs").glob("*.md")):
