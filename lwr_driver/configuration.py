@@ -236,13 +236,17 @@ def _alike(hint: Any, value: Any) -> bool:
 def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: Place) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ConfigurationError(f"{where}: expected a list, found {_kind(value)}")
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        if len(value) > LONGEST_LIST:
-            raise ConfigurationError(f"{where}: {len(value)} entries, limit {LONGEST_LIST}; shorten the list")
-        arguments = (arguments[0],) * len(value)
-    if len(value) != len(arguments):
-        raise ConfigurationError(f"{where}: expected {len(arguments)} entries, found {len(value)}")
-    kinds = [metas(hint) for hint in arguments]
+    alike = len(arguments) == 2 and arguments[1] is Ellipsis
+    if alike and len(value) > LONGEST_LIST:
+        raise ConfigurationError(f"{where}: {len(value)} entries, limit {LONGEST_LIST}; shorten the list")
+    kinds = [metas(arguments[0])] * len(value) if alike else [metas(hint) for hint in arguments]
+    if len(value) != len(kinds):
+        raise ConfigurationError(f"{where}: expected {len(kinds)} entries, found {len(value)}")
+    if alike and kinds and kinds[0][0] is float and all(map(_is_number, value)):
+        # The long lists: nothing is said of a single entry but its range.
+        numbers = tuple(map(float, value))
+        check_values(numbers, kinds[0][1], where)
+        return numbers
     converted = tuple(
         _convert(kind, item, where.entry(index, _label(item, index)))
         for index, ((kind, _), item) in enumerate(zip(kinds, value, strict=True))
@@ -252,6 +256,11 @@ def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: Place) -> tupl
     for index, ((_, ranges), item) in enumerate(zip(kinds, converted, strict=True)):
         check_value(item, ranges, where.entry(index))
     return converted
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a finite number of usual size."""
+    return (type(value) is float and math.isfinite(value)) or (type(value) is int and abs(value) < 2**53)
 
 
 def _label(item: Any, index: int) -> str:

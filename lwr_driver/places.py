@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -42,15 +42,16 @@ class Place:
     def key(self, name: str, shown: str | None = None) -> Place:
         """A key of this mapping."""
         text = f"{self.shown}: `{name}`" if shown is None else f"{self.shown}{shown}"
-        return replace(self, keys=(*self.keys, name), shown=text)
+        return Place(self.head, self.files, self.given, (*self.keys, name), text)
 
     def entry(self, index: int, label: str = "") -> Place:
         """An entry of this list; label : its name."""
-        return replace(self, keys=(*self.keys, index), shown=f"{self.shown}[{label or index}]")
+        text = f"{self.shown}[{label or index}]"
+        return Place(self.head, self.files, self.given, (*self.keys, index), text)
 
     def line_of(self, key: Key) -> Place:
         """This mapping, at the line of one of its keys."""
-        return replace(self, keys=(*self.keys, key))
+        return Place(self.head, self.files, self.given, (*self.keys, key), self.shown)
 
     def named_in(self, message: str, content: Mapping[Any, Any]) -> Place:
         """This mapping, at the line of the first of its keys named in a message."""
