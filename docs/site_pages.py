@@ -63,7 +63,7 @@ def turned(text: str, page: str) -> str:
         for name, file in PAGES.items():
             if there == ROOT / file:
                 return f"[{label}]({name}{anchor})"
-        if there.is_relative_to(ROOT / "docs"):
+        if there.is_relative_to(ROOT / "docs") and there.suffix not in (".ipynb", ".py"):
             return f"[{label}]({there.relative_to(ROOT / 'docs')}{anchor})"
         # Files of the repository are named, not linked: the site is read without it.
         return label if label.startswith("`") else f"{label} (`{there.relative_to(ROOT)}`)"
