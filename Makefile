@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.test-ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: help setup experiment test test-long quick hooks lint browser screenshot clean
+.PHONY: help setup experiment test test-long quick hooks lint browser docs pictures screenshot clean
 
 help:
 	@echo "make experiment   set up and run the whole experiment against the built-in emulator"
@@ -14,6 +14,8 @@ help:
 	@echo "make quick        run ruff and the tests nearest to the changed files, within seconds"
 	@echo "make test-long    run the tests marked long, minutes each"
 	@echo "make hooks        install the checks made at each commit"
+	@echo "make docs         build the documentation site into site/"
+	@echo "make pictures     draw the pictures of the documents again, those without a browser"
 	@echo "make screenshot   take the pictures of the documents again"
 	@echo "make clean        remove the virtual environment and the caches"
 
@@ -59,6 +61,12 @@ hooks: $(TEST_READY)
 # Benchmarks named in the documents, campaigns.
 test-long: $(TEST_READY) browser
 	$(BIN)/pytest -m long
+
+docs: $(TEST_READY)
+	$(BIN)/mkdocs build --strict --clean
+
+pictures: $(TEST_READY)
+	$(BIN)/python docs/images/draw.py
 
 screenshot: $(TEST_READY) browser
 	$(BIN)/python docs/images/take.py

@@ -1,6 +1,9 @@
-"""A place for compiled code (numba's cache) where neither installation nor home can be written, as in containers.
+"""The place of compiled code (numba's cache), beside the code of a checkout, else in the user's cache folder.
 
-Without one numba ends with "cannot cache function". The place is private to the user: cached code is executed.
+An installed package keeps `~/.cache/lwr-identification/numba` (or `$XDG_CACHE_HOME/...`): nothing stays in the
+installation after it is removed, and this folder can be removed at any time. Where neither can be written, as in
+containers, a private temporary folder serves; without one numba ends with "cannot cache function". The place is private
+to the user: cached code is executed. `NUMBA_CACHE_DIR` names another.
 """
 
 from __future__ import annotations
@@ -25,23 +28,35 @@ def provide() -> None:
     """
     if _usable():
         return
+    own = user_cache()
+    if _writable(own):
+        _name(own)
+        return
     for place in _fallbacks():
         if _private(place):
-            os.environ[_VARIABLE] = str(place)
-            if "numba" in sys.modules:
-                # It has read its settings already.
-                sys.modules["numba"].config.CACHE_DIR = str(place)
+            _name(place)
             return
+
+
+def user_cache() -> Path:
+    """Folder of an installed package's compiled code."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(home) / "lwr-identification/numba"
+
+
+def _name(place: Path) -> None:
+    os.environ[_VARIABLE] = str(place)
+    if "numba" in sys.modules:
+        # It has read its settings already.
+        sys.modules["numba"].config.CACHE_DIR = str(place)
 
 
 def _usable() -> bool:
     named = os.environ.get(_VARIABLE)
     if named:
         return _writable(Path(named))
-    if all(_writable(_ROOT / package / "__pycache__") for package in _PACKAGES):
-        return True
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return _writable(Path(home) / "numba")
+    checkout = (_ROOT / "pyproject.toml").is_file()
+    return checkout and all(_writable(_ROOT / package / "__pycache__") for package in _PACKAGES)
 
 
 def _writable(folder: Path) -> bool:

@@ -70,7 +70,7 @@ def metas(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
     return inner, tuple(entry for entry in extra if isinstance(entry, Meta))
 
 
-def check_value(value: Any, ranges: Sequence[Meta], subject: str) -> None:
+def check_value(value: Any, ranges: Sequence[Meta], subject: object) -> None:
     """Raise ConfigurationError unless a number, a text or a list of values keeps its ranges."""
     for meta in ranges:
         if meta.min_length is not None or meta.max_length is not None:
@@ -79,7 +79,7 @@ def check_value(value: Any, ranges: Sequence[Meta], subject: str) -> None:
             raise ConfigurationError(_complaint(value, value, meta, subject))
 
 
-def check_values(values: Sequence[Any], ranges: Sequence[Meta], subject: str) -> None:
+def check_values(values: Sequence[Any], ranges: Sequence[Meta], subject: object) -> None:
     """The same for each number of a list; a mistaken unit is mended for the whole list."""
     for meta in ranges:
         for index, value in enumerate(values):
@@ -119,7 +119,7 @@ def _extra(meta: Meta) -> dict[str, str]:
     return meta.extra or {"unit": "", "note": ""}
 
 
-def _complaint(value: float, whole: Any, meta: Meta, subject: str) -> str:
+def _complaint(value: float, whole: Any, meta: Meta, subject: object) -> str:
     extra = _extra(meta)
     unit = "" if extra["unit"] in ("", "share") else f" {extra['unit']}"
     advice = suspected(whole, extra["unit"], lambda number: _inside(number, meta))
@@ -147,7 +147,7 @@ def _inside(value: float, meta: Meta) -> bool:
     )
 
 
-def _check_length(value: Any, least: int, most: int, subject: str) -> None:
+def _check_length(value: Any, least: int, most: int, subject: object) -> None:
     if not isinstance(value, (str, list, tuple, dict)) or least <= len(value) <= most:
         return
     kind = "characters" if isinstance(value, str) else "entries"
@@ -165,7 +165,7 @@ def _declared(cls: Hashable) -> tuple[tuple[str, Any], ...]:
     )
 
 
-def _check_hint(hint: Any, value: Any, subject: str) -> None:
+def _check_hint(hint: Any, value: Any, subject: object) -> None:
     hint, ranges = metas(hint)
     check_value(value, ranges, subject)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)

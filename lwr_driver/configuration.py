@@ -18,6 +18,7 @@ import yaml
 
 from fri.errors import ConfigurationError
 from fri.quantities import LONGEST_LIST, LONGEST_TEXT, check_value, check_values, metas
+from lwr_driver.places import Place
 from lwr_driver.references import frozen_file, note
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -127,7 +128,9 @@ def read_yaml(path: Path) -> Any:
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
-        raise ConfigurationError(f"{path}: not valid YAML: {error}") from error
+        mark = getattr(error, "problem_mark", None)
+        where = path if mark is None else f"{path}:{mark.line + 1}"
+        raise ConfigurationError(f"{where}: not valid YAML: {error}") from error
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -138,36 +141,37 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return content
 
 
-def parse(cls: type[T], content: Any, where: str) -> T:
+def parse(cls: type[T], content: Any, where: str | Path | Place) -> T:
     """Build the dataclass `cls` from `content`; unknown or missing keys and wrong types are errors.
 
     Understood: nested dataclasses, `tuple[X, ...]`, fixed tuples, `dict[str, X]`, `X | None`, `Literal`,
     bool, int, float, str and Path; numbers must be finite and within the range declared beside their key
-    (`lwr_driver.quantities`). `where` names the file, also in front of an error
-    of the dataclass's own `__post_init__`.
+    (`fri.quantities`). where : file of the content, for messages with its line, or a text; also in front of an
+    error of the dataclass's own `__post_init__`.
     """
+    place = Place.of(where)
     if not isinstance(content, Mapping):
-        raise ConfigurationError(f"{where}: expected a mapping of keys, found {_kind(content)}")
+        raise ConfigurationError(f"{place}: expected a mapping of keys, found {_kind(content)}")
     hints = typing.get_type_hints(cls, include_extras=True)
     fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls)) if field.init}
     for key in content:
         if key not in fields:
             near = difflib.get_close_matches(_shown(str(key)), fields, n=1, cutoff=0.5)
             advice = f"did you mean `{near[0]}`?" if near else f"known keys: {', '.join(fields)}"
-            raise ConfigurationError(f"{where}: unknown key `{_shown(str(key))}`; {advice}")
+            raise ConfigurationError(f"{place.line_of(str(key))}: unknown key `{_shown(str(key))}`; {advice}")
     values = {}
     for name, field in fields.items():
         if name in content:
-            values[name] = _convert(hints[name], content[name], f"{where}: `{name}`")
+            values[name] = _convert(hints[name], content[name], place.key(name))
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ConfigurationError(f"{where}: key `{name}` is missing")
+            raise ConfigurationError(f"{place}: key `{name}` is missing")
     try:
         return cls(**values)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{where}: {error}") from error
+        raise ConfigurationError(f"{place.named_in(str(error), content)}: {error}") from error
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
+def _convert(hint: Any, value: Any, where: Place) -> Any:
     if typing.get_origin(hint) is Annotated:
         inner, ranges = metas(hint)
         converted = _convert(inner, value, where)
@@ -195,7 +199,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if not isinstance(value, Mapping):
             raise ConfigurationError(f"{where}: expected a mapping, found {_kind(value)}")
         return {
-            str(key): _convert(arguments[1], item, f"{where}.{_shown(str(key))}")
+            str(key): _convert(arguments[1], item, where.key(str(key), f".{_shown(str(key))}"))
             for key, item in value.items()
         }
     if dataclasses.is_dataclass(hint):
@@ -203,13 +207,12 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     return _convert_scalar(hint, value, where)
 
 
-def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
+def _convert_union(options: tuple[Any, ...], value: Any, where: Place) -> Any:
     if value is None and type(None) in options:
         return None
     failures = []
-    for option in options:
-        if option is type(None):
-            continue
+    known = [option for option in options if option is not type(None)]
+    for option in sorted(known, key=lambda option: not _alike(option, value)):
         try:
             return _convert(option, value, where)
         except ConfigurationError as error:
@@ -217,25 +220,47 @@ def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
     raise failures[0]
 
 
-def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+def _alike(hint: Any, value: Any) -> bool:
+    """Whether a value is of the kind of a hint, whatever its content."""
+    hint = metas(hint)[0]
+    origin = typing.get_origin(hint)
+    if isinstance(value, Mapping):
+        return origin is dict or dataclasses.is_dataclass(hint)
+    if isinstance(value, (list, tuple)):
+        return origin is tuple
+    if isinstance(value, str):
+        return hint in (str, Path) or origin is typing.Literal
+    return hint is type(value) or (hint is float and isinstance(value, int))
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: Place) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)):
         raise ConfigurationError(f"{where}: expected a list, found {_kind(value)}")
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        if len(value) > LONGEST_LIST:
-            raise ConfigurationError(f"{where}: {len(value)} entries, limit {LONGEST_LIST}; shorten the list")
-        arguments = (arguments[0],) * len(value)
-    if len(value) != len(arguments):
-        raise ConfigurationError(f"{where}: expected {len(arguments)} entries, found {len(value)}")
-    kinds = [metas(hint) for hint in arguments]
+    alike = len(arguments) == 2 and arguments[1] is Ellipsis
+    if alike and len(value) > LONGEST_LIST:
+        raise ConfigurationError(f"{where}: {len(value)} entries, limit {LONGEST_LIST}; shorten the list")
+    kinds = [metas(arguments[0])] * len(value) if alike else [metas(hint) for hint in arguments]
+    if len(value) != len(kinds):
+        raise ConfigurationError(f"{where}: expected {len(kinds)} entries, found {len(value)}")
+    if alike and kinds and kinds[0][0] is float and all(map(_is_number, value)):
+        # The long lists: nothing is said of a single entry but its range.
+        numbers = tuple(map(float, value))
+        check_values(numbers, kinds[0][1], where)
+        return numbers
     converted = tuple(
-        _convert(kind, item, f"{where}[{_label(item, index)}]")
+        _convert(kind, item, where.entry(index, _label(item, index)))
         for index, ((kind, _), item) in enumerate(zip(kinds, value, strict=True))
     )
     for _, ranges in kinds[:1]:
         check_values(converted, ranges, where)
     for index, ((_, ranges), item) in enumerate(zip(kinds, converted, strict=True)):
-        check_value(item, ranges, f"{where}[{index}]")
+        check_value(item, ranges, where.entry(index))
     return converted
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a finite number of usual size."""
+    return (type(value) is float and math.isfinite(value)) or (type(value) is int and abs(value) < 2**53)
 
 
 def _label(item: Any, index: int) -> str:
@@ -244,7 +269,7 @@ def _label(item: Any, index: int) -> str:
     return _shown(name) if isinstance(name, str) and name.isprintable() else str(index)
 
 
-def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+def _convert_scalar(hint: Any, value: Any, where: Place) -> Any:
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         try:
             number = float(value)

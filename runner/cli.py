@@ -47,6 +47,8 @@ VERBS = {
     "recover": "repair the log of a killed recorder",
     "attach": "add a controller's trace file to a session log",
     "import": "convert recordings of other programs to a session log",
+    "schema": "JSON Schemas of the YAML files, for editors",
+    "example": "fetch a public recording of a real arm",
     "completion": "completion script for bash, zsh or fish",
 }
 FAMILIES = {

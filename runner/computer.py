@@ -32,8 +32,14 @@ def software() -> str:
 
 @functools.cache
 def git_commit() -> str:
-    """Commit of the running checkout, with `+` after local changes; empty outside of a checkout."""
+    """Commit of this software, with `+` after local changes: baked into a wheel, else asked of the checkout.
+
+    Empty if neither is there; a checkout around the installation is of something else and not asked.
+    """
     root = Path(__file__).resolve().parents[1]
+    baked = Path(__file__).with_name("commit.txt")
+    if not (root / ".git").exists():
+        return baked.read_text(encoding="utf-8").strip() if baked.is_file() else ""
     ask = functools.partial(
         subprocess.check_output, cwd=root, text=True, timeout=10, stderr=subprocess.DEVNULL
     )

@@ -19,6 +19,7 @@ from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.arm.load import check_load
 from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
 from lwr_driver.extent import LONGEST_EXCITATION_S, Harmonics, Period, Periods
+from lwr_driver.places import Place
 from lwr_driver.session.motor_torque import KrlMotorTorque
 from runner.contact import ContactPlan
 
@@ -263,7 +264,7 @@ class Experiment:
         beside : folder for the files named in it, by default its own.
         """
         path = find(name)
-        experiment = parse(cls, read_mapping(path), str(path))
+        experiment = parse(cls, read_mapping(path), path)
         folder = path.parent if beside is None else beside
         vars(experiment).update(source=path, folder=folder, text=read_text(path))
         return experiment
@@ -293,7 +294,8 @@ class Experiment:
     def home(self, joints: int) -> npt.NDArray[np.float64]:
         """Resting position of the arm [rad], shape (joints,)."""
         given = len(self.moves.home)
-        _require(given == joints, f"{self.source}: moves.home has {given} joints, the arm has {joints}")
+        where = Place.of(self.source).line_of("moves").line_of("home")
+        _require(given == joints, f"{where}: moves.home has {given} joints, the arm has {joints}")
         return np.asarray(self.moves.home, dtype=np.float64)
 
     def payloads(self) -> dict[str, Payload]:

@@ -18,6 +18,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.arm.load import check_load
 from lwr_driver.configuration import find
+from lwr_driver.places import Place
 from lwr_driver.references import Frozen, Reference, UsedFile, freeze, noting, sha256, used
 from lwr_driver.session import read_session
 from runner.experiment import ExperimentProgress
@@ -63,9 +64,10 @@ def _check_home(experiment: Experiment, arm: Arm) -> None:
     home = experiment.home(len(arm.joint_names))
     for joint, q, low, high in zip(arm.joint_names, home, arm.q_low, arm.q_high, strict=True):
         if not low <= q <= high:
+            where = Place.of(experiment.source).line_of("moves").line_of("home")
             raise ConfigurationError(
-                f"{experiment.source}: moves.home: {joint} {q:.4g} rad is outside {low:.4f} to {high:.4f} rad; choose "
-                "a position within the limits"
+                f"{where}: moves.home: {joint} {q:.4g} rad is outside {low:.4f} to {high:.4f} rad; choose a position "
+                "within the limits"
             )
 
 

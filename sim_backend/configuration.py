@@ -16,6 +16,7 @@ from fri.errors import ConfigurationError
 from fri.policy import KrcPolicy
 from fri.quantities import FileName, Name, Version, check, entries, within
 from lwr_driver.configuration import CONFIGS, find, parse, read_mapping
+from lwr_driver.places import Place
 
 JOINTS = 7
 _FILES = (("robot", "urdf"), ("robot", "parameters"), ("controller", "urdf"), ("", "limits"))
@@ -260,7 +261,7 @@ class EmulatorConfig:
     """
 
     schema_version: Version = 1
-    seed: Annotated[int, within(0, 2**63)] = 1
+    seed: Annotated[int, within(0, 2**63 - 1)] = 1
     robot: RobotConfig = field(default_factory=RobotConfig)
     controller: ControllerConfig = field(default_factory=ControllerConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)
@@ -273,6 +274,7 @@ class EmulatorConfig:
     faults: Annotated[tuple[dict[str, Any], ...], entries(0, 1000)] = ()
     schedule: Annotated[tuple[dict[str, Any], ...], entries(0, 1000)] = ()
     source: Path = field(default=Path(), init=False)
+    place: Place = field(default=Place(""), init=False, repr=False, compare=False)
 
     def beside(self, name: str) -> Path:
         """Path of the file `name` of this configuration."""
@@ -288,11 +290,12 @@ def load_configuration(
     Raises ConfigurationError with file, key, value and advice.
     """
     path = find(name)
-    content = _with_base(path, ())
+    content, files = _with_base(path, ())
     for key, value in (overrides or {}).items():
         _put(content, key, value)
-    config = parse(EmulatorConfig, content, str(path))
-    object.__setattr__(config, "source", path)
+    place = Place(str(path), files, frozenset(overrides or {}))
+    config = parse(EmulatorConfig, content, place)
+    vars(config).update(source=path, place=place)
     return config
 
 
@@ -310,17 +313,20 @@ def read_settings(settings: Iterable[str]) -> dict[str, Any]:
     return found
 
 
-def _with_base(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
-    if path in seen:
-        raise ConfigurationError(f"{path}: `base` leads back to this file")
+def _with_base(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], tuple[Path, ...]]:
+    """The content of a file and those below it, and the files by precedence."""
     content = read_mapping(path)
     base = content.pop("base", None)
     if base is None:
-        return content
+        return content, (path,)
+    where = Place.of(path).line_of("base")
     if not isinstance(base, str):
-        raise ConfigurationError(f"{path}: `base` must be the name of a file, found {base!r}")
+        raise ConfigurationError(f"{where}: `base` must be the name of a file, found {base!r}")
     below = find(base, beside=path.parent)
-    return _merge(_resolved(_with_base(below, (*seen, path)), below.parent), content)
+    if below in (*seen, path):
+        raise ConfigurationError(f"{where}: `base` leads back to {below}")
+    under, files = _with_base(below, (*seen, path))
+    return _merge(_resolved(under, below.parent), content), (path, *files)
 
 
 def _resolved(content: dict[str, Any], beside: Path) -> dict[str, Any]:

@@ -78,12 +78,11 @@ class Operator:
         self._seen_state = State.OFF
         self._seen_moving = False
         config = cabinet.config
-        source = str(config.source)
+        faults, schedule = (config.place.key(name) for name in ("faults", "schedule"))
         for number, content in enumerate(config.faults):
-            wire.inject(parse(WireFault, content, f"{source}: `faults[{number}]`"), cabinet.cycle)
+            wire.inject(parse(WireFault, content, faults.entry(number)), cabinet.cycle)
         for number, content in enumerate(config.schedule):
-            entry = parse(ScheduleEntry, content, f"{source}: `schedule[{number}]`")
-            self._add(entry)
+            self._add(parse(ScheduleEntry, content, schedule.entry(number)))
         if config.fri.autostart:
             cabinet.start_program()
 

@@ -201,7 +201,7 @@ def robot_file(config: EmulatorConfig) -> RobotFile:
         for name, body in config.robot.payloads.items()
     }
     if model is None:
-        content = parse(RobotFile, read_mapping(path), str(path))
+        content = parse(RobotFile, read_mapping(path), path)
         return replace(content, payloads={**content.payloads, **own})
     from sim_backend.model_arm import model_parameters, model_payloads
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from fri.quantities import Name, within
 from ident.dynamics.tables import Tabular
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate, fisher_limit
@@ -32,10 +33,10 @@ class EssentialSettings:
         eliminated first and untested. Names with or without their `R`, or a symbol for all links (`Fvl`).
     """
 
-    significance: float = 0.01
-    largest_loss_percent: float = 1.0
-    keep: tuple[str, ...] = ()
-    drop: tuple[str, ...] = ()
+    significance: Annotated[float, within(0.0, 1.0, "share", above=True, below=True)] = 0.01
+    largest_loss_percent: Annotated[float, within(0.0, 1e6, "%")] = 1.0
+    keep: tuple[Name, ...] = ()
+    drop: tuple[Name, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.significance < 1.0:

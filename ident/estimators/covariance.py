@@ -23,12 +23,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import digamma, polygamma
 
+from fri.quantities import within
 from ident.dynamics.parameters import Floats
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import Problem, RowGroup
@@ -54,10 +55,10 @@ class CovarianceSettings:
     """
 
     kind: Literal["jackknife", "hac", "bootstrap", "textbook"] = "jackknife"
-    bandwidth_s: float | None = None
-    block_s: float | None = None
-    draws: int = 400
-    seed: int = 20160
+    bandwidth_s: Annotated[float, within(0.0, 1e5, "s")] | None = None
+    block_s: Annotated[float, within(0.0, 1e5, "s", above=True)] | None = None
+    draws: Annotated[int, within(2, 1_000_000)] = 400
+    seed: Annotated[int, within(0, 2**32 - 1)] = 20160
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from ident.excitation.motions import (
 from ident.model.model_file import write_checked
 from lwr_driver.configuration import parse, read_mapping
 from lwr_driver.extent import LONGEST_EXCITATION_S, Periods
+from lwr_driver.places import Place
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
@@ -41,7 +42,7 @@ _Limits = Annotated[tuple[_Limit, ...], entries(1, 100)]
 
 
 @dataclass(frozen=True)
-class _Fourier:
+class FourierKeys:
     """A Fourier series in a plan file."""
 
     type: Literal["fourier"]
@@ -53,7 +54,7 @@ class _Fourier:
 
 
 @dataclass(frozen=True)
-class _Spline:
+class SplineKeys:
     """A B-spline in a plan file."""
 
     type: Literal["bspline"]
@@ -62,7 +63,7 @@ class _Spline:
 
 
 @dataclass(frozen=True)
-class _Points:
+class PointKeys:
     """Postures in a plan file."""
 
     type: Literal["point to point"]
@@ -73,8 +74,12 @@ class _Points:
     dwell_s: Annotated[float, within(0.0, 600.0, "s")]
 
 
+MOTIONS = FourierKeys | SplineKeys | PointKeys
+"""The forms of `motion` in a plan file, told apart by `type`."""
+
+
 @dataclass(frozen=True)
-class _PlanFile:
+class PlanFile:
     """The keys of a plan file that decide the motion; the rest is a record of its planning."""
 
     schema_version: Version
@@ -184,20 +189,21 @@ class ExcitationPlan:
     @classmethod
     def load(cls, path: Path) -> ExcitationPlan:
         """Read a plan file; ConfigurationError with path and fault otherwise."""
-        return cls.from_mapping(read_mapping(path), str(path))
+        return cls.from_mapping(read_mapping(path), path)
 
     @classmethod
-    def from_mapping(cls, content: Any, path: str) -> ExcitationPlan:
+    def from_mapping(cls, content: Any, path: str | Path) -> ExcitationPlan:
         """The plan of a file's content; ConfigurationError with path and fault otherwise."""
+        place = Place.of(path)
         if not isinstance(content, Mapping) or content.get("kind") != "excitation plan":
             raise ConfigurationError(
                 f"{path}: `kind` is not that of an excitation plan of schema_version {_SCHEMA}"
             )
         keys = ("schema_version", "kind", "joint_names", "periods")
-        head = parse(_PlanFile, {key: content[key] for key in keys if key in content}, path)
+        head = parse(PlanFile, {key: content[key] for key in keys if key in content}, place)
         try:
             plan = cls(
-                motion=_motion_from_mapping(content.get("motion"), f"{path}: `motion`"),
+                motion=_motion_from_mapping(content.get("motion"), place.key("motion")),
                 joint_names=head.joint_names,
                 periods=head.periods,
                 objectives=content.get("objectives", {}),
@@ -207,11 +213,13 @@ class ExcitationPlan:
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             reason = str(error) if isinstance(error, ConfigurationError) else f"not readable: {error!r:.200}"
-            raise ConfigurationError(reason if reason.startswith(path) else f"{path}: {reason}") from error
+            raise ConfigurationError(
+                reason if reason.startswith(str(path)) else f"{path}: {reason}"
+            ) from error
         if not plan.duration_s <= LONGEST_EXCITATION_S:
             raise ConfigurationError(
-                f"{path}: {plan.periods} periods of {plan.period_s:g} s last {plan.duration_s:g} s, limit "
-                f"{LONGEST_EXCITATION_S:g} s; lower `periods`"
+                f"{place.line_of('periods')}: {plan.periods} periods of {plan.period_s:g} s last "
+                f"{plan.duration_s:g} s, limit {LONGEST_EXCITATION_S:g} s; lower `periods`"
             )
         return plan
 
@@ -231,11 +239,12 @@ def _motion_to_mapping(motion: ParametricMotion) -> dict[str, Any]:
     raise ConfigurationError(f"a {type(motion).__name__} cannot be stored in a plan file")
 
 
-def _motion_from_mapping(content: Any, where: str) -> ParametricMotion:
-    forms = {"fourier": _Fourier, "bspline": _Spline, "point to point": _Points}
+def _motion_from_mapping(content: Any, where: Place) -> ParametricMotion:
+    forms = {"fourier": FourierKeys, "bspline": SplineKeys, "point to point": PointKeys}
     kind = content.get("type") if isinstance(content, Mapping) else None
     if not isinstance(kind, str) or kind not in forms:
-        raise ConfigurationError(f"{where}: motion type {kind!r:.40} is unknown; known: {', '.join(forms)}")
+        place = where.line_of("type") if kind is not None else where
+        raise ConfigurationError(f"{place}: motion type {kind!r:.40} is unknown; known: {', '.join(forms)}")
     form: Any = parse(forms[kind], content, where)
 
     def arrays(*keys: str) -> list[Array]:
@@ -244,9 +253,9 @@ def _motion_from_mapping(content: Any, where: str) -> ParametricMotion:
             raise ConfigurationError(f"{where}: rows of different lengths; give one number per column")
         return [np.array(table, dtype=np.float64) for table in rows]
 
-    if isinstance(form, _Fourier):
+    if isinstance(form, FourierKeys):
         return FourierSeries(form.period_s, *arrays("bias", "a", "b"))
-    if isinstance(form, _Spline):
+    if isinstance(form, SplineKeys):
         return SplineMotion(form.duration_s, *arrays("points"))
     postures, v_max, a_max, j_max = arrays("postures", "v_max", "a_max", "j_max")
     return PointToPoint(postures, v_max, a_max, j_max, form.dwell_s)

@@ -12,6 +12,7 @@ from ident.excitation.check import Workspace
 from lwr_driver.arm.cell import PayloadShape
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.extent import LONGEST_EXCITATION_S, Harmonics, Period, Periods
+from lwr_driver.places import Place
 
 _Bound = Annotated[float, within(0.0, 1e12, above=True)]
 _Noise = Annotated[float, within(1e-6, 1000.0, "Nm")]
@@ -182,7 +183,7 @@ class PlanProblem:
         path = find(name)
         content = read_mapping(path)
         if "source" in content:
-            raise ConfigurationError(f"{path}: unknown key `source`")
-        problem = parse(cls, content, str(path))
+            raise ConfigurationError(f"{Place.of(path).line_of('source')}: unknown key `source`")
+        problem = parse(cls, content, path)
         object.__setattr__(problem, "source", path)
         return problem

@@ -20,11 +20,12 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from fri.errors import ConfigurationError
+from fri.quantities import FileName, Name, check, entries, within
 from ident.import_log.tables import Floats
 from lwr_driver.configuration import find, parse, read_mapping
 
@@ -53,6 +54,12 @@ _UNITS = {
     "mA": ("torque", None),
 }
 _CURRENTS = {"A": 1.0, "mA": 1e-3}
+_Rate = Annotated[float, within(0.0, 1e6, "Hz", above=True)]
+_Size = Annotated[float, within(-1e12, 1e12)]
+_Turns = Annotated[float, within(-1e6, 1e6)]
+_Place = Annotated[float, within(-1e4, 1e4)]
+_Sign = Annotated[int, within(-1, 1)]
+_Number = Annotated[int, within(1, 100_000)]
 Unit = Literal[
     "rad", "mrad", "deg", "rev", "counts", "m", "rad/s", "deg/s", "rpm", "m/s", "Nm", "mNm", "N", "A", "mA"
 ]  # fmt: skip
@@ -70,18 +77,17 @@ class TimeBase:
         up to the next time.
     """
 
-    column: str | int | None = None
-    file: str | None = None
+    column: Name | _Number | None = None
+    file: FileName | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
-    rate_hz: float | None = None
+    rate_hz: _Rate | None = None
     zero: Literal["start", "unix"] = "start"
     equal: Literal["refuse", "spread"] = "refuse"
 
     def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):
             raise ConfigurationError("`time` needs either `column` or `rate_hz`, and not both")
-        if self.rate_hz is not None and not self.rate_hz > 0:
-            raise ConfigurationError(f"`rate_hz` is {self.rate_hz}, it must be positive")
+        check(self)
 
     @property
     def seconds(self) -> float:
@@ -106,13 +112,13 @@ class Signal:
     """
 
     unit: Unit
-    file: str | tuple[str, ...] | None = None
-    columns: tuple[str | int, ...] | None = None
-    array: str | None = None
+    file: FileName | tuple[FileName, ...] | None = None
+    columns: tuple[Name | _Number, ...] | None = None
+    array: FileName | None = None
     side: Literal["joint", "motor"] | None = None
-    sign: int | tuple[int, ...] = 1
-    scale: float | tuple[float, ...] | None = None
-    torque_constant: float | tuple[float, ...] | None = None
+    sign: _Sign | tuple[_Sign, ...] = 1
+    scale: _Size | tuple[_Size, ...] | None = None
+    torque_constant: _Size | tuple[_Size, ...] | None = None
     time: TimeBase | None = None
 
     def __post_init__(self) -> None:
@@ -169,16 +175,16 @@ class Signal:
 class Coupling:
     """Motor `motor` turns `ratio` times as far as joint `joint`, besides the turns for its own joint."""
 
-    motor: str
-    joint: str
-    ratio: float
+    motor: Name
+    joint: Name
+    ratio: _Turns
 
 
 @dataclass(frozen=True)
 class Transmission:
     """Between motors and joints: q_motor = R q. reduction : the diagonal of R, may be negative."""
 
-    reduction: tuple[float, ...]
+    reduction: tuple[_Turns, ...]
     coupling: tuple[Coupling, ...] = ()
 
     def matrix(self, joints: tuple[str, ...]) -> Floats:
@@ -211,19 +217,14 @@ class PeriodMarks:
     count : number; None: all that fit; 0: none, and none are looked for.
     """
 
-    period_s: float | None = None
-    start_s: float = 0.0
-    count: int | None = None
+    period_s: Annotated[float, within(0.0, 1e6, "s", above=True)] | None = None
+    start_s: Annotated[float, within(0.0, 1e9, "s")] = 0.0
+    count: Annotated[int, within(0, 1_000_000)] | None = None
 
     def __post_init__(self) -> None:
         if self.period_s is None and self.count is None:
             raise ConfigurationError("`periods` needs `period_s` or `count`; leave it out to have them found")
-        if self.period_s is not None and not self.period_s > 0.0:
-            raise ConfigurationError(f"`period_s` is {self.period_s} s, it must be positive")
-        if self.start_s < 0.0 or (self.count is not None and self.count < 0):
-            raise ConfigurationError(
-                f"`start_s` {self.start_s} s and `count` {self.count} of `periods` cannot be negative"
-            )
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -243,29 +244,29 @@ class LogMapping:
     header : whether text files name their columns in the first row; None looks whether it holds numbers.
     """
 
-    robot: str
-    joints: tuple[str, ...]
+    robot: Name
+    joints: Annotated[tuple[Name, ...], entries(1, 100)]
     time: TimeBase
     position: Signal
     schema_version: Literal[1] = 1
-    serial: str = ""
-    payload: str = "none"
-    payload_mass: float | None = None
-    start_utc: str | None = None
-    source: str = ""
+    serial: Annotated[str, entries(0, 64)] = ""
+    payload: Name = "none"
+    payload_mass: Annotated[float, within(0.0, 1e4, "kg")] | None = None
+    start_utc: Annotated[str, entries(1, 64)] | None = None
+    source: Annotated[str, entries(0, 1000)] = ""
     joint_torque: Signal | None = None
     motor_torque: Signal | None = None
     velocity: Signal | None = None
     motor_position: Signal | None = None
     command: Signal | None = None
     transmission: Transmission | None = None
-    offset_rad: tuple[float, ...] | None = None
+    offset_rad: tuple[_Place, ...] | None = None
     periods: PeriodMarks | None = None
-    urdf: str | None = None
-    held: dict[str, float] | None = None
-    base: str | None = None
-    tip: str | None = None
-    delimiter: str | None = None
+    urdf: FileName | None = None
+    held: dict[str, _Place] | None = None
+    base: Name | None = None
+    tip: Name | None = None
+    delimiter: Annotated[str, entries(1, 8)] | None = None
     header: bool | None = None
 
     def __post_init__(self) -> None:
@@ -333,7 +334,7 @@ class LogMapping:
     def load(cls, name: str | Path) -> LogMapping:
         """Read a mapping file, looked for as given, in `configs/` and in `configs/imports/`."""
         path = mapping_path(name)
-        return parse(cls, read_mapping(path), str(path))
+        return parse(cls, read_mapping(path), path)
 
 
 def _plain(value: Any) -> Any:

@@ -233,7 +233,7 @@ def read_model(source: str | Path | Mapping[str, Any]) -> DynamicModel:
             f"{where}: schema_version is {version!r}; this software reads {SCHEMA_VERSION}. "
             "Write the model again with its own software, or update this one"
         )
-    file = parse(_File, content, where)
+    file = parse(_File, content, where if isinstance(source, Mapping) else Path(source))
     try:
         return _model(file, content, where)
     except ConfigurationError as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numba import njit
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from fri.errors import ConfigurationError
+from fri.quantities import within
 from ident.dynamics.parameters import Floats
 from ident.rows.butterworth import forward_and_back, sections, spectrum
 
@@ -24,6 +25,10 @@ from ident.rows.butterworth import forward_and_back, sections, spectrum
 CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
 # Highest cut-off over the sampling rate: differences lose accuracy beyond.
 NYQUIST_SHARE = 0.2
+
+
+Frequency = Annotated[float, within(0.0, 1e5, "Hz", above=True)]
+_Span = Annotated[float, within(0.0, 1e5, "s")]
 
 
 @dataclass(frozen=True)
@@ -52,21 +57,21 @@ class SignalSettings:
         early by Fvm / stiffness. None: rigid joints.
     """
 
-    cutoff_hz: float | None = None
-    order: int = 4
-    decimate_hz: float | None = None
-    rate_hz: float | None = None
-    attenuation_db: float = 40.0
+    cutoff_hz: Frequency | None = None
+    order: Annotated[int, within(1, 20)] = 4
+    decimate_hz: Frequency | None = None
+    rate_hz: Frequency | None = None
+    attenuation_db: Annotated[float, within(0.0, 300.0, "dB", above=True)] = 40.0
     average_periods: bool = False
-    edge_s: float | None = None
-    longest_bridge_s: float = 0.02
-    reversal_s: float | None = None
-    standstill_rad_s: float = 2e-3
-    known_share: float = 0.4
-    outlier_scale: float = 8.0
-    motor_delay_s: float | Literal["estimate"] = "estimate"
-    delay_search_s: float = 0.1
-    stiffness_nm_rad: tuple[float, ...] | None = None
+    edge_s: _Span | None = None
+    longest_bridge_s: _Span = 0.02
+    reversal_s: _Span | None = None
+    standstill_rad_s: Annotated[float, within(0.0, 100.0, "rad/s")] = 2e-3
+    known_share: Annotated[float, within(0.0, 1.0, "share")] = 0.4
+    outlier_scale: Annotated[float, within(0.0, 1e6, above=True)] = 8.0
+    motor_delay_s: Annotated[float, within(-10.0, 10.0, "s")] | Literal["estimate"] = "estimate"
+    delay_search_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.1
+    stiffness_nm_rad: tuple[Annotated[float, within(0.0, 1e12, "Nm/rad", above=True)], ...] | None = None
 
     def __post_init__(self) -> None:
         positive = (

@@ -76,4 +76,4 @@ class Cell:
     def load(cls, name: str | Path = CONFIGS / "cell.yaml", *, beside: Path | None = None) -> Cell:
         """Read a cell file; ConfigurationError names file, key and remedy."""
         path = find(name, beside=beside)
-        return parse(cls, read_mapping(path), str(path))
+        return parse(cls, read_mapping(path), path)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +19,7 @@ from fri.errors import ConfigurationError
 from fri.quantities import FileName, Name, Version, check, suspected, within
 from lwr_driver.arm.ceilings import JOINT_NAMES, LWR4PLUS, MODEL
 from lwr_driver.configuration import CONFIGS, find, parse, read_mapping, read_text
+from lwr_driver.places import Place
 
 JOINTS = 7
 
@@ -63,7 +64,7 @@ class _JointEntry:
 
 
 @dataclass(frozen=True)
-class _ArmFile:
+class ArmFile:
     """The arm file as written; units are in the key names."""
 
     schema_version: Version
@@ -194,14 +195,15 @@ class Arm:
         the URDF's chain, a link's inertia or collision shape is impossible, or the URDF has no collision geometry.
         """
         path = find(name, beside=beside)
-        content = parse(_ArmFile, read_mapping(path), str(path))
+        place = Place.of(path)
+        content = parse(ArmFile, read_mapping(path), place)
         urdf_path = find(content.urdf, beside=path.parent)
         urdf = read_text(urdf_path)
         joints = content.joints
         position = np.radians([joint.position_deg for joint in joints])
         margin = float(np.radians(content.position_margin_deg))
         if np.any(position[:, 1] - position[:, 0] <= 2.0 * margin):
-            raise ConfigurationError(f"{path}: position_margin_deg leaves no range; lower it")
+            raise ConfigurationError(f"{place.key('position_margin_deg')} leaves no range; lower it")
         values: dict[str, Any] = dict(  # noqa: C408
             name=content.name,
             joint_names=tuple(joint.name for joint in joints),
@@ -223,9 +225,19 @@ class Arm:
         try:
             arm = cls(**values)
         except ConfigurationError as error:
-            raise ConfigurationError(f"{path}: {error}") from error
+            raise ConfigurationError(f"{_place(error, place, content)}: {error}") from error
         _check_urdf(arm, str(urdf_path))
         return arm
+
+
+def _place(error: ConfigurationError, place: Place, content: ArmFile) -> Place:
+    """The line of the joint, and of its key, that an error names."""
+    said = str(error).split()
+    for number, joint in enumerate(content.joints):
+        if f"{joint.name}:" in said[:2]:
+            joints = replace(place, keys=("joints", number))
+            return joints.named_in(" ".join(said[2:]), vars(joint))
+    return place.named_in(str(error), vars(content))
 
 
 def _usual(limit: float, value: float) -> bool:

@@ -145,7 +145,7 @@ def command(
     )
 
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
-    wanted = read.identification(model or 2, estimator, file=settings or "")
+    wanted = read.identification(model or 2, estimator, file=Path(settings or "settings"))
     wanted = replace(wanted, without=(*wanted.without, *without))
     if essential and wanted.essential is None:
         raise ConfigurationError(

@@ -8,6 +8,7 @@ import click
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
+from runner.editor import hand_out
 from runner.output import OUTPUT_FOLDER
 from runner.terminal import json_option, to_json, verb
 
@@ -40,6 +41,7 @@ def command(folder: Path, as_json: bool) -> None:
             raise ConfigurationError(f"{target} is a folder; choose another FOLDER")
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes((CONFIGS / source).read_bytes())
+    hand_out(folder)
     if as_json:
         click.echo(to_json({"folder": folder, "files": list(FILES)}))
         return

@@ -26,9 +26,17 @@ def sealed(monkeypatch, tmp_path):
     os.environ.pop("NUMBA_CACHE_DIR", None)
 
 
-def test_a_writable_installation_or_home_needs_no_other_place(sealed, tmp_path):
+def test_a_checkout_that_can_be_written_needs_no_other_place(sealed):
     assert sealed("/") is None
-    assert sealed(tmp_path / "home") is None
+
+
+def test_else_the_cache_folder_of_the_user_serves(sealed, tmp_path):
+    assert sealed(tmp_path / "home") == str(tmp_path / "home/.cache/lwr-identification/numba")
+
+
+def test_an_installed_package_leaves_its_folder_alone(sealed, tmp_path, monkeypatch):
+    monkeypatch.setattr(compiler_cache, "_ROOT", tmp_path / "site-packages")
+    assert sealed("/") == str(tmp_path / "home/.cache/lwr-identification/numba")
 
 
 def test_without_both_a_private_temporary_place_serves(sealed, tmp_path):

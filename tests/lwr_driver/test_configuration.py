@@ -10,6 +10,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import find, parse, read_mapping, read_yaml, yaml_text
+from lwr_driver.places import Place
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def test_files_are_found_beside_and_in_configs(tmp_path: Path, monkeypatch: pyte
 def test_syntax_errors_name_file_and_line(tmp_path: Path) -> None:
     broken = tmp_path / "broken.yaml"
     broken.write_text("a: [1, 2\nb: 3\n")
-    with pytest.raises(ConfigurationError, match=r"broken\.yaml: not valid YAML(.|\n)*line 2"):
+    with pytest.raises(ConfigurationError, match=r"broken\.yaml:2: not valid YAML(.|\n)*line 2"):
         read_mapping(broken)
 
 
@@ -97,3 +98,37 @@ def test_a_number_with_an_exponent_is_a_number(text: str, tmp_path: Path) -> Non
 def test_a_text_that_only_resembles_a_number_stays_text(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(f"value: {text}\n")
     assert read_yaml(tmp_path / "a.yaml") == {"value": text}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("margin: 1\nmodus: fast\n", "cell.yaml:2: unknown key `modus`"),
+        ("mode: fast\nmargin: wide\n", "cell.yaml:2: `margin`: expected a number"),
+        ("margin: 1\nboxes:\n  - size:\n      - 1\n      - two\n      - 3\n", "cell.yaml:5: `boxes`[0]"),
+        ("mode: fast\nmargin: -1\n", "cell.yaml:2: margin -1.0 m is negative"),
+        ("margin: 1\nboxes:\n  - size: [1, 1, 1]\n  - name: b\n", "cell.yaml:4: `boxes`[b]: key `size` is missing"),
+        ("margin: 1\ntable:\n  a: 1\n  b: x\n", "cell.yaml:4: `table`.b: expected a number"),
+        ("x-load: &box\n  size: [1, 2]\nboxes: [*box]\nmargin: 1\n", "cell.yaml:1: unknown key `x-load`"),
+        ("margin: 1\nboxes: [&a {size: [1, 1, 1]}, {<<: *a, name: 3}]\n", "cell.yaml:2: `boxes`[1]: `name`"),
+        ("mode: fast\n", "cell.yaml: key `margin` is missing"),
+        ("- 1\n", "cell.yaml: expected a mapping"),
+        ("margin: 1\nmode: [\n", "cell.yaml:3: not valid YAML"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_named_with_file_and_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        parse(Cell, read_yaml(path), path)
+    assert message in str(caught.value)
+
+
+def test_of_several_files_the_one_with_the_key_is_named(tmp_path: Path) -> None:
+    below, above = tmp_path / "below.yaml", tmp_path / "above.yaml"
+    below.write_text("\nmargin: wide\nlimit: high\n")
+    above.write_text("limit: low\n")
+    place = Place(str(above), (above, below), frozenset({"mode"}))
+    assert str(place.key("margin")) == f"{below}:2: `margin`"
+    assert str(place.key("limit")) == f"{above}:1: `limit`"
+    assert str(place.key("mode")) == f"{above}: `mode`"

@@ -226,7 +226,7 @@ def test_channels_of_unequal_length_are_an_error(tmp_path: Path) -> None:
         ({"offset_rad": [1.0]}, "1 entries for 2 joints"),
         ({"position": PLAIN["position"] | {"unit": "Nm"}}, "cannot have the unit"),
         ({"position": PLAIN["position"] | {"side": "motor"}}, "give `transmission: {reduction"),
-        ({"position": PLAIN["position"] | {"sign": [1, 2]}}, "must be 1 or -1"),
+        ({"position": PLAIN["position"] | {"sign": [1, 2]}}, "is outside -1 to 1"),
         ({"position": PLAIN["position"] | {"unit": "counts"}}, "needs? `scale`|give `scale`"),
         ({"position": PLAIN["position"] | {"columns": ["qa"]}}, "1 `columns` for 2 joints"),
         ({"time": {"column": "t", "rate_hz": 10}}, "and not both"),

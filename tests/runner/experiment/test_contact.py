@@ -37,7 +37,7 @@ def test_an_experiment_file_lowers_the_limits_and_raises_none(tmp_path: Path) ->
     assert experiment.contact == ContactPlan(0.5, tuple(low))  # type: ignore[arg-type]
     file = experiment_file(tmp_path, contact={"external_nm": [*low[:6], 4.0]})
     with pytest.raises(
-        ConfigurationError, match=r"short\.yaml: `contact`: external_nm of joint 7 is 4\.0 Nm.*lowered"
+        ConfigurationError, match=r"short\.yaml:\d+: `contact`: external_nm of joint 7 is 4\.0 Nm.*lowered"
     ):
         Experiment.load(file)
 

@@ -12,18 +12,20 @@ import pytest
 
 from benchmarks.trust.files import CASES, UNCHANGED, judge
 from fri.quantities import metas
-from ident.excitation.plan import _Fourier, _PlanFile, _Points, _Spline
+from ident.excitation.plan import FourierKeys, PlanFile, PointKeys, SplineKeys
 from ident.excitation.problem import PlanProblem
+from ident.import_log import LogMapping
 from lwr_driver.arm.cell import Cell
-from lwr_driver.arm.description import _ArmFile
+from lwr_driver.arm.description import ArmFile
+from runner.estimation import IdentifySettings
 from runner.experiment_file import Experiment
 from sim_backend.configuration import EmulatorConfig
 from sim_backend.faults import WireFault
 from sim_backend.operator import ScheduleEntry
 
 FILES = (
-    Experiment, _ArmFile, Cell, EmulatorConfig, WireFault, ScheduleEntry,
-    PlanProblem, _PlanFile, _Fourier, _Spline, _Points,
+    Experiment, ArmFile, Cell, EmulatorConfig, WireFault, ScheduleEntry,
+    PlanProblem, PlanFile, FourierKeys, SplineKeys, PointKeys, LogMapping, IdentifySettings,
 )  # fmt: skip
 
 

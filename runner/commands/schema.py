@@ -1,0 +1,55 @@
+"""`lwr-run schema`: JSON Schemas of the YAML files, for editors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fri.errors import ConfigurationError
+from runner.output import OUTPUT_FILE
+from runner.terminal import json_option, to_json, verb
+
+
+@verb("schema")
+@click.argument("name", required=False)
+@click.option("--out", type=OUTPUT_FILE, help="Write the schema to this file.")
+@click.option(
+    "--refer",
+    "files",
+    multiple=True,
+    type=click.Path(dir_okay=False),
+    help="Let this YAML file refer to its schema, so that an editor finds it; may be repeated.",
+)
+@json_option
+def command(name: str | None, out: Path | None, files: tuple[str, ...], as_json: bool) -> None:
+    """Print the JSON Schema of a kind of file; without NAME list the kinds.
+
+    An editor with a YAML language server completes keys and marks errors. Templates refer to their schemas; a
+    copy in another folder needs --refer, which replaces the first line.
+
+    \b
+    lwr-run schema                               the kinds of files
+    lwr-run schema experiment                    the schema of experiment files
+    lwr-run schema cell --out cell.json          to a file
+    lwr-run schema --refer my_lab.yaml           my_lab.yaml is a copy of a template
+    lwr-run schema cell --refer my_cell.yaml     my_cell.yaml is written by hand
+    """
+    from runner.editor import refer
+    from runner.schema import FILES, schema_text
+
+    if out is not None and name is None:
+        raise ConfigurationError(f"--out {out} needs the NAME of a schema: {', '.join(FILES)}")
+    done = {file: refer(Path(file), name) for file in files}
+    if done:
+        lines = "\n".join(f"{file} refers to {target}" for file, target in done.items())
+        click.echo(to_json({"files": done}) if as_json else lines)
+    elif name is None:
+        width = max(map(len, FILES))
+        lines = "\n".join(f"{kind:<{width}}  {file.meaning}" for kind, file in FILES.items())
+        click.echo(to_json({kind: file.meaning for kind, file in FILES.items()}) if as_json else lines)
+    elif out is not None:
+        out.write_text(schema_text(name), encoding="utf-8")
+        click.echo(to_json({"file": str(out)}) if as_json else str(out))
+    else:
+        click.echo(schema_text(name), nl=False)
