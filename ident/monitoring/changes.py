@@ -31,7 +31,7 @@ _SIDE = 2
 # Least number of days of a drift: fewer are a step or outliers.
 _DRIFTING = 4
 # Weight of the usual scatter, in days.
-_USUAL_DAYS = 5.0
+_USUAL_DAYS = 10.0
 # Posterior probability of the interval of a change's day.
 _INTERVAL = 0.95
 # Largest number of changes in one quantity.
@@ -152,8 +152,8 @@ def _best(series: Series, noise: Floats) -> tuple[Change | None, int]:
     }
     course, k = min(tried, key=lambda key: tried[key][0])
     left, values, covariance = tried[course, k]
-    freedom = len(series.values) - 2
-    scale = max(left / freedom, 1.0)
+    freedom = len(series.values) - 2 + (0.0 if series.usual is None else _USUAL_DAYS)
+    scale = max(left / (len(series.values) - 2), 1.0)
     t = float(np.sqrt(max(constant - left, 0.0) / scale))
     p = min(1.0, 2.0 * len(tried) * float(student_tail(t, freedom)))
     alike = np.array([other for kind, other in tried if kind == course])
@@ -184,7 +184,7 @@ def _best(series: Series, noise: Floats) -> tuple[Change | None, int]:
 def _fit(series: Series, noise: Floats, columns: Sequence[Floats]) -> tuple[float, Floats, Floats]:
     """Chi-square, values and covariance of a constant with further columns."""
     matrix = np.stack([np.ones(len(noise)), *columns], axis=1) / noise[:, None]
-    inverse = np.linalg.pinv(matrix.T @ matrix)
+    inverse = np.asarray(np.linalg.pinv(matrix.T @ matrix), dtype=np.float64)
     values = inverse @ (matrix.T @ (series.values / noise))
     left = series.values / noise - matrix @ values
     return float(left @ left), values, inverse
