@@ -101,7 +101,7 @@ def main(arms: int, days: int, jobs: int, seed: int, diagnose: str, out: Path) -
         number = int(arm["arm"].rsplit("_", 1)[1])
         event = next((e for e in planned if e.arm == number), None)
         said = [
-            (c["name"], c["course"], c["earliest"], c["latest"], f"{c['percent'] or 0:+.0f} %")
+            (c["name"], c["course"], c["earliest"], c["latest"], f"{c['after'] - c['before']:+.3g} {c['unit']}")
             for c in arm["changes"]
         ]
         said += [("payload", name, day) for name, day in arm["new_payloads"].items()]

@@ -34,6 +34,8 @@ _DRIFTING = 4
 _USUAL_DAYS = 10.0
 # Posterior probability of the interval of a change's day.
 _INTERVAL = 0.95
+# Least size of a value for a percentage of it, in standard deviations.
+_KNOWN = 3.0
 # Largest number of changes in one quantity.
 _MOST = 4
 
@@ -93,8 +95,9 @@ class Change:
 
     @property
     def percent(self) -> float:
-        """Difference, of the value before [%]."""
-        return 100.0 * self.difference / abs(self.before) if self.before else np.inf
+        """Difference, of the value before [%]; infinite where that is not distinguishable from zero."""
+        known = abs(self.before) > _KNOWN * self.before_std
+        return 100.0 * self.difference / abs(self.before) if known else np.inf
 
 
 def day_scatter(series: Series) -> float:
