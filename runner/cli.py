@@ -41,6 +41,8 @@ VERBS = {
     "commission": "record a healthy-arm baseline",
     "diagnose": "model errors by cause and joint, and an extended model",
     "compare": "significant differences between two models",
+    "batch": "identify and diagnose every arm's every day",
+    "trend": "changes of an arm over its days, and arms unlike the others",
     "payload": "the payload's ten parameters from a known arm and one session",
     "export": "a model as URDF, MJCF, or stand-alone C and numpy code",
     "info": "summary of a session log",
@@ -56,6 +58,7 @@ FAMILIES = {
     "steps": ("record", "hold", "jog", "home"),
     "motions": ("plan", "check", "preview"),
     "models": ("validate", "compare", "payload", "export"),
+    "fleet": ("batch", "trend"),
     "logs": ("report", "info", "recover", "attach", "import"),
 }
 

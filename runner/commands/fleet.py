@@ -1,0 +1,171 @@
+"""`lwr-run batch` and `lwr-run trend`: many arms over many days."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from runner.output import NEW_FOLDER, OUTPUT_FILE
+from runner.terminal import GroupedCommand, json_option, to_json
+
+_STORE = click.option(
+    "--store",
+    type=NEW_FOLDER,
+    default=Path("fleet"),
+    show_default=True,
+    help="Folder of the results, a folder for each arm.",
+)
+
+
+@click.command(
+    "batch",
+    cls=GroupedCommand,
+    groups={
+        "Work": ("store", "diagnose", "reference_days", "settings"),
+        "Computers": ("jobs", "dask"),
+    },
+)
+@click.argument(
+    "places", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True), metavar="FOLDER..."
+)
+@_STORE
+@click.option(
+    "--diagnose",
+    type=click.Choice(["changed", "all", "none"]),
+    default="changed",
+    show_default=True,
+    help="Days with a diagnosis; `changed`: the first day after a change, and the newest one.",
+)
+@click.option(
+    "--reference-days",
+    type=click.IntRange(1, 60),
+    default=3,
+    show_default=True,
+    help="First days of each arm for its healthy-arm baseline.",
+)
+@click.option("--settings", metavar="FILE", help="As of `lwr-run identify`.")
+@click.option(
+    "--jobs", type=click.IntRange(-1, 1024), default=1, show_default=True, help="Processes; -1: one a core."
+)
+@click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster, such as tcp://host:8786.")
+@json_option
+def batch_command(
+    places: tuple[Path, ...],
+    store: Path,
+    diagnose: Any,
+    reference_days: int,
+    settings: str | None,
+    jobs: int,
+    dask: str | None,
+    as_json: bool,
+) -> None:
+    """Identify and diagnose every arm's every day in the logs below each FOLDER.
+
+    The arm is robot and serial number of a log, or the folder it lies in; the day a date in its path, such as
+    2026-03-12, or the log's own. What the store holds is not done again: add a day's folder and repeat the command.
+    Copies are known by the identity of the log. An unreadable log or a failed day is noted and stops nothing.
+
+    \b
+    lwr-run batch logs/ --store fleet --jobs -1
+    lwr-run batch logs/*/2026-03-* --diagnose all
+    lwr-run batch logs/ --dask tcp://head:8786         on a cluster that shares the disk
+    """
+    from fri.errors import DataError
+    from runner.estimation import IdentifySettings
+    from runner.fleet import FleetStore, Order, Progress, find_days, run_batch
+    from runner.fleet.store import parquet
+
+    parquet()
+    read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
+    wanted = replace(read.identification(2, "wls", file=settings or ""), essential=None)
+    home = FleetStore(store)
+    found = find_days(places, home.uids())
+    for path, reason in found.unreadable:
+        click.echo(f"{path}: left out: {reason}", err=True)
+    for path in found.repeated:
+        click.echo(f"{path}: left out: a copy of another log", err=True)
+    arms = len({day.arm for day in found.days})
+    click.echo(
+        f"{len(found.days)} new days of {arms} arms; {found.known} logs are in {store} already", err=as_json
+    )
+
+    def report(one: Progress) -> None:
+        click.echo(f"{one.arm} {one.day} {one.what}{f': {one.error}' if one.error else ''}", err=as_json)
+
+    with _cluster(dask):
+        order = Order(wanted, diagnose, reference_days, jobs)
+        done = run_batch(home, found.days, order, report)
+    failed = [one for one in done if one.error]
+    if as_json:
+        click.echo(
+            to_json(
+                {
+                    "schema_version": 1,
+                    "days": len(found.days),
+                    "known": found.known,
+                    "done": [one.__dict__ for one in done],
+                    "unreadable": [[str(path), reason] for path, reason in found.unreadable],
+                    "repeated": [str(path) for path in found.repeated],
+                }
+            )
+        )
+    else:
+        click.echo(
+            f"{len(done) - len(failed)} done, {len(failed)} failed. Next: lwr-run trend --store {store}"
+        )
+    if found.days and len(failed) >= len(done) > 0:
+        raise DataError(f"no day could be worked on; the first reason: {failed[0].error}")
+
+
+@contextlib.contextmanager
+def _cluster(address: str | None) -> Any:
+    """The context in which joblib uses a Dask cluster; the local machine without an address."""
+    if address is None:
+        yield
+        return
+    from lwr_driver.notebook import optional
+
+    distributed = optional("distributed", "--dask", "--jobs on this machine")
+    from joblib import parallel_config
+
+    with distributed.Client(address), parallel_config(backend="dask"):
+        yield
+
+
+@click.command("trend", cls=GroupedCommand, groups={"Results": ("store", "out")})
+@click.argument("arm", required=False)
+@_STORE
+@click.option("--out", type=OUTPUT_FILE, help="Page to write, e.g. trend.html.")
+@json_option
+def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool) -> None:
+    """Changes of an ARM over its days, with the first day and its uncertainty; without ARM: of all arms.
+
+    A change is a step or a drift of a parameter, or of the error of a torque, beyond the scatter from day to day; one
+    arm in a thousand has one by chance. Of five arms or more, those unlike the others are named.
+
+    \b
+    lwr-run trend --store fleet
+    lwr-run trend LWR4+_17 --store fleet --out arm17.html
+    """
+    from fri.errors import DataError
+    from runner.fleet import FleetStore, fleet_trend
+    from runner.fleet.page import arm_html, fleet_html, write_page
+
+    home = FleetStore(store)
+    if not home.arms():
+        raise DataError(f"{store} holds no results; make them with `lwr-run batch FOLDER... --store {store}`")
+    fleet = fleet_trend(home)
+    if arm is not None:
+        home.arm(arm)
+        one = next(found for found in fleet.arms if found.arm == arm)
+        click.echo(to_json({"schema_version": 1, **one.to_dict()}) if as_json else str(one))
+        text = arm_html(one) if out is not None else ""
+    else:
+        click.echo(to_json({"schema_version": 1, **fleet.to_dict()}) if as_json else str(fleet))
+        text = fleet_html(fleet) if out is not None else ""
+    if out is not None:
+        click.echo(str(write_page(text, out)), err=as_json)

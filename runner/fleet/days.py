@@ -1,0 +1,120 @@
+"""Session logs by arm and day, from their names and the head of each file."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime
+from pathlib import Path
+
+from fri.errors import DataError, LwrError
+from lwr_driver.session.scan import Scan
+
+_ISO_DAY = re.compile(r"(?<!\d)(\d{4}-\d{2}-\d{2})(?!\d)")
+_UNSAFE = re.compile(r"[^\w.+-]+")
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log on disk. uid : its identity, the same in a copy."""
+
+    path: Path
+    uid: str
+
+
+@dataclass(frozen=True)
+class ArmDay:
+    """The logs of an arm on a day that are not in the store yet.
+
+    part : 1, or more for logs that came after others of the day had been taken.
+    """
+
+    arm: str
+    day: date
+    logs: tuple[Log, ...]
+    part: int = 1
+
+    @property
+    def key(self) -> str:
+        """The day, with the part from the second on; the name of its files in the store."""
+        return self.day.isoformat() + (f"_{self.part}" if self.part > 1 else "")
+
+
+@dataclass(frozen=True)
+class Found:
+    """Days to work on; `unreadable` : path and reason; `repeated` : logs that are copies of others."""
+
+    days: tuple[ArmDay, ...]
+    unreadable: tuple[tuple[Path, str], ...] = ()
+    repeated: tuple[Path, ...] = ()
+    known: int = field(default=0)
+
+
+def find_days(places: Iterable[Path], known: Collection[str] = ()) -> Found:
+    """Logs under the folders and files of `places`, by arm and day, without those with a `known` uid.
+
+    The arm is robot and serial number of the log; without a number, the folder below the given one, or the folder's
+    name. The day is a date such as 2026-03-12 in the path, the deepest one; else the log's own.
+    DataError where there is no log at all.
+    """
+    groups: dict[tuple[str, date], list[Log]] = {}
+    unreadable: list[tuple[Path, str]] = []
+    repeated: list[Path] = []
+    seen, skipped = set(known), 0
+    logs = [(path, root) for root in places for path in _logs(root)]
+    for path, root in logs:
+        try:
+            log, arm, day = _head(path, root)
+        except (LwrError, OSError) as error:
+            unreadable.append((path, str(error)))
+            continue
+        if log.uid in seen:
+            if log.uid in known:
+                skipped += 1
+            else:
+                repeated.append(path)
+            continue
+        seen.add(log.uid)
+        groups.setdefault((arm, day), []).append(log)
+    if not logs:
+        raise DataError("no .mcap log in the given folders; name folders or files that hold session logs")
+    days = tuple(ArmDay(arm, day, tuple(files)) for (arm, day), files in sorted(groups.items()))
+    return Found(days, tuple(unreadable), tuple(repeated), skipped)
+
+
+def _logs(root: Path) -> list[Path]:
+    return [root] if root.is_file() else sorted(root.rglob("*.mcap"))
+
+
+def _head(path: Path, root: Path) -> tuple[Log, str, date]:
+    scan = Scan(path)
+    first = next(scan.blocks(), None)
+    if first is None:
+        raise DataError(f"{path}: holds no message")
+    metadata = next((values for name, values in scan.metadata if name == "session"), {})
+    robot, serial = metadata.get("robot", "") or "arm", metadata.get("serial", "")
+    inner = path.relative_to(root).parts[:-1] if path != root else ()
+    folders = [part for part in inner if not _ISO_DAY.search(part)]
+    own = serial or (folders[0] if folders else "" if root.is_file() else root.resolve().name)
+    arm = _UNSAFE.sub("_", f"{robot} {own}".strip())
+    return Log(path, metadata.get("uid") or _hash(path)), arm, _day(path, metadata, int(first.log_time[0]))
+
+
+def _day(path: Path, metadata: dict[str, str], first_ns: int) -> date:
+    for part in reversed(path.resolve().parts):
+        for text in reversed(_ISO_DAY.findall(part)):
+            try:
+                return date.fromisoformat(text)
+            except ValueError:
+                continue
+    try:
+        return datetime.fromisoformat(metadata.get("utc_start", "")).date()
+    except ValueError:
+        return datetime.fromtimestamp(1e-9 * first_ns, UTC).date()
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

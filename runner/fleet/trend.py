@@ -1,0 +1,271 @@
+"""What changed in an arm over its days, and which arms are unlike the others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from typing import Any
+
+import numpy as np
+
+from ident.monitoring import Change, Series, Unlike, changes, day_scatter, unlike
+from runner.fleet.store import ArmStore, FleetStore
+
+_ERROR = "error of "
+"""Before joint and side, the name of a residual over the days."""
+
+# Probability of any change of an arm without one.
+LEVEL = 0.001
+# A change below this share of a quantity [%] is of no use to anyone, however significant.
+_LEAST_PERCENT = 1.0
+
+
+@dataclass(frozen=True)
+class Named:
+    """A change with unit and kind of its quantity: `parameter`, or `error` for the residual of a joint's torque."""
+
+    change: Change
+    unit: str
+    kind: str
+
+    @property
+    def day(self) -> str:
+        """First day with another value."""
+        return as_day(self.change.time)
+
+    @property
+    def interval(self) -> str:
+        """The days in question."""
+        first, last = as_day(self.change.earliest), as_day(self.change.latest)
+        return first if first == last else f"{first} to {last}"
+
+    def __str__(self) -> str:
+        one = self.change
+        size = f" ({one.percent:+.1f} %)" if np.isfinite(one.percent) else ""
+        course = "since" if one.course == "step" else "drifts since"
+        return f"{one.name} {course} {self.interval}: {one.before:.4g} to {one.after:.4g} {self.unit}{size}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        one = self.change
+        return {
+            "name": one.name,
+            "kind": self.kind,
+            "unit": self.unit,
+            "course": one.course,
+            "day": self.day,
+            "earliest": as_day(one.earliest),
+            "latest": as_day(one.latest),
+            "before": one.before,
+            "before_std": one.before_std,
+            "after": one.after,
+            "after_std": one.after_std,
+            "percent": one.percent if np.isfinite(one.percent) else None,
+            "p": one.p,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTrend:
+    """An arm over its days.
+
+    days : keys in order. series : by name; units : by name. changes : by day. findings : rows of the store, by day.
+    payloads : first day of each payload. failed : days without an estimate, with the reason.
+    """
+
+    arm: str
+    days: tuple[str, ...]
+    series: Mapping[str, Series]
+    units: Mapping[str, str]
+    changes: tuple[Named, ...]
+    findings: tuple[Mapping[str, Any], ...]
+    payloads: Mapping[str, str]
+    failed: tuple[tuple[str, str], ...]
+
+    @property
+    def first_days(self) -> set[str]:
+        """Keys of the first days after each change, the latest in question."""
+        found = set()
+        for one in self.changes:
+            later = [key for key in self.days if day_of(key) >= one.change.latest]
+            found |= {later[0]} if later else set()
+        return found
+
+    @property
+    def first_findings(self) -> dict[tuple[str, str], Mapping[str, Any]]:
+        """The first day's row of each cause and joints."""
+        found: dict[tuple[str, str], Mapping[str, Any]] = {}
+        for row in self.findings:
+            found.setdefault((row["cause"], row["joints"]), row)
+        return found
+
+    @property
+    def new_payloads(self) -> dict[str, str]:
+        """First day of each payload that came after the first day."""
+        return {name: day for name, day in self.payloads.items() if day != self.days[0]}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        return {
+            "arm": self.arm,
+            "days": list(self.days),
+            "changes": [one.to_dict() for one in self.changes],
+            "new_payloads": self.new_payloads,
+            "findings": [
+                {
+                    "cause": cause,
+                    "joints": joints,
+                    "first_day": row["key"],
+                    "confidence": row["confidence"],
+                    "statement": row["statement"],
+                }
+                for (cause, joints), row in self.first_findings.items()
+            ],
+            "failed": [{"day": day, "reason": reason} for day, reason in self.failed],
+        }
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.arm}: {len(self.days)} days, {self.days[0]} to {self.days[-1]}" if self.days else self.arm
+        ]
+        lines += [f"  {one}" for one in self.changes]
+        lines += [f"  payload {name} since {day}" for name, day in self.new_payloads.items()]
+        lines += [
+            f"  {row['key']}: {row['statement']} (confidence {row['confidence']:.2f})"
+            for row in self.first_findings.values()
+        ]
+        lines += [f"  {day}: no estimate: {reason}" for day, reason in self.failed]
+        if len(lines) == 1:
+            lines.append("  no change beyond its scatter from day to day")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class FleetTrend:
+    """All arms, and the quantities in which an arm is unlike the others."""
+
+    arms: tuple[ArmTrend, ...]
+    strange: tuple[Unlike, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        return {
+            "arms": [arm.to_dict() for arm in self.arms],
+            "unlike": [one.__dict__ for one in self.strange],
+        }
+
+    def __str__(self) -> str:
+        calm = [
+            arm for arm in self.arms if not (arm.changes or arm.findings or arm.new_payloads or arm.failed)
+        ]
+        lines = [str(arm) for arm in self.arms if arm not in calm]
+        if calm:
+            lines.append(
+                f"{len(calm)} of {len(self.arms)} arms without a change: {', '.join(a.arm for a in calm)}"
+            )
+        for one in self.strange:
+            lines.append(
+                f"{one.arm} is unlike the others: {one.name} {one.value:.4g}, the others {one.median:.4g} +- "
+                f"{one.spread:.2g}"
+            )
+        return "\n".join(lines)
+
+
+def arm_trend(store: ArmStore, usual: Mapping[str, float] | None = None) -> ArmTrend:
+    """Changes of an arm's parameters and residuals. usual : day-to-day scatter of such arms, by quantity."""
+    known = _all_series(store, usual or {})
+    series = {name: one for name, (one, _) in known.items()}
+    units = {name: unit for name, (_, unit) in known.items()}
+    level = LEVEL / max(len(series), 1)
+    found = [
+        Named(change, units[name], "error" if name.startswith(_ERROR) else "parameter")
+        for name, one in series.items()
+        for change in changes(one, level)
+        if not abs(change.percent) < _LEAST_PERCENT
+    ]
+    sessions = store.read("sessions")
+    payloads: dict[str, str] = {}
+    for row in sessions:
+        if row["status"] == "taken":
+            payloads.setdefault(row["payload"] or "none", row["key"])
+    failed = {row["key"]: row["note"] for row in sessions if row["status"] == "failed"}
+    return ArmTrend(
+        store.name,
+        store.days(),
+        series,
+        units,
+        tuple(sorted(found, key=lambda one: (one.change.time, one.change.p))),
+        tuple(store.read("findings")),
+        payloads,
+        tuple(failed.items()),
+    )
+
+
+def usual_scatter(store: FleetStore) -> dict[str, float]:
+    """Day-to-day scatter of each quantity, the median of the arms; of three arms or more."""
+    scatters: dict[str, list[float]] = {}
+    for arm in store.arms():
+        for name, (series, _) in _all_series(arm, {}).items():
+            if len(series.values) > 2:
+                scatters.setdefault(name, []).append(day_scatter(series))
+    return {name: float(np.median(values)) for name, values in scatters.items() if len(values) > 2}
+
+
+def fleet_trend(store: FleetStore) -> FleetTrend:
+    """All arms; the scatter from day to day of each quantity is judged with that of all arms."""
+    usual = usual_scatter(store)
+    arms = tuple(arm_trend(arm, usual) for arm in store.arms())
+    return FleetTrend(arms, unlike(_latest(arms)))
+
+
+def _latest(arms: Sequence[ArmTrend]) -> dict[str, dict[str, tuple[float, float]]]:
+    """Mean of each parameter before its first change, with its standard deviation, by arm."""
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    for arm in arms:
+        first = {}
+        for one in reversed(arm.changes):
+            first[one.change.name] = one.change.earliest
+        for name, series in arm.series.items():
+            used = series.time < first.get(name, np.inf)
+            if name.startswith(_ERROR) or not used.any():
+                continue
+            values, count = series.values[used], int(used.sum())
+            std = np.hypot(day_scatter(series), float(np.mean(series.std[used]))) / np.sqrt(count)
+            found.setdefault(name, {})[arm.arm] = float(np.median(values)), float(std)
+    return found
+
+
+def _all_series(store: ArmStore, usual: Mapping[str, float]) -> dict[str, tuple[Series, str]]:
+    """Each parameter and residual over the days, with its unit."""
+    units: dict[str, str] = {}
+    columns: dict[str, dict[str, tuple[float, float]]] = {}
+    for row in store.read("parameters"):
+        units[row["name"]] = row["unit"]
+        columns.setdefault(row["name"], {})[row["key"]] = row["value"], row["std"]
+    for row in store.read("errors"):
+        name = f"{_ERROR}{row['joint']} {row['side']}"
+        units[name] = "Nm"
+        columns.setdefault(name, {})[row["key"]] = row["rms"], 0.0
+    return {name: (_series(name, values, usual.get(name)), units[name]) for name, values in columns.items()}
+
+
+def _series(name: str, values: Mapping[str, tuple[float, float]], usual: float | None) -> Series:
+    keys = sorted(values, key=day_of)
+    time = np.array([day_of(key) for key in keys])
+    numbers = np.array([values[key] for key in keys])
+    return Series(name, time, numbers[:, 0], np.where(np.isfinite(numbers[:, 1]), numbers[:, 1], 0.0), usual)
+
+
+def day_of(key: str) -> float:
+    """Days since year 1, of a day's key; later parts of a day follow within it."""
+    match = re.fullmatch(r"(\d{4}-\d{2}-\d{2})(?:_(\d+))?", key)
+    if match is None:
+        raise ValueError(f"{key!r} is no day")
+    return date.fromisoformat(match[1]).toordinal() + 0.01 * (int(match[2] or 1) - 1)
+
+
+def as_day(time: float) -> str:
+    """The day of `day_of` as text."""
+    return date.fromordinal(int(time + 1e-6)).isoformat()

@@ -1,0 +1,112 @@
+"""A small fleet: one arm wears, one gets another sensor, one a payload; the others are healthy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from ident.model.dynamic_model import DynamicModel
+from ident.model.model_file import read_model
+from runner.cli import main
+from runner.fleet import FleetStore, fleet_trend
+from tests.fleet import Event, Fleet
+from tests.ident.known_arm import truth_model  # noqa: F401  fixture
+
+ARMS, DAYS = 5, 9
+EVENTS = (
+    Event(1, "wear", 4, joint=2, size=0.12),
+    Event(2, "sensor", 5, joint=3, size=1.0),
+    Event(3, "payload", 6),
+)
+
+
+@pytest.fixture(scope="module")
+def fleet(truth_model: DynamicModel, tmp_path_factory: pytest.TempPathFactory) -> Fleet:  # noqa: F811
+    fleet = Fleet(truth_model, tmp_path_factory.mktemp("fleet") / "logs", EVENTS)
+    for arm in range(ARMS):
+        for day in range(DAYS - 1):
+            fleet.record(arm, day)
+    return fleet
+
+
+@pytest.fixture(scope="module")
+def store(fleet: Fleet) -> FleetStore:
+    (fleet.folder / "arm_00" / "2026-03-02" / "broken.mcap").write_bytes(b"no log")
+    found = batch(fleet)
+    assert found.exit_code == 0, found.output
+    assert "broken.mcap: left out" in found.stderr
+    return FleetStore(fleet.folder.parent / "store")
+
+
+def batch(fleet: Fleet, *options: str):  # type: ignore[no-untyped-def]
+    store = str(fleet.folder.parent / "store")
+    return CliRunner().invoke(
+        main, ["batch", str(fleet.folder), "--store", store, "--diagnose", "none", *options]
+    )
+
+
+def test_changes_are_found_on_their_day_and_nobody_else_is_accused(store: FleetStore) -> None:
+    arms = {arm.arm: arm for arm in fleet_trend(store).arms}
+    assert {name for name, arm in arms.items() if arm.changes} == {"LWR4+_arm_01", "LWR4+_arm_02"}
+    worn = arms["LWR4+_arm_01"].changes
+    assert {one.change.name for one in worn} <= {"Fcm2", "Fvm2"}
+    assert any(one.change.earliest <= one.change.time <= one.change.latest for one in worn)
+    assert min(one.day for one in worn) in {"2026-03-04", "2026-03-05", "2026-03-06"}
+    (sensor,) = arms["LWR4+_arm_02"].changes
+    assert (sensor.change.name, sensor.day, sensor.change.course) == ("offl3", "2026-03-06", "step")
+    assert sensor.change.difference == pytest.approx(1.0, abs=0.05)
+    assert arms["LWR4+_arm_03"].new_payloads == {"load": "2026-03-07"}
+
+
+def test_a_further_day_is_the_only_work_and_copies_are_known(fleet: Fleet, store: FleetStore) -> None:
+    before = {arm.name: arm.days() for arm in store.arms()}
+    (path,) = fleet.record(0, DAYS - 1)
+    (path.parent / "copy.mcap").write_bytes(path.read_bytes())
+    found = batch(fleet, "--json")
+    content = json.loads(found.stdout)
+    assert [(one["arm"], one["day"]) for one in content["done"]] == [("LWR4+_arm_00", "2026-03-09")]
+    assert len(content["repeated"]) == 1
+    after = {arm.name: arm.days() for arm in store.arms()}
+    assert after["LWR4+_arm_00"] == (*before["LWR4+_arm_00"], "2026-03-09")
+    assert json.loads(batch(fleet, "--json").stdout)["done"] == []
+
+
+def test_the_model_of_all_days_comes_from_the_factors_alone(fleet: Fleet, store: FleetStore) -> None:
+    arm = store.arm("LWR4+_arm_04")
+    model = read_model(arm.together)
+    truth = np.mean([fleet.model(4, day).values for day in range(DAYS - 1)], axis=0)
+    known = dict(zip(fleet.truth.names, truth, strict=True))
+    std = dict(zip(model.names, np.sqrt(np.diag(model.covariance)), strict=True))
+    z = np.array(
+        [(v - known[n]) / std[n] for n, v in zip(model.names, model.values, strict=True) if n in known]
+    )
+    assert np.sqrt(np.mean(z**2)) < 2.5
+    assert std["Fcm2"] / abs(known["Fcm2"]) > 0.003  # friction differs from day to day
+
+
+def test_tables_are_read_by_pandas(store: FleetStore) -> None:
+    pandas = pytest.importorskip("pandas")
+    table = pandas.read_parquet(store.folder / "LWR4+_arm_00" / "parameters")
+    assert set(table.columns) == {"arm", "day", "part", "name", "unit", "value", "std"}
+    assert table.groupby("day").size().nunique() == 1
+
+
+def test_trend_prints_and_writes_a_page(store: FleetStore, tmp_path: Path) -> None:
+    page = tmp_path / "arm.html"
+    found = CliRunner().invoke(
+        main, ["trend", "LWR4+_arm_02", "--store", str(store.folder), "--out", str(page)]
+    )
+    assert found.exit_code == 0, found.output
+    assert "offl3 since 2026-03-06" in found.output
+    assert "offl3 since 2026-03-06" in page.read_text()
+    whole = CliRunner().invoke(
+        main, ["trend", "--store", str(store.folder), "--out", str(tmp_path / "all.html")]
+    )
+    assert "of 5 arms without a change" in whole.output
+    unknown = CliRunner().invoke(main, ["trend", "nobody", "--store", str(store.folder)])
+    assert unknown.exit_code == 2
+    assert "LWR4+_arm_02" in unknown.output
