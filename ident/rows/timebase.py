@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,31 +20,63 @@ _TOO_MANY = 0.01
 _GRAINS = 5.0
 # Samples with one common noise level of a channel.
 _BLOCK = 50
+# Knots of a spline beside a part of it.
+_KNOTS = 40
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Equidistant samples without a long gap.
+    """Equidistant samples without a long gap, read part by part.
 
-    start : time of the first sample [s]. dt : sample time [s]. values : (n, k). bridged : (n,) interpolated ones.
-    resampled : whether all values are interpolated because of irregular times.
+    start : time of the first sample [s]. dt : sample time [s]. count : number n of samples. bridged : (n,)
+    interpolated ones. resampled : whether all values are interpolated because of irregular times.
+    columns : (N, k) arrays of the recording, side by side. known : (m,) their rows of this stretch. places : (m,)
+    number of the sample of each known row, or its time [samples] where all are interpolated.
     """
 
     start: float
     dt: float
-    values: Floats
+    count: int
     bridged: BoolArray
     resampled: bool
+    columns: tuple[Floats, ...]
+    known: NDArray[np.int64]
+    places: NDArray[Any]
 
     @property
     def times(self) -> Floats:
         """Sample times (n,) [s]."""
-        return self.start + self.dt * np.arange(len(self.values), dtype=np.float64)
+        return self.start + self.dt * np.arange(self.count, dtype=np.float64)
 
     @property
     def end(self) -> float:
         """Time of the last sample [s]."""
-        return self.start + self.dt * (len(self.values) - 1)
+        return self.start + self.dt * (self.count - 1)
+
+    @property
+    def values(self) -> Floats:
+        """All samples (n, k)."""
+        return self.part(0, self.count)
+
+    def part(self, low: int, high: int) -> Floats:
+        """Samples (high - low, k) from `low` on. A spline forgets a knot by a factor of 4 from one to the next."""
+        first = max(int(np.searchsorted(self.places, low)) - _KNOTS, 0)
+        last = min(int(np.searchsorted(self.places, high)) + _KNOTS, len(self.places))
+        rows, places = self.known[first:last], self.places[first:last]
+        if len(rows) and rows[-1] - rows[0] + 1 == len(rows):
+            rows = slice(int(rows[0]), int(rows[-1]) + 1)
+        values = np.hstack([column[rows] for column in self.columns])
+        wanted = np.arange(low, high)
+        if self.resampled:
+            return CubicSpline(places, values)(wanted.astype(np.float64))
+        inside = (places >= low) & (places < high)
+        if inside.sum() == high - low:
+            return values[inside]
+        found = np.empty((high - low, values.shape[1]))
+        found[places[inside] - low] = values[inside]
+        gaps = np.flatnonzero(self.bridged[low:high])
+        found[gaps] = CubicSpline(places.astype(np.float64), values)(wanted[gaps].astype(np.float64))
+        return found
 
 
 def sample_period(times: Floats, sequence: NDArray[np.int64] | None, where: str) -> float:
@@ -62,9 +95,9 @@ def sample_period(times: Floats, sequence: NDArray[np.int64] | None, where: str)
 
 
 def stretches(
-    times: Floats, values: Floats, bad: BoolArray, dt: float, longest_bridge_s: float
+    times: Floats, columns: Floats | tuple[Floats, ...], bad: BoolArray, dt: float, longest_bridge_s: float
 ) -> tuple[list[Stretch], int]:
-    """Equidistant stretches of (n, k) values at (n,) times, and the number of samples lost.
+    """Equidistant stretches of (n, k) columns at (n,) times, and the number of samples lost.
 
     Samples flagged `bad` (n,) and lost ones are bridged by a cubic spline through their neighbours and
     flagged; a hole longer than `longest_bridge_s` ends the stretch.
@@ -76,29 +109,25 @@ def stretches(
     lost = int(np.sum(np.maximum(np.rint(intervals[intervals > 1.75 * dt] / dt) - 1, 0)))
     hole = np.diff(times[good]) > longest_bridge_s + 1.75 * dt
     parts = np.split(good, np.flatnonzero(hole) + 1)
-    return [_uniform(times[part], values[part], dt) for part in parts if len(part) >= 16], lost
+    sides = columns if isinstance(columns, tuple) else (columns,)
+    return [_uniform(times[part], sides, part, dt) for part in parts if len(part) >= 16], lost
 
 
-def _uniform(times: Floats, values: Floats, dt: float) -> Stretch:
-    steps = np.rint((times - times[0]) / dt).astype(np.int64)
-    step = float((times[-1] - times[0]) / steps[-1]) if len(steps) > 1 and steps[-1] else dt
-    error = float(np.max(np.abs(times - times[0] - steps * step)))
+def _uniform(times: Floats, columns: tuple[Floats, ...], known: NDArray[np.int64], dt: float) -> Stretch:
+    start = float(times[0])
+    steps = np.rint((times - start) / dt).astype(np.int64)
+    step = float((times[-1] - start) / steps[-1]) if len(steps) > 1 and steps[-1] else dt
+    error = float(np.max(np.abs(times - start - steps * step)))
     if np.all(np.diff(steps) > 0) and error < max(_JITTER * dt, 2e-9):
-        count = int(steps[-1]) + 1
-        bridged = np.ones(count, dtype=bool)
+        bridged = np.ones(int(steps[-1]) + 1, dtype=bool)
         bridged[steps] = False
-        if bridged.any():
-            gaps, known = np.flatnonzero(bridged).astype(float), values
-            values = np.empty((count, known.shape[1]))
-            values[steps] = known
-            values[bridged] = CubicSpline(steps.astype(float), known)(gaps)
-        return Stretch(float(times[0]), step, values, bridged, False)
-    count = int(np.floor((times[-1] - times[0]) / dt)) + 1
-    grid = times[0] + dt * np.arange(count)
+        return Stretch(start, step, len(bridged), bridged, False, columns, known, steps)
+    count = int(np.floor((times[-1] - start) / dt)) + 1
+    grid = start + dt * np.arange(count)
     after = np.searchsorted(times, grid)
     nearest, before = (np.abs(grid - times[np.clip(k, 0, len(times) - 1)]) for k in (after, after - 1))
     bridged = np.minimum(nearest, before) > 1.0 * dt
-    return Stretch(float(times[0]), dt, CubicSpline(times, values)(grid), bridged, True)
+    return Stretch(start, dt, count, bridged, True, columns, known, (times - start) / dt)
 
 
 def flag_outliers(values: Floats, scale: float) -> tuple[BoolArray, list[int]]:

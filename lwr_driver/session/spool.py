@@ -1,0 +1,87 @@
+"""Long arrays in unnamed files of the temporary folder, so that memory holds a part of them at a time.
+
+A column of an hour at 1 kHz has 200 MB. Its pages come into memory where they are read, and `release` gives them
+back. Files have no name, so the system removes them with the last array, or with the process.
+"""
+
+from __future__ import annotations
+
+import mmap
+import tempfile
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEAST_BYTES = 16 * 2**20
+"""Smaller arrays stay in memory."""
+
+
+class Growing:
+    """Rows appended part by part: in memory while they are few, then in a file."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[Any]] = []
+        self._bytes = 0
+        self._file: Any = None
+        self._rows = 0
+
+    def append(self, part: NDArray[Any]) -> None:
+        """Further rows, of the shape and type of the first."""
+        if not len(part) and self._parts:
+            return
+        self._parts.append(part)
+        self._bytes += part.nbytes
+        self._rows += len(part)
+        if self._bytes >= LEAST_BYTES:
+            self._flush()
+
+    def array(self) -> NDArray[Any]:
+        """All rows; none may follow."""
+        if self._file is None:
+            return self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts)
+        self._flush()
+        self._file.flush()
+        last = self._parts[-1]
+        found = np.memmap(self._file, last.dtype, "r", shape=(self._rows, *last.shape[1:]))
+        self._file.close()
+        return np.asarray(found)
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def _flush(self) -> None:
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="lwr-")  # noqa: SIM115
+        for part in self._parts:
+            self._file.write(np.ascontiguousarray(part).data)
+        self._parts, self._bytes = [self._parts[-1][:0]], 0
+
+
+def release(*arrays: NDArray[Any] | None) -> None:
+    """Give the memory of arrays in files back; their content stays. Arrays in memory are left alone."""
+    for array in arrays:
+        held = mapping(array)
+        if held is not None:
+            held.madvise(mmap.MADV_DONTNEED)
+
+
+def mapping(array: Any) -> mmap.mmap | None:
+    """The file behind an array or a view of it, None for one in memory."""
+    while array is not None and not isinstance(array, mmap.mmap):
+        array = getattr(array, "base", None)
+    return array
+
+
+def stored(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    """The rows of all parts as one array: in memory if it is small, else in a file, read-only."""
+    rows = Growing()
+    for part in parts:
+        rows.append(part)
+    return rows.array()
+
+
+def spans(count: int, size: int = 2**16) -> Iterator[slice]:
+    """Slices of `size` rows, the last one shorter."""
+    return (slice(first, min(first + size, count)) for first in range(0, count, size))
