@@ -385,7 +385,9 @@ class _JointTopic:
         return columns
 
     def _check_finite(self, name: str, values: NDArray[np.float64], log_time: NDArray[np.int64]) -> None:
-        wrong = [np.argwhere(~np.isfinite(values[some])) + np.array([some.start, 0]) for some in spans(len(values))]
+        wrong = [
+            np.argwhere(~np.isfinite(values[some])) + np.array([some.start, 0]) for some in spans(len(values))
+        ]
         release(values)
         bad = np.concatenate(wrong) if wrong else np.zeros((0, 2))
         if len(bad):

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import mmap
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,21 @@ class Growing:
             self._file = tempfile.TemporaryFile(prefix="lwr-")  # noqa: SIM115
         for part in self._parts:
             self._file.write(np.ascontiguousarray(part).data)
-        self._parts, self._bytes = [self._parts[-1][:0]], 0
+        self._parts, self._bytes = [self._parts[-1][:0].copy()], 0
+
+
+def shelved(groups: Iterable[Sequence[NDArray[Any]]]) -> list[list[NDArray[Any]]]:
+    """The same groups of arrays, the first arrays of all groups in one file, the second in another, and so on."""
+    shelves: list[Growing] = []
+    counts = []
+    for group in groups:
+        shelves = shelves or [Growing() for _ in group]
+        for shelf, array in zip(shelves, group, strict=True):
+            shelf.append(array)
+        counts.append(len(group[0]))
+    whole = [shelf.array() for shelf in shelves]
+    ends = [0, *accumulate(counts)]
+    return [[array[a:b] for array in whole] for a, b in pairwise(ends)]
 
 
 def release(*arrays: NDArray[Any] | None) -> None:
