@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d
@@ -75,7 +76,12 @@ class Stretch:
         found = np.empty((high - low, values.shape[1]))
         found[places[inside] - low] = values[inside]
         gaps = np.flatnonzero(self.bridged[low:high])
-        found[gaps] = CubicSpline(places.astype(np.float64), values)(wanted[gaps].astype(np.float64))
+        for run in np.split(gaps, np.flatnonzero(np.diff(gaps) > _KNOTS) + 1):
+            near = np.searchsorted(places, [low + run[0], low + run[-1]]) + np.array([-_KNOTS, _KNOTS])
+            some = slice(max(int(near[0]), 0), int(near[1]))
+            found[run] = CubicSpline(places[some].astype(np.float64), values[some])(
+                wanted[run].astype(np.float64)
+            )
         return found
 
 
@@ -142,10 +148,8 @@ def flag_outliers(values: Floats, scale: float) -> tuple[BoolArray, list[int]]:
     flags = np.zeros(values.shape, dtype=bool)
     crowded = []
     for column, series in enumerate(values.T):
-        padded = np.pad(series, 2, mode="edge")
-        far_left, left, middle, right, far_right = (padded[i : i + len(series)] for i in range(5))
-        distance = np.abs(series - _median_of_five(far_left, left, middle, right, far_right))
-        cubic = np.abs(series - (4.0 * (left + right) - far_left - far_right) / 6.0)
+        series = np.array(series)
+        distance, cubic = _displaced(np.pad(series, 2, mode="edge"))
         low, high = np.percentile(series, [0.5, 99.5])
         steps = np.abs(np.diff(series))
         # A joint at standstill jumps by a few encoder steps.
@@ -167,7 +171,16 @@ def _median_around(values: Floats) -> Floats:
     return np.repeat(maximum_filter1d(medians, 3, mode="nearest"), _BLOCK)[: len(values)]
 
 
-def _median_of_five(a: Floats, b: Floats, c: Floats, d: Floats, e: Floats) -> Floats:
-    low = np.maximum(np.minimum(a, b), np.minimum(c, d))
-    high = np.minimum(np.maximum(a, b), np.maximum(c, d))
-    return np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e))
+@njit(cache=True, nogil=True)
+def _displaced(padded):  # type: ignore[no-untyped-def]
+    """Distance (n,) of samples from the median of five around them, and from the cubic through the four neighbours."""
+    count = len(padded) - 4
+    distance, cubic = np.empty(count), np.empty(count)
+    for k in range(count):
+        a, b, c, d, e = padded[k], padded[k + 1], padded[k + 2], padded[k + 3], padded[k + 4]
+        low = max(min(a, b), min(c, d))
+        high = min(max(a, b), max(c, d))
+        middle = max(min(low, high), min(max(low, high), e))
+        distance[k] = abs(c - middle)
+        cubic[k] = abs(c - (4.0 * (b + d) - a - e) / 6.0)
+    return distance, cubic

@@ -1,22 +1,33 @@
 """Long arrays in unnamed files of the temporary folder, so that memory holds a part of them at a time.
 
-A column of an hour at 1 kHz has 200 MB. Its pages come into memory where they are read, and `release` gives them
-back. Files have no name, so the system removes them with the last array, or with the process.
+The positions of an hour at 1 kHz have 200 MB. Their pages come into memory where they are read; `release` gives them
+back, and so does a thread beyond 64 MB in all. Files have no name, so the system removes them with the last array, or
+with the process.
 """
 
 from __future__ import annotations
 
 import mmap
 import tempfile
+import threading
+import time
+import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST_BYTES = 16 * 2**20
+LEAST_BYTES = 4 * 2**20
 """Smaller arrays stay in memory."""
+_MOST_BYTES = 64 * 2**20
+_EVERY_S = 0.01
+_page = mmap.PAGESIZE
+_open: weakref.WeakSet[Any] = weakref.WeakSet()
+_watch: threading.Thread | None = None
+_starting = threading.Lock()
 
 
 class Growing:
@@ -47,7 +58,9 @@ class Growing:
         last = self._parts[-1]
         found = np.memmap(self._file, last.dtype, "r", shape=(self._rows, *last.shape[1:]))
         self._file.close()
-        return np.asarray(found)
+        array = np.asarray(found)
+        _watched(mapping(array))
+        return array
 
     def __len__(self) -> int:
         return self._rows
@@ -95,6 +108,38 @@ def stored(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
     for part in parts:
         rows.append(part)
     return rows.array()
+
+
+def _watched(held: mmap.mmap | None) -> None:
+    """Bound the memory of all open files: a thread gives pages back, whoever reads them comes by them again."""
+    global _watch
+    if held is None or not Path("/proc/self/statm").exists():
+        return
+    with _starting:
+        _open.add(held)
+        if _watch is None or not _watch.is_alive():
+            _watch = threading.Thread(target=_bound, name="long arrays", daemon=True)
+            _watch.start()
+
+
+def _bound() -> None:
+    start = _in_files()
+    while True:
+        time.sleep(_EVERY_S)
+        with _starting:
+            held = list(_open)
+            if not held:
+                break
+        if _in_files() > start + _MOST_BYTES:
+            for one in held:
+                one.madvise(mmap.MADV_DONTNEED)
+            start = min(start, _in_files())
+        del held
+
+
+def _in_files() -> int:
+    """Bytes of this process in files, programs and libraries included."""
+    return int(Path("/proc/self/statm").read_text().split()[2]) * _page
 
 
 def spans(count: int, size: int = 2**16) -> Iterator[slice]:
