@@ -10,7 +10,7 @@ the true motion and is independent of the sensors. `InstrumentalVariables` and t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -34,7 +34,7 @@ from ident.rows.filters import (
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, clock_ns
 from ident.rows.timebase import Stretch, sample_period, stretches
 from lwr_driver.session import Session
-from lwr_driver.session.spool import release
+from lwr_driver.session.spool import Growing, release
 
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
@@ -62,14 +62,14 @@ def observe(
     nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
         slopes: dict[int, Floats] = {}
-        by_side: dict[Side, list[_Part]] = {side: [] for side in structure.sides}
+        by_side = {side: _Collected(session) for side in structure.sides}
         for passage in session.passages:
-            for side, parts in by_side.items():
+            for side, rows in by_side.items():
                 part = _side(passage, side, structure, payload, chosen, session)
                 if part is not None:
-                    parts.append(part)
-        for side, parts in by_side.items():
-            for group, slope in _groups(session, number, side, parts) if parts else []:
+                    rows.add(part)
+        for side, rows in by_side.items():
+            for group, slope in rows.groups(number, side):
                 if side != "joint":
                     slopes[len(groups)] = slope
                 groups.append(group)
@@ -226,25 +226,35 @@ def _filtered(
     return matrix, target
 
 
-def _groups(
-    session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]
-) -> list[tuple[RowGroup, Floats]]:
-    """Row group and slope of each joint with rows."""
-    result = []
-    average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
-    for joint, name in enumerate(session.joint_names):
-        kept = [(part, part.valid[:, joint]) for part in parts]
-        matrix = np.concatenate([part.matrix[joint][k] for part, k in kept])
-        target = np.concatenate([part.target[k, joint] for part, k in kept])
-        slope = np.concatenate([part.slope[k, joint] for part, k in kept])
-        index = np.concatenate([part.index[k] for part, k in kept])
-        if average and session.period_rows is not None:
-            matrix, target, slope, index = _averaged(
-                matrix, target, slope, index, session.period_rows, session.periods
-            )
-        if len(target):
-            result.append((RowGroup(name, side, number, matrix, target, index), slope))
-    return result
+class _Collected:
+    """Rows of one side by joint, part after part; long matrices in files."""
+
+    def __init__(self, session: PreparedSession) -> None:
+        self._session = session
+        self._rows = [tuple(Growing() for _ in range(4)) for _ in session.joint_names]
+
+    def add(self, part: _Part) -> None:
+        """The valid rows of the next part."""
+        for joint, shelves in enumerate(self._rows):
+            kept = part.valid[:, joint]
+            arrays = (part.matrix[joint], part.target[:, joint], part.slope[:, joint], part.index)
+            for shelf, array in zip(shelves, arrays, strict=True):
+                shelf.append(array[kept])
+
+    def groups(self, number: int, side: Side) -> Iterator[tuple[RowGroup, Floats]]:
+        """Row group and slope of each joint with rows."""
+        session = self._session
+        average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
+        for name, shelves in zip(session.joint_names, self._rows, strict=True):
+            if not len(shelves[1]):
+                continue
+            matrix, target, slope, index = (shelf.array() for shelf in shelves)
+            if average and session.period_rows is not None:
+                matrix, target, slope, index = _averaged(
+                    matrix, target, slope, index, session.period_rows, session.periods
+                )
+            if len(target):
+                yield RowGroup(name, side, number, matrix, target, index), slope
 
 
 def _averaged(
