@@ -396,7 +396,7 @@ def _score(
     prepared: PreparedSession,
 ) -> Score:
     """times : (m,) of the samples."""
-    error, torque, used, moving = samples
+    error, _, used, moving = samples
     if not used.any():
         return Score(joint, side, 0, *[math.nan] * 11)
     e = error[used]

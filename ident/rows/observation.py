@@ -16,6 +16,7 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fri.errors import DataError
@@ -200,7 +201,6 @@ def _filtered(
     known = channel.known.astype(np.float64)
     times, torque = block_means(channel.times, factor), block_means(channel.torque * known, factor)
     share = block_means(known, factor)
-    mean = np.full(factor, 1.0 / factor)
     blocks = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db).blocks()
     while batch := list(islice(blocks, _BLOCKS)):
         low, high = batch[0][1].start, batch[-1][1].stop
@@ -215,8 +215,8 @@ def _filtered(
             drive=None if channel.drive is None else channel.drive.at(part),
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
-        masked = wide.T.reshape(len(columns), joints, -1) * known[part].T
-        flat = (masked.reshape(-1, factor) @ mean).reshape(len(columns) * joints, high - low)
+        table = wide.T.reshape(len(columns), joints, -1)
+        flat = _known_means(table, np.ascontiguousarray(known[part].T), factor)
         for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
@@ -224,6 +224,23 @@ def _filtered(
             matrix[:, outputs] = filtered.transpose(1, 2, 0) / total.T[:, :, None]
             target[outputs] = (weights @ torque[samples]) / total
     return matrix, target
+
+
+@njit(cache=True, nogil=True)
+def _known_means(table, known, factor):  # type: ignore[no-untyped-def]
+    """Means (C n, m // factor) over neighbouring samples of (C, n, m) columns times the known share (n, m)."""
+    columns, joints, samples = table.shape
+    count = samples // factor
+    result = np.empty((columns * joints, count))
+    for column in range(columns):
+        for joint in range(joints):
+            row = column * joints + joint
+            for k in range(count):
+                total = 0.0
+                for i in range(k * factor, (k + 1) * factor):
+                    total += table[column, joint, i] * known[joint, i]
+                result[row, k] = total / factor
+    return result
 
 
 class _Collected:
