@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from lwr_driver.session import JointColumns, Session
-from lwr_driver.session.spool import spans
+from lwr_driver.session.spool import column, spans
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -162,7 +162,7 @@ def _jolts(position: Floats) -> Flags:
     jolting = np.zeros(len(position) - 3)
     # Column by column: a long session has room for one.
     for joint in np.flatnonzero(moves):
-        q = np.array(position[:, joint])
+        q = column(position, int(joint))
         third = np.abs(np.diff(q, 3))
         steps = np.abs(np.diff(q))
         step = np.min(steps, where=steps > 0.0, initial=np.inf)

@@ -175,7 +175,7 @@ def interpolate_uniform(values: Floats, start: float, dt: float, times: Floats) 
     return _lagrange(np.ascontiguousarray(values), np.ascontiguousarray(position))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lagrange(values, position):  # type: ignore[no-untyped-def]
     rows, columns = len(position), values.shape[1]
     result = np.empty((rows, columns))

@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter1d
 
 from fri.errors import DataError
 from ident.dynamics.parameters import Floats
+from lwr_driver.session.spool import column, spans
 
 BoolArray = NDArray[np.bool_]
 
@@ -147,37 +148,61 @@ def flag_outliers(values: Floats, scale: float) -> tuple[BoolArray, list[int]]:
     """
     flags = np.zeros(values.shape, dtype=bool)
     crowded = []
-    for column, series in enumerate(values.T):
-        series = np.array(series)
-        distance, cubic = _displaced(np.pad(series, 2, mode="edge"))
+    for joint in range(values.shape[1]):
+        # One array of a long column at a time, and two beside it.
+        series = column(values, joint)
         low, high = np.percentile(series, [0.5, 99.5])
-        steps = np.abs(np.diff(series))
         # A joint at standstill jumps by a few encoder steps.
-        grain = _GRAINS * float(np.min(steps, where=steps > 0.0, initial=np.inf)) if np.any(steps) else 0.0
-        grain = min(grain, 0.5 * float(np.ptp(series)))
-        usual = np.maximum(_median_around(cubic), float(np.median(cubic)))
-        far = distance > np.maximum(scale * 1.4826 * usual, max(0.01 * float(high - low), grain))
+        grain = min(_GRAINS * _least_step(series), 0.5 * float(np.ptp(series)))
+        distance, cubic = _displaced(series)
+        del series
+        around = np.maximum(_medians_around(cubic), float(np.median(cubic, overwrite_input=True)))
+        del cubic
+        far = _beyond(distance, scale * 1.4826 * around, max(0.01 * float(high - low), grain))
         if far.mean() > _TOO_MANY:
-            crowded.append(column)
+            crowded.append(joint)
         else:
-            flags[:, column] = far
+            flags[:, joint] = far
     return flags, crowded
 
 
-def _median_around(values: Floats) -> Floats:
-    """The largest of the medians of a sample's block (n,) and of the neighbouring blocks."""
+def _medians_around(values: Floats) -> Floats:
+    """The largest of the medians of each block (m,) of `_BLOCK` values (n,) and of the neighbouring blocks."""
     whole = len(values) // _BLOCK * _BLOCK
-    medians = np.append(np.median(values[:whole].reshape(-1, _BLOCK), axis=1), np.median(values[-_BLOCK:]))
-    return np.repeat(maximum_filter1d(medians, 3, mode="nearest"), _BLOCK)[: len(values)]
+    table = values[:whole].reshape(-1, _BLOCK)
+    medians = [np.median(table[some], axis=1) for some in spans(len(table))]
+    last = np.array([np.median(values[-_BLOCK:])])
+    return np.asarray(maximum_filter1d(np.concatenate([*medians, last]), 3, mode="nearest"))
 
 
 @njit(cache=True, nogil=True)
-def _displaced(padded):  # type: ignore[no-untyped-def]
+def _least_step(series):  # type: ignore[no-untyped-def]
+    """Smallest step of (n,) values but zero; 0 without any."""
+    least = np.inf
+    for k in range(1, len(series)):
+        step = abs(series[k] - series[k - 1])
+        if 0.0 < step < least:
+            least = step
+    return least if least < np.inf else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _beyond(distance, around, least):  # type: ignore[no-untyped-def]
+    """Samples (n,) farther than the limit of their block and than `least`."""
+    found = np.empty(len(distance), dtype=np.bool_)
+    for k in range(len(distance)):
+        found[k] = distance[k] > max(around[k // _BLOCK], least)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _displaced(series):  # type: ignore[no-untyped-def]
     """Distance (n,) of samples from the median of five around them, and from the cubic through the four neighbours."""
-    count = len(padded) - 4
-    distance, cubic = np.empty(count), np.empty(count)
-    for k in range(count):
-        a, b, c, d, e = padded[k], padded[k + 1], padded[k + 2], padded[k + 3], padded[k + 4]
+    last = len(series) - 1
+    distance, cubic = np.empty(last + 1), np.empty(last + 1)
+    for k in range(last + 1):
+        a, b = series[max(k - 2, 0)], series[max(k - 1, 0)]
+        c, d, e = series[k], series[min(k + 1, last)], series[min(k + 2, last)]
         low = max(min(a, b), min(c, d))
         high = min(max(a, b), max(c, d))
         middle = max(min(low, high), min(max(low, high), e))

@@ -8,6 +8,7 @@ with the process.
 from __future__ import annotations
 
 import mmap
+import os
 import tempfile
 import threading
 import time
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 LEAST_BYTES = 4 * 2**20
 """Smaller arrays stay in memory."""
+_SMALL_BYTES, _ARENA_BYTES = 2**16, 2**28
 _MOST_BYTES = 64 * 2**20
 _EVERY_S = 0.01
 _page = mmap.PAGESIZE
@@ -73,6 +75,29 @@ class Growing:
         self._parts, self._bytes = [self._parts[-1][:0].copy()], 0
 
 
+class Arena:
+    """Arrays of any shape kept in files, one after the other; they go with the last of them."""
+
+    def __init__(self) -> None:
+        self._held: mmap.mmap | None = None
+        self._used = 0
+
+    def keep(self, array: NDArray[Any]) -> NDArray[Any]:
+        """The same array in a file; a small one as it is."""
+        if array.nbytes < _SMALL_BYTES:
+            return array
+        if self._held is None or self._used + array.nbytes > len(self._held):
+            size = max(_ARENA_BYTES, array.nbytes)
+            with tempfile.TemporaryFile(prefix="lwr-") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+                self._held, self._used = mmap.mmap(file.fileno(), size), 0
+            _watched(self._held)
+        kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
+        kept[...] = array
+        self._used += -(-array.nbytes // 64) * 64
+        return kept
+
+
 def shelved(groups: Iterable[Sequence[NDArray[Any]]]) -> list[list[NDArray[Any]]]:
     """The same groups of arrays, the first arrays of all groups in one file, the second in another, and so on."""
     shelves: list[Growing] = []
@@ -93,6 +118,15 @@ def release(*arrays: NDArray[Any] | None) -> None:
         held = mapping(array)
         if held is not None:
             held.madvise(mmap.MADV_DONTNEED)
+
+
+def column(array: NDArray[Any], number: int) -> NDArray[Any]:
+    """A copy (n,) of one column of (n, k), with little of the rest in memory."""
+    found = np.empty(len(array), array.dtype)
+    for some in spans(len(array)):
+        found[some] = array[some, number]
+        release(array)
+    return found
 
 
 def mapping(array: Any) -> mmap.mmap | None:
