@@ -7,6 +7,8 @@ with the process.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import mmap
 import os
 import tempfile
@@ -26,6 +28,7 @@ LEAST_BYTES = 4 * 2**20
 _SMALL_BYTES, _ARENA_BYTES = 2**16, 2**28
 _MOST_BYTES = 64 * 2**20
 _EVERY_S = 0.01
+_M_MMAP_THRESHOLD = -3
 _page = mmap.PAGESIZE
 _open: weakref.WeakSet[Any] = weakref.WeakSet()
 _watch: threading.Thread | None = None
@@ -151,9 +154,19 @@ def _watched(held: mmap.mmap | None) -> None:
         return
     with _starting:
         _open.add(held)
+        if _watch is None:
+            _return_blocks()
         if _watch is None or not _watch.is_alive():
             _watch = threading.Thread(target=_bound, name="long arrays", daemon=True)
             _watch.start()
+
+
+def _return_blocks() -> None:
+    """Let the C library give every array of a few MB back when it is freed, as it does by default for 32 MB."""
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, LEAST_BYTES)
+        library.malloc_trim(0)
 
 
 def _bound() -> None:
