@@ -165,7 +165,7 @@ def _return_blocks() -> None:
     """Let the C library give every array of a few MB back when it is freed, as it does by default for 32 MB."""
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
-        library.mallopt(_M_MMAP_THRESHOLD, LEAST_BYTES)
+        library.mallopt(_M_MMAP_THRESHOLD, 4 * 2**20)
         library.malloc_trim(0)
 
 

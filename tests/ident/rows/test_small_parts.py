@@ -17,10 +17,10 @@ from ident.rows.filters import (
     advice,
     block_means,
     excitation_frequency,
-    median_step,
     half_width,
     interpolate_uniform,
     low_pass,
+    median_step,
     moving,
     thinning,
 )
