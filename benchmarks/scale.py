@@ -57,14 +57,16 @@ def tile(source: Session, path: Path, seconds: float, seed: int) -> None:
             )
             writer.write_joint_command(command.log_time + shift, command.position, sequence=numbers)
             at = np.arange(-(-(shift) // step), -(-(shift + length) // step)) * step
-            effort = np.column_stack([
-                np.interp(at - shift, motor.log_time - first, column) for column in motor.effort.T
-            ])
+            effort = np.column_stack(
+                [np.interp(at - shift, motor.log_time - first, column) for column in motor.effort.T]
+            )
             writer.write_motor_states(first + at, effort + TORQUE_NOISE_NM * random.normal(size=effort.shape))
             if source.status is not None:
                 inside = (source.status.log_time >= first) & (source.status.log_time < last)
                 columns = {
-                    name: values[inside] for name, values in asdict(source.status).items() if name not in _TILED
+                    name: values[inside]
+                    for name, values in asdict(source.status).items()
+                    if name not in _TILED
                 }
                 status = source.status.log_time[inside] + shift
                 columns["sequence"] = numbers[: len(status)]
@@ -78,7 +80,7 @@ def command_of(name: str, folder: Path) -> list[str]:
     model = str(folder / "model.yaml")
     return {
         "identify": ["identify", *logs, "--out", model],
-        "validate": ["validate", model, *logs],
+        "validate": ["validate", model, *logs, "--allow-seen"],
         "diagnose": ["diagnose", *logs, "--out", str(folder / f"diagnosis-{time.time_ns()}")],
         "results": ["identify", *logs, "--results", str(folder / f"results-{time.time_ns()}")],
     }[name]
@@ -92,7 +94,10 @@ def measure(arguments: Sequence[str], log: Path) -> tuple[int, float, float, flo
             sys.executable,
             [sys.executable, "-m", "runner.cli", *arguments],
             os.environ,
-            file_actions=[(os.POSIX_SPAWN_DUP2, output.fileno(), 1), (os.POSIX_SPAWN_DUP2, output.fileno(), 2)],
+            file_actions=[
+                (os.POSIX_SPAWN_DUP2, output.fileno(), 1),
+                (os.POSIX_SPAWN_DUP2, output.fileno(), 2),
+            ],
         )
         _, status, used = os.wait4(child, 0)
     cpu = used.ru_utime + used.ru_stime
@@ -116,7 +121,8 @@ def main(arguments: Sequence[str]) -> int:
         for command in chosen.commands:
             code, wall, cpu, peak = measure(command_of(command, folder), folder / f"{command}.txt")
             print(
-                f"{command:10} 2 x {minutes:g} min: CPU {cpu:6.1f} s, wall {wall:6.1f} s, peak {peak:6.0f} MB, exit {code}",
+                f"{command:10} 2 x {minutes:g} min: CPU {cpu:6.1f} s, wall {wall:6.1f} s, "
+                f"peak {peak:6.0f} MB, exit {code}",
                 flush=True,
             )
     return 0

@@ -364,9 +364,8 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
     band = parallel.apply(error)
     if passage.core != (-np.inf, np.inf):
         own = passage.own(channel.times)
-        times, error, torque, used, moving = (
-            array[own] for array in (channel.times, error, torque, used, moving)
-        )
+        times = channel.times[own]
+        error, torque, used, moving = error[own], torque[own], used[own], moving[own]
         return _Rows(times, error, torque, used, moving, band, valid, passage.index)
     return _Rows(channel.times, error, torque, used, moving, band, valid, passage.index)
 

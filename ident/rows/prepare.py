@@ -88,7 +88,8 @@ class TorqueChannel:
     def on(self, arrays: Sequence[NDArray[Any]]) -> TorqueChannel:
         """The channel with other arrays."""
         drive = None if self.drive is None else DriveMotion(arrays[len(_SAMPLED)], arrays[len(_SAMPLED) + 1])
-        return replace(self, **dict(zip(_SAMPLED, arrays, strict=False)), drive=drive)
+        found: dict[str, Any] = dict(zip(_SAMPLED, arrays, strict=False))
+        return replace(self, **found, drive=drive)
 
     def at(self, samples: NDArray[np.bool_] | NDArray[np.int64]) -> TorqueChannel:
         """The channel at some of its samples."""
@@ -143,7 +144,7 @@ class PreparedSession:
     name: str
     joint_names: tuple[str, ...]
     settings: SignalSettings
-    passages: tuple[Passage, ...]
+    passages: Sequence[Passage]
     row_time_s: float
     period_rows: int | None
     periods: int
@@ -234,6 +235,13 @@ def prepare(
     motions = _shelved(_filtered(parts, longest, spectrum, effort_flags, times, settings, springs, blocks))
     release(position, effort)
     excitation = spectrum.frequency()
+    flagged = {
+        "stale": int(old.sum()),
+        "position_outliers": int(position_flags.sum()),
+        "joint_torque_outliers": int(effort_flags.sum()),
+    }
+    # A tenth of a gigabyte for an hour.
+    del parts, longest, position_flags, effort_flags, old, bad, times
     motor_data = (
         _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
     )
@@ -273,9 +281,7 @@ def prepare(
     warnings += advised if advise else ()
     counts = {
         "lost": lost,
-        "stale": int(old.sum()),
-        "position_outliers": int(position_flags.sum()),
-        "joint_torque_outliers": int(effort_flags.sum()),
+        **flagged,
         "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
         "stretches": count,
         "resampled": int(resampled),
@@ -374,8 +380,8 @@ class _Motion:
             twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
             rate, change = differentiate(twist, part.dt)
             drive = DriveMotion((qd + rate)[kept], (qdd + change)[kept])
-        arrays = (array[kept] for array in (q, qd, qdd, torque, flagged, away))
-        return cls(part.start, part.end, part.dt, span[0], core, *arrays, drive)
+        states = q[kept], qd[kept], qdd[kept], torque[kept]
+        return cls(part.start, part.end, part.dt, span[0], core, *states, flagged[kept], away[kept], drive)
 
     @property
     def arrays(self) -> tuple[Floats | BoolArray, ...]:
@@ -387,7 +393,8 @@ class _Motion:
         """The same with other arrays."""
         names = ("q", "qd", "qdd", "torque", "flagged", "away")
         drive = None if self.drive is None else DriveMotion(arrays[6], arrays[7])
-        return replace(self, **dict(zip(names, arrays, strict=False)), drive=drive)
+        found: dict[str, Any] = dict(zip(names, arrays, strict=False))
+        return replace(self, **found, drive=drive)
 
     @property
     def first(self) -> float:
@@ -427,7 +434,7 @@ class _Motion:
         """
         first, last = self.usable(settings)
         actual = times - delay
-        low, high = np.searchsorted(actual, first), np.searchsorted(actual, last, side="right")
+        low, high = int(np.searchsorted(actual, first)), int(np.searchsorted(actual, last, side="right"))
         if high - low < 16:
             return None
         period = median_step(actual[low:high])
@@ -439,7 +446,7 @@ class _Motion:
         if self.core[1] < np.inf:
             until = int(np.searchsorted(actual, self.first + self.dt * (len(self.q) - 1), side="right"))
             high = min(high, until)
-        inside = slice(int(low), int(high))
+        inside = slice(low, high)
         actual, flagged = actual[inside], flags[inside]
         start, dt = self.first, self.dt
         q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))

@@ -65,9 +65,9 @@ class Stretch:
         first = max(int(np.searchsorted(self.places, low)) - _KNOTS, 0)
         last = min(int(np.searchsorted(self.places, high)) + _KNOTS, len(self.places))
         rows, places = self.known[first:last], self.places[first:last]
-        if len(rows) and rows[-1] - rows[0] + 1 == len(rows):
-            rows = slice(int(rows[0]), int(rows[-1]) + 1)
-        values = np.hstack([column[rows] for column in self.columns])
+        joined = len(rows) and rows[-1] - rows[0] + 1 == len(rows)
+        some: Any = slice(int(rows[0]), int(rows[-1]) + 1) if joined else rows
+        values = np.hstack([column[some] for column in self.columns])
         wanted = np.arange(low, high)
         if self.resampled:
             return CubicSpline(places, values)(wanted.astype(np.float64))

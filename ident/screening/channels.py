@@ -107,9 +107,9 @@ def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 def _shared_rows(a: Session, b: Session) -> float:
     """Share of the rows of the shorter log found in the other to the last bit, in motion."""
-    rows = [np.unique(_row_hashes(session)) for session in (a, b)]
-    fewer = min(len(part) for part in rows)
-    return len(np.intersect1d(*rows, assume_unique=True)) / fewer if fewer else 0.0
+    one, two = (np.unique(_row_hashes(session)) for session in (a, b))
+    fewer = min(len(one), len(two))
+    return len(np.intersect1d(one, two, assume_unique=True)) / fewer if fewer else 0.0
 
 
 def _row_hashes(session: Session) -> NDArray[np.uint64]:
