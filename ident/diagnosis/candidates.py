@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.optimize import minimize, minimize_scalar
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import Nominal
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
+from lwr_driver.session.spool import Arena
 
 # Bursts: shortest, least excess over its standard deviation, longest, largest number.
 _WINDOW_S, _FAR, _LONGEST_S, _MOST = 0.1, 8.0, 4.0, 4
@@ -183,6 +184,7 @@ class Dictionary:
             for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
+        self._arena = Arena()
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
         """Columns of a candidate in rows: (m, k) by side and joint."""
@@ -207,7 +209,12 @@ class Dictionary:
 
     def _entry(self, shape: Shape, rows: Rows) -> _Entry:
         padded = self.evidence.padded(rows)
-        return shape, rows, padded, self.evidence.alone(padded)
+        products = self.evidence.alone(padded)
+        # All candidates together exceed the memory.
+        rows, padded = (
+            {key: self._arena.keep(values) for key, values in columns.items()} for columns in (rows, padded)
+        )
+        return shape, rows, padded, replace(products, base=self._arena.keep(products.base))
 
     def _prepared(self, candidate: Candidate) -> list[_Entry]:
         if candidate.key not in self._kept:

@@ -19,6 +19,7 @@ from fri.errors import DataError
 from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.estimators.estimate import chi_square_tail, fisher_tail
+from lwr_driver.session.spool import Arena
 
 Floats = NDArray[np.float64]
 # Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
@@ -122,6 +123,7 @@ class Evidence:
         floor: Mapping[str, Floats] | None = None,
     ) -> None:
         self.settings, self.prior, self.compared = settings, prior, compared
+        self._arena = Arena()
         self.floor = dict(sigma if floor is None else floor)
         self.nominal = nominal
         self.sigma = {side: np.array(value) for side, value in sigma.items()}
@@ -139,7 +141,7 @@ class Evidence:
                 self._weights[key] = 1.0 / (self.sigma[side][j] ** 2 * self.variance_inflation[side][j])
                 # Most base columns do not act on most joints.
                 self._acting[key] = np.flatnonzero(np.any(wide != 0.0, axis=0))
-                self._columns[key] = self._padded(side, wide[:, self._acting[key]])
+                self._columns[key] = self._arena.keep(self._padded(side, wide[:, self._acting[key]]))
                 self._targets[key] = self._padded(side, np.where(keep, rows.target[:, j], 0.0)[:, None])
                 self.mask[key] = self._padded(side, keep.astype(float)[:, None])
         self.base_count = len(nominal.base)

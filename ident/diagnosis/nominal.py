@@ -34,6 +34,7 @@ from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
 from ident.rows.filters import differentiate, low_pass
+from lwr_driver.session.spool import Arena
 
 Floats = NDArray[np.float64]
 
@@ -286,14 +287,21 @@ class Nominal:
         parts = []
         for number, ((recording, stretch), signal) in enumerate(zip(self.stretches, values, strict=True)):
             if _holds(recording, stretch, side):
-                operator, dt = self._operator(side, number, stretch)
-                rows = self._slow(side, operator @ signal.reshape(len(signal), -1), dt)
-                parts.append(rows[self._windows(recording, self._stamps(side, stretch))])
+                operator, dt = self._operator(side, number, recording, stretch)
+                rows = operator @ signal.reshape(len(signal), -1)
+                if self.band_hz[side] is not None:
+                    rows = self._slow(side, rows, dt)[self._windows(recording, self._stamps(side, stretch))]
+                parts.append(rows)
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
-    def _operator(self, side: str, number: int, stretch: RecordStretch) -> tuple[csr_array, float]:
-        """Matrix (m, N) from the grid of a stretch to its rows, at the channel's delay, and the rows' distance [s]."""
+    def _operator(
+        self, side: str, number: int, recording: SessionRecord, stretch: RecordStretch
+    ) -> tuple[csr_array, float]:
+        """Matrix (m, N) from the grid of a stretch to its rows, at the channel's delay, and the rows' distance [s].
+
+        Without a low-pass across rows it makes the rows in use alone.
+        """
         delay = self.arm.joint_delay_s if side == "joint" else self.arm.motor_delay_s
         key = (side, number, delay)
         if key not in self._operators:
@@ -309,6 +317,8 @@ class Nominal:
             weights = np.concatenate([1.0 - share, share]) / width
             places = np.concatenate([row, row]), np.concatenate([low, low + 1])
             matrix = csr_array((weights, places), shape=(count, len(stretch.time)))
+            if self.band_hz[side] is None:
+                matrix = matrix[np.flatnonzero(self._windows(recording, self._stamps(side, stretch)))]
             self._operators[key] = matrix, width * usual_step(stamp) if len(stamp) > 1 else 0.0
         return self._operators[key]
 
@@ -373,8 +383,15 @@ class Nominal:
                 _at(stretch.time, self._steady(speed, stretch), at) > 0.999
             )
             dt = width * usual_step(stamp)
-            wide = self._matrix(side, motion, recording, stretch.time, at, width)
-            matrix = np.stack([self._slow(side, table, dt) for table in wide])
+            stamps = self._stamps(side, stretch)
+            chosen = self._windows(recording, stamps)
+            if self.band_hz[side] is None:
+                # The rows in use alone.
+                used = at[: len(at) // width * width].reshape(-1, width)[chosen].reshape(-1)
+                matrix = self._matrix(side, motion, recording, stretch.time, used, width)
+            else:
+                wide = self._matrix(side, motion, recording, stretch.time, at, width)
+                matrix = np.stack([self._slow(side, table, dt) for table in wide])[:, chosen]
             torque = self._slow(side, bins(target, width), dt)
             if self.band_hz[side] is not None:
                 # The columns pass through the same low-pass, so rounded reversals cancel; only longer rests are
@@ -387,13 +404,13 @@ class Nominal:
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
                 valid = (bins(usable.astype(float), width) > 1.0 - 1e-9) & moves
-            stamps = self._stamps(side, stretch)
-            chosen = self._windows(recording, stamps)
             session, test = (np.full(int(chosen.sum()), v) for v in (recording.number, recording.test))
             usual = torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test
-            parts.append((matrix[:, chosen], *usual))
+            parts.append((matrix, *usual))
         matrices, *others = zip(*parts, strict=True)
-        return SideRows(np.concatenate(matrices, axis=1), *(np.concatenate(part) for part in others))
+        return SideRows(
+            Arena().keep(np.concatenate(matrices, axis=1)), *(np.concatenate(part) for part in others)
+        )
 
     def _steady(self, speed: Floats, stretch: RecordStretch) -> Floats:
         """1 where a joint keeps its direction for a while before and after, 0 elsewhere, (N, n)."""
@@ -406,7 +423,7 @@ class Nominal:
         self, side: str, motion: ArmMotion, recording: SessionRecord, grid: Floats, at: Floats, width: int
     ) -> Floats:
         """(n, m, p) regressor of one stretch and side in rows, the drives at the motors' own motion."""
-        exact = _on_grid(grid, at)
+        exact = _on_grid(grid, at) if len(at) else None
         signals = (
             motion.q,
             motion.qd,

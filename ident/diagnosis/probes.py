@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
@@ -19,6 +20,7 @@ from ident.diagnosis.nominal import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import NAMELESS
 from ident.effects.nameless import KNOTS, hats
+from lwr_driver.session.spool import spans
 
 # Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
@@ -30,6 +32,8 @@ _STANDS_OUT = 16.0
 _IN_EACH = 4.0
 # Zero padding of the spectrum, against lines between two of its frequencies.
 _PADDING = 4
+# Windows of a median in memory together.
+_TOGETHER = 1024
 _RIDGE = 1e-3
 # Least explained share of the noise; generic functions find a little everywhere.
 _LEAST_INFLATION = 0.012
@@ -59,7 +63,7 @@ def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tu
     grid = float(frequency[1] - frequency[0])
     width = int(_BESIDE_HZ / grid)
     around = [slice(max(0, k - width), k + width + 1) for k in range(len(power))]
-    beside = np.array([np.median(power[near]) for near in around])
+    beside = _medians(power, width)
     best = int(np.argmax(power / np.maximum(beside, 1e-300)))
     rare = each[:, best] < _IN_EACH * np.median(each[:, around[best]], axis=1)
     if power[best] < _STANDS_OUT * beside[best] or np.any(rare):
@@ -76,6 +80,19 @@ def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tu
         for wave in (np.cos, np.sin)
     ]
     return top, {(side, joint): np.column_stack(waves)}, len(frequency) // _PADDING
+
+
+def _medians(power: Floats, width: int) -> Floats:
+    """Median (m,) of each value and of `width` values on either side, fewer at the ends."""
+    inner = np.arange(width, len(power) - width)
+    found = np.empty(len(power))
+    if len(inner):
+        windows = sliding_window_view(power, 2 * width + 1)
+        for some in spans(len(inner), _TOGETHER):
+            found[inner[some]] = np.median(windows[some], axis=1)
+    for k in [*range(min(width, len(power))), *range(max(len(power) - width, width), len(power))]:
+        found[k] = np.median(power[max(0, k - width) : k + width + 1])
+    return found
 
 
 def _spectrum(values: Floats, dt: float, size: int, frequency: Floats) -> Floats:

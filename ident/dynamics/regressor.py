@@ -154,7 +154,7 @@ def _cos_sin(angle, cosine, sine, size):  # type: ignore[no-untyped-def]
         sine[s] = -t if quarter >= 2.0 else t
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  # type: ignore[no-untyped-def]
     samples, n = q.shape
     block = min(_BLOCK, samples)
@@ -387,7 +387,7 @@ def _rnea(q: Floats, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, grav
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, out):  # type: ignore[no-untyped-def]
     samples, n = ct.shape
     force = np.empty((n, 6))

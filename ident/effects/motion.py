@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -89,6 +90,11 @@ class ArmMotion:
         """Rigid inverse dynamics (N, n) [Nm] of the links with the payload, or of other `bodies` (n, 10)."""
         return regressor.torque(self.chain, q, qd, qdd, self.bodies if bodies is None else bodies)
 
+    @cached_property
+    def still_rigid(self) -> Floats:
+        """`rigid_torque` (N, n) of the motion itself [Nm], computed once."""
+        return self.rigid_torque(self.q, self.qd, self.qdd)
+
     def smooth_torque(self, side: str) -> Floats:
         """Predicted torque (N, n) of a side without the Coulomb friction and its jumps at reversals."""
         link = self.link_coulomb * np.sign(self.qd)
@@ -107,7 +113,7 @@ class ArmMotion:
         shift, rate, acceleration : (N, n) [rad, rad/s, rad/s^2].
         """
         moved = self.rigid_torque(self.q + shift, self.qd + rate, self.qdd + acceleration)
-        return moved - self.rigid_torque(self.q, self.qd, self.qdd)
+        return moved - self.still_rigid
 
 
 def in_order(motions: Sequence[ArmMotion]) -> list[ArmMotion]:
@@ -118,7 +124,7 @@ def in_order(motions: Sequence[ArmMotion]) -> list[ArmMotion]:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def dahl(path, length, start):  # type: ignore[no-untyped-def]
     """State z (N,) in [-1, 1] of Dahl's friction along `path` (N,): dz = (1 - z sign(dx)) dx / length.
 
@@ -138,7 +144,7 @@ def dahl(path, length, start):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def first_order(signal, keep, start):  # type: ignore[no-untyped-def]
     """First-order low-pass (N,) of `signal` (N,): value = keep value + (1 - keep) signal."""
     out = np.empty(signal.shape[0])

@@ -348,6 +348,7 @@ def identify(
             motor=needs_motor,
             log=first,
             advise=not known.signal_reasons,
+            blocks=True,
         )
         seen = observe(
             [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units

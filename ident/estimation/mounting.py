@@ -32,6 +32,7 @@ from ident.rows.observation import observe
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
+from lwr_driver.session.spool import stored
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def tilt_columns(found: Identification, sessions: Sequence[Session]) -> list[Flo
 def with_tilt(problem: Problem, columns: Sequence[Floats]) -> Problem:
     """The problem with two further columns for the tilt."""
     groups = tuple(
-        replace(group, matrix=np.column_stack([group.matrix, column]))
+        replace(group, matrix=stored([np.column_stack([group.matrix, column])]))
         for group, column in zip(problem.groups, columns, strict=True)
     )
     names, units = (
@@ -227,7 +228,12 @@ def _columns(
     for session, payload in zip(sessions, found.payloads, strict=True):
         chosen = session.select(structure.chain.joint_names)
         moving = prepare(
-            chosen, settings.signals, resonance_hz=settings.resonance_hz, motor=settings.model == 2, log=False
+            chosen,
+            settings.signals,
+            resonance_hz=settings.resonance_hz,
+            motor=settings.model == 2,
+            log=False,
+            blocks=True,
         )
         still = _at_rest(moving)
         groups = [observe([still], [payload], s, columns=found.base.columns).groups for s in structures]

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from ident.rows.prepare import Passage, PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
 from lwr_driver.notebook import subplots
 from lwr_driver.session import Session
+from lwr_driver.session.spool import Growing, release
 
 _DRAWN = 3000
 """Most samples of a trace."""
@@ -229,7 +230,8 @@ def by_side(shares: Mapping[str, float]) -> str:
 class _Rows:
     """Residuals of one side of one passage: at the samples (m, n), and in the band (K, n) with validity.
 
-    used : measured samples of the excitation. moving : those of a moving joint.
+    used : measured samples of the excitation. moving : those of a moving joint. Samples that other blocks of the same
+    stretch have, too, are left out.
     """
 
     times: Floats
@@ -240,6 +242,31 @@ class _Rows:
     band: Floats
     valid: NDArray[np.bool_]
     index: NDArray[np.int64]
+
+    def in_band(self) -> _Rows:
+        """The same without its samples."""
+        empty: dict[str, Any] = {key: getattr(self, key)[:0].copy() for key in (*_KEYS, "times")}
+        return replace(self, **empty)
+
+
+class _Samples(NamedTuple):
+    """Residual and torque of one joint [Nm], samples used and moving ones, each (m,)."""
+
+    error: Any
+    torque: Any
+    used: Any
+    moving: Any
+
+    @property
+    def power(self) -> Floats:
+        """Sums of squares of residual and torque over the used samples, over the moving ones, and their numbers."""
+        found = [
+            float(np.sum(x[on] ** 2)) for on in (self.used, self.moving) for x in (self.error, self.torque)
+        ]
+        return np.array([*found, np.count_nonzero(self.used), np.count_nonzero(self.moving)])
+
+
+_KEYS = _Samples._fields
 
 
 def score_session(
@@ -264,22 +291,37 @@ def score_session(
         # A motor-only session has no joint torque; its prepared one is a placeholder.
         if side != "motor" and not session.joint.effort.shape[1]:
             continue
-        rows = [
-            r for p in prepared.passages if (r := _residuals(p, predict, side, prepared.settings)) is not None
-        ]
+        rows: list[_Rows] = []
+        clock = Growing()
+        shelves = [_Samples(*(Growing() for _ in _KEYS)) for _ in prepared.joint_names]
+        for passage in prepared.passages:
+            found = _residuals(passage, predict, side, prepared.settings)
+            passage.release()
+            if found is None:
+                continue
+            clock.append(found.times)
+            for k, own in enumerate(shelves):
+                for key, shelf in zip(_KEYS, own, strict=True):
+                    shelf.append(getattr(found, key)[:, k])
+            rows.append(found.in_band())
         if not rows:
             continue
-        keys = ("times", "error", "torque", "used", "moving")
-        times, error, torque, used, moving = (np.concatenate([getattr(r, key) for r in rows]) for key in keys)
-        computed = torque - error
+        times = clock.array()
+        columns = [_Samples(*(shelf.array() for shelf in own)) for own in shelves]
         thin = slice(None, None, -(-len(times) // _DRAWN))
-        traces[side] = Trace(times[thin].copy(), torque[thin].copy(), np.where(used, computed, np.nan)[thin])
-        figures["relative"][side] = torque_error(torque, computed, used)
-        figures["moving_relative"][side] = torque_error(torque, computed, moving)
-        figures["standstill"][side], figures["standstill_error"][side] = _standstill(error, used, moving)
+        traces[side] = Trace(
+            times[thin].copy(),
+            np.column_stack([c.torque[thin] for c in columns]),
+            np.column_stack([np.where(c.used, c.torque - c.error, np.nan)[thin] for c in columns]),
+        )
+        power = np.sum([c.power for c in columns], axis=0)
+        figures["relative"][side] = math.sqrt(_ratio(power[0], power[1]))
+        figures["moving_relative"][side] = math.sqrt(_ratio(power[2], power[3]))
+        figures["standstill"][side] = 1.0 - _ratio(power[5], power[4])
+        figures["standstill_error"][side] = 1.0 - _ratio(power[2], power[0])
         for k, joint in enumerate(prepared.joint_names):
-            columns = (times, error[:, k], torque[:, k], used[:, k], moving[:, k])
-            scores.append(_score(joint, side, k, rows, columns, prepared))
+            scores.append(_score(joint, side, k, rows, times, columns[k], prepared))
+            release(*columns[k])
     if not scores:
         raise DataError(
             f"{prepared.name}: no usable {' or '.join(sides)} torque; this session has no channel of the "
@@ -319,14 +361,13 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
     inside = _inside(channel, passage)
     used = inside[:, None] & ~flagged
     moving = used & (np.abs(channel.qd) >= settings.standstill_rad_s)
-    return _Rows(channel.times, error, torque, used, moving, parallel.apply(error), valid, passage.index)
-
-
-def _standstill(error: Floats, used: NDArray[np.bool_], moving: NDArray[np.bool_]) -> tuple[float, float]:
-    """Share of standstill in the samples used, and in their squared error."""
-    squares = float(np.sum(error[used] ** 2))
-    share = 1.0 - _ratio(np.count_nonzero(moving), np.count_nonzero(used))
-    return share, 1.0 - _ratio(float(np.sum(error[moving] ** 2)), squares)
+    band = parallel.apply(error)
+    if passage.core != (-np.inf, np.inf):
+        own = passage.own(channel.times)
+        times = channel.times[own]
+        error, torque, used, moving = error[own], torque[own], used[own], moving[own]
+        return _Rows(times, error, torque, used, moving, band, valid, passage.index)
+    return _Rows(channel.times, error, torque, used, moving, band, valid, passage.index)
 
 
 def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
@@ -336,12 +377,11 @@ def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
 
 def _inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
     """Samples in the part of the passage with rows."""
-    step = float(np.median(np.diff(passage.rows))) if len(passage.rows) > 1 else 1.0
-    nearest = np.clip(np.searchsorted(passage.rows, channel.times), 0, len(passage.rows) - 1)
+    rows = passage.stretch_rows if len(passage.stretch_rows) else passage.rows
+    step = float(np.median(np.diff(rows))) if len(rows) > 1 else 1.0
+    nearest = np.clip(np.searchsorted(rows, channel.times), 0, len(rows) - 1)
     before = np.maximum(nearest - 1, 0)
-    distance = np.minimum(
-        np.abs(passage.rows[nearest] - channel.times), np.abs(passage.rows[before] - channel.times)
-    )
+    distance = np.minimum(np.abs(rows[nearest] - channel.times), np.abs(rows[before] - channel.times))
     return distance <= step
 
 
@@ -350,30 +390,31 @@ def _score(
     side: str,
     k: int,
     rows: Sequence[_Rows],
-    samples: tuple[Floats, Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]],
+    times: Floats,
+    samples: _Samples,
     prepared: PreparedSession,
 ) -> Score:
-    """samples : times, residual, torque, samples used and moving ones, each (m,)."""
-    times, error, torque, used, moving = samples
+    """times : (m,) of the samples."""
+    error, _, used, moving = samples
     if not used.any():
         return Score(joint, side, 0, *[math.nan] * 11)
     e = error[used]
     worst = int(np.argmax(np.abs(e)))
     band = np.concatenate([r.band[r.valid[:, k], k] for r in rows])
-    standstill, standstill_error = _standstill(error, used, moving)
+    power = samples.power
     return Score(
         joint=joint,
         side=side,
         samples=len(e),
         rms=_rms(e),
-        relative=torque_error(torque, torque - error, used),
+        relative=math.sqrt(_ratio(power[0], power[1])),
         bias=float(e.mean()),
         worst=float(e[worst]),
         worst_time_s=float(times[used][worst]),
         moving_rms=_rms(error[moving]),
-        moving_relative=torque_error(torque, torque - error, moving),
-        standstill=standstill,
-        standstill_error=standstill_error,
+        moving_relative=math.sqrt(_ratio(power[2], power[3])),
+        standstill=1.0 - _ratio(power[5], power[4]),
+        standstill_error=1.0 - _ratio(power[2], power[0]),
         band_rms=_rms(band),
         floor_rms=_floor(np.concatenate([r.index[r.valid[:, k]] for r in rows]), band, prepared),
     )

@@ -174,7 +174,8 @@ def validate(
                 )
             predict = predictor(model, mounted(model, session))
             settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])
-            prepared = prepared_session(model, session, settings)
+            # Effects may remember the motion before.
+            prepared = prepared_session(model, session, settings, blocks=not model.effects)
             sides = model.structure.sides
             scores.append(score_session(prepared, predict, sides, session, "identified model", seen=flag))
         except LwrError as error:
@@ -261,14 +262,17 @@ def mounted(model: DynamicModel, session: Session) -> str | None:
 
 
 def prepared_session(
-    model: DynamicModel, session: Session, settings: SignalSettings | None
+    model: DynamicModel, session: Session, settings: SignalSettings | None, *, blocks: bool = False
 ) -> PreparedSession:
-    """The session with the joints of the model, filtered as for the estimation (settings: `signals_for`)."""
+    """The session with the joints of the model, filtered as for the estimation (settings: `signals_for`).
+
+    blocks : as for `prepare`.
+    """
     chosen = session.select(model.structure.chain.joint_names)
     signals, own = signals_for(model, settings), signals_for(model)
     # Cut-offs of the model are no choice of the session's.
     advise = (signals.cutoff_hz, signals.decimate_hz) != (own.cutoff_hz, own.decimate_hz)
-    return prepare(chosen, signals, motor=_has_motor(model), advise=advise)
+    return prepare(chosen, signals, motor=_has_motor(model), advise=advise, blocks=blocks)
 
 
 def _few(lines: Sequence[str], count: int) -> list[str]:

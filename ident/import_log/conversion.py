@@ -155,9 +155,9 @@ def import_log(
         robot_description=None,
         attachments=attachments,
     ) as writer:
-        _write(writer, channels)
         if periods is not None:
             _mark(writer, periods, joint.times)
+        _write(writer, channels)
     check_written(Path(output), {key: (one.times, one.values) for key, one in channels.items()})
     written = {
         topic: len(channels[key].times)
@@ -430,28 +430,49 @@ def _convert(mapping: LogMapping, name: str, signal: Signal, raw: Floats) -> Flo
 
 
 def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
-    def values(name: str) -> Floats | None:
-        return channels[name].values if name in channels else None
+    """Write all channels, a block of time after the other: messages need several times the memory of the samples."""
+    joint, motor, command = (channels.get(name) for name in ("position", "motor_torque", "command"))
+    position = channels.get("motor_position")
+    if motor is not None and position is not None and not np.array_equal(position.times, motor.times):
+        raise DataError(
+            f"{writer.path}: `motor_position` and `motor_torque` have different times; one channel"
+        )
+    assert joint is not None
+    longest = max((one for one in (joint, motor, command) if one is not None), key=lambda one: len(one.times))
+    edges = [*longest.times[:: 2**15][1:].tolist(), np.iinfo(np.int64).max]
+    before = -1
+    for edge in edges:
 
-    joint = channels["position"]
-    writer.write_joint_states(
-        joint.times,
-        joint.values,
-        values("joint_torque"),
-        velocity=values("velocity"),
-        publish_time=joint.published,
-    )
-    if "motor_torque" in channels:
-        motor = channels["motor_torque"]
-        position = values("motor_position")
-        if position is not None and not np.array_equal(channels["motor_position"].times, motor.times):
-            raise DataError(
-                f"{writer.path}: `motor_position` and `motor_torque` have different times; one channel"
+        def part(channel: _Channel, first: int = before, last: int = edge) -> slice:
+            return slice(*np.searchsorted(channel.times, [first, last]).tolist())
+
+        def values(name: str, some: slice) -> Floats | None:
+            return channels[name].values[some] if name in channels else None
+
+        some = part(joint)
+        writer.write_joint_states(
+            joint.times[some],
+            joint.values[some],
+            values("joint_torque", some),
+            velocity=values("velocity", some),
+            publish_time=joint.published[some],
+        )
+        if motor is not None:
+            some = part(motor)
+            writer.write_motor_states(
+                motor.times[some],
+                motor.values[some],
+                values("motor_position", some),
+                publish_time=motor.published[some],
             )
-        writer.write_motor_states(motor.times, motor.values, position, publish_time=motor.published)
-    if "command" in channels:
-        command = channels["command"]
-        writer.write_joint_command(command.times, command.values, publish_time=command.published)
+        if command is not None:
+            some = part(command)
+            writer.write_joint_command(
+                command.times[some], command.values[some], publish_time=command.published[some]
+            )
+        if edge != edges[-1]:
+            writer.advance(edge)
+        before = edge
 
 
 def _conversions(mapping: LogMapping) -> tuple[str, ...]:

@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from lwr_driver.session.spool import Growing
 
 Floats = NDArray[np.float64]
 _COMMENTS = ("#", "%")
+# Beginning of a text that shows its layout, and longest part of it in memory.
+_HEAD_BYTES, _BATCH_BYTES = 2**20, 2**23
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,35 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
     one before the numbers has the names if it has as many words as columns. Rows of words below the names, such as
     units, are passed over, and a column that begins with a word is nan. DataError with line and column.
     """
-    rows = [(number, line) for number, line in enumerate(_lines(path), 1) if line.strip()]
+    long = _long(path, delimiter, header)
+    if long is not None:
+        return long
+    layout = _layout(path, _lines(path), delimiter, header)
+    rows, mark, width = layout.rows, layout.mark, layout.width
+    values = _fast(rows, mark, width)
+    if values is None:
+        values = np.empty((len(rows), width))
+        words = {k for k, part in enumerate(_split(rows[0][1], mark)) if part and not _is_number(part)}
+        for index, (number, line) in enumerate(rows):
+            parts = _split(line, mark)
+            values[index] = _row(path, number, parts, width, layout.names, words if layout.named else set())
+    return Table(layout.names or _numbers(width), values)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Names, mark between columns and decimal point of a text, and its numbered rows of numbers, with points."""
+
+    names: tuple[str, ...]
+    named: bool
+    mark: str | None
+    point: str
+    width: int
+    rows: list[tuple[int, str]]
+
+
+def _layout(path: Path, lines: list[str], delimiter: str | None, header: bool | None) -> _Layout:
+    rows = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     comment = next((k for k, (_, line) in enumerate(rows) if line.lstrip()[0] not in _COMMENTS), len(rows))
     above = rows[comment - 1][1].strip().lstrip("".join(_COMMENTS)) if comment else ""
     rows = [(number, line) for number, line in rows[comment:] if line.lstrip()[0] not in _COMMENTS]
@@ -54,13 +85,48 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
     width = len(names) if named else len(_split(rows[0][1], mark))
     if not named and len(_split(above, mark)) == width and not all(map(_is_number, _split(above, mark))):
         names = tuple(_split(above, mark))
-    values = _fast(rows, mark, width)
-    if values is None:
-        values = np.empty((len(rows), width))
-        words = {k for k, part in enumerate(_split(rows[0][1], mark)) if part and not _is_number(part)}
-        for index, (number, line) in enumerate(rows):
-            values[index] = _row(path, number, _split(line, mark), width, names, words if named else set())
-    return Table(names or _numbers(width), values)
+    return _Layout(names, named, mark, point, width, rows)
+
+
+def _long(path: Path, delimiter: str | None, header: bool | None) -> Table | None:
+    """A long plain table, batch after batch by pyarrow; None for a short one, and for one it cannot read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            if len(head) < _HEAD_BYTES:
+                return None
+        text = head[: head.rindex(b"\n")].decode("utf-8-sig")
+        layout = _layout(path, text.splitlines(), delimiter, header)
+    except (OSError, ValueError, DataError):
+        # The slow way says what is wrong.
+        return None
+    numbers = layout.rows[0][1]
+    if layout.mark is None or len(layout.mark) != 1 or len(numbers.split(layout.mark)) != layout.width:
+        return None
+    decimal = "," if layout.mark != "," and "." not in text.splitlines()[layout.rows[0][0] - 1] else "."
+    from pyarrow import ArrowException, csv, float64
+
+    names = list(_numbers(layout.width))
+    found = Growing()
+    try:
+        with csv.open_csv(
+            path,
+            read_options=csv.ReadOptions(
+                column_names=names,
+                skip_rows=layout.rows[0][0] - 1,
+                block_size=_BATCH_BYTES,
+                use_threads=False,
+            ),
+            parse_options=csv.ParseOptions(delimiter=layout.mark),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(names, float64()), null_values=[], decimal_point=decimal
+            ),
+        ) as batches:
+            for batch in batches:
+                found.append(np.column_stack([column.to_numpy() for column in batch.columns]))
+    except (ArrowException, ValueError):
+        return None
+    return Table(layout.names or _numbers(layout.width), found.array())
 
 
 def _lines(path: Path) -> list[str]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from lwr_driver.session import JointColumns, Session
+from lwr_driver.session.spool import column, spans
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -117,7 +118,7 @@ def clipped_at(columns: JointColumns) -> Floats:
     found = np.full(n, np.nan)
     if len(effort) < 2:
         return found
-    fresh = np.concatenate([[False], np.any(np.diff(columns.position, axis=0) != 0.0, axis=1)])
+    fresh = np.concatenate([[False], np.any(columns.position[1:] != columns.position[:-1], axis=1)])
     fresh &= ~_same(effort)
     for joint in range(n):
         values = effort[fresh, joint]
@@ -158,30 +159,39 @@ def _jolts(position: Floats) -> Flags:
     moves = np.ptp(position, axis=0) > 0.0 if len(position) else np.zeros(0, dtype=bool)
     if len(position) < 4 or moves.sum() < 2:
         return found
-    q = position[:, moves]
-    third = np.abs(np.diff(q, 3, axis=0))
-    steps = np.abs(np.diff(q, axis=0))
-    step = np.min(np.where(steps > 0.0, steps, np.inf), axis=0)
-    usual = np.maximum(np.median(third, axis=0), _STEPS * step)
-    found[2:-1] = np.mean(third > _JOLT * usual, axis=1) > 0.5
-    return found & _behind(q)
+    jolting = np.zeros(len(position) - 3)
+    # Column by column: a long session has room for one.
+    for joint in np.flatnonzero(moves):
+        q = column(position, int(joint))
+        third = np.abs(np.diff(q, 3))
+        steps = np.abs(np.diff(q))
+        step = np.min(steps, where=steps > 0.0, initial=np.inf)
+        jolting += third > _JOLT * max(float(np.median(third)), float(_STEPS * step))
+    found[2:-1] = jolting > 0.5 * moves.sum()
+    if not found.any():
+        return found
+    return found & _behind(position, moves)
 
 
-def _behind(q: Floats) -> Flags:
-    """Samples (N,) beside one with all joints behind their path by one share of their progress.
+def _behind(position: Floats, moves: Flags) -> Flags:
+    """Samples (N,) beside one with all moving joints behind their path by one share of their progress.
 
     A sample is displaced from the cubic through its four neighbours. One of an older moment lies back along the motion,
     by its age in all joints alike; a jerk of the motion itself does not.
     """
-    found = np.zeros(len(q), dtype=bool)
-    if len(q) < 5:
+    found = np.zeros(len(position), dtype=bool)
+    if len(position) < 5:
         return found
-    away = q[2:-2] - (4.0 * (q[1:-3] + q[3:-1]) - q[:-4] - q[4:]) / 6.0
-    progress = (q[4:] - q[:-4]) / 4.0
-    power = np.maximum(np.einsum("ij,ij->i", progress, progress), 1e-300)
-    age = -np.einsum("ij,ij->i", away, progress) / power
-    across = np.linalg.norm(away + age[:, None] * progress, axis=1)
-    found[2:-2] = (age > _AGE) & (across < _ACROSS * np.linalg.norm(away, axis=1))
+    for some in spans(len(position) - 4):
+        q = position[some.start : some.stop + 4, moves]
+        away = q[2:-2] - (4.0 * (q[1:-3] + q[3:-1]) - q[:-4] - q[4:]) / 6.0
+        progress = (q[4:] - q[:-4]) / 4.0
+        power = np.maximum(np.einsum("ij,ij->i", progress, progress), 1e-300)
+        age = -np.einsum("ij,ij->i", away, progress) / power
+        across = np.linalg.norm(away + age[:, None] * progress, axis=1)
+        found[some.start + 2 : some.stop + 2] = (age > _AGE) & (
+            across < _ACROSS * np.linalg.norm(away, axis=1)
+        )
     return np.asarray(binary_dilation(found, iterations=1))
 
 
@@ -198,7 +208,7 @@ def _same(effort: Floats) -> Flags:
     """Samples (N,) with the last sample's torques in all joints; a single joint proves nothing."""
     if effort.shape[1] < 2:
         return np.zeros(len(effort), dtype=bool)
-    return np.concatenate([[False], np.all(np.diff(effort, axis=0) == 0.0, axis=1)])
+    return np.concatenate([[False], np.all(effort[1:] == effort[:-1], axis=1)])
 
 
 def _repeated(effort: Floats) -> int:
@@ -206,7 +216,7 @@ def _repeated(effort: Floats) -> int:
     if effort.shape[1] < 2 or len(effort) < 3:
         return 0
     same = _same(effort)[1:]
-    each = np.mean(np.diff(effort, axis=0) == 0.0, axis=0)
+    each = np.mean(effort[1:] == effort[:-1], axis=0)
     # With a share r repeated and a chance e_j of each joint: each_j = r + (1 - r) e_j, same = r + (1 - r) prod e_j.
     share, low, high = float(same.mean()), 0.0, float(same.mean())
     for _ in range(_BISECTIONS):

@@ -16,6 +16,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +27,15 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem, RowGroup
 from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
+from lwr_driver.session.spool import Growing, release
 
 logger = logging.getLogger(__name__)
 
+# Highest cut-off of the rows of a delay [Hz], and attenuation beyond.
+DELAY_HZ, DELAY_DB = 5.0, 40.0
 _SYMBOLS = ("Ia", "Fvm", "Fcm", "offm")
 _STEPS = 12
 _GRID = 41
-_ATTENUATION_DB = 40.0
 # Least share of a row's filter on known samples.
 _KNOWN = 0.4
 # Rows of a joint needed for a delay of its own.
@@ -101,10 +104,11 @@ class Delay:
 
 @dataclass(frozen=True)
 class DelayData:
-    """One uninterrupted stretch: joint channel on (n,) even times, motor channel on (m,) times [s].
+    """One uninterrupted stretch or a block of it: joint channel on (n,) even times, motor channel on (m,) times [s].
 
     qd, qdd, joint_torque : (n, J); motor_torque : (m, J). known : (n, J), samples away from the reversals of their
-    joint. span : first and last usable time [s].
+    joint. span : first and last usable time of the stretch [s]. core : times of the rows of this block [s]; blocks of
+    one stretch follow each other.
     """
 
     times: Floats
@@ -115,6 +119,7 @@ class DelayData:
     motor_times: Floats
     motor_torque: Floats
     span: tuple[float, float]
+    core: tuple[float, float] = (-np.inf, np.inf)
 
 
 def estimate_delay(
@@ -129,7 +134,8 @@ def estimate_delay(
     A motion too short or too weak for an estimate gives zero, with the sample time of the motor channel as its
     standard deviation. Raises DataError when the data clearly prefer a delay at the edge of +- `search_s`.
     """
-    parts = [part for data in stretches if (part := _Rows.of(data, cutoff_hz, search_s)) is not None]
+    by_stretch = [list(blocks) for _, blocks in groupby(stretches, key=lambda data: data.span)]
+    parts = [part for blocks in by_stretch if (part := _Rows.of(blocks, cutoff_hz, search_s)) is not None]
     joints = [
         j
         for j in range(len(joint_names))
@@ -175,56 +181,24 @@ def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """The known samples of the motor channel in one stretch, and their low-pass to rows.
-
-    known : (m, J) as 0 and 1; share : (K, J) of a row's filter on them; known_rows : (K, J).
-    """
+class _Block:
+    """The rows of a block: samples `inside` of the motor channel, and their low-pass. state : (n, 3 J)."""
 
     data: DelayData
     state: Floats
     parallel: ParallelFilter
     inside: slice
-    known: Floats
-    share: Floats
-    known_rows: NDArray[np.bool_]
 
-    @classmethod
-    def of(cls, data: DelayData, cutoff_hz: float, search_s: float, every: int = 1) -> _Rows | None:
-        width = half_width(cutoff_hz, _ATTENUATION_DB)
-        first = max(data.span[0], float(data.motor_times[0])) + search_s
-        last = min(data.span[1], float(data.motor_times[-1])) - search_s
-        if last - first < 2.0 * width:
-            return None
-        low, high = np.searchsorted(data.motor_times, [first, last])
-        inside = slice(int(low), int(high), every)
-        times = data.motor_times[inside]
-        outputs = np.arange(first + 0.5 * width, last - 0.5 * width, 1.0 / (2.5 * cutoff_hz))
-        parallel = ParallelFilter(times, outputs, cutoff_hz, _ATTENUATION_DB)
-        dt = float(data.times[1] - data.times[0])
-        # Interpolation smooths noise, and more so between two samples: without a low-pass the noise chooses the delay.
-        torque = low_pass(data.joint_torque, dt, min(3.0 * cutoff_hz, 0.4 / dt))
-        state = np.hstack([data.qdd, data.qd, torque])
-        empty = np.zeros((len(times), data.qd.shape[1]))
-        rows = np.zeros((len(outputs), data.qd.shape[1]))
-        return cls(data, state, parallel, inside, empty, rows, rows > 0.0).masked(0.0)
-
-    def masked(self, delay: float) -> _Rows:
-        """With the samples that are known for a delay."""
+    def known(self, delay: float) -> Floats:
+        """Known samples (m, J) for a delay, as 0 and 1."""
         data = self.data
         step = float(data.times[1] - data.times[0])
         place = np.rint((data.motor_times[self.inside] - delay - data.times[0]) / step).astype(np.int64)
-        known = data.known[np.clip(place, 0, len(data.times) - 1)].astype(np.float64)
-        share = self.parallel.apply(known)
-        return replace(self, known=known, share=share, known_rows=share > _KNOWN)
+        found = data.known[np.clip(place, 0, len(data.times) - 1)].astype(np.float64)
+        release(data.known)
+        return found
 
-    def thinned(self, cutoff_hz: float) -> _Rows:
-        """With no more samples than the coarse search needs, 40 a period of the cut-off."""
-        step = float(np.median(np.diff(self.parallel.times)))
-        search = max(0.0, float(self.parallel.times[0] - self.data.span[0]))
-        return _Rows.of(self.data, cutoff_hz, search, max(1, int(1.0 / (40.0 * cutoff_hz * step)))) or self
-
-    def at(self, delay: float) -> tuple[Floats, Floats]:
+    def at(self, delay: float, known: Floats, total: Floats) -> tuple[Floats, Floats]:
         """Columns (K, J, 4) and difference of the torques (K, J) for a delay."""
         data = self.data
         times = data.motor_times[self.inside] - delay
@@ -232,10 +206,89 @@ class _Rows:
         qdd, qd, torque = np.split(
             interpolate_uniform(self.state, float(data.times[0]), dt, times), 3, axis=1
         )
+        release(self.state)
         signals = [qdd, qd, np.sign(qd), np.ones_like(qd), data.motor_torque[self.inside] - torque]
-        total = np.where(self.known_rows, self.share, 1.0)
-        filtered = self.parallel.apply(np.stack(signals, axis=2) * self.known[:, :, None]) / total[:, :, None]
+        filtered = self.parallel.apply(np.stack(signals, axis=2) * known[:, :, None]) / total[:, :, None]
         return filtered[:, :, :4], filtered[:, :, 4]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The rows of one stretch, block after block.
+
+    known : by block (m, J), the known samples as 0 and 1; share : (K, J) of a row's filter on them; known_rows :
+    (K, J). search_s : delays searched. step_s : between samples of the motor channel. row_s : between rows.
+    """
+
+    blocks: tuple[_Block, ...]
+    search_s: float
+    step_s: float
+    row_s: float
+    known: tuple[Floats, ...] = ()
+    share: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @classmethod
+    def of(
+        cls, blocks: Sequence[DelayData], cutoff_hz: float, search_s: float, every: int = 1
+    ) -> _Rows | None:
+        data = blocks[0]
+        width = half_width(cutoff_hz, DELAY_DB)
+        first = max(data.span[0], float(data.motor_times[0])) + search_s
+        last = min(data.span[1], float(data.motor_times[-1])) - search_s
+        if last - first < 2.0 * width:
+            return None
+        low, high = np.searchsorted(data.motor_times, [first, last]).tolist()
+        outputs = np.arange(first + 0.5 * width, last - 0.5 * width, 1.0 / (2.5 * cutoff_hz))
+        step = float(np.median(np.diff(data.motor_times[low:high:every])))
+        found, states = [], Growing()
+        for block in blocks:
+            rows = outputs[(outputs >= block.core[0]) & (outputs < block.core[1])]
+            if not len(rows):
+                continue
+            near = np.searchsorted(data.motor_times, [rows[0] - width, rows[-1] + width])
+            begin = max(low, low + (int(near[0]) - low) // every * every - every)
+            inside = slice(begin, min(high, int(near[1]) + 1 + every), every)
+            parallel = ParallelFilter(data.motor_times[inside], rows, cutoff_hz, DELAY_DB)
+            dt = float(block.times[1] - block.times[0])
+            # Interpolation smooths noise, and more so between two samples: without a low-pass the noise chooses the
+            # delay.
+            torque = low_pass(block.joint_torque, dt, min(3.0 * cutoff_hz, 0.4 / dt))
+            states.append(np.hstack([block.qdd, block.qd, torque]))
+            release(block.qdd, block.qd, block.joint_torque)
+            found.append(_Block(block, np.zeros((0, 0)), parallel, inside))
+        if not found:
+            return None
+        ends = np.cumsum([0, *(len(block.data.times) for block in found)]).tolist()
+        whole = states.array()
+        kept = (replace(block, state=whole[a:b]) for block, (a, b) in zip(found, pairwise(ends), strict=True))
+        return cls(tuple(kept), search_s, step, 1.0 / (2.5 * cutoff_hz)).masked(0.0)
+
+    @property
+    def known_rows(self) -> NDArray[np.bool_]:
+        """Rows (K, J) with enough known samples."""
+        return self.share > _KNOWN
+
+    def masked(self, delay: float) -> _Rows:
+        """With the samples that are known for a delay."""
+        known = tuple(block.known(delay) for block in self.blocks)
+        share = [block.parallel.apply(own) for block, own in zip(self.blocks, known, strict=True)]
+        return replace(self, known=known, share=np.concatenate(share))
+
+    def thinned(self, cutoff_hz: float) -> _Rows:
+        """With no more samples than the coarse search needs, 40 a period of the cut-off."""
+        every = max(1, int(1.0 / (40.0 * cutoff_hz * self.step_s)))
+        if every == 1:
+            return self
+        return _Rows.of([block.data for block in self.blocks], cutoff_hz, self.search_s, every) or self
+
+    def at(self, delay: float) -> tuple[Floats, Floats]:
+        """Columns (K, J, 4) and difference of the torques (K, J) for a delay."""
+        total, place, found = np.where(self.known_rows, self.share, 1.0), 0, []
+        for block, known in zip(self.blocks, self.known, strict=True):
+            rows = slice(place, place + len(block.parallel.outputs))
+            found.append(block.at(delay, known, total[rows]))
+            place = rows.stop
+        return np.concatenate([columns for columns, _ in found]), np.concatenate([rest for _, rest in found])
 
 
 def _misfit(parts: Sequence[_Rows], joints: Sequence[int], delay: float) -> float:
@@ -290,6 +343,6 @@ def _newton(
         first += len(used[j])
     titles = [f"{_SYMBOLS[k]} {j}" for j in joints for k in used[j]]
     titles += [f"delay {k}" for k in range(count)]
-    step = float(parts[0].parallel.outputs[1] - parts[0].parallel.outputs[0])
+    step = parts[0].row_s
     fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(Problem(tuple(titles), tuple(groups), step))
     return fit.values[-count:], fit.std[-count:]

@@ -19,7 +19,7 @@ from scipy.ndimage import correlate1d
 from fri.errors import ConfigurationError
 from fri.quantities import within
 from ident.dynamics.parameters import Floats
-from ident.rows.butterworth import forward_and_back, sections, spectrum
+from ident.rows.butterworth import forward_and_back, sections
 
 # The paper's filters, section 5, and a time beside reversals that covers the turning of a strain-wave drive.
 CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
@@ -153,6 +153,11 @@ def low_pass(values: Floats, dt: float, cutoff_hz: float, order: int = 4) -> Flo
     return forward_and_back(sections(order, cutoff_hz / nyquist), values, pad)
 
 
+def settling(cutoff_hz: float, order: int = 4) -> float:
+    """Time [s] in which the slowest pole of a Butterworth low-pass decays to 1e-17, its overlap between blocks."""
+    return 40.0 / (2.0 * np.pi * cutoff_hz * np.sin(0.5 * np.pi / order))
+
+
 def differentiate(values: Floats, dt: float) -> tuple[Floats, Floats]:
     """First and second derivative (n, k) by central differences of sixth order; no phase shift."""
     first = correlate1d(values, _FIRST / dt, axis=0, mode="nearest")
@@ -172,7 +177,7 @@ def interpolate_uniform(values: Floats, start: float, dt: float, times: Floats) 
     return _lagrange(np.ascontiguousarray(values), np.ascontiguousarray(position))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lagrange(values, position):  # type: ignore[no-untyped-def]
     rows, columns = len(position), values.shape[1]
     result = np.empty((rows, columns))
@@ -194,11 +199,17 @@ def _lagrange(values, position):  # type: ignore[no-untyped-def]
     return result
 
 
-def thinning(times: Floats, cutoff_hz: float) -> int:
-    """Number of neighbouring samples to average before a low-pass at `cutoff_hz`: 40 means a period stay."""
-    if len(times) < 2:
-        return 1
-    return max(1, int(1.0 / (40.0 * cutoff_hz * float(np.median(np.diff(times))))))
+def thinning(period_s: float, cutoff_hz: float) -> int:
+    """Number of neighbouring samples to average before a low-pass at `cutoff_hz`: 40 means a period stay.
+
+    period_s : median time between samples [s]; NaN for a single one.
+    """
+    return max(1, int(1.0 / (40.0 * cutoff_hz * period_s))) if period_s > 0.0 else 1
+
+
+def median_step(times: Floats) -> float:
+    """Median time between samples [s], NaN for less than two."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else float("nan")
 
 
 def block_means(values: NDArray[np.generic], factor: int) -> Floats:
@@ -321,19 +332,51 @@ def _kaiser(position: Floats, attenuation_db: float) -> Floats:
     return np.i0(beta * np.sqrt(np.maximum(1.0 - position**2, 0.0))) / np.i0(beta)
 
 
-def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> float:
-    """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
+class Excitation:
+    """Upper frequency of a motion from its blocks: Welch's spectrum, segment after segment."""
 
-    velocity : (n, J) low-passed, equidistant. About the highest harmonic n_f w0 of a Fourier excitation.
-    """
-    highest = 0.0
-    power_of_joint = np.var(velocity, axis=0)
-    for joint in np.flatnonzero(power_of_joint > 1e-4 * power_of_joint.max(initial=0.0)):
-        frequency, power = _spectrum(velocity[:, joint], dt)
-        cumulative = np.cumsum(power)
-        if cumulative[-1] > 0:
-            highest = max(highest, float(frequency[np.searchsorted(cumulative, share * cumulative[-1])]))
-    return highest
+    def __init__(self, count: int, dt: float) -> None:
+        self._dt, self._segment = dt, min(count, max(256, round(30.0 / dt)))
+        self._rest: Floats | None = None
+        self._frequency: Floats = np.zeros(0)
+        self._power: Floats | float = 0.0
+        self._moments: list[tuple[int, Floats, Floats]] = []
+
+    def add(self, velocity: Floats) -> None:
+        """The next samples (m, J) of the low-passed joint velocities."""
+        mean = velocity.mean(axis=0)
+        self._moments.append((len(velocity), mean, np.sum((velocity - mean) ** 2, axis=0)))
+        rest = velocity if self._rest is None else np.concatenate([self._rest, velocity])
+        step = self._segment - self._segment // 2
+        whole = (len(rest) - self._segment) // step + 1 if len(rest) >= self._segment else 0
+        if whole:
+            used = rest[: (whole - 1) * step + self._segment]
+            self._frequency, power = spectrum(used, self._dt, self._segment)
+            self._power = self._power + whole * power
+        self._rest = np.array(rest[whole * step :])
+
+    def frequency(self, share: float = 0.999) -> float:
+        """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
+
+        About the highest harmonic n_f w0 of a Fourier excitation.
+        """
+        count = sum(n for n, _, _ in self._moments)
+        mean = sum(n * m for n, m, _ in self._moments) / count
+        variance = sum(square + n * (m - mean) ** 2 for n, m, square in self._moments) / count
+        highest = 0.0
+        for joint in np.flatnonzero(variance > 1e-4 * np.max(variance, initial=0.0)):
+            cumulative = np.cumsum(np.asarray(self._power)[:, joint])
+            if cumulative[-1] > 0:
+                place = np.searchsorted(cumulative, share * cumulative[-1])
+                highest = max(highest, float(self._frequency[place]))
+        return highest
+
+
+def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> float:
+    """Upper frequency [Hz] of the motion of velocities (n, J), low-passed and equidistant: see `Excitation`."""
+    found = Excitation(len(velocity), dt)
+    found.add(velocity)
+    return found.frequency(share)
 
 
 def advice(
@@ -382,10 +425,6 @@ def advice(
                 f"{resonance_hz:g} Hz through; lower `decimate_hz`"
             )
     return tuple(found)
-
-
-def _spectrum(signal: Floats, dt: float) -> tuple[Floats, Floats]:
-    return spectrum(signal, dt, min(len(signal), max(256, round(30.0 / dt))))
 
 
 def moving(position: Floats, names: Sequence[str], threshold: float = 1e-2) -> tuple[str, ...]:

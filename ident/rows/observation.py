@@ -10,11 +10,13 @@ the true motion and is independent of the sensors. `InstrumentalVariables` and t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fri.errors import DataError
@@ -27,11 +29,13 @@ from ident.rows.filters import (
     differentiate,
     interpolate_uniform,
     low_pass,
+    settling,
     thinning,
 )
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, clock_ns
 from ident.rows.timebase import Stretch, sample_period, stretches
 from lwr_driver.session import Session
+from lwr_driver.session.spool import Growing, release
 
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
@@ -59,13 +63,14 @@ def observe(
     nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
         slopes: dict[int, Floats] = {}
-        for side in structure.sides:
-            parts = [
-                part
-                for passage in session.passages
-                if (part := _side(passage, side, structure, payload, chosen, session)) is not None
-            ]
-            for group, slope in _groups(session, number, side, parts) if parts else []:
+        by_side = {side: _Collected(session) for side in structure.sides}
+        for passage in session.passages:
+            for side, rows in by_side.items():
+                part = _side(passage, side, structure, payload, chosen, session)
+                if part is not None:
+                    rows.add(part)
+        for side, rows in by_side.items():
+            for group, slope in rows.groups(number, side):
                 if side != "joint":
                     slopes[len(groups)] = slope
                 groups.append(group)
@@ -148,6 +153,7 @@ def _side(
         return None
     matrix, target = _filtered(channel, passage.rows, side, structure, payload, columns, session)
     slope = np.zeros_like(target) if side == "joint" else _slope(channel, passage.rows, session)
+    passage.release()
     return _Part(matrix, target, slope, valid, passage.index)
 
 
@@ -161,10 +167,10 @@ def _difference(joint: TorqueChannel, motor: TorqueChannel) -> TorqueChannel:
 def _slope(channel: TorqueChannel, rows: Floats, session: PreparedSession) -> Floats:
     """Time derivative (K, n) of the torque in the rows, the error per second of a wrong delay."""
     settings = session.settings
-    dt = float(np.median(np.diff(channel.times)))
+    dt = channel.period_s
     smooth = low_pass(channel.torque, dt, min(2.5 * settings.decimate, 0.4 / dt))
     known = channel.known.astype(np.float64)
-    factor = thinning(channel.times, settings.decimate)
+    factor = thinning(channel.period_s, settings.decimate)
     times, share = block_means(channel.times, factor), block_means(known, factor)
     rate = block_means(np.gradient(smooth, dt, axis=0) * known, factor)
     parallel = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db)
@@ -191,11 +197,10 @@ def _filtered(
     matrix = np.empty((joints, len(rows), len(columns)))
     target = np.empty((len(rows), joints))
     # Averaging neighbouring samples first saves nine tenths of the work and is the same for both sides.
-    factor = thinning(channel.times, settings.decimate)
+    factor = thinning(channel.period_s, settings.decimate)
     known = channel.known.astype(np.float64)
     times, torque = block_means(channel.times, factor), block_means(channel.torque * known, factor)
     share = block_means(known, factor)
-    mean = np.full(factor, 1.0 / factor)
     blocks = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db).blocks()
     while batch := list(islice(blocks, _BLOCKS)):
         low, high = batch[0][1].start, batch[-1][1].stop
@@ -210,8 +215,8 @@ def _filtered(
             drive=None if channel.drive is None else channel.drive.at(part),
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
-        masked = wide.T.reshape(len(columns), joints, -1) * known[part].T
-        flat = (masked.reshape(-1, factor) @ mean).reshape(len(columns) * joints, high - low)
+        table = wide.T.reshape(len(columns), joints, -1)
+        flat = _known_means(table, np.ascontiguousarray(known[part].T), factor)
         for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
@@ -221,25 +226,52 @@ def _filtered(
     return matrix, target
 
 
-def _groups(
-    session: PreparedSession, number: int, side: Side, parts: Sequence[_Part]
-) -> list[tuple[RowGroup, Floats]]:
-    """Row group and slope of each joint with rows."""
-    result = []
-    average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
-    for joint, name in enumerate(session.joint_names):
-        kept = [(part, part.valid[:, joint]) for part in parts]
-        matrix = np.concatenate([part.matrix[joint][k] for part, k in kept])
-        target = np.concatenate([part.target[k, joint] for part, k in kept])
-        slope = np.concatenate([part.slope[k, joint] for part, k in kept])
-        index = np.concatenate([part.index[k] for part, k in kept])
-        if average and session.period_rows is not None:
-            matrix, target, slope, index = _averaged(
-                matrix, target, slope, index, session.period_rows, session.periods
-            )
-        if len(target):
-            result.append((RowGroup(name, side, number, matrix, target, index), slope))
+@njit(cache=True, nogil=True)
+def _known_means(table, known, factor):  # type: ignore[no-untyped-def]
+    """Means (C n, m // factor) over neighbouring samples of (C, n, m) columns times the known share (n, m)."""
+    columns, joints, samples = table.shape
+    count = samples // factor
+    result = np.empty((columns * joints, count))
+    for column in range(columns):
+        for joint in range(joints):
+            row = column * joints + joint
+            for k in range(count):
+                total = 0.0
+                for i in range(k * factor, (k + 1) * factor):
+                    total += table[column, joint, i] * known[joint, i]
+                result[row, k] = total / factor
     return result
+
+
+class _Collected:
+    """Rows of one side by joint, part after part; long matrices in files."""
+
+    def __init__(self, session: PreparedSession) -> None:
+        self._session = session
+        self._rows = [tuple(Growing() for _ in range(4)) for _ in session.joint_names]
+
+    def add(self, part: _Part) -> None:
+        """The valid rows of the next part."""
+        for joint, shelves in enumerate(self._rows):
+            kept = part.valid[:, joint]
+            arrays = (part.matrix[joint], part.target[:, joint], part.slope[:, joint], part.index)
+            for shelf, array in zip(shelves, arrays, strict=True):
+                shelf.append(array[kept])
+
+    def groups(self, number: int, side: Side) -> Iterator[tuple[RowGroup, Floats]]:
+        """Row group and slope of each joint with rows."""
+        session = self._session
+        average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
+        for name, shelves in zip(session.joint_names, self._rows, strict=True):
+            if not len(shelves[1]):
+                continue
+            matrix, target, slope, index = (shelf.array() for shelf in shelves)
+            if average and session.period_rows is not None:
+                matrix, target, slope, index = _averaged(
+                    matrix, target, slope, index, session.period_rows, session.periods
+                )
+            if len(target):
+                yield RowGroup(name, side, number, matrix, target, index), slope
 
 
 def _averaged(
@@ -267,41 +299,49 @@ def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | 
     dt = sample_period(times, command.sequence if command.numbered else None, where)
     bad: NDArray[np.bool_] = np.asarray(~np.isfinite(command.position).all(axis=1))
     parts, _ = stretches(times, command.position, bad, dt, prepared.settings.longest_bridge_s)
-    motions = [_Motion(parts.pop(0), prepared) for _ in range(len(parts))]
     passages = []
     for passage in prepared.passages:
-        home = next((m for m in motions if m.covers(passage.joint) and m.covers(passage.motor)), None)
+        channels = [channel for channel in (passage.joint, passage.motor) if channel is not None]
+        home = next((part for part in parts if all(_covers(part, channel) for channel in channels)), None)
         if home is None:
             return None
-        passages.append(
-            replace(
-                passage,
-                joint=home.at(passage.joint),
-                motor=None if passage.motor is None else home.at(passage.motor),
-            )
-        )
-    return replace(prepared, passages=tuple(passages))
+        passages.append((passage, home))
+    return replace(prepared, passages=_Commanded(passages, prepared))
 
 
-class _Motion:
-    """The commanded motion of one stretch, filtered like the measured one."""
+def _covers(part: Stretch, channel: TorqueChannel) -> bool:
+    """Whether the channel's times lie within the stretch."""
+    slack = 0.5 * part.dt
+    return bool(part.start - slack <= channel.times[0] and channel.times[-1] <= part.end + slack)
 
-    def __init__(self, part: Stretch, prepared: PreparedSession) -> None:
-        self._start, self._dt, self._end = part.start, part.dt, part.end
-        position = low_pass(part.values, part.dt, prepared.cutoff_hz, prepared.settings.order)
-        self._states = (position, *differentiate(position, part.dt))
 
-    def covers(self, channel: TorqueChannel | None) -> bool:
-        """Whether the channel's times lie within the stretch."""
-        if channel is None:
-            return True
-        slack = 0.5 * self._dt
-        first, last = self._start - slack, self._end + slack
-        return bool(first <= channel.times[0] and channel.times[-1] <= last)
+class _Commanded(Sequence[Passage]):
+    """Passages with the commanded motion, filtered like the measured one when they are asked for."""
 
-    def at(self, channel: TorqueChannel) -> TorqueChannel:
-        """The channel with the commanded motion at its times."""
-        q, qd, qdd = (
-            interpolate_uniform(state, self._start, self._dt, channel.times) for state in self._states
-        )
-        return replace(channel, q=q, qd=qd, qdd=qdd, drive=None)
+    def __init__(self, parts: Sequence[tuple[Passage, Stretch]], prepared: PreparedSession) -> None:
+        self._parts, self._prepared = parts, prepared
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __getitem__(self, number: Any) -> Any:
+        passage, part = self._parts[number]
+        order = self._prepared.settings.order
+        around = settling(self._prepared.cutoff_hz, order) + 16.0 * part.dt
+        channels = [channel for channel in (passage.joint, passage.motor) if channel is not None]
+        first = min(float(channel.times[0]) for channel in channels) - around - part.start
+        last = max(float(channel.times[-1]) for channel in channels) + around - part.start
+        low = max(int(first / part.dt), 0) if passage.core[0] > -np.inf else 0
+        high = min(int(last / part.dt) + 1, part.count) if passage.core[1] < np.inf else part.count
+        values = part.part(low, high)
+        release(*part.columns)
+        position = low_pass(values, part.dt, self._prepared.cutoff_hz, order)
+        states = (position, *differentiate(position, part.dt))
+        start = part.start + part.dt * low
+
+        def at(channel: TorqueChannel) -> TorqueChannel:
+            q, qd, qdd = (interpolate_uniform(state, start, part.dt, channel.times) for state in states)
+            return replace(channel, q=q, qd=qd, qdd=qdd, drive=None)
+
+        motor = None if passage.motor is None else at(passage.motor)
+        return replace(passage, joint=at(passage.joint), motor=motor)

@@ -8,8 +8,10 @@ the motor channel minus its delay, so a slow or irregular torque is never resamp
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +20,20 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import DriveMotion
 from ident.rows.data_quality import stale
-from ident.rows.delay import Delay, DelayData, estimate_delay
+from ident.rows.delay import DELAY_DB, DELAY_HZ, Delay, DelayData, estimate_delay
 from ident.rows.filters import (
+    Excitation,
     ParallelFilter,
     SignalSettings,
     advice,
     block_means,
     differentiate,
-    excitation_frequency,
+    half_width,
     interpolate_uniform,
     low_pass,
+    median_step,
     moving,
+    settling,
     thinning,
 )
 from ident.rows.reversals import away_from_reversals
@@ -40,6 +45,7 @@ from ident.rows.timebase import (
     stretches,
 )
 from lwr_driver.session import JointColumns, Session
+from lwr_driver.session.spool import release, shelved, spans
 
 BoolArray = NDArray[np.bool_]
 
@@ -48,6 +54,8 @@ logger = logging.getLogger(__name__)
 # Scatter of seven joints over their standard deviations, exceeded once in a thousand healthy sessions, for deviations
 # that are a third too small.
 _DISAGREEMENT = 3.0
+# Longest block [s]. Bounds of the frequency and the attenuation of the rows of a delay.
+_BLOCK_S = 120.0
 _SAMPLED = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
 
 
@@ -57,7 +65,7 @@ class TorqueChannel:
 
     times : (m,) [s], delay removed. q, qd, qdd, torque : (m, J). flagged : (m, J), bridged or outliers.
     known : (m, J), neither flagged nor beside a reversal of their joint. drive : motion of the motors
-    where it is known to differ from the links', else None.
+    where it is known to differ from the links', else None. period_s : median time between samples [s].
     """
 
     side: str
@@ -69,6 +77,19 @@ class TorqueChannel:
     flagged: BoolArray
     known: BoolArray
     drive: DriveMotion | None = None
+    period_s: float = float("nan")
+
+    @property
+    def arrays(self) -> tuple[Floats | BoolArray, ...]:
+        """All arrays by sample."""
+        drive = () if self.drive is None else (self.drive.speed, self.drive.acceleration)
+        return (*(getattr(self, name) for name in _SAMPLED), *drive)
+
+    def on(self, arrays: Sequence[NDArray[Any]]) -> TorqueChannel:
+        """The channel with other arrays."""
+        drive = None if self.drive is None else DriveMotion(arrays[len(_SAMPLED)], arrays[len(_SAMPLED) + 1])
+        found: dict[str, Any] = dict(zip(_SAMPLED, arrays, strict=False))
+        return replace(self, **found, drive=drive)
 
     def at(self, samples: NDArray[np.bool_] | NDArray[np.int64]) -> TorqueChannel:
         """The channel at some of its samples."""
@@ -78,10 +99,11 @@ class TorqueChannel:
 
 @dataclass(frozen=True)
 class Passage:
-    """An uninterrupted stretch with the times of its rows.
+    """An uninterrupted stretch with the times of its rows, or a block of it.
 
     rows : (K,) times of the rows [s]; index : (K,) int64, their numbers within the session.
-    joint_valid, motor_valid : (K, J), usable rows.
+    joint_valid, motor_valid : (K, J), usable rows. core : times of the block [s]; its samples overlap those of its
+    neighbours by the reach of the filters. stretch_rows : times of all rows of the stretch.
     """
 
     rows: Floats
@@ -90,6 +112,22 @@ class Passage:
     joint_valid: BoolArray
     motor: TorqueChannel | None
     motor_valid: BoolArray | None
+    core: tuple[float, float] = (-np.inf, np.inf)
+    stretch_rows: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def continues(self) -> bool:
+        """Whether it goes on where the block before ends."""
+        return self.core[0] > -np.inf
+
+    def own(self, times: Floats) -> BoolArray:
+        """Samples (m,) of this block alone."""
+        return np.asarray((times >= self.core[0]) & (times < self.core[1]))
+
+    def release(self) -> None:
+        """Give the memory of its samples back, as far as they are in files."""
+        for channel in (self.joint, self.motor):
+            release(*(() if channel is None else channel.arrays))
 
 
 @dataclass(frozen=True)
@@ -106,7 +144,7 @@ class PreparedSession:
     name: str
     joint_names: tuple[str, ...]
     settings: SignalSettings
-    passages: tuple[Passage, ...]
+    passages: Sequence[Passage]
     row_time_s: float
     period_rows: int | None
     periods: int
@@ -144,11 +182,13 @@ def prepare(
     motor: bool = True,
     log: bool = True,
     advise: bool = True,
+    blocks: bool = False,
 ) -> PreparedSession:
     """Filter and align one session.
 
     motor : False leaves the motor channel aside. log : False keeps warnings to itself. advise : False gives no advice
-    on cut-offs, for those that the data chose.
+    on cut-offs, for those that the data chose. blocks : passages of two minutes at most, with samples beyond their
+    ends for the filters and kept in files, so that the memory does not grow with the session.
 
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
@@ -183,16 +223,25 @@ def prepare(
         )
     old = stale(session.joint) if clock is None else clock.repeated
     bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
-    parts, lost = stretches(times, np.hstack([position, effort]), bad, dt, settings.longest_bridge_s)
+    parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
     windows, periods = _windows(session, times)
     grid, period_rows = _row_grid(windows, periods, settings)
     count, resampled = len(parts), any(part.resampled for part in parts)
     springs = _stiffness(settings, session.joint_names) if sensed else None
-    motions = [_Motion.of(parts.pop(0), effort_flags, times, settings, springs) for _ in range(count)]
-    longest = max(motions, key=lambda motion: len(motion.qd))
-    excitation = excitation_frequency(longest.qd, dt)
+    longest = max(parts, key=lambda part: part.count)
+    spectrum = Excitation(longest.count, dt)
+    motions = _shelved(_filtered(parts, longest, spectrum, effort_flags, times, settings, springs, blocks))
+    release(position, effort)
+    excitation = spectrum.frequency()
+    flagged = {
+        "stale": int(old.sum()),
+        "position_outliers": int(position_flags.sum()),
+        "joint_torque_outliers": int(effort_flags.sum()),
+    }
+    # A tenth of a gigabyte for an hour.
+    del parts, longest, position_flags, effort_flags, old, bad, times
     motor_data = (
         _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
     )
@@ -214,11 +263,7 @@ def prepare(
                 "elastic joints do by one or two at most: the joint torque is late, or the stamps are wrong. It is "
                 "taken as not late; correct the stamps, or state `motor_delay_s`"
             )
-    passages = [
-        passage
-        for motion in motions
-        if (passage := _passage(motion, grid, windows, motor_data, delay, settings)) is not None
-    ]
+    passages = _motors_shelved(_passages(motions, grid, windows, motor_data, delay, settings))
     if not sensed:
         passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
     if not passages:
@@ -236,9 +281,7 @@ def prepare(
     warnings += advised if advise else ()
     counts = {
         "lost": lost,
-        "stale": int(old.sum()),
-        "position_outliers": int(position_flags.sum()),
-        "joint_torque_outliers": int(effort_flags.sum()),
+        **flagged,
         "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
         "stretches": count,
         "resampled": int(resampled),
@@ -273,18 +316,27 @@ def prepare(
 def _mean_torque(passages: list[Passage]) -> tuple[float, ...]:
     sums, count = np.zeros(passages[0].joint.torque.shape[1]), 0
     for passage in passages:
-        inside = (passage.joint.times >= passage.rows[0]) & (passage.joint.times <= passage.rows[-1])
+        times, rows = passage.joint.times, passage.stretch_rows
+        inside = passage.own(times) & (times >= rows[0]) & (times <= rows[-1])
         sums += np.abs(passage.joint.torque[inside]).sum(axis=0)
         count += int(inside.sum())
+        passage.release()
     return tuple((sums / max(count, 1)).tolist())
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """Filtered motion of one stretch and its joint torque."""
+    """Filtered motion of a block of one stretch and its joint torque.
+
+    start, end : times of the whole stretch's first and last sample [s]. low : number of the first sample here. core :
+    times of the block [s].
+    """
 
     start: float
+    end: float
     dt: float
+    low: int
+    core: tuple[float, float]
     q: Floats
     qd: Floats
     qdd: Floats
@@ -297,35 +349,62 @@ class _Motion:
     def of(
         cls,
         part: Stretch,
+        span: tuple[int, int],
+        core: tuple[float, float],
         effort_flags: BoolArray,
         times: Floats,
         settings: SignalSettings,
         stiffness: Floats | None,
     ) -> _Motion:
+        """The samples from span[0] to before span[1], filtered with those around."""
         joints = effort_flags.shape[1]
-        q = low_pass(part.values[:, :joints], part.dt, settings.cutoff, settings.order)
+        around = int(np.ceil((settling(settings.cutoff, settings.order) + settings.reversal) / part.dt)) + 16
+        low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
+        values = part.part(low, high)
+        release(*part.columns)
+        q = low_pass(values[:, :joints], part.dt, settings.cutoff, settings.order)
         qd, qdd = differentiate(q, part.dt)
-        torque = part.values[:, joints:].copy()
-        flagged = np.repeat(part.bridged[:, None], joints, axis=1)
-        grid = part.times
+        torque = values[:, joints:].copy()
+        flagged = np.repeat(part.bridged[low:high, None], joints, axis=1)
+        grid = part.start + part.dt * np.arange(low, high, dtype=np.float64)
         for joint in np.flatnonzero(effort_flags.any(axis=0)):
-            hit = np.rint((times[effort_flags[:, joint]] - part.start) / part.dt).astype(np.int64)
+            hit = np.rint((times[effort_flags[:, joint]] - part.start) / part.dt).astype(np.int64) - low
             spread = np.unique(np.concatenate([hit - 1, hit, hit + 1])) if part.resampled else np.unique(hit)
             flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
             good = ~flagged[:, joint]
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
         away = away_from_reversals(qd, part.dt, settings.reversal, settings.standstill_rad_s)
         drive = None
+        kept = slice(span[0] - low, span[1] - low)
         if stiffness is not None:
             twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
             rate, change = differentiate(twist, part.dt)
-            drive = DriveMotion(qd + rate, qdd + change)
-        return cls(part.start, part.dt, q, qd, qdd, torque, flagged, away, drive)
+            drive = DriveMotion((qd + rate)[kept], (qdd + change)[kept])
+        states = q[kept], qd[kept], qdd[kept], torque[kept]
+        return cls(part.start, part.end, part.dt, span[0], core, *states, flagged[kept], away[kept], drive)
+
+    @property
+    def arrays(self) -> tuple[Floats | BoolArray, ...]:
+        """All arrays by sample."""
+        drive = () if self.drive is None else (self.drive.speed, self.drive.acceleration)
+        return (self.q, self.qd, self.qdd, self.torque, self.flagged, self.away, *drive)
+
+    def on(self, arrays: Sequence[NDArray[Any]]) -> _Motion:
+        """The same with other arrays."""
+        names = ("q", "qd", "qdd", "torque", "flagged", "away")
+        drive = None if self.drive is None else DriveMotion(arrays[6], arrays[7])
+        found: dict[str, Any] = dict(zip(names, arrays, strict=False))
+        return replace(self, **found, drive=drive)
+
+    @property
+    def first(self) -> float:
+        """Time of the first sample here [s]."""
+        return self.start + self.dt * self.low
 
     @property
     def times(self) -> Floats:
         """Sample times (n,) [s]."""
-        return self.start + self.dt * np.arange(len(self.q), dtype=np.float64)
+        return self.start + self.dt * np.arange(self.low, self.low + len(self.q), dtype=np.float64)
 
     @property
     def of_motors(self) -> tuple[Floats, Floats]:
@@ -333,17 +412,17 @@ class _Motion:
         return (self.qd, self.qdd) if self.drive is None else (self.drive.speed, self.drive.acceleration)
 
     def usable(self, settings: SignalSettings) -> tuple[float, float]:
-        """First and last time unaffected by the filter's start and end [s]."""
-        return self.start + settings.edge, self.start + self.dt * (len(self.q) - 1) - settings.edge
+        """First and last time of the stretch unaffected by the filter's start and end [s]."""
+        return self.start + settings.edge, self.end - settings.edge
 
     def channel(self, settings: SignalSettings) -> TorqueChannel:
         """The joint torque channel, without the filter's ends."""
-        cut = int(np.ceil(settings.edge / self.dt))
-        part = slice(cut, len(self.q) - cut)
+        cut, count = int(np.ceil(settings.edge / self.dt)), round((self.end - self.start) / self.dt) + 1
+        part = slice(max(cut - self.low, 0), max(min(count - cut - self.low, len(self.q)), 0))
         flagged = self.flagged[part]
         return TorqueChannel(
             "joint", self.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
-            flagged, self.away[part] & ~flagged,
+            flagged, self.away[part] & ~flagged, period_s=self.dt,
         )  # fmt: skip
 
     def motor_channel(
@@ -355,11 +434,21 @@ class _Motion:
         """
         first, last = self.usable(settings)
         actual = times - delay
-        inside = (actual >= first) & (actual <= last)
-        if inside.sum() < 16:
+        low, high = int(np.searchsorted(actual, first)), int(np.searchsorted(actual, last, side="right"))
+        if high - low < 16:
             return None
+        period = median_step(actual[low:high])
+        # Samples averaged before a low-pass are the same in all blocks.
+        together = thinning(period, settings.decimate)
+        if self.core[0] > -np.inf:
+            since = int(np.searchsorted(actual, self.first)) - low
+            low += max(-(-since // together), 0) * together
+        if self.core[1] < np.inf:
+            until = int(np.searchsorted(actual, self.first + self.dt * (len(self.q) - 1), side="right"))
+            high = min(high, until)
+        inside = slice(low, high)
         actual, flagged = actual[inside], flags[inside]
-        start, dt = self.start, self.dt
+        start, dt = self.first, self.dt
         q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
         at = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
         drive = None
@@ -367,7 +456,92 @@ class _Motion:
             moved = (self.drive.speed, self.drive.acceleration)
             drive = DriveMotion(*(interpolate_uniform(state, start, dt, actual) for state in moved))
         known = self.away[at] & ~flagged
-        return TorqueChannel("motor", actual, q, qd, qdd, torque[inside], flagged, known, drive)
+        return TorqueChannel(
+            "motor", actual, q, qd, qdd, torque[inside], flagged, known, drive, period_s=period
+        )
+
+
+def _filtered(
+    parts: list[Stretch],
+    longest: Stretch,
+    spectrum: Excitation,
+    effort_flags: BoolArray,
+    times: Floats,
+    settings: SignalSettings,
+    stiffness: Floats | None,
+    blocks: bool,
+) -> Iterator[_Motion]:
+    """The motions of all stretches, block after block; the longest one goes into the spectrum."""
+    for part in parts:
+        for span, core in _cut(part, settings, blocks):
+            motion = _Motion.of(part, span, core, effort_flags, times, settings, stiffness)
+            if part is longest:
+                mine = (motion.times >= core[0]) & (motion.times < core[1])
+                spectrum.add(motion.qd[mine])
+            yield motion
+
+
+def _cut(
+    part: Stretch, settings: SignalSettings, blocks: bool
+) -> Iterator[tuple[tuple[int, int], tuple[float, float]]]:
+    """Samples of each block of a stretch, with those in reach of its filters, and its core [s]."""
+    together = thinning(part.dt, settings.decimate)
+    size = max(1, round(_BLOCK_S / part.dt / together)) * together
+    cut = int(np.ceil(settings.edge / part.dt))
+    count = (part.count - 2 * cut) // size
+    if not blocks or count < 2:
+        yield (0, part.count), (-np.inf, np.inf)
+        return
+    delay_hz = min(DELAY_HZ, settings.cutoff)
+    reach_s = max(
+        half_width(settings.decimate, settings.attenuation_db) + settling(2.5 * settings.decimate),
+        half_width(delay_hz, DELAY_DB) + settings.delay_search_s + settling(3.0 * delay_hz),
+    )
+    reach = -(-round((reach_s + 0.5) / part.dt) // together) * together
+    for k in range(count):
+        first, last = cut + k * size, cut + (k + 1) * size
+        low = first - reach if k and first - reach > cut else 0
+        high = last + reach if k < count - 1 and last + reach < part.count - cut else part.count
+        # A core ends between two samples.
+        ends = (part.start + part.dt * (sample - 0.5) for sample in (first, last))
+        begin, end = (
+            edge if inner else limit
+            for edge, inner, limit in zip(ends, (k > 0, k < count - 1), (-np.inf, np.inf), strict=True)
+        )
+        yield (low, high), (begin, end)
+
+
+def _shelved(motions: Iterable[_Motion]) -> list[_Motion]:
+    """The same motions with their arrays in files where they are long."""
+    bare: list[_Motion] = []
+
+    def arrays() -> Iterator[tuple[NDArray[Any], ...]]:
+        for motion in motions:
+            bare.append(motion.on([array[:0].copy() for array in motion.arrays]))
+            yield motion.arrays
+
+    found = shelved(arrays())
+    return [motion.on(arrays) for motion, arrays in zip(bare, found, strict=True)]
+
+
+def _motors_shelved(passages: Iterable[Passage]) -> list[Passage]:
+    """The same passages with the arrays of their motor channels in files where they are long."""
+    bare: list[Passage] = []
+
+    def arrays() -> Iterator[tuple[NDArray[Any], ...]]:
+        for passage in passages:
+            if passage.motor is None:
+                bare.append(passage)
+                continue
+            held = passage.motor.arrays
+            bare.append(replace(passage, motor=passage.motor.on([array[:0].copy() for array in held])))
+            yield held
+
+    found = iter(shelved(arrays()))
+    return [
+        passage if passage.motor is None else replace(passage, motor=passage.motor.on(next(found)))
+        for passage in bare
+    ]
 
 
 def _stiffness(settings: SignalSettings, names: tuple[str, ...]) -> Floats | None:
@@ -380,33 +554,39 @@ def _stiffness(settings: SignalSettings, names: tuple[str, ...]) -> Floats | Non
     return np.array(settings.stiffness_nm_rad)
 
 
-def _passage(
-    motion: _Motion,
+def _passages(
+    motions: Sequence[_Motion],
     grid: Floats,
     windows: list[tuple[float, float]],
     motor_data: tuple[Floats, Floats, BoolArray] | None,
     delay: Delay | None,
     settings: SignalSettings,
-) -> Passage | None:
-    first, last = motion.usable(settings)
+) -> Iterator[Passage]:
     within = np.zeros(len(grid), dtype=bool)
     for low, high in windows:
         within |= (grid >= low - 1e-9) & (grid <= high + 1e-9)
-    inside = within & (grid >= first) & (grid <= last)
-    if not inside.any():
-        return None
-    rows = grid[inside]
-    joint = motion.channel(settings)
-    motor = motor_valid = None
-    if motor_data is not None and delay is not None:
-        motor = motion.motor_channel(*motor_data, delay.seconds, settings)
-        motor_valid = _valid(motor, rows, settings) if motor is not None else None
-    return Passage(rows, np.flatnonzero(inside), joint, _valid(joint, rows, settings), motor, motor_valid)
+    for motion in motions:
+        first, last = motion.usable(settings)
+        whole = within & (grid >= first) & (grid <= last)
+        inside = whole & (grid >= motion.core[0]) & (grid < motion.core[1])
+        if not inside.any():
+            continue
+        rows = grid[inside]
+        joint = motion.channel(settings)
+        motor = motor_valid = None
+        if motor_data is not None and delay is not None:
+            motor = motion.motor_channel(*motor_data, delay.seconds, settings)
+            motor_valid = _valid(motor, rows, settings) if motor is not None else None
+        valid = _valid(joint, rows, settings)
+        release(*motion.arrays)
+        yield Passage(
+            rows, np.flatnonzero(inside), joint, valid, motor, motor_valid, motion.core, grid[whole]
+        )
 
 
 def _valid(channel: TorqueChannel, rows: Floats, settings: SignalSettings) -> BoolArray:
     """Rows (K, J) with enough known samples in their filter; a gap and an end of the stretch are unknown."""
-    factor = thinning(channel.times, settings.decimate)
+    factor = thinning(channel.period_s, settings.decimate)
     times = block_means(channel.times, factor)
     parallel = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db)
     known = parallel.share(block_means(channel.known, factor)) * parallel.coverage()[:, None]
@@ -436,7 +616,7 @@ def _motor(
     effort = session.motor.effort
     flags, crowded = flag_outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
-    effort = effort.copy()
+    effort = effort.copy() if flags.any() else effort
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]
         effort[~good, joint] = np.interp(times[~good], times[good], effort[good, joint])
@@ -464,7 +644,7 @@ def _delay(
     times, torque, _ = motor_data
     data = [
         DelayData(
-            m.times, *m.of_motors, m.torque, m.away & ~m.flagged, times, torque, m.usable(settings)
+            m.times, *m.of_motors, m.torque, m.away & ~m.flagged, times, torque, m.usable(settings), m.core
         )
         for m in motions
     ]  # fmt: skip
@@ -472,7 +652,7 @@ def _delay(
     return estimate_delay(
         data,
         names,
-        cutoff_hz=min(5.0, settings.cutoff, 0.2 * rate),
+        cutoff_hz=min(DELAY_HZ, settings.cutoff, 0.2 * rate),
         search_s=settings.delay_search_s,
     )
 
@@ -484,7 +664,9 @@ def clock_ns(columns: JointColumns) -> NDArray[np.int64]:
 
 def _check_finite(columns: JointColumns, name: str) -> None:
     for what, values in (("position", columns.position), ("effort", columns.effort)):
-        if values.size and not np.all(np.isfinite(values)):
+        whole = all(np.isfinite(values[some]).all() for some in spans(len(values)))
+        release(values)
+        if not whole:
             row, joint = np.argwhere(~np.isfinite(values))[0]
             raise DataError(
                 f"{name}: {columns.topic} {what} of {columns.names[joint]} is {values[row, joint]} at "

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve
@@ -46,6 +47,9 @@ _MOST_ROWS = 800
 _COVERED = 0.9
 
 
+_ARRAYS = ("q", "qd", "qdd", "sign", "coupled", "torque", "slope")
+
+
 @dataclass(frozen=True)
 class SampledRows:
     """Filtered motion and torque of one side of one session at the times of its rows.
@@ -74,8 +78,7 @@ class SampledRows:
 
     def thinned(self, step: int) -> SampledRows:
         """Every `step`-th row."""
-        names = ("q", "qd", "qdd", "sign", "coupled", "torque", "slope")
-        return replace(self, **{name: getattr(self, name)[::step] for name in names})
+        return replace(self, **{name: getattr(self, name)[::step] for name in _ARRAYS})
 
 
 def sampled(
@@ -86,15 +89,27 @@ def sampled(
     for record, session in enumerate(sessions):
         sensed = bool(session.joint.effort.shape[1])
         wanted = replace(signals, motor_delay_s=0.0)
-        whole = prepare(session, wanted, motor=session.motor is not None, log=False)
+        whole = prepare(session, wanted, motor=session.motor is not None, log=False, blocks=True)
+        # Blocks of one stretch, side by side.
+        runs: list[dict[str, list[SampledRows]]] = []
         for passage in whole.passages:
-            channels = [passage.joint if sensed else None, passage.motor]
-            for channel in channels:
+            if not (runs and passage.continues):
+                runs.append({})
+            for channel in (passage.joint if sensed else None, passage.motor):
                 if channel is not None:
-                    found.append(
-                        _rows(channel, passage.rows, record, payload_name(session), signals, couplings)
-                    )
+                    rows = _rows(channel, passage.rows, record, payload_name(session), signals, couplings)
+                    runs[-1].setdefault(channel.side, []).append(rows)
+            passage.release()
+        found += [_joined(parts) for run in runs for parts in run.values()]
     return [rows for rows in found if len(rows.q)]
+
+
+def _joined(parts: Sequence[SampledRows]) -> SampledRows:
+    """The rows of several blocks as one."""
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS
+    }
+    return replace(parts[0], **arrays)
 
 
 def _rows(
@@ -105,7 +120,7 @@ def _rows(
     signals: SignalSettings,
     couplings: Sequence[tuple[int, int]],
 ) -> SampledRows:
-    factor = thinning(channel.times, signals.decimate)
+    factor = thinning(channel.period_s, signals.decimate)
     times, torque = block_means(channel.times, factor), block_means(channel.torque, factor)
     step = 0.04 / signals.decimate
 

@@ -37,6 +37,7 @@ from lwr_driver.session.session import (
     stamp,
     summarise,
 )
+from lwr_driver.session.spool import Growing, release, spans
 
 SCHEMA_VERSION = "1"
 _FIELDS = ("position", "velocity", "effort")
@@ -273,7 +274,7 @@ class _JointTopic:
     names: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
     layouts: dict[int, list[tuple[Layout, list[int] | None]]] = field(default_factory=dict)
-    parts: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    parts: dict[str, Growing] = field(default_factory=dict)
     unstamped: tuple[int, int] | None = None
 
     def take(self, block: Block, rows: NDArray[np.int64]) -> None:
@@ -324,7 +325,7 @@ class _JointTopic:
             **values,
         }
         for name, part in columns_.items():
-            self.parts.setdefault(name, []).append(part)
+            self.parts.setdefault(name, Growing()).append(part)
 
     def _learn(self, block: Block, row: int) -> tuple[Layout, list[int] | None]:
         """Layout of a message, and the columns of our joints in it; None if in our order."""
@@ -360,8 +361,8 @@ class _JointTopic:
         """All samples, after checks."""
         if not self.parts:
             return None
-        count = sum(map(len, self.parts["log_time"]))
-        joined = {name: np.concatenate(parts) for name, parts in self.parts.items()}
+        count = len(self.parts["log_time"])
+        joined = {name: parts.array() for name, parts in self.parts.items()}
         self.parts = {}
         for name in _FIELDS:
             if name in joined:
@@ -384,12 +385,16 @@ class _JointTopic:
         return columns
 
     def _check_finite(self, name: str, values: NDArray[np.float64], log_time: NDArray[np.int64]) -> None:
-        finite = np.isfinite(values)
-        if not finite.all():
-            row, column = np.argwhere(~finite)[0].tolist()
+        wrong = [
+            np.argwhere(~np.isfinite(values[some])) + np.array([some.start, 0]) for some in spans(len(values))
+        ]
+        release(values)
+        bad = np.concatenate(wrong) if wrong else np.zeros((0, 2))
+        if len(bad):
+            row, column = bad[0].tolist()
             raise DataError(
                 f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: `{name}` of joint "
-                f"{self.names[column]} is {values[row, column]} ({int((~finite).sum())} such values); "
+                f"{self.names[column]} is {values[row, column]} ({len(bad)} such values); "
                 "it must be finite"
             )
 

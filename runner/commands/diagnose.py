@@ -98,8 +98,8 @@ def command(
     replaceable(out)
     status = StatusLine()
     status.show("diagnosing model errors")
-    logs = [read_recording(path) for path in sessions]
-    held = [read_recording(path) for path in test]
+    logs = [read_recording(path, status=False) for path in sessions]
+    held = [read_recording(path, status=False) for path in test]
     chain = chain_of(logs, urdf)
     known = known_arm(arm, chain)
     pairs = [(asked(a, chain.joint_names), asked(b, chain.joint_names)) for a, b in compare]

@@ -61,7 +61,7 @@ def validate_command(
     from runner.estimation import IdentifySettings
 
     tested = read_model(model)
-    logs = [read_recording(path) for path in sessions]
+    logs = [read_recording(path, status=False) for path in sessions]
     signals = None if settings is None else IdentifySettings.load(settings).signals
     if estimate_delay:
         signals = signals_for(tested, signals, estimate_delay=True)

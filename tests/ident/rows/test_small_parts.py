@@ -20,6 +20,7 @@ from ident.rows.filters import (
     half_width,
     interpolate_uniform,
     low_pass,
+    median_step,
     moving,
     thinning,
 )
@@ -80,9 +81,9 @@ def test_a_low_pass_of_a_short_series_is_padded_by_what_there_is():
 
 
 def test_thinning_leaves_forty_samples_a_period():
-    assert thinning(np.arange(100) * 0.001, 2.0) == 12
-    assert thinning(np.arange(100) * 0.1, 2.0) == 1
-    assert (thinning(np.zeros(1), 2.0), thinning(np.array([0.0, 0.001]), 2.0)) == (1, 12)
+    assert thinning(median_step(np.arange(100) * 0.001), 2.0) == 12
+    assert thinning(median_step(np.arange(100) * 0.1), 2.0) == 1
+    assert (thinning(median_step(np.zeros(1)), 2.0), thinning(0.001, 2.0)) == (1, 12)
 
 
 def test_means_of_blocks_and_bins_leave_the_rest_out():

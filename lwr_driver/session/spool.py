@@ -1,0 +1,194 @@
+"""Long arrays in unnamed files of the temporary folder, so that memory holds a part of them at a time.
+
+The positions of an hour at 1 kHz have 200 MB. Their pages come into memory where they are read; `release` gives them
+back, and so does a thread beyond 64 MB in all. Files have no name, so the system removes them with the last array, or
+with the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+import os
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEAST_BYTES = 4 * 2**20
+"""Smaller arrays stay in memory."""
+_SMALL_BYTES, _ARENA_BYTES = 2**16, 2**28
+_MOST_BYTES = 64 * 2**20
+_EVERY_S = 0.01
+_M_MMAP_THRESHOLD = -3
+_page = mmap.PAGESIZE
+_open: weakref.WeakSet[Any] = weakref.WeakSet()
+_watch: threading.Thread | None = None
+_starting = threading.Lock()
+
+
+class Growing:
+    """Rows appended part by part: in memory while they are few, then in a file."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[Any]] = []
+        self._bytes = 0
+        self._file: Any = None
+        self._rows = 0
+
+    def append(self, part: NDArray[Any]) -> None:
+        """Further rows, of the shape and type of the first."""
+        if not len(part) and self._parts:
+            return
+        self._parts.append(part)
+        self._bytes += part.nbytes
+        self._rows += len(part)
+        if self._bytes >= LEAST_BYTES:
+            self._flush()
+
+    def array(self) -> NDArray[Any]:
+        """All rows; none may follow."""
+        if self._file is None:
+            return self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts)
+        self._flush()
+        self._file.flush()
+        last = self._parts[-1]
+        found = np.memmap(self._file, last.dtype, "r", shape=(self._rows, *last.shape[1:]))
+        self._file.close()
+        array = np.asarray(found)
+        _watched(mapping(array))
+        return array
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def _flush(self) -> None:
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="lwr-")  # noqa: SIM115
+        for part in self._parts:
+            self._file.write(np.ascontiguousarray(part).data)
+        self._parts, self._bytes = [self._parts[-1][:0].copy()], 0
+
+
+class Arena:
+    """Arrays of any shape kept in files, one after the other; they go with the last of them."""
+
+    def __init__(self) -> None:
+        self._held: mmap.mmap | None = None
+        self._used = 0
+
+    def keep(self, array: NDArray[Any]) -> NDArray[Any]:
+        """The same array in a file; a small one as it is."""
+        if array.nbytes < _SMALL_BYTES:
+            return array
+        if self._held is None or self._used + array.nbytes > len(self._held):
+            size = max(_ARENA_BYTES, array.nbytes)
+            with tempfile.TemporaryFile(prefix="lwr-") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+                self._held, self._used = mmap.mmap(file.fileno(), size), 0
+            _watched(self._held)
+        kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
+        kept[...] = array
+        self._used += -(-array.nbytes // 64) * 64
+        return kept
+
+
+def shelved(groups: Iterable[Sequence[NDArray[Any]]]) -> list[list[NDArray[Any]]]:
+    """The same groups of arrays, the first arrays of all groups in one file, the second in another, and so on."""
+    shelves: list[Growing] = []
+    counts = []
+    for group in groups:
+        shelves = shelves or [Growing() for _ in group]
+        for shelf, array in zip(shelves, group, strict=True):
+            shelf.append(array)
+        counts.append(len(group[0]))
+    whole = [shelf.array() for shelf in shelves]
+    ends = [0, *accumulate(counts)]
+    return [[array[a:b] for array in whole] for a, b in pairwise(ends)]
+
+
+def release(*arrays: NDArray[Any] | None) -> None:
+    """Give the memory of arrays in files back; their content stays. Arrays in memory are left alone."""
+    for array in arrays:
+        held = mapping(array)
+        if held is not None:
+            held.madvise(mmap.MADV_DONTNEED)
+
+
+def column(array: NDArray[Any], number: int) -> NDArray[Any]:
+    """A copy (n,) of one column of (n, k), with little of the rest in memory."""
+    found = np.empty(len(array), array.dtype)
+    for some in spans(len(array)):
+        found[some] = array[some, number]
+        release(array)
+    return found
+
+
+def mapping(array: Any) -> mmap.mmap | None:
+    """The file behind an array or a view of it, None for one in memory."""
+    while array is not None and not isinstance(array, mmap.mmap):
+        array = getattr(array, "base", None)
+    return array
+
+
+def stored(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    """The rows of all parts as one array: in memory if it is small, else in a file, read-only."""
+    rows = Growing()
+    for part in parts:
+        rows.append(part)
+    return rows.array()
+
+
+def _watched(held: mmap.mmap | None) -> None:
+    """Bound the memory of all open files: a thread gives pages back, whoever reads them comes by them again."""
+    global _watch
+    if held is None or not Path("/proc/self/statm").exists():
+        return
+    with _starting:
+        _open.add(held)
+        if _watch is None:
+            _return_blocks()
+        if _watch is None or not _watch.is_alive():
+            _watch = threading.Thread(target=_bound, name="long arrays", daemon=True)
+            _watch.start()
+
+
+def _return_blocks() -> None:
+    """Let the C library give every array of a few MB back when it is freed, as it does by default for 32 MB."""
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 4 * 2**20)
+        library.malloc_trim(0)
+
+
+def _bound() -> None:
+    start = _in_files()
+    while True:
+        time.sleep(_EVERY_S)
+        with _starting:
+            held = list(_open)
+            if not held:
+                break
+        if _in_files() > start + _MOST_BYTES:
+            for one in held:
+                one.madvise(mmap.MADV_DONTNEED)
+            start = min(start, _in_files())
+        del held
+
+
+def _in_files() -> int:
+    """Bytes of this process in files, programs and libraries included."""
+    return int(Path("/proc/self/statm").read_text().split()[2]) * _page
+
+
+def spans(count: int, size: int = 2**16) -> Iterator[slice]:
+    """Slices of `size` rows, the last one shorter."""
+    return (slice(first, min(first + size, count)) for first in range(0, count, size))
