@@ -19,7 +19,7 @@ from scipy.ndimage import correlate1d
 from fri.errors import ConfigurationError
 from fri.quantities import within
 from ident.dynamics.parameters import Floats
-from ident.rows.butterworth import forward_and_back, sections
+from ident.rows.butterworth import forward_and_back, sections, spectrum
 
 # The paper's filters, section 5, and a time beside reversals that covers the turning of a strain-wave drive.
 CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
@@ -351,7 +351,8 @@ class Excitation:
         whole = (len(rest) - self._segment) // step + 1 if len(rest) >= self._segment else 0
         if whole:
             used = rest[: (whole - 1) * step + self._segment]
-            self._frequency, power = spectrum(used, self._dt, self._segment)
+            found = [spectrum(column, self._dt, self._segment) for column in used.T]
+            self._frequency, power = found[0][0], np.stack([each for _, each in found], axis=1)
             self._power = self._power + whole * power
         self._rest = np.array(rest[whole * step :])
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
-from runner.output import OUTPUT_FOLDER
+from runner.output import NEW_FOLDER
 from runner.terminal import json_option, to_json, verb
 
 
 @verb("example")
 @click.argument("name", required=False)
 @click.option("--list", "listing", is_flag=True, help="List the recordings, with source and licence.")
-@click.option("--out", type=OUTPUT_FOLDER, help="Folder of the files; default: ./NAME.")
+@click.option("--out", type=NEW_FOLDER, help="Folder of the files; default: ./NAME.")
 @click.option("--mirror", help="Folder or URL with the same files, in place of the source.")
 @json_option
 def command(name: str | None, listing: bool, out: Path | None, mirror: str | None, as_json: bool) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from runner.output import NEW_FOLDER, OUTPUT_FILE
-from runner.terminal import GroupedCommand, json_option, to_json
+from runner.terminal import PATH, GroupedCommand, json_option, to_json
 
 _STORE = click.option(
     "--store",
@@ -29,9 +29,7 @@ _STORE = click.option(
         "Computers": ("jobs", "dask"),
     },
 )
-@click.argument(
-    "places", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True), metavar="FOLDER..."
-)
+@click.argument("places", nargs=-1, required=True, type=PATH, metavar="FOLDER...")
 @_STORE
 @click.option(
     "--diagnose",

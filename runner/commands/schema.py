@@ -8,7 +8,7 @@ import click
 
 from fri.errors import ConfigurationError
 from runner.output import OUTPUT_FILE
-from runner.terminal import json_option, to_json, verb
+from runner.terminal import PATH, json_option, to_json, verb
 
 
 @verb("schema")
@@ -18,11 +18,11 @@ from runner.terminal import json_option, to_json, verb
     "--refer",
     "files",
     multiple=True,
-    type=click.Path(dir_okay=False),
+    type=PATH,
     help="Let this YAML file refer to its schema, so that an editor finds it; may be repeated.",
 )
 @json_option
-def command(name: str | None, out: Path | None, files: tuple[str, ...], as_json: bool) -> None:
+def command(name: str | None, out: Path | None, files: tuple[Path, ...], as_json: bool) -> None:
     """Print the JSON Schema of a kind of file; without NAME list the kinds.
 
     An editor with a YAML language server completes keys and marks errors. Templates refer to their schemas; a
@@ -40,7 +40,7 @@ def command(name: str | None, out: Path | None, files: tuple[str, ...], as_json:
 
     if out is not None and name is None:
         raise ConfigurationError(f"--out {out} needs the NAME of a schema: {', '.join(FILES)}")
-    done = {file: refer(Path(file), name) for file in files}
+    done = {str(file): refer(file, name) for file in files}
     if done:
         lines = "\n".join(f"{file} refers to {target}" for file, target in done.items())
         click.echo(to_json({"files": done}) if as_json else lines)

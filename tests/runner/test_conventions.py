@@ -41,12 +41,14 @@ MISSING = (
     "commission --experiment none.yaml --out m.yaml",
     "diagnose none.mcap --out d",
     "compare none.yaml none.yaml",
+    "batch none",
     "payload none.yaml none.mcap",
     "export none.yaml m.urdf",
     "info none.mcap",
     "recover none.mcap",
     "attach none.mcap none.csv --force",
     "import none.yaml none.csv m.mcap",
+    "schema --refer none.yaml",
 )
 
 
@@ -75,7 +77,7 @@ def test_a_missing_file_is_code_2_and_json_says_so(
 
 def test_every_command_with_an_input_was_tried() -> None:
     tried = {line.split()[0] for line in MISSING}
-    assert set(VERBS) - tried == {"init", "completion"}
+    assert set(VERBS) - tried == {"init", "completion", "example", "trend"}
 
 
 def test_a_near_name_of_a_missing_file_is_suggested(tmp_path: Path) -> None:
@@ -116,6 +118,8 @@ REPLACING = (
     "diagnose none.mcap --out {}/..",
     "report . --figures {}/..",
     "init {}/..",
+    "schema none --out {}",
+    "trend --store none --out {}",
 )
 
 
