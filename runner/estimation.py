@@ -148,6 +148,22 @@ def announced(sessions: Sequence[Session], payloads: Sequence[str]) -> list[Sess
     return corrected
 
 
+def known_from(
+    sessions: Sequence[Session], chain: Chain, wanted: IdentificationSettings, model: int | None = None
+) -> IdentificationSettings:
+    """The settings with what is known of the arm: the stiffness of its file; Model 1 without motor torques.
+
+    model : as asked for, None for none.
+    """
+    if model is None and all(session.motor is None for session in sessions):
+        wanted = dataclasses.replace(wanted, model=1)
+    arm = known_arm(None, chain)
+    if arm is None or wanted.signals.stiffness_nm_rad is not None:
+        return wanted
+    signals = dataclasses.replace(wanted.signals, stiffness_nm_rad=tuple(arm.stiffness.tolist()))
+    return dataclasses.replace(wanted, signals=signals)
+
+
 def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None = None) -> DynamicModel:
     """The identified model with the name of the robot, and this software in its provenance.
 

@@ -269,6 +269,20 @@ class Experiment:
         vars(experiment).update(source=path, folder=folder, text=read_text(path))
         return experiment
 
+    @classmethod
+    def commanded(cls, name: str | Path, *, implied: bool) -> Experiment:
+        """As `load`, for a command that moves the arm. implied : nobody named the file.
+
+        ConfigurationError for a real arm by an implied file: whoever forgot the name may be in the wrong folder.
+        """
+        experiment = cls.load(name)
+        if implied and experiment.backend == "fri":
+            raise ConfigurationError(
+                f"{experiment.source} moves a real arm, and was taken because it lies in this folder; name it on the "
+                f"command line to move the arm: {Path(name).name}"
+            )
+        return experiment
+
     def changed(self, *, sealed: bool | None = None, **values: Any) -> Experiment:
         """The same experiment and file with other values of some keys."""
         other = dataclasses.replace(self, **values)

@@ -60,12 +60,21 @@ NAMED_FILE = click.Path()
 
 
 def default_file() -> str:
-    """The `experiment.yaml` of a laboratory in the working folder, else the default one, on the emulator."""
+    """The `experiment.yaml` of a laboratory in the working folder, else the default one, on the emulator.
+
+    A real arm is not moved by a file that nobody named: see `commanded`.
+    """
     here = Path("experiment.yaml")
     # A folder of results has one too: it is a record, not a laboratory.
     if here.is_file() and not Path("progress.json").exists():
         return str(here)
     return str(CONFIGS / "experiments/default.yaml")
+
+
+def implied(argument: str = "file") -> bool:
+    """Whether nobody named the file of the present command."""
+    source = click.get_current_context().get_parameter_source(argument)
+    return source is None or source.name in ("DEFAULT", "DEFAULT_MAP")
 
 
 def verbosity() -> int:

@@ -37,7 +37,7 @@ _FIRST_SEED = 1001
     "--experiment",
     "file",
     type=NAMED_FILE,
-    help="Experiment whose sessions are recorded; default: on the built-in emulator.",
+    help="Experiment whose sessions are recorded; default: experiment.yaml here, else on the emulator.",
 )
 @click.option(
     "--sets",
@@ -103,7 +103,7 @@ def command(
         size = len(sessions) // count
         paths = [list(sessions[k : k + size]) for k in range(0, len(sessions), size)]
     else:
-        experiment = Experiment.load(file if file is not None else default_file())
+        experiment = Experiment.commanded(file or default_file(), implied=file is None)
         folder, count = out.with_name(f"{out.stem}_sessions"), sets or _RECORDED_SETS
         folder.mkdir(parents=True, exist_ok=True)
         click.get_current_context().with_resource(locked(folder))

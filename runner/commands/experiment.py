@@ -86,7 +86,8 @@ def command(
     again, estimates the model, and diagnoses its errors. Ends with the verdict, its numbers, and the command that
     opens the report; report.txt and --verbose have the tables.
 
-    Without FILE it takes the experiment.yaml of `lwr-run init` in this folder, else the default experiment.
+    Without FILE it takes the experiment.yaml of `lwr-run init` in this folder, if that is on the emulator, else the
+    default experiment. A real arm is moved by a FILE that you name alone.
 
     Ctrl-C once stops the arm within its limits, twice drops the link.
 
@@ -250,7 +251,7 @@ def _begin(
         experiment, remarks = go_on(resume.resolve(), rounds=rounds)
         _tell_files(status, resume, remarks)
         return experiment, resume
-    experiment = Experiment.load(file if file is not None else default_file())
+    experiment = Experiment.commanded(file or default_file(), implied=file is None)
     if hide is not None:
         from runner.hiding.effect import emulated_arm
 

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from runner.output import NEW_FOLDER, OUTPUT_FILE
-from runner.terminal import PATH, GroupedCommand, json_option, to_json
+from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_option, to_json
 
 _STORE = click.option(
     "--store",
@@ -45,7 +45,7 @@ _STORE = click.option(
     show_default=True,
     help="First days of each arm for its healthy-arm baseline.",
 )
-@click.option("--settings", metavar="FILE", help="As of `lwr-run identify`.")
+@click.option("--settings", type=NAMED_FILE, metavar="FILE", help="As of `lwr-run identify`.")
 @click.option(
     "--jobs", type=click.IntRange(-1, 1024), default=1, show_default=True, help="Processes; -1: one a core."
 )
@@ -75,13 +75,13 @@ def batch_command(
     from fri.errors import DataError
     from runner.estimation import IdentifySettings
     from runner.fleet import FleetStore, Order, Progress, find_days, run_batch
-    from runner.fleet.store import parquet
 
-    parquet()
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
     wanted = replace(read.identification(2, "wls", file=settings or ""), essential=None)
+    # A cluster's processes have other working folders.
+    store = store.resolve()
     home = FleetStore(store)
-    found = find_days(places, home.uids())
+    found = find_days([place.resolve() for place in places], home.uids())
     for path, reason in found.unreadable:
         click.echo(f"{path}: left out: {reason}", err=True)
     for path in found.repeated:
@@ -99,17 +99,15 @@ def batch_command(
         done = run_batch(home, found.days, order, report)
     failed = [one for one in done if one.error]
     if as_json:
-        click.echo(
-            to_json(
-                {
-                    "schema_version": 1,
-                    "days": len(found.days),
-                    "known": found.known,
-                    "done": [one.__dict__ for one in done],
-                    "unreadable": [[str(path), reason] for path, reason in found.unreadable],
-                    "repeated": [str(path) for path in found.repeated],
-                }
-            )
+        hold_json(
+            {
+                "schema_version": 1,
+                "days": len(found.days),
+                "known": found.known,
+                "done": [one.__dict__ for one in done],
+                "unreadable": [[str(path), reason] for path, reason in found.unreadable],
+                "repeated": [str(path) for path in found.repeated],
+            }
         )
     else:
         click.echo(
@@ -136,7 +134,9 @@ def _cluster(address: str | None) -> Any:
 
 @click.command("trend", cls=GroupedCommand, groups={"Results": ("store", "out")})
 @click.argument("arm", required=False)
-@_STORE
+@click.option(
+    "--store", type=PATH, default=Path("fleet"), show_default=True, help="Folder of `lwr-run batch`."
+)
 @click.option("--out", type=OUTPUT_FILE, help="Page to write, e.g. trend.html.")
 @json_option
 def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool) -> None:
@@ -151,7 +151,8 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
     """
     from fri.errors import DataError
     from runner.fleet import FleetStore, fleet_trend
-    from runner.fleet.page import arm_html, fleet_html, write_page
+    from runner.fleet.page import arm_html, fleet_html
+    from runner.report.page import write_page
 
     home = FleetStore(store)
     if not home.arms():

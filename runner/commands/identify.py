@@ -139,7 +139,7 @@ def command(
         IdentifySettings,
         announced,
         couplings,
-        known_arm,
+        known_from,
         named_model,
         recorded_couplings,
     )
@@ -157,16 +157,11 @@ def command(
     status = StatusLine()
     logs = read_recordings((*sessions, *test), urdf=urdf, folder=folder, base=base, tip=tip, **known)
     logs = announced(logs, payload)
-    if model is None and all(log.motor is None for log in logs):
-        wanted = replace(wanted, model=1)
     if not wanted.couplings:
         wanted = replace(wanted, couplings=couplings(recorded_couplings(logs)))
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     chain = session_chain(logs[0], urdf, base=base, tip=tip)
-    arm = known_arm(None, chain)
-    if arm is not None and wanted.signals.stiffness_nm_rad is None:
-        stiffness = tuple(arm.stiffness.tolist())
-        wanted = replace(wanted, signals=replace(wanted.signals, stiffness_nm_rad=stiffness))
+    wanted = known_from(logs, chain, wanted, model)
     mounting = None
     status.show("estimating the model")
     if estimator == AUTO:

@@ -13,7 +13,7 @@ import click
 from fri.errors import ConfigurationError, OperatorError
 from runner.output import NEW_FILE, check_folder
 from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, PATH, ask, default_file, json_option, to_json, verb
+from runner.terminal import NAMED_FILE, PATH, ask, default_file, implied, json_option, to_json, verb
 
 if TYPE_CHECKING:
     from runner.experiment_file import Experiment
@@ -69,7 +69,7 @@ def _run(order: _Order, work: Callable[[Steps, Path], Step]) -> Step:
     from runner.steps import Steps
 
     path = _log(order)
-    experiment = Experiment.load(order.file)
+    experiment = Experiment.commanded(order.file, implied=order.name != "record" and implied())
     payload = _payload(experiment, order.payload)
     status = StatusLine()
     if order.question and experiment.backend == "fri" and not order.yes:

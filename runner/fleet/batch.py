@@ -24,7 +24,8 @@ from ident.estimators.least_squares import factor_of
 from ident.model.model_file import read_model, write_model
 from ident.model.signals import signal_settings
 from lwr_driver.session import Session, read_session
-from runner.diagnosis import arm_data, known_arm
+from runner.diagnosis import arm_data
+from runner.estimation import known_arm, known_from
 from runner.fleet.days import ArmDay
 from runner.fleet.store import ArmStore, FleetStore, Row
 from runner.fleet.together import write_together
@@ -55,7 +56,7 @@ class Progress:
 
     arm: str
     day: str
-    what: Literal["identified", "diagnosed"]
+    what: Literal["identified", "diagnosed", "joined"]
     error: str = ""
 
 
@@ -71,18 +72,20 @@ def run_batch(
             done.append(one)
 
     days = [_next_part(store, day) for day in days]
-    without = {day.arm for day in days if not ArmStore(store.folder / day.arm).model.is_file()}
-    first = {arm: min(d.key for d in days if d.arm == arm) for arm in without}
-    opening = [day for day in days if first.get(day.arm) == day.key]
-    take(_parallel([(_identified, (store.folder, day, order)) for day in opening], order.jobs))
-    rest = [day for day in days if day not in opening]
+    rest = list(days)
+    while opening := _opening(store, rest):
+        take(_parallel([(_identified, (store.folder, day, order)) for day in opening], order.jobs))
+        rest = [day for day in rest if day not in opening]
     take(_parallel([(_identified, (store.folder, day, order)) for day in rest], order.jobs))
     touched = sorted({day.arm for day in days})
     usual = usual_scatter(store)
     if order.diagnose != "none":
         take(_parallel([(_diagnosed_arm, (store.folder, arm, order, usual)) for arm in touched], order.jobs))
     for arm in touched:
-        write_together(ArmStore(store.folder / arm), usual)
+        try:
+            write_together(ArmStore(store.folder / arm), usual)
+        except (LwrError, OSError, ValueError) as error:
+            take([Progress(arm, "", "joined", _words(error))])
     return done
 
 
@@ -101,8 +104,20 @@ def _parallel(
         yield from progress
 
 
+def _opening(store: FleetStore, days: Sequence[ArmDay]) -> list[ArmDay]:
+    """The first of the days of each arm without a model: its signal settings hold for all others."""
+    first: dict[str, ArmDay] = {}
+    for day in sorted(days, key=lambda day: day.key):
+        if not ArmStore(store.folder / day.arm).model.is_file():
+            first.setdefault(day.arm, day)
+    return list(first.values())
+
+
 def _next_part(store: FleetStore, day: ArmDay) -> ArmDay:
-    taken = set(ArmStore(store.folder / day.arm).days())
+    # The files of a failed day are written anew.
+    taken = {
+        row["key"] for row in ArmStore(store.folder / day.arm).read("sessions") if row["status"] == "taken"
+    }
     while day.key in taken:
         day = replace(day, part=day.part + 1)
     return day
@@ -143,7 +158,7 @@ def _read(day: ArmDay) -> tuple[list[Session | None], list[dict[str, Any]]]:
             if end not in ("success", ""):
                 row |= {"status": "left out", "note": f"the session ended with {end}"}
                 session = None
-        except (LwrError, OSError, ValueError) as error:
+        except Exception as error:
             row |= {"status": "unreadable", "note": _words(error)}
         sessions.append(session)
         rows.append(row)
@@ -151,10 +166,8 @@ def _read(day: ArmDay) -> tuple[list[Session | None], list[dict[str, Any]]]:
 
 
 def _identification(store: ArmStore, sessions: Sequence[Session], order: Order) -> Identification:
-    settings = order.settings
     chain = session_chain(sessions[0])
-    if all(session.motor is None for session in sessions):
-        settings = replace(settings, model=1)
+    settings = known_from(sessions, chain, order.settings)
     if store.model.is_file():
         model = read_model(store.model)
         signals = signal_settings(model)
@@ -166,11 +179,6 @@ def _identification(store: ArmStore, sessions: Sequence[Session], order: Order) 
                 coulomb=model.structure.coulomb,
                 row_coulomb=model.structure.coulomb,
             )
-    else:
-        arm = known_arm(None, chain)
-        if arm is not None and settings.signals.stiffness_nm_rad is None:
-            stiffness = tuple(arm.stiffness.tolist())
-            settings = replace(settings, signals=replace(settings.signals, stiffness_nm_rad=stiffness))
     return identify(sessions, chain, settings)
 
 
@@ -204,6 +212,14 @@ def _diagnosed_arm(folder: Path, arm: str, order: Order, usual: Mapping[str, flo
     """The diagnoses that an arm's days ask for."""
     logging.getLogger("ident").setLevel(logging.ERROR)
     store = ArmStore(folder / arm)
+    try:
+        return _diagnoses(store, order, usual)
+    except Exception as failure:
+        return [Progress(arm, "", "diagnosed", _words(failure))]
+
+
+def _diagnoses(store: ArmStore, order: Order, usual: Mapping[str, float]) -> list[Progress]:
+    arm = store.name
     sessions: dict[str, list[Path]] = {}
     for row in store.read("sessions"):
         if row["status"] == "taken":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -55,8 +55,9 @@ class Found:
 def find_days(places: Iterable[Path], known: Collection[str] = ()) -> Found:
     """Logs under the folders and files of `places`, by arm and day, without those with a `known` uid.
 
-    The arm is robot and serial number of the log; without a number, the folder below the given one, or the folder's
-    name. The day is a date such as 2026-03-12 in the path, the deepest one; else the log's own.
+    The arm is robot and serial number of the log; without a number, the first folder from the given one on
+    without a date in its name. The day is a date such as 2026-03-12 in the path from the given folder on, the deepest
+    one; else the log's own.
     DataError where there is no log at all.
     """
     groups: dict[tuple[str, date], list[Log]] = {}
@@ -67,7 +68,7 @@ def find_days(places: Iterable[Path], known: Collection[str] = ()) -> Found:
     for path, root in logs:
         try:
             log, arm, day = _head(path, root)
-        except (LwrError, OSError) as error:
+        except (LwrError, OSError, ValueError) as error:
             unreadable.append((path, str(error)))
             continue
         if log.uid in seen:
@@ -96,14 +97,18 @@ def _head(path: Path, root: Path) -> tuple[Log, str, date]:
     metadata = next((values for name, values in scan.metadata if name == "session"), {})
     robot, serial = metadata.get("robot", "") or "arm", metadata.get("serial", "")
     inner = path.relative_to(root).parts[:-1] if path != root else ()
-    folders = [part for part in inner if not _ISO_DAY.search(part)]
-    own = serial or (folders[0] if folders else "" if root.is_file() else root.resolve().name)
+    outer = path.resolve().parents if root.is_file() else (root.resolve(), *root.resolve().parents)
+    folders = (part for part in (*inner, *(folder.name for folder in outer)) if not _ISO_DAY.search(part))
+    own = serial or next(folders, "")
     arm = _UNSAFE.sub("_", f"{robot} {own}".strip())
-    return Log(path, metadata.get("uid") or _hash(path)), arm, _day(path, metadata, int(first.log_time[0]))
+    dated = (
+        (root.resolve().name, *path.relative_to(root).parts) if path != root else path.resolve().parts[-3:]
+    )
+    return Log(path, metadata.get("uid") or _hash(path)), arm, _day(dated, metadata, int(first.log_time[0]))
 
 
-def _day(path: Path, metadata: dict[str, str], first_ns: int) -> date:
-    for part in reversed(path.resolve().parts):
+def _day(dated: Sequence[str], metadata: dict[str, str], first_ns: int) -> date:
+    for part in reversed(dated):
         for text in reversed(_ISO_DAY.findall(part)):
             try:
                 return date.fromisoformat(text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from html import escape
-from pathlib import Path
 
 import numpy as np
 
@@ -90,14 +89,6 @@ def fleet_html(fleet: FleetTrend) -> str:
         [("arms", "Arms"), ("unlike", "Unlike the others")],
         str(versions()["software"]),
     )
-
-
-def write_page(text: str, path: Path) -> Path:
-    """Write a page, whole or not at all."""
-    draft = path.with_suffix(".part")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
-    return path
 
 
 def _verdict(trend: ArmTrend) -> tuple[Level, str]:

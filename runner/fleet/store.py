@@ -25,7 +25,6 @@ import numpy as np
 
 from fri.errors import ConfigurationError, DataError
 from ident.estimators.problem import TriangularFactor
-from lwr_driver.notebook import optional
 
 TABLES: Mapping[str, Sequence[tuple[str, str]]] = {
     "parameters": (("name", "string"), ("unit", "string"), ("value", "float64"), ("std", "float64")),
@@ -54,13 +53,6 @@ TABLES: Mapping[str, Sequence[tuple[str, str]]] = {
 """Columns of each table with their types, after `arm`, `day` and `part`."""
 
 Row = Mapping[str, Any]
-
-_WANTED = "a store of a fleet", "`lwr-run identify` for each day"
-
-
-def parquet() -> Any:
-    """`pyarrow.parquet`. ConfigurationError with advice without pyarrow."""
-    return optional("pyarrow.parquet", *_WANTED)
 
 
 @dataclass(frozen=True)
@@ -95,7 +87,9 @@ class ArmStore:
 
     def write(self, key: str, table: str, rows: Sequence[Row]) -> None:
         """Write a day's rows of a table, whole or not at all."""
-        pyarrow = optional("pyarrow", *_WANTED)
+        import pyarrow
+        import pyarrow.parquet
+
         day, _, part = key.partition("_")
         kinds = {"string": pyarrow.string(), "float64": pyarrow.float64(), "int64": pyarrow.int64()}
         columns = {
@@ -108,15 +102,17 @@ class ArmStore:
         target = self.folder / table / f"{key}.parquet"
         target.parent.mkdir(parents=True, exist_ok=True)
         draft = target.with_suffix(".part")
-        parquet().write_table(pyarrow.table(columns), draft)
+        pyarrow.parquet.write_table(pyarrow.table(columns), draft)
         draft.replace(target)
 
     def read(self, table: str) -> list[dict[str, Any]]:
         """All rows of a table, by day. `key` : of the day."""
+        import pyarrow.parquet
+
         rows: list[dict[str, Any]] = []
         for path in sorted((self.folder / table).glob("*.parquet")):
             try:
-                found = parquet().read_table(path).to_pylist()
+                found = pyarrow.parquet.read_table(path).to_pylist()
             except (OSError, ValueError) as error:
                 raise DataError(
                     f"{path} cannot be read: {error}; remove the day's files, and `lwr-run batch` makes them again"
@@ -162,5 +158,6 @@ class FleetStore:
         return found[name]
 
     def uids(self) -> set[str]:
-        """Identities of all logs taken."""
-        return {str(row["uid"]) for arm in self.arms() for row in arm.read("sessions")}
+        """Identities of all logs that need no further work; those of a failed day are tried again."""
+        rows = (row for arm in self.arms() for row in arm.read("sessions"))
+        return {str(row["uid"]) for row in rows if row["status"] in ("taken", "left out")}

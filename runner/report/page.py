@@ -56,7 +56,7 @@ def write_report(folder: str | Path) -> Path:
     ConfigurationError without results in the folder, or without the extra `view`.
     """
     results = ResultFolder.load(folder)
-    return write_page(report_html(results), results.path)
+    return write_page(report_html(results), results.path / REPORT)
 
 
 def write_diagnosis_report(folder: str | Path) -> Path:
@@ -65,7 +65,7 @@ def write_diagnosis_report(folder: str | Path) -> Path:
     ConfigurationError where the folder holds no diagnosis or the extra `view` is not installed.
     """
     diagnosis = DiagnosisFolder.load(folder)
-    return write_page(diagnosis_html(diagnosis), diagnosis.path)
+    return write_page(diagnosis_html(diagnosis), diagnosis.path / REPORT)
 
 
 def diagnosis_html(diagnosis: DiagnosisFolder) -> str:
@@ -82,9 +82,8 @@ def diagnosis_html(diagnosis: DiagnosisFolder) -> str:
     )
 
 
-def write_page(text: str, folder: Path) -> Path:
-    """Write the text of `report.html` into a folder, whole or not at all; returns its path."""
-    target = folder / REPORT
+def write_page(text: str, target: Path) -> Path:
+    """Write a page, whole or not at all; returns its path."""
     draft = target.with_suffix(".html.part")
     draft.write_text(text, encoding="utf-8")
     draft.replace(target)

@@ -41,6 +41,7 @@ def test_loop_process_loads_only_what_it_runs():
         "loop",
         "loop_process",
         "pace",
+        "places",
         "realtime",
         "references",
         "ring",
