@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def of_estimate(content: Mapping[str, Any], model: Path | None, tables: str) -> 
     sentence = f"Model {content['model']} estimated from {len(names)} session{'s' * (len(names) > 1)}."
     warnings = content.get("warnings") or ()
     advice = [] if verbosity() else ["`--verbose` shows the tables, `--results FOLDER` writes a report"]
-    next_step = "" if model is None else f"lwr-run validate {model} HELD_OUT.mcap"
+    next_step = "" if model is None else f"lwr-run validate {quote(str(model))} HELD_OUT.mcap"
     look = [Verdict("warning", text, "", "look") for text in warnings]
     return Ending("look" if look else "good", sentence, numbers_of(content), look, advice, next_step, tables)
 
@@ -104,7 +105,7 @@ def of_diagnosis(said: Statements, page: Path | None, folder: Path, tables: str)
     look = [
         Verdict(line.subject, line.found, line.wanted, line.level) for line in shown if line.level != "good"
     ]
-    next_step = open_page(page) if page is not None else f"open {folder / 'diagnosis.txt'}"
+    next_step = open_page(page if page is not None else folder / "diagnosis.txt")
     return Ending(said.level, f"{said.headline}.", numbers, look, said.answers, next_step, tables)
 
 
@@ -119,7 +120,7 @@ def _spread(mass: float, std: float) -> str:
 
 def open_page(page: Path) -> str:
     """The shell command that opens a page."""
-    return f"open {page}"
+    return f"open {quote(str(page))}"
 
 
 def of_folder(
@@ -137,6 +138,6 @@ def of_folder(
         tuple(numbers.items()),
         [line for line in lines if line.level != "good"],
         advice,
-        open_page(page) if page is not None else f"open {folder / 'report.txt'}",
+        open_page(page if page is not None else folder / "report.txt"),
         tables,
     )

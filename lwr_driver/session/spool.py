@@ -11,6 +11,7 @@ import contextlib
 import ctypes
 import mmap
 import os
+import resource
 import tempfile
 import threading
 import time
@@ -25,7 +26,9 @@ from numpy.typing import NDArray
 
 LEAST_BYTES = 4 * 2**20
 """Smaller arrays stay in memory."""
-_SMALL_BYTES, _ARENA_BYTES = 2**16, 2**28
+_SMALL_BYTES = 2**16
+_ARENA_BYTES = 2**22, 2**28
+"""First and largest file of an arena; each has twice the size of the one before."""
 _MOST_BYTES = 64 * 2**20
 _EVERY_S = 0.01
 _M_MMAP_THRESHOLD = -3
@@ -48,6 +51,8 @@ class Growing:
         """Further rows, of the shape and type of the first."""
         if not len(part) and self._parts:
             return
+        if self._parts and part.dtype != self._parts[-1].dtype:
+            raise TypeError(f"rows of type {part.dtype} behind rows of type {self._parts[-1].dtype}")
         self._parts.append(part)
         self._bytes += part.nbytes
         self._rows += len(part)
@@ -83,17 +88,22 @@ class Arena:
 
     def __init__(self) -> None:
         self._held: mmap.mmap | None = None
-        self._used = 0
+        self._used, self._next = 0, _ARENA_BYTES[0]
 
     def keep(self, array: NDArray[Any]) -> NDArray[Any]:
         """The same array in a file; a small one as it is."""
         if array.nbytes < _SMALL_BYTES:
             return array
         if self._held is None or self._used + array.nbytes > len(self._held):
-            size = max(_ARENA_BYTES, array.nbytes)
-            with tempfile.TemporaryFile(prefix="lwr-") as file:
-                os.posix_fallocate(file.fileno(), 0, size)
-                self._held, self._used = mmap.mmap(file.fileno(), size), 0
+            size = max(self._next, array.nbytes)
+            try:
+                with tempfile.TemporaryFile(prefix="lwr-") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+                    self._held, self._used = mmap.mmap(file.fileno(), size), 0
+            except OSError:
+                # No room in the temporary folder: memory has to do.
+                return array
+            self._next = min(2 * size, _ARENA_BYTES[1])
             _watched(self._held)
         kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
         kept[...] = array
@@ -155,14 +165,18 @@ def _watched(held: mmap.mmap | None) -> None:
     with _starting:
         _open.add(held)
         if _watch is None:
-            _return_blocks()
-        if _watch is None or not _watch.is_alive():
+            _prepare_process()
             _watch = threading.Thread(target=_bound, name="long arrays", daemon=True)
             _watch.start()
 
 
-def _return_blocks() -> None:
-    """Let the C library give every array of a few MB back when it is freed, as it does by default for 32 MB."""
+def _prepare_process() -> None:
+    """Let the C library give every array of a few MB back when it is freed, as it does by default for 32 MB, and allow
+    as many open files as the system does: each array in a file has one.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
         library.mallopt(_M_MMAP_THRESHOLD, 4 * 2**20)
@@ -170,17 +184,19 @@ def _return_blocks() -> None:
 
 
 def _bound() -> None:
+    global _watch
     start = _in_files()
     while True:
         time.sleep(_EVERY_S)
         with _starting:
             held = list(_open)
             if not held:
-                break
+                _watch = None
+                return
         if _in_files() > start + _MOST_BYTES:
             for one in held:
                 one.madvise(mmap.MADV_DONTNEED)
-            start = min(start, _in_files())
+            start = _in_files()
         del held
 
 

@@ -116,7 +116,7 @@ def command(
     from runner.replanning import Rounds, rounds_begun
     from runner.results import estimate, held_out_errors, summarise, write_results
 
-    status = StatusLine()
+    status, ahead = StatusLine(), None
     experiment, folder = _begin(file, out, resume, hide, replan or 0, status)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
@@ -127,8 +127,8 @@ def command(
     experiment = _sealed(experiment, arm, motions, folder, hide)
     laboratory = partial(Laboratory, assume_yes=yes, allow_non_realtime=allow_non_realtime, status=status)
     with laboratory(experiment) as bench, _watched(bench, experiment, live_port if live else None) as watched:
-        if experiment.hosted:
-            import_ahead("runner.diagnosis.after_run", "runner.report.page")
+        if experiment.hosted and experiment.diagnosis.run and not no_diagnosis:
+            ahead = import_ahead("runner.diagnosis.after_run", "runner.report.page")
         first = Run(experiment, folder, watched, motions.rows)
         rounds = max(experiment.replan.rounds if replan is None else replan, rounds_begun(folder))
         records = Rounds(experiment, arm, cell, folder, status).run(first, first.sessions(), rounds)
@@ -143,6 +143,8 @@ def command(
         status.say(held_out_errors(summary, folder))
     more, advice = [], []
     if done and experiment.diagnosis.run and not no_diagnosis:
+        if ahead is not None:
+            ahead.join()
         from runner.diagnosis.after_run import conclude_run
 
         status.show("diagnosing model errors")

@@ -41,6 +41,8 @@ def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
     from lwr_driver.session import recover
 
     target = out if out is not None else default_output(session.with_suffix(".recovered.mcap"), forced())
+    if target.resolve() == session.resolve():
+        raise ConfigurationError(f"--out {target} is the damaged log itself; it is kept, choose another name")
     with set_aside(target):
         done = recover(session, target)
     click.echo(to_json(done) if as_json else str(done))

@@ -12,6 +12,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from lwr_driver.configuration import CONFIGS
 from runner.cli import VERBS, main
 from runner.output import OutputFile, set_aside
 from runner.terminal import NAMED_FILE, InputPath
@@ -246,3 +247,28 @@ def test_verbose_stands_before_or_behind_the_command(tmp_path: Path, monkeypatch
     for line in ("completion bash", "-v completion bash", "completion bash -v", "-v completion -v bash"):
         assert lwr_run(line)[0] == 0
     assert seen == [0, 1, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["experiment --yes", "hold --yes", "jog A6 1 --yes", "home --yes", "commission --yes --out m.yaml"],
+)
+def test_a_real_arm_is_moved_by_a_named_file_alone(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (CONFIGS / "experiments/default.yaml").read_text()
+    text = text.replace("backend: emulator", "backend: fri").replace("lock_step: true", "lock_step: false")
+    Path("experiment.yaml").write_text(text)
+    code, _, said = lwr_run(line)
+    assert code == 2
+    assert "moves a real arm" in said
+    assert "name it" in said
+
+
+def test_a_damaged_log_is_not_replaced_by_its_repair(tmp_path: Path) -> None:
+    log = tmp_path / "a.mcap"
+    log.write_bytes(b"damaged")
+    code, _, said = lwr_run(f"recover {log} --out {log} --force")
+    assert (code, log.read_bytes()) == (2, b"damaged")
+    assert "the damaged log itself" in said
