@@ -77,8 +77,11 @@ def fleet_html(fleet: FleetTrend) -> str:
     moved = [arm for arm in fleet.arms if arm.changes]
     for arm in moved:
         names = {one.change.name for one in arm.changes}
-        content += section(f"arm-{escape(arm.arm)}", escape(arm.arm), _panels(arm, names))
-    lines = [Verdict(arm.arm, _verdict(arm)[1], "no change", "look", "arms") for arm in moved]
+        content += section(f"arm-{arm.arm}", arm.arm, _panels(arm, names))
+    lines = [Verdict(arm.arm, _verdict(arm)[1], "no change", "look", f"arm-{arm.arm}") for arm in moved]
+    for arm in fleet.arms:
+        for name, day in arm.new_payloads.items():
+            lines.append(Verdict(arm.arm, f"payload {name} since {day}", "as before", "look", "arms"))
     sentence = f"{len(moved) or 'none'} of {len(fleet.arms)} arms changed"
     return page_html(
         "Fleet",

@@ -37,9 +37,9 @@ class Named:
 
     @property
     def interval(self) -> str:
-        """The days in question."""
+        """The day, with the days in question if there are several."""
         first, last = as_day(self.change.earliest), as_day(self.change.latest)
-        return first if first == last else f"{first} to {last}"
+        return self.day if first == last else f"{self.day} ({first} to {last})"
 
     def __str__(self) -> str:
         one = self.change
