@@ -97,20 +97,34 @@ def validate_command(
     show_default=True,
     help="Probability of any false difference.",
 )
-def compare_command(first: Path, second: Path, as_json: bool, level: float) -> None:
+@click.option("--report", type=OUTPUT_FILE, metavar="HTML", help="Page to write, e.g. comparison.html.")
+def compare_command(first: Path, second: Path, as_json: bool, level: float, report: Path | None) -> None:
     """List the significant differences between two models: two robots, two dates, two settings.
 
-    Models with different base sets are compared in the parameter combinations common to both.
+    FIRST and SECOND are models, or folders of results with one. Models with different base sets are compared in the
+    parameter combinations common to both.
 
     \b
     lwr-run compare robot_a.yaml robot_b.yaml
+    lwr-run compare monday friday --report comparison.html    two runs, as a page
     """
     from ident.estimation.compare import compare
     from ident.model.model_file import read_model
 
     labels = (f"{first}", f"{second}")
-    result = compare(read_model(first), read_model(second), level=level, labels=labels)
+    paths = [path / "model.yaml" if path.is_dir() else path for path in (first, second)]
+    models = [read_model(path) for path in paths]
+    result = compare(*models, level=level, labels=labels)
     click.echo(to_json(result.to_dict()) if as_json else str(result))
+    if report is not None:
+        from runner.report.comparison import comparison_html
+        from runner.report.page import write_page
+
+        runs = {str(place): place for place in (first, second) if (place / "summary.json").is_file()}
+        click.echo(
+            str(write_page(comparison_html(result, models[0].structure.chain.joint_names, runs), report)),
+            err=as_json,
+        )
 
 
 @verb("payload")

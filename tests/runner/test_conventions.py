@@ -121,6 +121,7 @@ REPLACING = (
     "init {}/..",
     "schema none --out {}",
     "trend --store none --out {}",
+    "compare none.yaml none.yaml --report {}",
 )
 
 
