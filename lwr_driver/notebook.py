@@ -8,17 +8,17 @@ from typing import Any
 from fri.errors import ConfigurationError
 
 
-def optional(package: str, use: str, instead: str) -> Any:
+def optional(package: str, use: str, instead: str, extra: str = "notebook") -> Any:
     """The imported package. Raises ConfigurationError, with advice, where it is not installed.
 
-    use : what needs it. instead : what works without it.
+    use : what needs it. instead : what works without it. extra : of this package, with it.
     """
     try:
         return import_module(package)
     except ImportError as error:
         raise ConfigurationError(
             f"{use} needs {package.partition('.')[0]}, which is not installed; install it "
-            f"(`pip install 'lwr-identification[notebook]'`) or use {instead}"
+            f"(`pip install 'lwr-identification[{extra}]'`) or use {instead}"
         ) from error
 
 

@@ -125,7 +125,7 @@ def _cluster(address: str | None) -> Any:
         return
     from lwr_driver.notebook import optional
 
-    distributed = optional("distributed", "--dask", "--jobs on this machine")
+    distributed = optional("distributed", "--dask", "--jobs on this machine", "fleet")
     from joblib import parallel_config
 
     with distributed.Client(address), parallel_config(backend="dask"):
