@@ -17,17 +17,9 @@ from datetime import date, timedelta
 from pathlib import Path
 
 import click
-import numpy as np
-import yaml
 
-from ident.dynamics import parameters
-from ident.dynamics.base_set import numeric_base
-from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import ModelStructure
-from ident.model.dynamic_model import DynamicModel
-from lwr_driver.configuration import CONFIGS
 from tests.fleet import START, Event, Fleet
-from tests.ident.known_arm import LOAD
+from tests.ident.known_arm import truth
 
 # A day's growth of friction, as a share of it.
 _WEAR = 0.01
@@ -42,19 +34,6 @@ def events(days: int) -> tuple[Event, ...]:
         Event(14, "sensor", days // 2, joint=3, size=0.5),
         Event(17, "payload", 2 * days // 3),
     )
-
-
-def truth() -> DynamicModel:
-    """The arm of the emulator with a load, exactly known."""
-    chain = Chain.from_urdf(CONFIGS / "lwr4plus.urdf")
-    structure = ModelStructure(chain, 2, payloads=("load",))
-    values = yaml.safe_load((CONFIGS / "emulator" / "table2.yaml").read_text())["parameters"]
-    load = dict(zip(parameters.INERTIAL, LOAD, strict=True))
-    standard = np.array(
-        [float(values.get(n, load.get(n[:-1], 0.0) if n[-1] == "8" else 0.0)) for n in structure.names]
-    )
-    base = numeric_base(structure)
-    return DynamicModel("LWR4+", structure, base.names, base.reduce(standard), None, base)
 
 
 def _run(*arguments: str) -> tuple[str, float]:

@@ -150,20 +150,19 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
     lwr-run trend LWR4+_17 --store fleet --out arm17.html
     """
     from fri.errors import DataError
-    from runner.fleet import FleetStore, fleet_trend
+    from runner.fleet import FleetStore, arm_trend, fleet_trend, usual_scatter
     from runner.fleet.page import arm_html, fleet_html
     from runner.report.page import write_page
 
     home = FleetStore(store)
     if not home.arms():
         raise DataError(f"{store} holds no results; make them with `lwr-run batch FOLDER... --store {store}`")
-    fleet = fleet_trend(home)
     if arm is not None:
-        home.arm(arm)
-        one = next(found for found in fleet.arms if found.arm == arm)
+        one = arm_trend(home.arm(arm), usual_scatter(home))
         click.echo(to_json({"schema_version": 1, **one.to_dict()}) if as_json else str(one))
         text = arm_html(one) if out is not None else ""
     else:
+        fleet = fleet_trend(home)
         click.echo(to_json({"schema_version": 1, **fleet.to_dict()}) if as_json else str(fleet))
         text = fleet_html(fleet) if out is not None else ""
     if out is not None:

@@ -3,7 +3,7 @@
 from runner.fleet.batch import Order, Progress, run_batch
 from runner.fleet.days import ArmDay, find_days
 from runner.fleet.store import ArmStore, FleetStore
-from runner.fleet.trend import ArmTrend, FleetTrend, arm_trend, fleet_trend
+from runner.fleet.trend import ArmTrend, FleetTrend, arm_trend, fleet_trend, usual_scatter
 
 __all__ = [
     "ArmDay",
@@ -17,4 +17,5 @@ __all__ = [
     "find_days",
     "fleet_trend",
     "run_batch",
+    "usual_scatter",
 ]

@@ -31,8 +31,6 @@ from runner.fleet.store import ArmStore, FleetStore, Row
 from runner.fleet.together import write_together
 from runner.fleet.trend import arm_trend, usual_scatter
 
-logger = logging.getLogger(__name__)
-
 Diagnosed = Literal["changed", "all", "none"]
 
 
@@ -130,9 +128,8 @@ def _identified(folder: Path, day: ArmDay, order: Order) -> list[Progress]:
     sessions, rows = _read(day)
     error = ""
     try:
-        usable = [s for s in sessions if s is not None]
-        if usable:
-            _write_day(store, day, _identification(store, usable, order))
+        if sessions:
+            _write_day(store, day, _identification(store, sessions, order))
         else:
             error = "no usable log"
     except Exception as failure:
@@ -144,23 +141,22 @@ def _identified(folder: Path, day: ArmDay, order: Order) -> list[Progress]:
     return [Progress(day.arm, day.key, "identified", error)]
 
 
-def _read(day: ArmDay) -> tuple[list[Session | None], list[dict[str, Any]]]:
-    """The readable logs of a day, and a row of the table for each."""
-    sessions: list[Session | None] = []
+def _read(day: ArmDay) -> tuple[list[Session], list[dict[str, Any]]]:
+    """The usable logs of a day, and a row of the table for every one."""
+    sessions: list[Session] = []
     rows: list[dict[str, Any]] = []
     for log in day.logs:
         row = {"uid": log.uid, "file": str(log.path.resolve()), "payload": "", "status": "taken", "note": ""}
-        session = None
         try:
             session = read_session(log.path, status=False)
             row["payload"] = session.metadata.get("payload", "")
             end = (session.end or {}).get("exit_status", "success")
-            if end not in ("success", ""):
+            if end in ("success", ""):
+                sessions.append(session)
+            else:
                 row |= {"status": "left out", "note": f"the session ended with {end}"}
-                session = None
         except Exception as error:
             row |= {"status": "unreadable", "note": _words(error)}
-        sessions.append(session)
         rows.append(row)
     return sessions, rows
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 
@@ -49,7 +49,7 @@ class Found:
     days: tuple[ArmDay, ...]
     unreadable: tuple[tuple[Path, str], ...] = ()
     repeated: tuple[Path, ...] = ()
-    known: int = field(default=0)
+    known: int = 0
 
 
 def find_days(places: Iterable[Path], known: Collection[str] = ()) -> Found:

@@ -99,8 +99,7 @@ class Bench:
         return read_session(path)
 
 
-@pytest.fixture(scope="session")
-def truth_model() -> DynamicModel:
+def truth() -> DynamicModel:
     """Table 2 with a load of our own, exactly known: base parameters of Model 2, unloaded and loaded."""
     chain = Chain.from_urdf(CONFIGS / "lwr4plus.urdf")
     structure = ModelStructure(chain, 2, payloads=("load",))
@@ -114,6 +113,12 @@ def truth_model() -> DynamicModel:
     )
     base = numeric_base(structure)
     return DynamicModel("LWR4+", structure, base.names, base.reduce(standard), None, base)
+
+
+@pytest.fixture(scope="session")
+def truth_model() -> DynamicModel:
+    """The model of `truth`."""
+    return truth()
 
 
 @pytest.fixture(scope="session")
