@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any
 
@@ -15,6 +15,9 @@ from runner.fleet.store import ArmStore, FleetStore
 
 _ERROR = "error of "
 """Before joint and side, the name of a residual over the days."""
+
+_Known = Mapping[str, tuple[Series, str]]
+"""Each quantity over the days, with its unit, by name."""
 
 # Probability of any change of an arm without one.
 LEVEL = 0.001
@@ -175,8 +178,11 @@ class FleetTrend:
 
 def arm_trend(store: ArmStore, usual: Mapping[str, float] | None = None) -> ArmTrend:
     """Changes of an arm's parameters and residuals. usual : day-to-day scatter of such arms, by quantity."""
-    known = _all_series(store, usual or {})
-    series = {name: one for name, (one, _) in known.items()}
+    return _judged(store, _read(store), usual or {})
+
+
+def _judged(store: ArmStore, known: _Known, usual: Mapping[str, float]) -> ArmTrend:
+    series = {name: replace(one, usual=usual.get(name)) for name, (one, _) in known.items()}
     units = {name: unit for name, (_, unit) in known.items()}
     level = LEVEL / max(len(series), 1)
     found = [
@@ -205,9 +211,13 @@ def arm_trend(store: ArmStore, usual: Mapping[str, float] | None = None) -> ArmT
 
 def usual_scatter(store: FleetStore) -> dict[str, float]:
     """Day-to-day scatter of each quantity, the median of the arms; of three arms or more."""
+    return _usual(map(_read, store.arms()))
+
+
+def _usual(arms: Iterable[_Known]) -> dict[str, float]:
     scatters: dict[str, list[float]] = {}
-    for arm in store.arms():
-        for name, (series, _) in _all_series(arm, {}).items():
+    for known in arms:
+        for name, (series, _) in known.items():
             if len(series.values) > 2:
                 scatters.setdefault(name, []).append(day_scatter(series))
     return {name: float(np.median(values)) for name, values in scatters.items() if len(values) > 2}
@@ -215,8 +225,9 @@ def usual_scatter(store: FleetStore) -> dict[str, float]:
 
 def fleet_trend(store: FleetStore) -> FleetTrend:
     """All arms; the scatter from day to day of each quantity is judged with that of all arms."""
-    usual = usual_scatter(store)
-    arms = tuple(arm_trend(arm, usual) for arm in store.arms())
+    known = {arm: _read(arm) for arm in store.arms()}
+    usual = _usual(known.values())
+    arms = tuple(_judged(arm, one, usual) for arm, one in known.items())
     return FleetTrend(arms, unlike(_latest(arms)))
 
 
@@ -237,7 +248,7 @@ def _latest(arms: Sequence[ArmTrend]) -> dict[str, dict[str, tuple[float, float]
     return found
 
 
-def _all_series(store: ArmStore, usual: Mapping[str, float]) -> dict[str, tuple[Series, str]]:
+def _read(store: ArmStore) -> _Known:
     """Each parameter and residual over the days, with its unit."""
     units: dict[str, str] = {}
     columns: dict[str, dict[str, tuple[float, float]]] = {}
@@ -248,14 +259,14 @@ def _all_series(store: ArmStore, usual: Mapping[str, float]) -> dict[str, tuple[
         name = f"{_ERROR}{row['joint']} {row['side']}"
         units[name] = "Nm"
         columns.setdefault(name, {})[row["key"]] = row["rms"], 0.0
-    return {name: (_series(name, values, usual.get(name)), units[name]) for name, values in columns.items()}
+    return {name: (_series(name, values), units[name]) for name, values in columns.items()}
 
 
-def _series(name: str, values: Mapping[str, tuple[float, float]], usual: float | None) -> Series:
+def _series(name: str, values: Mapping[str, tuple[float, float]]) -> Series:
     keys = sorted(values, key=day_of)
     time = np.array([day_of(key) for key in keys])
     numbers = np.array([values[key] for key in keys])
-    return Series(name, time, numbers[:, 0], np.where(np.isfinite(numbers[:, 1]), numbers[:, 1], 0.0), usual)
+    return Series(name, time, numbers[:, 0], np.where(np.isfinite(numbers[:, 1]), numbers[:, 1], 0.0))
 
 
 def day_of(key: str) -> float:
