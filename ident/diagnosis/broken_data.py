@@ -125,13 +125,10 @@ def _usable(record: SessionRecord, broken: Sequence[BrokenChannel]) -> SessionRe
     return replace(record, stretches=tuple(stretches))
 
 
-@contextmanager
-def blamed(broken: Sequence[BrokenChannel], names: Sequence[str]) -> Iterator[None]:
-    """An error inside is one of the broken channels, where there are any: DataError with all of them."""
-    try:
-        yield
-    except (LwrError, np.linalg.LinAlgError):
-        doubts = [
+def refuse(broken: Sequence[BrokenChannel], names: Sequence[str]) -> None:
+    """Raise DataError with all of the broken channels, where there are any. names : of the joints."""
+    settle(
+        [
             Doubt(
                 b.channel,
                 () if b.joint is None else (names[b.joint - 1],),
@@ -143,5 +140,14 @@ def blamed(broken: Sequence[BrokenChannel], names: Sequence[str]) -> Iterator[No
             )
             for b in broken
         ]
-        settle(doubts)
+    )
+
+
+@contextmanager
+def blamed(broken: Sequence[BrokenChannel], names: Sequence[str]) -> Iterator[None]:
+    """An error inside is one of the broken channels, where there are any: DataError with all of them."""
+    try:
+        yield
+    except (LwrError, np.linalg.LinAlgError):
+        refuse(broken, names)
         raise

@@ -22,6 +22,7 @@ from ident.diagnosis.bench import (
     nominal_arm,
     prepare_bench,
 )
+from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
 from ident.diagnosis.candidates import Trial
 from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
@@ -199,7 +200,8 @@ def commission(
     The side of the joints that the positions come from, stiffness and presliding come from the first sets;
     parameters and noise from all, with what changed between them; the null, the mean gain of each candidate,
     from each set against a reference made of the others. Raises DataError for sessions that cannot
-    be used, and where the sets differ in their channels or in the number of payloads.
+    be used, for channels that cannot be what they say, see `ident.screening`, and where the sets differ in their
+    channels or in the number of payloads. Dead and frozen torques are left out.
     """
     settings = settings or DiagnosisSettings()
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
@@ -216,7 +218,10 @@ def commission(
     settings = settled(settings, parts[0], chain)
     recorded: list[list[SessionRecord]] = []
     for part in parts:
-        recorded.append([record(s, k, chain, settings) for k, s in enumerate(part)])
+        broken = broken_channels(part, chain, settings.signals, () if arm is None else arm.couplings)
+        refuse([one for one in broken if not one.lost], chain.joint_names)
+        records = [record(s, k, chain, settings) for k, s in enumerate(part)]
+        recorded.append(list(without_broken(records, broken)))
         every_joint_moves(recorded[-1], chain)
     first = recorded[0]
     # Both sides in bins long enough to average the links' ringing, for a fair comparison.

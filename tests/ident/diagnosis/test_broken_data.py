@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.diagnosis import diagnose
+from ident.diagnosis import commission, diagnose
 from ident.diagnosis.broken_data import blamed, broken_channels
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model, write_model
@@ -111,6 +111,22 @@ def test_causes_of_other_joints_are_still_named_beside_a_dead_sensor(make: Make,
     found = diagnose(edited(drifting, "joint", "effort", dead), chain)
     assert [(f.cause, f.joints) for f in found.findings] == [("sensor_offset_drift", (1,))]
     assert {(one.channel, one.joint) for one in found.data} == {("joint torque", 3)}
+
+
+def test_no_healthy_arm_is_learnt_from_a_channel_that_cannot_be_what_it_says(
+    pair: list[Session], make: Make, chain: Chain
+) -> None:
+    healthy = [make("c.mcap", 11), make("d.mcap", 12, None, 1)]
+    with pytest.raises(DataError, match=r"two joint torque: .*reversed sign"):
+        commission([healthy, edited(pair, "joint", "effort", reversed_sign)], chain)
+
+
+def test_a_dead_sensor_is_left_out_of_the_healthy_arm(pair: list[Session], make: Make, chain: Chain) -> None:
+    healthy = [make("c.mcap", 11), make("d.mcap", 12, None, 1)]
+    sets = [edited(part, "joint", "effort", dead) for part in (pair, healthy)]
+    names = commission(sets, chain).model.names
+    assert "Fcl3" not in names
+    assert "Fcl2" in names
 
 
 def test_some_percent_are_no_broken_channel(make: Make, chain: Chain) -> None:
