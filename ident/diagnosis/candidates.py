@@ -32,6 +32,8 @@ _TIED = 6.0
 _STEP_ROOM_S = 1.0
 # Longest pause between sessions over which a drive stays warm [s].
 _DAY_S = 86400.0
+# Lengths of a push to try, over that of its burst: only the middle of a weak one stands out.
+_LONGER = (1.0, 1.6)
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,7 @@ class Dictionary:
         rows, padded = (
             {key: self._arena.keep(values) for key, values in columns.items()} for columns in (rows, padded)
         )
-        return shape, rows, padded, replace(products, base=self._arena.keep(products.base))
+        return shape, rows, padded, replace(products, alone=self._arena.keep(products.alone))
 
     def _prepared(self, candidate: Candidate) -> list[_Entry]:
         if candidate.key not in self._kept:
@@ -261,11 +263,13 @@ class Dictionary:
         """The best contact in a burst of the residual, on any link from the third on."""
         best: Trial | None = None
         n = self.nominal.arm.chain.n
-        for burst, link in product(find_bursts(self.evidence), range(min(3, n), n + 1)):
-            middle, duration = burst.start_s + 0.5 * burst.duration_s, burst.duration_s + 0.1
+        links = range(min(3, n), n + 1)
+        for burst, link, longer in product(find_bursts(self.evidence), links, _LONGER):
+            middle, duration = burst.start_s + 0.5 * burst.duration_s, longer * burst.duration_s + 0.1
             shape = Shape(time=middle, duration=duration, session=burst.session + 1, link=link)
-            trial = self.trial(candidate, shape, 20 * self.evidence.blocks)
-            if trial is None or (best is not None and trial.score.gain <= best.score.gain):
+            trial = self.trial(candidate, shape, 20 * len(_LONGER) * self.evidence.blocks)
+            # Links whose frames share an origin tie, up to rounding.
+            if trial is None or (best is not None and trial.score.gain < best.score.gain + 1e-6):
                 continue
             if not self._recurs(trial):
                 best = trial

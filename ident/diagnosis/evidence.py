@@ -9,8 +9,8 @@ motion never checks itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 # Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3
 
+# A column with less than this share of its power beside the base carries no information of its own.
+_LEAST_LEFT = 1e-5
 # A fall of the chi-square up to this is no evidence, whatever its value on the held-back parts.
 _NO_EVIDENCE = 12.0
 
@@ -83,18 +85,33 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Products of a group's columns with the base and among themselves in each block, and their sums over the parts
-    held back in turn; `parts` (parts, blocks) is 1 for the blocks of a part."""
+    """Products of a group's columns with the base, among themselves and with the torques in each block.
 
-    base: Floats
+    alone : (blocks, k, p) with the base parameters; own (blocks, k, k); target (blocks, k). parts : (parts, blocks),
+    1 for the blocks of a part held back in turn. further : makes those with the further columns (blocks, k, w) on
+    demand; further_sums : their sums (parts, k, w). crossed : such sums by group of further columns, as met so far.
+    """
+
+    alone: Floats
     own: Floats
     target: Floats
     parts: Floats
+    further: Callable[[], Floats] | None = None
+    further_sums: Floats | None = None
+    crossed: dict[int, Floats] = field(default_factory=dict)
+
+    @cached_property
+    def base(self) -> Floats:
+        """(blocks, k, P) with base and further columns."""
+        return self.alone if self.further is None else np.concatenate([self.alone, self.further()], axis=2)
 
     @cached_property
     def sums(self) -> _Sums:
         """Base, own and target of each part."""
-        return _sums(self.parts, self.base), _sums(self.parts, self.own), self.parts @ self.target
+        base = _sums(self.parts, self.alone)
+        if self.further_sums is not None:
+            base = np.concatenate([base, self.further_sums], axis=2)
+        return base, _sums(self.parts, self.own), self.parts @ self.target
 
     def only(self, on: Floats) -> Products:
         """Products of the blocks with weight 1 in `on` (blocks,) alone."""
@@ -131,6 +148,7 @@ class Evidence:
         self._layout(nominal)
         self.mask: dict[Key, Floats] = {}
         self._weights: dict[Key, float] = {}
+        self._independent: dict[Key, float] = {}
         self._columns: dict[Key, Floats] = {}
         self._acting: dict[Key, NDArray[np.int64]] = {}
         self._targets: dict[Key, Floats] = {}
@@ -144,10 +162,11 @@ class Evidence:
                 self._columns[key] = self._arena.keep(self._padded(side, wide[:, self._acting[key]]))
                 self._targets[key] = self._padded(side, np.where(keep, rows.target[:, j], 0.0)[:, None])
                 self.mask[key] = self._padded(side, keep.astype(float)[:, None])
+                self._independent[key] = float(keep.sum()) / float(self.variance_inflation[side][j])
         self.base_count = len(nominal.base)
         self.extra: list[Rows] = []
         self._known: dict[int, tuple[Rows, dict[Key, Floats], Products]] = {}
-        self._joined: dict[Key, Floats] | None = None
+        self._joined: dict[tuple[int, ...], dict[Key, Floats]] = {}
         self._base_products()
         self._gram()
 
@@ -272,28 +291,42 @@ class Evidence:
         return {key: self._padded(key[0], values) * self.mask[key] for key, values in rows.items()}
 
     def products(self, columns: Mapping[Key, Floats], known: Products | None = None) -> Products:
-        """Products in each block of padded columns (blocks, L, k); `known` : those with the base alone."""
+        """Products in each block of padded columns (blocks, L, k); `known` : those with the base alone, which remember
+        the ones with further columns."""
         known = self.alone(columns) if known is None else known
         if not self.extra:
             return known
-        base = np.concatenate([known.base, self._cross(columns, self._beside())], axis=2)
-        return Products(base, known.own, known.target, self.parts)
+        missing = [rows for rows in self.extra if id(rows) not in known.crossed]
+        if missing:
+            sums, place = _sums(self.parts, self._cross(columns, self._together(missing))), 0
+            for rows in missing:
+                known.crossed[id(rows)] = sums[:, :, place : place + _width(rows)]
+                place += _width(rows)
+        further = partial(self._further, columns, list(self.extra))
+        sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
+        return replace(known, further=further, further_sums=sums)
 
-    def _beside(self) -> dict[Key, Floats]:
-        """All further columns together, padded, by key."""
-        if self._joined is None:
-            p, size = self.base_count, self.gram.shape[1]
-            self._joined = {}
-            for here, rows in self._places():
+    def _further(self, columns: Mapping[Key, Floats], groups: Sequence[Rows]) -> Floats:
+        """Products (blocks, k, w) of padded columns with groups of further columns."""
+        return self._cross(columns, self._together(groups))
+
+    def _together(self, groups: Sequence[Rows]) -> dict[Key, Floats]:
+        """Groups of further columns side by side, padded, by key."""
+        names = tuple(map(id, groups))
+        if names not in self._joined:
+            joined, size, place = dict[Key, Floats](), sum(map(_width, groups)), 0
+            for rows in groups:
                 for key, values in self._known[id(rows)][1].items():
-                    joined = self._joined.setdefault(key, np.zeros((*values.shape[:2], size - p)))
-                    joined[:, :, here.start - p : here.stop - p] = values
-        return self._joined
+                    wide = joined.setdefault(key, np.zeros((*values.shape[:2], size)))
+                    wide[:, :, place : place + _width(rows)] = values
+                place += _width(rows)
+            self._joined[names] = joined
+        return self._joined[names]
 
     def replace(self, extra: Sequence[Rows]) -> None:
         """Replace the columns beyond the base."""
         self.extra = list(extra)
-        self._joined = None
+        self._joined.clear()
         for rows in self.extra:
             if id(rows) not in self._known:
                 padded = self.padded(rows)
@@ -303,11 +336,12 @@ class Evidence:
 
     def _cross(self, a: Mapping[Key, Floats], b: Mapping[Key, Floats]) -> Floats:
         """Products (blocks, k, l) of two groups of padded columns."""
-        width = (next(iter(a.values())).shape[2], next(iter(b.values())).shape[2])
+        width = (next(iter(a.values())).shape[2], next(iter(b.values())).shape[2]) if b else (0, 0)
         total = np.zeros((self.blocks, *width))
         # In a fixed order: the last digits of a sum depend on it.
         for key in sorted(a.keys() & b.keys()):
-            total += self._weights[key] * np.matmul(a[key].transpose(0, 2, 1), b[key])
+            on = _active(a[key])
+            total[on] += self._weights[key] * np.matmul(a[key][on].transpose(0, 2, 1), b[key][on])
         return total
 
     def alone(self, columns: Mapping[Key, Floats]) -> Products:
@@ -316,11 +350,17 @@ class Evidence:
         base = np.zeros((self.blocks, width, self.base_count))
         own = np.zeros((self.blocks, width, width))
         target = np.zeros((self.blocks, width))
-        for key, matrix in columns.items():
+        for key, wide in columns.items():
+            on = _active(wide)
+            matrix = wide[on]
             turned = self._weights[key] * matrix.transpose(0, 2, 1)
-            base[:, :, self._acting[key]] += np.matmul(turned, self._columns[key])
-            own += np.matmul(turned, matrix)
-            target += np.matmul(turned, self._targets[key])[:, :, 0]
+            products = np.matmul(turned, self._columns[key][on])
+            if isinstance(on, slice):
+                base[:, :, self._acting[key]] += products
+            else:
+                base[on[:, None, None], np.arange(width)[:, None], self._acting[key]] += products
+            own[on] += np.matmul(turned, matrix)
+            target[on] += np.matmul(turned, self._targets[key][on])[:, :, 0]
         return Products(base, own, target, self.parts)
 
     # ---- scores ----
@@ -362,7 +402,7 @@ class Evidence:
                 mine = base[part], own[part], target[part]
                 rest = pulled[0] - mine[0], pulled[1] - mine[1], pulled[2] - mine[2]
                 gain += self._held_gain(mine, rest, part, ridge)
-        rows = sum(float(self.mask[key].sum()) / self.variance_inflation[key[0]][key[1]] for key in keys)
+        rows = sum(self._independent[key] for key in keys)
         if self.prior is not None and self.compared and fitted > _NO_EVIDENCE:
             changed = self.full.values - projection @ coefficients
             gain += self._prior_penalty(self.full.values) - self._prior_penalty(changed)
@@ -483,6 +523,12 @@ def _width(rows: Rows) -> int:
     return next(iter(rows.values())).shape[1]
 
 
+def _active(columns: Floats) -> slice | NDArray[np.int64]:
+    """Blocks in which padded columns (blocks, L, k) act."""
+    found = np.flatnonzero(columns.any(axis=(1, 2)))
+    return slice(None) if len(found) == len(columns) else found
+
+
 def _sums(parts: Floats, values: Floats) -> Floats:
     """Sums (parts, k, l) of values (blocks, k, l) over the blocks of each part."""
     return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
@@ -494,14 +540,19 @@ def _schur(products: _Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats | No
     cross, own, target = products
     projection = fit.inverse @ cross.T
     inner = own - cross @ projection
+    if len(own) == 1:
+        # Most groups are one column.
+        power, left = float(own[0, 0]), float(inner[0, 0])
+        if power <= 0.0 or left < _LEAST_LEFT * power:
+            return projection, None, np.zeros(1)
+        return projection, np.array([[1.0 / (left + ridge * power)]]), target - cross @ fit.values
     size = np.diag(own).copy()
-    # A column with less than this share beside the base carries no information of its own.
-    if np.any(size <= 0.0) or np.any(np.diag(inner) < 1e-5 * size):
+    if np.any(size <= 0.0) or np.any(np.diag(inner) < _LEAST_LEFT * size):
         return projection, None, np.zeros(len(own))
     inner = inner + ridge * np.diag(size)
     root = np.sqrt(np.diag(inner))
     scaled = inner / np.outer(root, root)
-    if len(own) > 1 and np.linalg.eigvalsh(scaled)[0] < 1e-9:
+    if np.linalg.eigvalsh(scaled)[0] < 1e-9:
         return projection, None, np.zeros(len(own))
     return projection, np.linalg.inv(scaled) / np.outer(root, root), target - cross @ fit.values
 

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 
 from ident.diagnosis.nominal import SideRows
 from ident.diagnosis.recording import SessionRecord
@@ -98,8 +99,6 @@ def _same_motion(one: SessionRecord, other: SessionRecord) -> bool:
 def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
     """Size (n,) of the residual and its variance inflation (n,), the number of rows counting as one, from the
     autocorrelation."""
-    from scipy.signal import correlate
-
     n = residual.shape[1]
     sigma, inflation = np.ones(n), np.ones(n)
     for j in range(n):
@@ -109,8 +108,8 @@ def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
             ok = np.isfinite(d)
             if ok.sum() < 8:
                 continue
-            part = correlate(np.where(ok, d, 0.0), np.where(ok, d, 0.0), method="fft")[len(d) - 1 :]
-            part = part[: max(8, len(d) // 3)]
+            length = next_fast_len(2 * len(d) - 1, real=True)
+            part = irfft(np.abs(rfft(np.where(ok, d, 0.0), length)) ** 2, length)[: max(8, len(d) // 3)]
             if len(part) > len(total):
                 total = np.pad(total, (0, len(part) - len(total)))
             total[: len(part)] += part

@@ -1,0 +1,68 @@
+"""Candidates: pushes longer than their bursts, and remembered products."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ident.diagnosis.candidates import Candidate, find_bursts
+from ident.diagnosis.signatures import signature_bench
+from ident.dynamics.kinematics import Chain
+from ident.effects import EFFECTS
+from lwr_driver.session import Session
+
+MIDDLE_S, LENGTH_S, SIZE_NM = 8.0, 3.0, 0.12
+
+
+def test_a_push_longer_than_its_burst_is_tried(make: Callable[..., Session], chain: Chain) -> None:
+    random = np.random.default_rng(3)
+
+    def restless(s: dict[str, np.ndarray]) -> None:
+        knots = np.arange(0.0, s["time"][-1] + 1.0, 0.15)
+        for joint in range(chain.n):
+            wave = np.interp(s["time"], knots, 0.05 * random.normal(size=len(knots)))
+            s["joint"][:, joint] += wave
+            s["motor"][:, joint] += wave
+
+    def leaning(s: dict[str, np.ndarray]) -> None:
+        restless(s)
+        since = s["time"] - MIDDLE_S
+        push = np.where(np.abs(since) < 0.5 * LENGTH_S, SIZE_NM * np.cos(np.pi * since / LENGTH_S), 0.0)
+        s["joint"][:, 1] += push
+        s["motor"][:, 1] += push
+
+    bench = signature_bench([make("a.mcap", 1, leaning), make("b.mcap", 2, restless, 1)], chain)
+    burst = find_bursts(bench.evidence)[0]
+    found = bench.dictionary.best(Candidate(EFFECTS["contact"], -1))
+    assert found is not None
+    assert abs(found.shape["time"] - MIDDLE_S) < 0.5
+    assert burst.duration_s + 0.3 < found.shape["duration"] < LENGTH_S + 0.5
+
+
+def test_remembered_products_are_those_of_the_present_columns(
+    make: Callable[..., Session], chain: Chain
+) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    evidence = bench.evidence
+    rows = [
+        bench.dictionary.rows(Candidate(EFFECTS[cause], joint), shape)
+        for cause, joint in (("viscous_nonlinear", 0), ("joint_torque_delay", -1), ("sensor_gain", 1))
+        for shape in EFFECTS[cause].shapes(bench.dictionary.setting, max(joint, 0))[:1]
+    ]
+    columns = evidence.padded(
+        bench.dictionary.rows(
+            Candidate(EFFECTS["base_tilt"], -1), EFFECTS["base_tilt"].shapes(bench.dictionary.setting, 0)[0]
+        )
+    )
+    known = evidence.alone(columns)
+    for extra in ([rows[0], rows[1]], [rows[1]], [rows[2], rows[0], rows[1]], []):
+        evidence.replace(extra)
+        again, fresh = evidence.products(columns, known), evidence.products(columns)
+        np.testing.assert_allclose(again.base, fresh.base, atol=1e-12 * np.abs(fresh.base).max())
+        for here, there in zip(again.sums, fresh.sums, strict=True):
+            np.testing.assert_allclose(here, there, atol=1e-12 * np.abs(there).max())
+        np.testing.assert_allclose(again.sums[0], np.einsum("pb,bkl->pkl", fresh.parts, fresh.base))
+        assert again.base.shape[2] == evidence.base_count + sum(
+            next(iter(r.values())).shape[1] for r in extra
+        )
