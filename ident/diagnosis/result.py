@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.diagnosis.broken_data import BrokenChannel
+from ident.diagnosis.claims_in_words import finding_statement
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.statements import Statements, finding_statement, statements
+from ident.diagnosis.statements import Statements, statements
 from ident.dynamics.tables import Tabular
 from ident.effects.words import quantity_text
 from ident.model import DynamicModel

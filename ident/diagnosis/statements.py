@@ -8,29 +8,29 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from ident.diagnosis.selection import margin
-from ident.effects import EFFECTS, described, summary_of
-from ident.effects.words import joints_text, named, quantity_text, spoken
+from ident.diagnosis.claims_in_words import (
+    SURE,
+    WIDTH,
+    Comparison,
+    FindingStatement,
+    Plain,
+    answer_statement,
+    beside,
+    capital,
+    comparison,
+    finding_statement,
+    wrapped,
+)
+from ident.effects.words import spoken
 
-Plain = Mapping[str, Any]
-
-SURE = 0.8
-"""Default confidence below which a finding with alternatives is open between look-alikes."""
-
-_WIDTH = 100
 _MOST_ROWS = {"unexplained": 4, "absorbed": 5}
 _REPR_LINES = 10
 _AVOIDABLE_LOOK = 0.3
 _WORSE_REPLAY = 1.1
-_SEEN = {
-    "motor": "Seen in the motor torque only.",
-    "joint": "Acts on the links, so both torques see it.",
-    "sensor": "An error of the joint torque sensor.",
-}
 REPLAYED = (
     ("position", "position", "mrad", 1e3),
     ("motor", "motor torque", "Nm", 1.0),
@@ -67,45 +67,6 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Two causes side by side. place : in the list of `look_alikes`, from 0; finding : number from 1, 0 if asked for.
-
-    decides : empty for causes separated by these sessions.
-    """
-
-    place: int
-    finding: int
-    title: str
-    overlap: str
-    decides: str
-
-
-@dataclass(frozen=True)
-class FindingStatement:
-    """One finding. facts : error, alternatives, discriminating motion; statistics : parameters with their meaning and
-    the figures behind the claim; both as (label, text).
-    """
-
-    number: int
-    cause: str
-    title: str
-    text: str
-    confidence: str
-    facts: tuple[tuple[str, str], ...]
-    statistics: tuple[tuple[str, str], ...]
-    is_open: bool
-
-    def lines(self) -> list[str]:
-        """For the terminal."""
-        found = [f"{self.number}. {_capital(self.title)} [{self.cause}]: {self.confidence}"]
-        found += _wrapped(self.text, "     ", "     ") if self.text else []
-        for label, text in self.facts:
-            if self.is_open or label.startswith("error"):
-                found += _wrapped(f"{label}: {text}", "     ", "        ")
-        return found
-
-
-@dataclass(frozen=True)
 class Part:
     """Sentences and a table under a title. rows : of the table, each with its heading first."""
 
@@ -118,10 +79,10 @@ class Part:
     def lines(self) -> list[str]:
         """For the terminal."""
         if self.anchor == "limits":
-            return [line for note in self.sentences for line in _wrapped(note, "note: ", "      ")]
+            return [line for note in self.sentences for line in wrapped(note, "note: ", "      ")]
         found = [self.title]
         for sentence in self.sentences:
-            found += _wrapped(sentence, "  ", "    ")
+            found += wrapped(sentence, "  ", "    ")
         if not self.rows:
             return found
         most = _MOST_ROWS.get(self.anchor, len(self.rows))
@@ -155,17 +116,17 @@ class Statements:
 
     def text(self) -> str:
         """The whole, for the terminal."""
-        found = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
+        found = [*wrapped(self.about, "", "  "), *wrapped(f"{self.headline}.", "", "")]
         found += [f"{answer}." for answer in self.answers]
         found += [line for part in self.parts if part.anchor == "data" for line in part.lines()]
         for finding in (*self.findings, *self.character):
             if self.character and finding is self.character[0]:
                 found.append("Character of the arm, as drives of its kind have it:")
             found += finding.lines()
-            found += [x for one in self.comparisons if one.finding == finding.number for x in _beside(one)]
+            found += [x for one in self.comparisons if one.finding == finding.number for x in beside(one)]
         for one in self.comparisons:
             if not one.finding:
-                found += [f"Side by side: {one.title}", *_beside(one)]
+                found += [f"Side by side: {one.title}", *beside(one)]
         rest = (part for part in self.parts if part.anchor != "data")
         return "\n".join([*found, *(line for part in rest for line in part.lines())])
 
@@ -174,7 +135,7 @@ class Statements:
         found = [self.about, f"{self.headline}.", *(f"{line.subject}: {line.found}" for line in self.lines)]
         more = len(found) - _REPR_LINES
         kept = [*found[: _REPR_LINES - 1], f"... and {more + 1} more lines"] if more > 0 else found
-        return "\n".join(textwrap.shorten(line, 2 * _WIDTH, placeholder=" ...") for line in kept)
+        return "\n".join(textwrap.shorten(line, 2 * WIDTH, placeholder=" ...") for line in kept)
 
 
 def statements(
@@ -208,106 +169,6 @@ def statements(
         tuple(comparison(one, names, k) for k, one in enumerate(details.get("look_alikes") or [])),
         tuple(part for part in parts if part.sentences or part.rows),
     )
-
-
-def is_open(confidence: float | None, alternatives: Sequence[Any] | None, sure: float = SURE) -> bool:
-    """Whether a finding is open between look-alikes."""
-    return confidence is not None and confidence < sure and bool(alternatives)
-
-
-def values_of(finding: Plain) -> dict[str, tuple[float, float, str]]:
-    """Value, standard deviation and unit by parameter."""
-    return {
-        name: (float(one.get("value", math.nan)), float(one.get("std") or 0.0), str(one.get("unit", "1")))
-        for name, one in (finding.get("parameters") or {}).items()
-    }
-
-
-def finding_statement(
-    number: int, finding: Plain, names: Sequence[str], sure: float = SURE
-) -> FindingStatement:
-    """A finding in words."""
-    cause, mode, side = str(finding["cause"]), finding.get("mode"), str(finding.get("side", ""))
-    counted = cause in EFFECTS and EFFECTS[cause].counted
-    meaning = ""
-    if mode and counted:
-        meaning = f"{summary_of(cause)}: {mode}."
-    elif finding.get("parameters"):
-        meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
-        meaning += f", {mode} sessions." if mode else "."
-    confidence, others = finding.get("confidence"), finding.get("alternatives") or []
-    open_ = is_open(confidence, others, sure)
-    known = "no confidence given" if confidence is None else f"confidence {confidence:.2f}"
-    facts = []
-    evidence = finding.get("evidence") or {}
-    before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
-    if before and after is not None and not (mode and counted):
-        interval = evidence.get("gain_interval_95")
-        gain = f", less by {interval[0]:.3g} to {interval[1]:.3g} Nm (95 %)" if interval else ""
-        facts.append(("error on held-out data", f"{before:.3g} -> {after:.3g} Nm{gain}"))
-    facts += [("could also be", _placed(other, names)) for other in others]
-    if finding.get("tell_apart") and others:
-        facts.append(("discriminating experiment", named(str(finding["tell_apart"]), names)))
-    return FindingStatement(
-        number,
-        cause,
-        _placed(finding, names, always=True),
-        " ".join(part for part in (_capital(meaning), _SEEN.get(side, "")) if part),
-        known + (", open between look-alikes" if open_ else ""),
-        tuple(facts),
-        tuple(_statistics(finding)),
-        open_,
-    )
-
-
-def comparison(entry: Plain, names: Sequence[str], place: int = 0) -> Comparison:
-    """Two causes side by side, from the plain content of a `LookAlikes`."""
-    first, second = (
-        f"{spoken(one['cause'])} ({joints_text(one['joints'], names)})" for one in entry["causes"]
-    )
-    if not entry["told_apart"]:
-        verdict = "not with these sessions"
-    elif entry["shape_alone"]:
-        verdict = (
-            "their shapes differ enough, but without a motor torque a sensor error cannot be separated from a torque "
-            "of the arm of the same shape"
-        )
-    else:
-        verdict = "these sessions do"
-    overlap = (
-        f"overlap {entry['overlap']:.3f}: beside a refitted base model, {first} would leave "
-        f"{entry['strength'][0]:.2g} times the noise, and {second} could imitate all of it but {entry['apart']:.2g}. "
-        f"Telling them apart takes {entry['needed']:.2g}: {verdict}"
-    )
-    decides, seen = "", entry.get("foreseen")
-    if not entry["told_apart"] or entry["shape_alone"]:
-        decides = " or ".join(dict.fromkeys(named(text, names) for text in entry["decides"]))
-    if seen is not None:
-        needed = math.sqrt(margin(seen["strength"] ** 2))
-        decides += (
-            f"{'; ' * bool(decides)}with {seen['file']} recorded as well, the expected overlap is "
-            f"{seen['overlap']:.3f} and the expected rest {seen['apart']:.2g} times the noise, of {needed:.2g} needed: "
-            + ("enough" if seen["apart"] > needed else "not enough")
-        )
-    return Comparison(place, int(entry.get("finding") or 0), f"{first} or {second}", overlap, decides)
-
-
-def answer_statement(answer: Plain, names: Sequence[str]) -> str:
-    """The answer of the discriminating experiments to one open finding."""
-
-    def said(place: Plain) -> str:
-        return f"{spoken(place['cause'])} ({joints_text(place['joints'], names)})"
-
-    asked, found = " or ".join(map(said, answer["rivals"])), answer.get("named")
-    named_one, confidence = "nothing" if found is None else said(found), f"{answer['confidence']:.2f}"
-    if answer["outcome"] == "decided":
-        return f"Decided: {named_one}, confidence {confidence}; the question was {asked}"
-    if answer["outcome"] == "open":
-        return (
-            f"Still open after the discriminating experiments: {asked}; {named_one} is the better now, "
-            f"confidence {confidence}"
-        )
-    return f"Decided against all candidates ({asked}); found instead: {named_one}"
 
 
 def run_advice(experiment: str | None) -> str:
@@ -374,7 +235,7 @@ def _data(content: Plain, names: Sequence[str]) -> Part:
         subject = (
             f"{_name(one['joint'], names)} {one['channel']}" if one.get("joint") else str(one["channel"])
         )
-        sentences.append(f"{_capital(subject)}: {one['what']}; {one['advice']}")
+        sentences.append(f"{capital(subject)}: {one['what']}; {one['advice']}")
     return Part("data", "Channels that cannot be what they say", tuple(dict.fromkeys(sentences)))
 
 
@@ -466,23 +327,6 @@ def _worse(details: Plain, names: Sequence[str]) -> list[str]:
     return [f"{_name(r['joint'], names)} {r['side']}" for r in rows if r["gain_interval_95"][1] < 0.0]
 
 
-def _statistics(finding: Plain) -> list[tuple[str, str]]:
-    cause, evidence = str(finding["cause"]), finding.get("evidence") or {}
-    meanings = {p.name: p.meaning for p in EFFECTS[cause].parameters} if cause in EFFECTS else {}
-    rows = []
-    for name, one in values_of(finding).items():
-        meaning = meanings.get(name, "").replace("`", "")
-        rows.append((spoken(name), quantity_text(*one) + (f" ({meaning})" if meaning else "")))
-    for key, label in (("delta_bic", "ΔBIC"), ("p_value", "p-value")):
-        if evidence.get(key) is not None:
-            rows.append((label, f"{evidence[key]:.3g}"))
-    return rows + [
-        (f"ΔBIC with {spoken(other['cause'])} instead", f"{other['delta_bic']:.3g}")
-        for other in finding.get("alternatives") or []
-        if other.get("delta_bic") is not None
-    ]
-
-
 def _experiments(details: Plain, names: Sequence[str]) -> Part:
     sentences = []
     for offer in details.get("deciding_motions") or []:
@@ -490,7 +334,7 @@ def _experiments(details: Plain, names: Sequence[str]) -> Part:
         loads = " and ".join("bare" if load is None else f"with {load}" for load in offer["payloads"])
         causes = " or ".join(dict.fromkeys(spoken(rival["cause"]) for rival in offer["rivals"]))
         sentences.append(
-            f"{_capital(offer['kind'])}{where}, {offer['duration_s']:.0f} s, {loads}, for {causes}: `{offer['file']}`"
+            f"{capital(offer['kind'])}{where}, {offer['duration_s']:.0f} s, {loads}, for {causes}: `{offer['file']}`"
         )
     return Part("deciding", "Discriminating experiments", sentences)
 
@@ -595,7 +439,7 @@ def _replay(content: Plain, names: Sequence[str]) -> Part:
                 rows.append((f"{label} [{unit}], {model}", *cells))
     said = ["No controller enters: measured minus simulated, root mean square."]
     method = (content.get("gain") or {}).get("simulation") or {}
-    said += [f"{_capital(what)}: {how}." for what, how in method.items()]
+    said += [f"{capital(what)}: {how}." for what, how in method.items()]
     return Part("replay", "Replay in simulation", said * bool(rows), ("", *names), rows)
 
 
@@ -611,25 +455,5 @@ def _absorbed(details: Plain) -> Part:
     return Part("absorbed", "Base parameters affected by the findings", [sentence] * bool(rows), head, rows)
 
 
-def _beside(one: Comparison) -> list[str]:
-    found = _wrapped(one.overlap, "     ", "        ")
-    return found + (_wrapped(f"to decide: {one.decides}", "     ", "        ") if one.decides else [])
-
-
-def _placed(entry: Plain, names: Sequence[str], *, always: bool = False) -> str:
-    """A cause with its joints, in words. always : say `whole arm`, too."""
-    joints = entry.get("joints", [])
-    return spoken(str(entry["cause"])) + (f", {joints_text(joints, names)}" if joints or always else "")
-
-
 def _name(joint: int, names: Sequence[str]) -> str:
     return names[joint - 1] if 0 < joint <= len(names) else str(joint)
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _wrapped(text: str, first: str, later: str) -> list[str]:
-    wrapper = textwrap.TextWrapper(_WIDTH, first, later, break_long_words=False, break_on_hyphens=False)
-    return wrapper.wrap(text)

@@ -362,7 +362,7 @@ def competitor_scores(
     found = []
     for session in as_sessions(sessions):
         if session.joint.effort.shape[1] and "joint" in model.structure.sides:
-            prepared = prepared_session(model, session, settings)
+            prepared = prepared_session(model, session, settings, blocks=True)
             controller = score_controller_model(prepared, session)
             if controller is not None:
                 found.append(controller)
@@ -439,6 +439,6 @@ def _score_other(
             f"the model of {other.robot} computes the torque of the {theirs} side, the tested one that of the "
             f"{own} side, so they cannot compete; choose models with a side in common"
         )
-    prepared = prepared_session(other, session, settings)
+    prepared = prepared_session(other, session, settings, blocks=not other.effects)
     predict = predictor(other, mounted(other, session))
     return score_session(prepared, predict, common, session, f"model of {other.robot}")

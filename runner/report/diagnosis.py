@@ -11,16 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError
+from ident.diagnosis.claims_in_words import Comparison, FindingStatement
 from ident.diagnosis.look_alikes import LookAlikes
-from ident.diagnosis.statements import (
-    Comparison,
-    FindingStatement,
-    Number,
-    Part,
-    Statements,
-    run_advice,
-    statements,
-)
+from ident.diagnosis.statements import Number, Part, Statements, run_advice, statements
 from runner.diagnosis.records import (
     LOOK_ALIKES,
     REPLAY,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError, DataError
+from ident.diagnosis.claims_in_words import comparison
 from ident.diagnosis.look_alikes import LookAlikes
-from ident.diagnosis.statements import comparison
 from ident.dynamics.kinematics import Chain
 from ident.effects import Discriminator
 from ident.excitation import ExcitationPlan
