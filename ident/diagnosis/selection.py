@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -190,6 +191,16 @@ def _gain(trial: Trial) -> float:
     return trial.score.gain - 2.0 * trial.shape.freedom
 
 
+class _Tolerance(NamedTuple):
+    """A tolerated deviation: name, rows, unit of the coefficient, largest size, and the candidate with these rows."""
+
+    name: str
+    rows: Rows
+    unit: float
+    size: float
+    of: tuple[str, int] | None = None
+
+
 @dataclass(eq=False)
 class _State:
     dictionary: Dictionary
@@ -199,20 +210,20 @@ class _State:
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
     weak: bool = False
-    _tolerances: list[tuple[str, Rows, float, float]] | None = None
+    _tolerances: list[_Tolerance] | None = None
 
     # ---- tolerated deviations ----
 
-    def tolerances(self) -> list[tuple[str, Rows, float, float]]:
-        """Name, rows, unit of the coefficient and tolerance of each tolerated deviation."""
+    def tolerances(self) -> list[_Tolerance]:
+        """The tolerated deviations."""
         if self._tolerances is not None:
             return self._tolerances
-        nominal, found = self.dictionary.nominal, []
+        nominal, found = self.dictionary.nominal, list[_Tolerance]()
         limit = self.settings.delay_tolerance_s
         for side in nominal.rows:
             rows = self.dictionary.rows(Candidate(DELAYS[side], -1), Shape(delay=1e-3))
             if side == "motor":
-                found.append(("motor delay", rows, 1e-3, limit))
+                found.append(_Tolerance("motor delay", rows, 1e-3, limit, (DELAYS[side].cause, -1)))
             else:
                 found += self._joint_delays(rows, limit)
         if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
@@ -224,15 +235,20 @@ class _State:
                 rows = self.dictionary.rows(Candidate(ELASTICITY, joint), shape)
                 if rows:
                     size = share * float(nominal.arm.compliance[joint])
-                    found.append((f"compliance {joint + 1}", rows, 1.0, size))
+                    found.append(
+                        _Tolerance(f"compliance {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint))
+                    )
         if self.evidence.compared:
             # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
             size = _HABITUAL * nominal.arm.gain_std
-            found += [(f"{GAIN} {j + 1}", rows, 1.0, size) for j, rows in gain_rows(self.dictionary).items()]
+            found += [
+                _Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
+                for j, rows in gain_rows(self.dictionary).items()
+            ]
         self._tolerances = found
         return found
 
-    def _joint_delays(self, rows: Rows, limit: float) -> list[tuple[str, Rows, float, float]]:
+    def _joint_delays(self, rows: Rows, limit: float) -> list[_Tolerance]:
         """Tolerated delays of the torque sensors: a common one, and the difference of each from it.
 
         Each sensor has electronics of its own and a delay of its own. The delay of the whole channel is their mean,
@@ -246,31 +262,36 @@ class _State:
             for key, part in evidence.padded(rows).items()
         }
         best = max(keys, key=lambda key: weight[key])
-        found = [("joint delay", rows, 1e-3, (_KNOWN_DELAY if known else 2.0) * limit)]
+        common = (_KNOWN_DELAY if known else 2.0) * limit
+        found = [_Tolerance("joint delay", rows, 1e-3, common, (DELAYS["joint"].cause, -1))]
         for key in keys:
             if key != best and weight[best] > 0.0:
                 apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
-                found.append((f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
+                found.append(_Tolerance(f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
         return found
 
     def tolerate(self, accepted: Sequence[Trial]) -> None:
-        """Base with the accepted columns and the deviations within their tolerance."""
-        entries = self.tolerances()
+        """Base with the accepted columns and the deviations within their tolerance, but for those of an accepted
+        cause: of two equal columns each would take a half."""
+        taken = {t.candidate.key for t in accepted}
+        entries = [one for one in self.tolerances() if one.of not in taken]
         fixed = [t.rows for t in accepted]
-        self.evidence.replace([*fixed, *(rows for _, rows, _, _ in entries)])
+        self.evidence.replace([*fixed, *(one.rows for one in entries)])
         place = self.evidence.base_count + sum(_width(rows) for rows in fixed)
         values = self.evidence.full.values[place:]
-        inside = [e for e, value in zip(entries, values, strict=True) if abs(value) * e[2] <= e[3]]
+        inside = [
+            one for one, value in zip(entries, values, strict=True) if abs(value) * one.unit <= one.size
+        ]
         if len(inside) < len(entries):
-            self.evidence.replace([*fixed, *(rows for _, rows, _, _ in inside)])
+            self.evidence.replace([*fixed, *(one.rows for one in inside)])
         values = self.evidence.full.values[place:]
         # A motion without information on a deviation leaves its variance open.
         std = np.sqrt(np.maximum(np.diag(self.evidence.full.inverse), 0.0))[place:]
         self.nuisance = {
-            name: (float(v) * unit, float(s) * unit)
-            for (name, _, unit, _), v, s in zip(inside, values, std, strict=True)
+            one.name: (float(v) * one.unit, float(s) * one.unit)
+            for one, v, s in zip(inside, values, std, strict=True)
         }
-        self.nuisance_rows = [rows for _, rows, _, _ in inside]
+        self.nuisance_rows = [one.rows for one in inside]
 
     # ---- rounds ----
 

@@ -128,3 +128,20 @@ def test_slow_motor_samples_leave_a_drive_inertia_uncertain_by_their_phase(
         assert inertia.value == pytest.approx(0.4, abs=4.0 * inertia.std)
         std.append(inertia.std)
     assert std[1] ** 2 > std[0] ** 2 + 0.9 * INERTIA_BY_PHASE**2 / 3.0
+
+
+def test_a_gain_beyond_the_usual_is_told_with_its_own_size(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    # Half of it would be a usual gain of another day.
+    true = 4.5 * reference.gain_std
+
+    def scaled(s: Signals) -> None:
+        s["joint"][:, 1] *= 1.0 + true
+
+    found = diagnose(pair(make, scaled), chain, reference=reference)
+    (finding,) = [f for f in found.findings if f.cause == "sensor_gain"]
+    assert finding.joints == (2,)
+    error = finding.parameters["error"]
+    assert error.std < 0.2 * true
+    assert error.value == pytest.approx(true, abs=3.0 * error.std)
