@@ -236,7 +236,10 @@ def again_with(
     inflation = {side: value.copy() for side, value in evidence.variance_inflation.items()}
     # Rows without a claim keep their noise: the null was counted in it.
     for side, joint in {key for c in selection.claims for key in c.trial.rows}:
-        sigma[side][joint], inflation[side][joint] = new_sigma[side][joint], new_inflation[side][joint]
+        new = new_sigma[side][joint]
+        # Of a model with more in it no more noise is left; a longer correlation of less residual is chance.
+        most = inflation[side][joint] * (sigma[side][joint] / new) ** 2
+        sigma[side][joint], inflation[side][joint] = new, min(new_inflation[side][joint], most)
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(
         nominal, settings, sigma, inflation, evidence.prior, compared=evidence.compared, floor=floor
