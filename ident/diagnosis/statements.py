@@ -15,6 +15,7 @@ from typing import Any, Literal
 from ident.diagnosis.selection import margin
 from ident.effects import EFFECTS, described, summary_of
 from ident.effects.words import joints_text, named, quantity_text, spoken
+from lwr_driver.listing import Listing, Piece, text_of
 
 Plain = Mapping[str, Any]
 
@@ -115,21 +116,18 @@ class Part:
     head: Sequence[str] = ()
     rows: Sequence[Row] = ()
 
-    def lines(self) -> list[str]:
+    def lines(self) -> list[Piece]:
         """For the terminal."""
         if self.anchor == "limits":
             return [line for note in self.sentences for line in _wrapped(note, "note: ", "      ")]
-        found = [self.title]
+        found: list[Piece] = [self.title]
         for sentence in self.sentences:
             found += _wrapped(sentence, "  ", "    ")
         if not self.rows:
             return found
         most = _MOST_ROWS.get(self.anchor, len(self.rows))
-        rows = [self.head, *([str(cell) for cell in row] for row in self.rows[:most])]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        for first, *rest in rows:
-            cells = (f"{cell:>{width}}" for cell, width in zip(rest, widths[1:], strict=True))
-            found.append(f"  {first:<{widths[0]}}  {'  '.join(cells)}".rstrip())
+        rows = [[str(cell) for cell in row] for row in self.rows[:most]]
+        found.append(Listing(self.head, rows))
         more = len(self.rows) - most
         return [*found, f"  ... and {more} more"] if more > 0 else found
 
@@ -154,8 +152,12 @@ class Statements:
     parts: tuple[Part, ...]
 
     def text(self) -> str:
+        """The whole as plain text."""
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
         """The whole, for the terminal."""
-        found = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
+        found: list[Piece] = [*_wrapped(self.about, "", "  "), *_wrapped(f"{self.headline}.", "", "")]
         found += [f"{answer}." for answer in self.answers]
         found += [line for part in self.parts if part.anchor == "data" for line in part.lines()]
         for finding in (*self.findings, *self.character):
@@ -167,7 +169,7 @@ class Statements:
             if not one.finding:
                 found += [f"Side by side: {one.title}", *_beside(one)]
         rest = (part for part in self.parts if part.anchor != "data")
-        return "\n".join([*found, *(line for part in rest for line in part.lines())])
+        return [*found, *(line for part in rest for line in part.lines())]
 
     def brief(self) -> str:
         """Headline and summary, at most ten lines."""

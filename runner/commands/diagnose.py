@@ -129,4 +129,4 @@ def command(
     if as_json:
         hold_json(content)
     else:
-        of_diagnosis(found.said, page, out, str(found)).tell()
+        of_diagnosis(found.said, page, out).tell()

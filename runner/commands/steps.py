@@ -12,8 +12,8 @@ import click
 
 from fri.errors import ConfigurationError, OperatorError
 from runner.output import NEW_FILE, check_folder
-from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, PATH, ask, default_file, implied, json_option, to_json, verb
+from runner.status import StatusLine, answer
+from runner.terminal import NAMED_FILE, PATH, ask, default_file, implied, json_option, tell, verb
 
 if TYPE_CHECKING:
     from runner.experiment_file import Experiment
@@ -103,12 +103,9 @@ def _payload(experiment: Experiment, name: str | None) -> Any:
 
 
 def _tell(order: _Order, step: Step, *more: str) -> None:
-    if order.as_json:
-        click.echo(to_json(step))
-        return
-    for line in (*step.notes, *more):
-        click.echo(line)
-    click.echo(str(step))
+    if not order.as_json:
+        answer(*step.notes, *more)
+    tell(step, order.as_json)
 
 
 @verb("record")
