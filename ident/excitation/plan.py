@@ -28,6 +28,7 @@ from lwr_driver.configuration import parse, read_mapping
 from lwr_driver.extent import LONGEST_EXCITATION_S, Periods
 from lwr_driver.listing import Listing, Piece
 from lwr_driver.places import Place
+from lwr_driver.yaml_loader import yaml_content
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
@@ -182,7 +183,7 @@ class ExcitationPlan:
         """Write the plan file, read back first."""
 
         def check(text: str) -> None:
-            if ExcitationPlan.from_mapping(yaml.safe_load(text), "plan").to_yaml() != text:
+            if ExcitationPlan.from_mapping(yaml_content(text), "plan").to_yaml() != text:
                 raise DataError("the plan read back differs from the one written")
 
         write_checked(path, self.to_yaml(), check)
