@@ -89,7 +89,8 @@ def command(
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
     from ident.import_log import read_recording
-    from runner.diagnosis import arm_data, chain_of, known_arm
+    from runner.diagnosis import arm_data, chain_of
+    from runner.estimation import known_arm
     from runner.experiment_file import Experiment
     from runner.files import locked
     from runner.status import StatusLine

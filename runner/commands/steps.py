@@ -32,6 +32,15 @@ yes_option = click.option("--yes", is_flag=True, help="Confirm every question; f
 rights_option = click.option(
     "--allow-non-realtime", is_flag=True, help="Command a real arm without real-time rights; may stutter."
 )
+
+
+def _step_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of every step that commands the arm."""
+    for option in (json_option, rights_option, yes_option, out_option, payload_option):
+        command = option(command)
+    return command
+
+
 speed_option = click.option(
     "--speed",
     default=_SPEED,
@@ -164,11 +173,7 @@ def _write_poses(path: Path, step: Step) -> None:
     type=click.FloatRange(0.5, 3600.0),
     help="Time in command mode.",
 )
-@payload_option
-@out_option
-@yes_option
-@rights_option
-@json_option
+@_step_options
 def hold_command(
     file: str,
     seconds: float,
@@ -196,11 +201,7 @@ def hold_command(
 @click.argument("degrees", type=float)
 @click.argument("file", type=NAMED_FILE, default=default_file, callback=_no_option)
 @speed_option
-@payload_option
-@out_option
-@yes_option
-@rights_option
-@json_option
+@_step_options
 def jog_command(
     joint: str,
     degrees: float,
@@ -239,11 +240,7 @@ def jog_command(
 )
 @click.option("--pose", metavar="NAME", help="One of --poses; default: its `moves.home`.")
 @speed_option
-@payload_option
-@out_option
-@yes_option
-@rights_option
-@json_option
+@_step_options
 def home_command(
     file: str,
     poses: Path | None,
