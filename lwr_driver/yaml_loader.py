@@ -14,7 +14,7 @@ FLOAT = re.compile(r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-
 """Numbers of YAML 1.2: `5e-05` is one too, without a point and without a sign."""
 
 try:
-    from yaml.cyaml import CParser
+    from yaml._yaml import CParser
 except ImportError:
 
     class Loader(yaml.SafeLoader):

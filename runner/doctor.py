@@ -226,8 +226,8 @@ class Examination:
         """The findings as a table, advice, times of the answers, verdict."""
         lines: list[Piece] = [
             Listing(
-                ("", "subject", "found", "wanted"),
-                [(f.mark, f.subject, f.value, f.limit) for f in self.findings],
+                ("subject", "", "found", "wanted"),
+                [(f.subject, f.mark, f.value, f.limit) for f in self.findings],
                 0,
             ),
             *(f"  → {f.subject}: {f.advice}" for f in self.findings if f.verdict != "ok" and f.advice),

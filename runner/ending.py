@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # a command imports its own alone
     from ident.estimation.validate import Validation
     from ident.excitation.plan import ExcitationPlan
     from lwr_driver.session.session import SessionSummary
+    from runner.preflight import Preflight
 
 
 @dataclass(frozen=True)
@@ -204,6 +205,17 @@ def of_session(found: SessionSummary) -> Ending:
     next_step = f"lwr-run recover {path}" if ended is None else f"lwr-run identify {path} --out model.yaml"
     shown: list[Piece] = [found.topics(), "", found.joints()]
     return Ending(level, sentence, numbers, (), _VERBOSE, next_step, found.pieces(), shown)
+
+
+def of_check(found: Mapping[str, Preflight], file: str, files: int) -> Ending:
+    """The end of the checks of an experiment `file`, all held. found : by session. files : number of its files."""
+    count = sum(len(one.items) for one in found.values())
+    numbers = [
+        ("sessions", ", ".join(found)),
+        ("files", f"{files}, `--verbose` lists them with their SHA-256"),
+    ]
+    sentence = f"Nothing moved; all {count} conditions hold."
+    return Ending("good", sentence, numbers, next_step=f"lwr-run preview {quote(file)}")
 
 
 def of_plan(found: ExcitationPlan, target: Path) -> Ending:

@@ -235,9 +235,9 @@ class Preflight:
 
     def pieces(self) -> list[Piece]:
         """The conditions as a table, and the advice for those that fail."""
-        rows = [("ok" if one.ok else "FAIL", one.subject, one.value, one.limit) for one in self.items]
+        rows = [(one.subject, "ok" if one.ok else "FAIL", one.value, one.limit) for one in self.items]
         advice = [f"  → {one.subject}: {one.advice}" for one in self.items if not one.ok and one.advice]
-        return [Listing(("", "condition", "value", "limit"), rows, 0), *advice]
+        return [Listing(("condition", "", "value", "limit"), rows, 0), *advice]
 
     def __str__(self) -> str:
         return text_of(self.pieces())

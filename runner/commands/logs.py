@@ -230,8 +230,8 @@ def report_command(
         if as_json:
             click.echo(to_json(content))
         else:
-            rows = [(line.level, line.subject, line.found, line.wanted) for line in lines]
-            of_folder(folder, page, [Listing(("", "question", "found", "wanted"), rows, 0)]).tell()
+            rows = [(line.subject, line.level, line.found, line.wanted) for line in lines]
+            of_folder(folder, page, [Listing(("question", "", "found", "wanted"), rows, 0)]).tell()
         return
     from runner.report.paper_folder import save_for_paper
 

@@ -10,7 +10,7 @@ from lwr_driver.configuration import CONFIGS
 from runner import status
 from runner.output import OUTPUT_FILE, default_output
 from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb
+from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb, verbosity
 
 
 @verb("plan")
@@ -67,6 +67,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     """
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
+    from runner.ending import of_check
     from runner.experiment_file import Experiment
     from runner.files import examine, listed
     from runner.planning import Excitations, session_motion
@@ -74,7 +75,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
 
     experiment = Experiment.load(file)
     files = examine(experiment)
-    if not as_json:
+    if not as_json and verbosity():
         status.answer(listed(files))
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
@@ -90,6 +91,9 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
         hold_json({name: list_.items for name, list_ in found.items()})
     for preflight in found.values():
         preflight.enforce()
+    if not as_json:
+        status.answer("")
+        of_check(found, file, len(files)).tell()
 
 
 @verb("preview")
