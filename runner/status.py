@@ -20,12 +20,7 @@ if TYPE_CHECKING:  # rich is imported on the first use at a terminal: help pages
 STYLES = {"good": "green", "look": "yellow", "bad": "red"}
 """Colour by verdict."""
 
-# Verdict words of the tables: at the beginning of a line, or as a column.
-_WORDS = {
-    r"^\s*(ok|good)(?= )|(?<= )holds(?= )": "green",
-    r"^\s*(look|note|hint)(?= )": "yellow",
-    r"^\s*(FAIL|bad)(?= )|(?<= )VIOLATED(?= )": "bold red",
-}
+# Verdict words in the cells of tables.
 _VERDICTS = {
     **dict.fromkeys(("ok", "good", "yes", "holds", "kept"), "green"),
     **dict.fromkeys(("look", "note", "hint", "differs", "advice"), "yellow"),
@@ -127,10 +122,7 @@ def _hung(line: str, width: int, style: str, command: bool) -> Text:
             row = ""
         row += word
     text = ("\\\n" if command else "\n").join([*rows, row]).replace("\u00a0", " ")
-    shown = Text(text, style=style, no_wrap=True, overflow="ignore")
-    for words, colour in _WORDS.items() if not style else ():
-        shown.highlight_regex(words, colour)
-    return shown
+    return Text(text, style=style, no_wrap=True, overflow="ignore")
 
 
 def _pieces(word: str, width: int) -> Iterator[str]:
