@@ -224,7 +224,9 @@ def pictures_page() -> str:
         "Made by `make pictures`, by `make screenshot` in a browser, and by the benchmarks.\n",
     ]
     seen = set()
-    for page in sorted((ROOT / "docs").glob("*.md")):
+    # In the order of the navigation.
+    pages = re.findall(r"(\w+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    for page in (ROOT / "docs" / name for name in pages if (ROOT / "docs" / name).is_file()):
         for words, file in re.findall(r"!\[([^\]]*)\]\((images/[^)]+)\)", page.read_text(encoding="utf-8")):
             if file not in seen:
                 seen.add(file)

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lwr_driver.listing import Listing, Piece
-from runner.ending import Ending
 from runner.output import OUTPUT_FILE
-from runner.report.verdicts import Verdict
 from runner.terminal import (
     NAMED_FILE,
     PATH,
@@ -26,6 +24,7 @@ from runner.terminal import (
 
 if TYPE_CHECKING:
     from ident.diagnosis import Reference
+    from runner.ending import Ending
     from runner.experiment_file import Experiment
 
 
@@ -207,6 +206,9 @@ def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, 
 
 
 def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], out: Path) -> Ending:
+    from runner.ending import Ending
+    from runner.report.verdicts import Verdict
+
     rows: list[tuple[str, ...]] = []
     if len(found.compliance) and (found.compliance > 0.0).all():
         rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" for c in found.compliance)))
