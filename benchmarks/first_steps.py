@@ -1,7 +1,8 @@
 """How long do a newcomer's first hours take? The commands of the tutorials, timed.
 
 Run `python -m benchmarks.first_steps [--only emulator logs fault] [--lwr-run COMMAND]`. Each command runs in an empty
-folder, as a person would give it; wall and processor time are printed. `logs` reads the ROKAE recordings in
+folder, as a person would give it; wall and processor time are printed, and the
+end of its output. `logs` reads the ROKAE recordings in
 `../shared/data/xmate7p`, and is left out without them. The compiled code of an earlier run is used again.
 """
 
@@ -17,6 +18,9 @@ import time
 from pathlib import Path
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data/xmate7p"
+_SHOWN = 8
+"""Last lines of each command that are printed, too."""
+
 HOSE = """
 emulator_settings:
   robot.effects:
@@ -54,6 +58,8 @@ def trial(name: str, lwr_run: str) -> None:
             done = subprocess.run([lwr_run, *line.split()], cwd=place, capture_output=True, text=True)
             wall, used = time.monotonic() - began, processor_s() - used
             print(f"{wall:7.1f} s  processor {used:6.1f} s  lwr-run {line}", flush=True)
+            for text in done.stdout.rstrip().splitlines()[-_SHOWN:]:
+                print(f"    {text}")
             if done.returncode:
                 sys.exit(f"ended with {done.returncode}: {done.stderr.strip()}")
             if line == "init hose":
