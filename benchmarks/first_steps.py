@@ -1,9 +1,9 @@
 """How long do a newcomer's first hours take? The commands of the tutorials, timed.
 
 Run `python -m benchmarks.first_steps [--only emulator logs fault] [--lwr-run COMMAND]`. Each command runs in an empty
-folder, as a person would give it; wall and processor time are printed, and the
-end of its output. `logs` reads the ROKAE recordings in
-`../shared/data/xmate7p`, and is left out without them. The compiled code of an earlier run is used again.
+folder, as a person would give it; wall and processor time are printed, and the end of its output. `logs` reads the
+ROKAE recordings in `../shared/data/xmate7p`, and is left out without them. The compiled code of an earlier run is used
+again.
 """
 
 from __future__ import annotations
