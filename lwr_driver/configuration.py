@@ -19,7 +19,7 @@ from fri.errors import ConfigurationError
 from fri.quantities import LONGEST_LIST, LONGEST_TEXT, check_value, check_values, metas
 from lwr_driver.places import Place
 from lwr_driver.references import frozen_file, note
-from lwr_driver.yaml_loader import FLOAT, yaml_content
+from lwr_driver.yaml_text import Dumper, yaml_content
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
@@ -30,17 +30,10 @@ _LARGEST_FILE = 50_000_000  # [bytes]
 T = TypeVar("T")
 
 
-class _Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes every text `yaml_content` would read as a number."""
-
-
-_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+.0123456789"))
-
-
 def yaml_text(content: Any) -> str:
     """Plain content as YAML that `read_yaml` reads back, keys in their order."""
     return yaml.dump(
-        content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+        content, Dumper=Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from lwr_driver.yaml_loader import Loader
+from lwr_driver.yaml_text import Loader
 
 Key = str | int
 

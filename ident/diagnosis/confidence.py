@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fri.errors import ConfigurationError
-from lwr_driver.yaml_loader import yaml_content
+from lwr_driver.yaml_text import yaml_content
 
 WEIGHTS = "confidence.yaml"
 # Least probability of a finding.

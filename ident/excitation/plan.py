@@ -28,7 +28,7 @@ from lwr_driver.configuration import parse, read_mapping
 from lwr_driver.extent import LONGEST_EXCITATION_S, Periods
 from lwr_driver.listing import Listing, Piece
 from lwr_driver.places import Place
-from lwr_driver.yaml_loader import yaml_content
+from lwr_driver.yaml_text import yaml_content
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6

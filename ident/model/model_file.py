@@ -36,7 +36,7 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.model.covariance import DIGITS, nearest_covariance, rounded
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import parse, read_mapping
-from lwr_driver.yaml_loader import yaml_content
+from lwr_driver.yaml_text import Dumper, yaml_content
 
 Model: TypeAlias = DynamicModel | str | os.PathLike[str]
 """A model or the path of a model file."""
@@ -332,7 +332,7 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(Dumper):
     """Block style for the file, flow style for its rows, literal blocks for texts of several lines."""
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Union, cast
 
 import msgspec
 
-from lwr_driver.yaml_loader import yaml_content
+from lwr_driver.yaml_text import yaml_content
 
 MEANINGS = Path(__file__).with_name("meanings.yaml")
 

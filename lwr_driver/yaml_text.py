@@ -10,8 +10,9 @@ from yaml.composer import Composer
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
-FLOAT = re.compile(r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+$")
-"""Numbers of YAML 1.2: `5e-05` is one too, without a point and without a sign."""
+_FLOAT = re.compile(
+    r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+$"
+)  # as YAML 1.2: `5e-05` too
 
 try:
     from yaml._yaml import CParser
@@ -31,7 +32,12 @@ else:
                 base.__init__(self)
 
 
-Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+.0123456789"))
+class Dumper(yaml.SafeDumper):
+    """SafeDumper that quotes every text `Loader` would read as a number."""
+
+
+for _kind in (Loader, Dumper):
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
 
 
 def yaml_content(text: str) -> Any:
