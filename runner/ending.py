@@ -212,7 +212,7 @@ def of_check(found: Mapping[str, Preflight], file: str, files: int) -> Ending:
     count = sum(len(one.items) for one in found.values())
     numbers = [
         ("sessions", ", ".join(found)),
-        ("files", f"{files}, `--verbose` lists them with their SHA-256"),
+        ("files", f"{files}, with their SHA-256 above"),
     ]
     sentence = f"Nothing moved; all {count} conditions hold."
     return Ending("good", sentence, numbers, next_step=f"lwr-run preview {quote(file)}")

@@ -10,7 +10,7 @@ from lwr_driver.configuration import CONFIGS
 from runner import status
 from runner.output import OUTPUT_FILE, default_output
 from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb, verbosity
+from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb
 
 
 @verb("plan")
@@ -75,7 +75,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
 
     experiment = Experiment.load(file)
     files = examine(experiment)
-    if not as_json and verbosity():
+    if not as_json:
         status.answer(listed(files))
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
