@@ -158,12 +158,12 @@ def of_comparison(found: Comparison, models: Sequence[Path], page: Path | None) 
         sentence = f"{count} of {all_} parameters differ by more than chance."
     else:
         sentence = f"No parameter of {all_} differs by more than chance."
-    largest = max(found.differences, key=lambda one: abs(one.z) if math.isfinite(one.z) else -1.0)
-    numbers = [
-        ("all together", f"p = {found.p:.2g} by chance" if known else "unknown"),
-        ("largest", f"{largest.name} {largest.percent:+z.1f} %, {abs(largest.z):.1f} standard deviations"),
-        ("level", f"{100 * found.level:g} % over all of them together"),
-    ]
+    numbers = [("all together", f"p = {found.p:.2g} by chance" if known else "unknown")]
+    if known:
+        largest = max(found.differences, key=lambda one: abs(one.z) if math.isfinite(one.z) else -1.0)
+        text = f"{largest.name} {largest.percent:+z.1f} %, {abs(largest.z):.1f} standard deviations"
+        numbers.append(("largest", text))
+    numbers.append(("level", f"{100 * found.level:g} % over all of them together"))
     shown: list[Piece] = []
     if 0 < count <= _SHORT:
         shown = [f"first   {found.first}", f"second  {found.second}", "", found.listing(all_rows=False)]
@@ -220,11 +220,11 @@ def of_check(found: Mapping[str, Preflight], file: str, files: int) -> Ending:
 
 def of_plan(found: ExcitationPlan, target: Path) -> Ending:
     """The end of the planning of a motion, written to `target`."""
-    margin = min(found.check.margins, key=lambda one: one.share)
+    margins = sorted(found.check.margins, key=lambda one: one.share)
     worst = max(found.rsd_percent.items(), key=lambda item: item[1], default=("-", math.nan))
     numbers = [
         *((name, f"{value:.4g}") for name, value in list(found.objectives.items())[:1]),
-        ("tightest", f"{margin}"),
+        *(("tightest", f"{margin}") for margin in margins[:1]),
         ("least certain", f"{worst[0]}, {worst[1]:.1f} % predicted"),
     ]
     kept = "within every limit" if found.check.ok else "OUTSIDE its limits"
