@@ -10,6 +10,7 @@ import importlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ PAGES = {
     "changes.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
     "krl.md": "configs/krl/README.md",
+    "notebook.md": "docs/notebook.ipynb",
 }
 PACKAGES = ("fri", "lwr_driver", "ident", "sim_backend", "runner")
 API = {
@@ -57,7 +59,7 @@ def turned(text: str, page: str) -> str:
         if "://" in target or not target:
             return found[0]
         there = (source.parent / target).resolve()
-        if re.fullmatch(r"[\w./]+\.md", label):
+        if re.fullmatch(r"[\w./]+\.(md|ipynb)", label):
             # A page has no ending.
             label = Path(label).stem.replace("_", " ")
         for name, file in PAGES.items():
@@ -171,6 +173,28 @@ def _template(node: ast.expr) -> str:
     return "..."
 
 
+@cache
+def notebook() -> tuple[str, dict[str, bytes]]:
+    """The notebook as Markdown with the outputs that it stores, and its figures by name."""
+    from nbconvert import MarkdownExporter
+
+    text, found = MarkdownExporter().from_filename(str(ROOT / PAGES["notebook.md"]))
+    # Tables of pandas get the style of the site, and scroll on narrow screens.
+    text = re.sub(
+        r'<table border="1" class="dataframe">|<style scoped>.*?</style>', _plain_table, text, flags=re.DOTALL
+    )
+    return text.replace("![png](", "![Figure of the cell above]("), found["outputs"]
+
+
+def _plain_table(found: re.Match[str]) -> str:
+    return "<table>" if found[0].startswith("<table") else ""
+
+
+def notebook_page() -> str:
+    """The notebook with the outputs that the tests compare."""
+    return notebook()[0]
+
+
 def messages_page() -> str:
     """Every message of an error, by who must act."""
     found = list(messages())
@@ -200,7 +224,9 @@ def pictures_page() -> str:
         "Made by `make pictures`, by `make screenshot` in a browser, and by the benchmarks.\n",
     ]
     seen = set()
-    for page in sorted((ROOT / "docs").glob("*.md")):
+    # In the order of the navigation.
+    pages = re.findall(r"(\w+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    for page in (ROOT / "docs" / name for name in pages if (ROOT / "docs" / name).is_file()):
         for words, file in re.findall(r"!\[([^\]]*)\]\((images/[^)]+)\)", page.read_text(encoding="utf-8")):
             if file not in seen:
                 seen.add(file)
@@ -215,6 +241,7 @@ MADE = {
     "api.md": api_page,
     "messages.md": messages_page,
     "pictures.md": pictures_page,
+    "notebook.md": notebook_page,
 }
 """Pages made from the code, by name."""
 
@@ -222,7 +249,7 @@ MADE = {
 def generated() -> dict[str, str]:
     """Text of each page that is not a file of docs/."""
     return {
-        **{page: (ROOT / file).read_text(encoding="utf-8") for page, file in PAGES.items()},
+        **{p: (ROOT / f).read_text(encoding="utf-8") for p, f in PAGES.items() if p not in MADE},
         **{page: make() for page, make in MADE.items()},
     }
 
@@ -231,8 +258,8 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages made here."""
     from mkdocs.structure.files import File
 
-    for name, text in generated().items():
-        files.append(File.generated(config, name, content=text))
+    for name, content in {**generated(), **notebook()[1]}.items():
+        files.append(File.generated(config, name, content=content))
     return files
 
 

@@ -6,10 +6,9 @@ Names are imported on first use, so `import ident` is cheap. The packages below 
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import fri  # noqa: F401 - finds a place for compiled code
+from fri.on_first_use import on_first_use
 
 if TYPE_CHECKING:
     from ident.diagnosis import commission, diagnose
@@ -65,17 +64,11 @@ _HOMES = {
 }
 
 
+_find, __dir__ = on_first_use(globals(), _HOMES)
+
+
 def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        return _version()
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(home), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return _version() if name == "__version__" else _find(name)
 
 
 def _version() -> str:

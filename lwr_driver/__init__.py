@@ -5,8 +5,9 @@ Names are imported on first use: a process of the driver loads its own modules o
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from fri.on_first_use import on_first_use
 
 if TYPE_CHECKING:
     from lwr_driver.arm import Arm, Cell, CollisionChecker
@@ -31,19 +32,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    "arm": ("Arm", "Cell", "CollisionChecker"),
-    "driver": ("Driver", "LinkSettings"),
-    "motion": ("Motion", "check_motion", "move_to"),
-    "session": ("Session", "SessionWriter", "read_session", "recover", "session_metadata"),
+    ".arm": ("Arm", "Cell", "CollisionChecker"),
+    ".driver": ("Driver", "LinkSettings"),
+    ".motion": ("Motion", "check_motion", "move_to"),
+    ".session": ("Session", "SessionWriter", "read_session", "recover", "session_metadata"),
 }
-
-
-def __getattr__(name: str) -> Any:
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{home}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = on_first_use(globals(), _HOMES)

@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import math
 import os
-import re
 import reprlib
 import types
 import typing
@@ -20,6 +19,7 @@ from fri.errors import ConfigurationError
 from fri.quantities import LONGEST_LIST, LONGEST_TEXT, check_value, check_values, metas
 from lwr_driver.places import Place
 from lwr_driver.references import frozen_file, note
+from lwr_driver.yaml_text import Dumper, yaml_content
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
@@ -30,26 +30,10 @@ _LARGEST_FILE = 50_000_000  # [bytes]
 T = TypeVar("T")
 
 
-class _Loader(yaml.SafeLoader):
-    """SafeLoader with the numbers of YAML 1.2: `5e-05` is one too, without a point and without a sign."""
-
-
-class _Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes every text `_Loader` would read as a number."""
-
-
-for _kind_of_yaml in (_Loader, _Dumper):
-    _kind_of_yaml.add_implicit_resolver(
-        "tag:yaml.org,2002:float",
-        re.compile(r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+$"),
-        list("-+.0123456789"),
-    )
-
-
 def yaml_text(content: Any) -> str:
     """Plain content as YAML that `read_yaml` reads back, keys in their order."""
     return yaml.dump(
-        content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
+        content, Dumper=Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120
     )
 
 
@@ -126,7 +110,7 @@ def read_yaml(path: Path) -> Any:
     """Parsed content of a YAML file (safe types only), with the position of a syntax error in the message."""
     text = read_text(path)
     try:
-        return yaml.load(text, _Loader)
+        return yaml_content(text)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = path if mark is None else f"{path}:{mark.line + 1}"

@@ -81,6 +81,8 @@ class HostedLoop:
         except OSError as error:
             raise NetworkError(f"the emulator's process {host.pid} is gone: {error}") from error
         answer = self._next(_START_TIMEOUT_S)
+        while answer is not None and "ended" in answer:  # the loop before this one
+            answer = self._next(_START_TIMEOUT_S)
         if answer is None:
             raise NetworkError(f"the loop did not get ready within {_START_TIMEOUT_S:g} s")
         if "error" in answer:

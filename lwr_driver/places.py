@@ -14,6 +14,8 @@ from typing import Any
 
 import yaml
 
+from lwr_driver.yaml_text import Loader
+
 Key = str | int
 
 
@@ -87,7 +89,7 @@ def line_of(file: Path, keys: tuple[Key, ...]) -> int | None:
 
 @lru_cache(maxsize=4)
 def _composed(file: Path, changed_ns: int) -> yaml.Node | None:
-    return yaml.compose(file.read_text(encoding="utf-8"), yaml.SafeLoader)
+    return yaml.compose(file.read_text(encoding="utf-8"), Loader)
 
 
 def _child(node: yaml.Node | None, key: Key) -> tuple[int, yaml.Node] | None:

@@ -12,7 +12,6 @@ import shutil
 import socket
 import struct
 import subprocess
-import textwrap
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -69,7 +68,7 @@ _NET = Path("/sys/class/net")
 _GOOD_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter")
 _CLOCK_UNSYNCHRONISED = 5
 _TIMEX_BYTES = 256
-_MARKS = {"ok": "ok  ", "advice": "note", "fail": "FAIL"}
+_MARKS = {"ok": "ok", "advice": "note", "fail": "FAIL"}
 
 
 @dataclass(frozen=True)
@@ -86,12 +85,10 @@ class ComputerFinding:
     advice: str = ""
     who: type[LwrError] = RefusedError
 
-    def __str__(self) -> str:
-        text = f"{_MARKS[self.verdict]} {self.subject:<22} {self.value:<44} {self.limit}".rstrip()
-        if self.verdict == "ok" or not self.advice:
-            return text
-        lines = textwrap.wrap(self.advice, 100, break_long_words=False, break_on_hyphens=False)
-        return "\n".join([text, f"     → {lines[0]}", *(f"       {line}" for line in lines[1:])])
+    @property
+    def mark(self) -> str:
+        """The verdict in a table."""
+        return _MARKS[self.verdict]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""

@@ -24,6 +24,7 @@ from fri.states import ALL_DRIVES
 from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings, LinkState
 from lwr_driver.link import advise_quality
+from lwr_driver.listing import Listing, Piece, text_of
 from runner.computer import ComputerFinding, examine_computer, find_interface, graded
 
 _HEADER = np.dtype([("send_seq", "<u2"), ("refl_seq", "<u2"), ("packet_size", "<u2"), ("datagram_id", "<u2")])
@@ -35,7 +36,7 @@ _POOR_SHARE = 0.95
 _WARM = 60.0
 # Upper edges of the printed histogram [us].
 _STEPS = (20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
-_BAR = 40
+_BAR = 18
 _QUANTILES = (0.5, 0.99, 0.999)
 _RANKS = ("UNACCEPTABLE", "BAD", "OK", "PERFECT")
 
@@ -221,11 +222,22 @@ class Examination:
             return f"Not ready: {', '.join(failed)}."
         return f"Ready. Better with: {', '.join(noted)}." if noted else "Ready."
 
-    def __str__(self) -> str:
-        lines = [str(finding) for finding in self.findings]
+    def pieces(self) -> list[Piece]:
+        """The findings as a table, advice, times of the answers, verdict."""
+        lines: list[Piece] = [
+            Listing(
+                ("subject", "", "found", "wanted"),
+                [(f.subject, f.mark, f.value, f.limit) for f in self.findings],
+                0,
+            ),
+            *(f"  → {f.subject}: {f.advice}" for f in self.findings if f.verdict != "ok" and f.advice),
+        ]
         if self.link is not None and self.link.counts.sum():
-            lines += ["", "time from packet to answer", *_histogram(self.link)]
-        return "\n".join([*lines, "", self.verdict])
+            lines += ["", _histogram(self.link)]
+        return [*lines, "", self.verdict]
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -484,15 +496,15 @@ def _program(patient: Patient, link: LinkTest) -> list[ComputerFinding]:
     return [*found, graded("motor torques", f"{rate:.1f} new values/s", "above 20/s", *cases, RobotError)]
 
 
-def _histogram(link: LinkTest) -> list[str]:
+def _histogram(link: LinkTest) -> Listing:
     edges = np.array([*_STEPS, np.inf])
     places = np.searchsorted(edges, 1e6 * link.edges - 1e-6)
     places[-1] = len(edges) - 1
     sums = np.bincount(places, weights=link.counts, minlength=len(edges))
     total = sums.sum()
-    lines = []
+    rows = []
     for place, count in enumerate(sums.tolist()):
         name = f"to {edges[place]:.0f} µs" if np.isfinite(edges[place]) else f"over {_STEPS[-1]:.0f} µs"
         bar = "█" * round(_BAR * count / total)
-        lines.append(f"  {name:>13} {int(count):>8} {100 * count / total:7.3f} %  {bar}".rstrip())
-    return lines
+        rows.append((name, f"{int(count)}", f"{100 * count / total:.3f}", bar))
+    return Listing(("packet to answer", "count", "%", ""), rows)

@@ -8,16 +8,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ident.diagnosis.statements import Statements
 from ident.estimation.scores import by_side
+from lwr_driver.listing import Piece
 from runner import status
 from runner.report.folder import ResultFolder
 from runner.report.verdicts import Level, Verdict, headline, verdicts
 from runner.terminal import verbosity
+
+if TYPE_CHECKING:  # a command imports its own alone
+    from ident.estimation.compare import Comparison
+    from ident.estimation.payload import PayloadEstimate
+    from ident.estimation.validate import Validation
+    from ident.excitation.plan import ExcitationPlan
+    from lwr_driver.session.session import SessionSummary
+    from runner.preflight import Preflight
 
 
 @dataclass(frozen=True)
@@ -25,7 +34,7 @@ class Ending:
     """The end of a command.
 
     numbers : name and value. look : verdicts to look at. advice : sentences before the next step. next_step : a shell
-    command. tables : the whole text, for `--verbose`.
+    command. shown : tables always there. tables : all of them instead, for `--verbose`.
     """
 
     level: Level
@@ -34,13 +43,15 @@ class Ending:
     look: Sequence[Verdict] = ()
     advice: Sequence[str] = ()
     next_step: str = ""
-    tables: str = ""
+    tables: Sequence[Piece] = ()
+    shown: Sequence[Piece] = ()
 
     def tell(self) -> None:
         """Write the end to standard output, the last line being the next step."""
         out = sys.stdout
-        if verbosity() and self.tables:
-            status.write(f"{self.tables.rstrip()}\n", stream=out)
+        pieces = self.tables if verbosity() and self.tables else self.shown
+        if pieces:
+            status.answer(*pieces, "")
         status.write(self.sentence, f"bold {status.STYLES[self.level]}", stream=out)
         for verdict in self.look:
             wanted = f" (wanted: {verdict.wanted})" if verdict.wanted else ""
@@ -49,10 +60,10 @@ class Ending:
         width = max((len(name) for name, _ in self.numbers), default=0)
         for name, value in self.numbers:
             status.write(f"  {name:<{width}}  {value}", stream=out)
-        for text in self.advice:
+        for text in () if verbosity() and self.advice == _VERBOSE else self.advice:
             status.write(text, stream=out)
         if self.next_step:
-            status.write(self.next_step, "bold", stream=out, command=True)
+            status.next_step(self.next_step)
 
 
 def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -87,18 +98,18 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     return found
 
 
-def of_estimate(content: Mapping[str, Any], model: Path | None, tables: str) -> Ending:
+def of_estimate(content: Mapping[str, Any], model: Path | None, tables: Sequence[Piece]) -> Ending:
     """The end of an estimate without a folder of results. content : of `Identification.to_dict`."""
     names = [one["name"] for one in content["sessions"]]
     sentence = f"Model {content['model']} estimated from {len(names)} session{'s' * (len(names) > 1)}."
     warnings = content.get("warnings") or ()
-    advice = [] if verbosity() else ["`--verbose` shows the tables, `--results FOLDER` writes a report"]
+    advice = ["`--verbose` shows every table, `--results FOLDER` writes a report."]
     next_step = "" if model is None else f"lwr-run validate {quote(str(model))} HELD_OUT.mcap"
     look = [Verdict("warning", text, "", "look") for text in warnings]
     return Ending("look" if look else "good", sentence, numbers_of(content), look, advice, next_step, tables)
 
 
-def of_diagnosis(said: Statements, page: Path | None, folder: Path, tables: str) -> Ending:
+def of_diagnosis(said: Statements, page: Path | None, folder: Path) -> Ending:
     """The end of a diagnosis with results in `folder`."""
     shown = [line for line in said.lines if line.anchor != "limits"]
     numbers = [(line.subject, line.found) for line in shown if line.level == "good"]
@@ -106,7 +117,132 @@ def of_diagnosis(said: Statements, page: Path | None, folder: Path, tables: str)
         Verdict(line.subject, line.found, line.wanted, line.level) for line in shown if line.level != "good"
     ]
     next_step = open_page(page if page is not None else folder / "diagnosis.txt")
-    return Ending(said.level, f"{said.headline}.", numbers, look, said.answers, next_step, tables)
+    return Ending(said.level, f"{said.headline}.", numbers, look, said.answers, next_step, said.pieces())
+
+
+def of_validation(found: Validation, tables: Sequence[Piece], sessions: Sequence[Path]) -> Ending:
+    """The end of a test of a model. tables : of all that was computed."""
+    worst = max(found.scores, key=lambda score: max(score.relative.values()))
+    seen = " (seen by the estimate: no validation)" if worst.seen else " on held-out data"
+    sentence = (
+        f"The model of {found.robot} predicts the torque with an error of {by_side(worst.relative)}{seen}."
+    )
+    own = [max(score.relative.values()) for score in found.scores]
+    joints = max(worst.scores, key=lambda score: -1.0 if math.isnan(score.relative) else score.relative)
+    numbers = [
+        ("sessions", f"{len(own)}" + (f", the best {100 * min(own):.2f} %" if len(own) > 1 else "")),
+        ("largest", f"{joints.joint} {joints.side}, {100 * joints.relative:.1f} %, rms {joints.rms:.3f} Nm"),
+        ("compared with", ", ".join(dict.fromkeys(one.predictor for one in found.competitors)) or "nothing"),
+    ]
+    look = [Verdict("not validated", f"{one}", "", "bad") for one in found.unscored]
+    look += [Verdict("warning", text, "", "look") for text in found.warnings]
+    return Ending(
+        _level(look),
+        sentence,
+        numbers,
+        look,
+        _VERBOSE,
+        " ".join(["lwr-run diagnose", *(quote(str(path)) for path in sessions), "--out diagnosis"]),
+        tables,
+        found.comparison(),
+    )
+
+
+def of_comparison(found: Comparison, models: Sequence[Path], page: Path | None) -> Ending:
+    """The end of a comparison of two models. page : its report, None without."""
+    count, all_ = len(found.significant), len(found.differences)
+    known = math.isfinite(found.p)
+    if not known:
+        sentence = f"{all_} parameters compared without significance: a model has no covariance."
+    elif count:
+        sentence = f"{count} of {all_} parameters differ by more than chance."
+    else:
+        sentence = f"No parameter of {all_} differs by more than chance."
+    numbers = [("all together", f"p = {found.p:.2g} by chance" if known else "unknown")]
+    if known:
+        largest = max(found.differences, key=lambda one: abs(one.z) if math.isfinite(one.z) else -1.0)
+        text = f"{largest.name} {largest.percent:+z.1f} %, {abs(largest.z):.1f} standard deviations"
+        numbers.append(("largest", text))
+    numbers.append(("level", f"{100 * found.level:g} % over all of them together"))
+    shown: list[Piece] = []
+    if 0 < count <= _SHORT:
+        shown = [f"first   {found.first}", f"second  {found.second}", "", found.listing(all_rows=False)]
+    ask = " ".join(["lwr-run compare", *(quote(str(path)) for path in models), "--report comparison.html"])
+    level: Level = "good" if known and not count else "look"
+    next_step = ask if page is None else open_page(page)
+    return Ending(level, sentence, numbers, (), _VERBOSE, next_step, found.pieces(), shown)
+
+
+def of_payload(found: PayloadEstimate, arm: Path, sessions: Sequence[Path], out: Path | None) -> Ending:
+    """The end of an estimate of a payload. arm : the model. out : the model written with the payload."""
+    sure = not abs(found.mass_deviation) > 3.0
+    sentence = f"Payload {found.payload} has {_spread(found.mass, found.mass_std)}."
+    com = ", ".join(f"{1e3 * c:z.1f} ± {1e3 * s:.1f}" for c, s in zip(found.com, found.com_std, strict=True))
+    numbers = [
+        ("centre of mass", f"{com} mm"),
+        ("mass", found.verdict),
+        ("residual rms", f"up to {max(found.residual.values()):.3f} Nm"),
+    ]
+    again = ["lwr-run payload", *(quote(str(path)) for path in (arm, *sessions)), "--out with_payload.yaml"]
+    next_step = " ".join(again) if out is None else f"lwr-run export {quote(str(out))} arm.urdf"
+    notes = [Verdict("note", text.removeprefix("WARNING: "), "", "look") for text in found.notes]
+    level: Level = "good" if sure and not notes else "look"
+    return Ending(level, sentence, numbers, notes, (), next_step, found.pieces(), [found.listing()])
+
+
+def of_session(found: SessionSummary) -> Ending:
+    """The end of a summary of a session log."""
+    data, path = found.metadata, quote(str(found.path))
+    ended = None if found.end is None else found.end.get("exit_status", "unknown")
+    level: Level = "bad" if ended is None else "good" if ended == "success" else "look"
+    how = "the recorder died" if ended is None else f"ended with {ended}"
+    sentence = f"{found.duration_s:.1f} s of {data.get('robot', 'an unknown arm')}, {how}."
+    numbers = [
+        ("payload", found.payload),
+        ("recorded", found.utc_first),
+        ("missing", "; ".join(found.missing) or "nothing"),
+    ]
+    next_step = f"lwr-run recover {path}" if ended is None else f"lwr-run identify {path} --out model.yaml"
+    shown: list[Piece] = [found.topics(), "", found.joints()]
+    return Ending(level, sentence, numbers, (), _VERBOSE, next_step, found.pieces(), shown)
+
+
+def of_check(found: Mapping[str, Preflight], file: str, files: int) -> Ending:
+    """The end of the checks of an experiment `file`, all held. found : by session. files : number of its files."""
+    count = sum(len(one.items) for one in found.values())
+    numbers = [
+        ("sessions", ", ".join(found)),
+        ("files", f"{files}, with their SHA-256 above"),
+    ]
+    sentence = f"Nothing moved; all {count} conditions hold."
+    return Ending("good", sentence, numbers, next_step=f"lwr-run preview {quote(file)}")
+
+
+def of_plan(found: ExcitationPlan, target: Path) -> Ending:
+    """The end of the planning of a motion, written to `target`."""
+    margins = sorted(found.check.margins, key=lambda one: one.share)
+    worst = max(found.rsd_percent.items(), key=lambda item: item[1], default=("-", math.nan))
+    numbers = [
+        *((name, f"{value:.4g}") for name, value in list(found.objectives.items())[:1]),
+        *(("tightest", f"{margin}") for margin in margins[:1]),
+        ("least certain", f"{worst[0]}, {worst[1]:.1f} % predicted"),
+    ]
+    kept = "within every limit" if found.check.ok else "OUTSIDE its limits"
+    sentence = f"A motion of {found.period_s:g} s, {kept}."
+    next_step = f"lwr-run preview {quote(str(target))}"
+    from ident.excitation.plan import plan_pieces
+
+    level: Level = "good" if found.check.ok else "bad"
+    return Ending(level, sentence, numbers, (), _VERBOSE, next_step, plan_pieces(found))
+
+
+_VERBOSE = ("`--verbose` shows every table.",)
+_SHORT = 12
+"""Rows of a table shown without `--verbose`."""
+
+
+def _level(look: Sequence[Verdict]) -> Level:
+    return next((one for one in ("bad", "look") if any(line.level == one for line in look)), "good")
 
 
 def _is_mass(name: str) -> bool:
@@ -124,7 +260,11 @@ def open_page(page: Path) -> str:
 
 
 def of_folder(
-    folder: Path, page: Path | None, tables: str = "", more: Sequence[str] = (), advice: Sequence[str] = ()
+    folder: Path,
+    page: Path | None,
+    tables: Sequence[Piece] = (),
+    more: Sequence[str] = (),
+    advice: Sequence[str] = (),
 ) -> Ending:
     """The end of a run with results in `folder`. page : its report. more : sentences after the verdict."""
     results = ResultFolder.load(folder)

@@ -27,6 +27,7 @@ from lwr_driver.arm import Arm
 from lwr_driver.arm.collision import CollisionChecker
 from lwr_driver.driver import Driver
 from lwr_driver.link import LinkState
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.motion import Motion, extremes
 from lwr_driver.realtime import Rights
 from runner.computer import free_disk
@@ -220,11 +221,6 @@ class Item:
     ok: bool
     advice: str = ""
 
-    def __str__(self) -> str:
-        mark = "ok  " if self.ok else "FAIL"
-        text = f"{mark} {self.subject:<28} {self.value:<34} limit {self.limit}"
-        return text if self.ok or not self.advice else f"{text}\n     → {self.advice}"
-
 
 @dataclass(frozen=True)
 class Preflight:
@@ -237,8 +233,14 @@ class Preflight:
         """Every condition holds."""
         return all(item.ok for item in self.items)
 
+    def pieces(self) -> list[Piece]:
+        """The conditions as a table, and the advice for those that fail."""
+        rows = [(one.subject, "ok" if one.ok else "FAIL", one.value, one.limit) for one in self.items]
+        advice = [f"  → {one.subject}: {one.advice}" for one in self.items if not one.ok and one.advice]
+        return [Listing(("condition", "", "value", "limit"), rows, 0), *advice]
+
     def __str__(self) -> str:
-        return "\n".join(str(item) for item in self.items)
+        return text_of(self.pieces())
 
     def __add__(self, other: Iterable[Item]) -> Preflight:
         return Preflight((*self.items, *other))

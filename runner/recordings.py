@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fri.errors import ConfigurationError, DataError
+from runner.status import write
 from runner.terminal import ask
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def read_recordings(
             f"{mapping} exists and was not guessed; use it with `lwr-run import`, or remove it"
         )
     mapping.write_text(guess.text, encoding="utf-8")
-    click.echo(f"{mapping}\n", err=True)
+    write(f"{mapping}\n")
     names = dict(zip(foreign, _names(foreign), strict=True))
     sessions = []
     for path in paths:
@@ -132,7 +133,7 @@ def read_recordings(
             continue
         target = folder / f"{names[path]}.mcap"
         _clear(target)
-        click.echo(f"{import_log(guess.mapping, path, target)}\n", err=True)
+        write(f"{import_log(guess.mapping, path, target)}\n")
         sessions.append(read_session(target, status=False))
     return sessions
 
@@ -155,16 +156,21 @@ def at_terminal() -> bool:
     return sys.stdin.isatty()
 
 
+def _show(guess: Guess) -> None:
+    for piece in guess.pieces():
+        write(piece)
+
+
 def _confirm(guess: Guess, yes: bool) -> None:
     if yes:
-        click.echo(str(guess), err=True)
+        _show(guess)
     elif not at_terminal():
         raise ConfigurationError(
             f"the columns of {guess.source} are a guess, to be confirmed at a terminal or with --yes:\n{guess}\n"
             f"or correct this mapping file and use `lwr-run import`:\n\n{guess.text}"
         )
     else:
-        click.echo(str(guess), err=True)
+        _show(guess)
         if not ask("Is this right?"):
             raise ConfigurationError(f"correct this mapping file and use `lwr-run import`:\n\n{guess.text}")
 

@@ -25,6 +25,7 @@ from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
+from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, read_session
 from runner.computer import versions
 from runner.estimation import named_model
@@ -237,8 +238,8 @@ def estimated(
 
 def write_results(
     folder: Path, experiment: Experiment, arm: Arm, summary: dict[str, Any], found: Identification | None
-) -> str:
-    """Write model.yaml, report.txt and summary.json into `folder`; returns the report.
+) -> list[Piece]:
+    """Write model.yaml, report.txt and summary.json into `folder`; returns the text of the report.
 
     Link statistics of sessions finished in an earlier run stay in the summary.
     """
@@ -247,7 +248,7 @@ def write_results(
     if found is not None:
         files = {file["path"]: file["sha256"] for file in summary.get("files", ())}
         write_model(named_model(found.model, arm.name, files), folder / "model.yaml")
-    (folder / "report.txt").write_text(report, encoding="utf-8")
+    (folder / "report.txt").write_text(text_of(report) + "\n", encoding="utf-8")
     write_json(folder / "summary.json", summary)
     return report
 
@@ -275,8 +276,8 @@ def _estimates(estimate: Estimate) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def _report(experiment: Experiment, summary: dict[str, Any], found: Identification | None) -> str:
-    lines = [f"Experiment {experiment.name}: {summary['exit_status']}"]
+def _report(experiment: Experiment, summary: dict[str, Any], found: Identification | None) -> list[Piece]:
+    lines: list[Piece] = [f"Experiment {experiment.name}: {summary['exit_status']}"]
     if summary["reason"]:
         lines.append(f"  reason: {summary['reason']}")
     for entry in summary["sessions"]:
@@ -290,7 +291,7 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
             f"tracking error at most {tracking:.1f} mrad"
         )
     if found is None:
-        return "\n".join(lines) + "\n"
+        return lines
     if "within_3_sigma" in summary:
         held = summary["intervals_95_hold"].values()
         inside, count = (sum(tally[key] for tally in held) for key in ("inside", "count"))
@@ -304,7 +305,7 @@ def _report(experiment: Experiment, summary: dict[str, Any], found: Identificati
     lines += [
         f"  no torque error of {one['session']}: {one['reason']}" for one in summary.get("unscored", ())
     ]
-    return "\n".join([*lines, "", found.summary()]) + "\n"
+    return [*lines, "", *found.pieces()]
 
 
 _ANNOUNCED = ("payload", "payload_mass")

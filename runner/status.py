@@ -9,19 +9,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TextIO
 
+from lwr_driver.listing import Listing, Piece
+
 if TYPE_CHECKING:  # rich is imported on the first use at a terminal: help pages and pipes go without
     from rich.console import Console, ConsoleOptions, RenderResult
     from rich.live import Live
+    from rich.padding import Padding
     from rich.text import Text
 
 STYLES = {"good": "green", "look": "yellow", "bad": "red"}
 """Colour by verdict."""
 
-# Verdict words of the tables: at the beginning of a line, or as a column.
-_WORDS = {
-    r"^\s*(ok|good)(?= )|(?<= )holds(?= )": "green",
-    r"^\s*(look|note|hint)(?= )": "yellow",
-    r"^\s*(FAIL|bad)(?= )|(?<= )VIOLATED(?= )": "bold red",
+# Verdict words in the cells of tables.
+_VERDICTS = {
+    **dict.fromkeys(("ok", "good", "yes", "holds", "kept"), "green"),
+    **dict.fromkeys(("look", "note", "hint", "differs", "advice"), "yellow"),
+    **dict.fromkeys(("FAIL", "bad", "NO", "VIOLATED", "violated"), "bold red"),
 }
 _WIDE = 60
 _BARS = (6, 24)
@@ -44,28 +47,57 @@ def console(stream: TextIO) -> Console:
     return Console(file=stream, highlight=False, markup=False, emoji=False)
 
 
-def write(text: str, style: str = "", *, stream: TextIO | None = None, command: bool = False) -> None:
-    """Write `text` above the live line, by default to standard error; on a terminal wrapped and in colour.
+def write(piece: Piece, style: str = "", *, stream: TextIO | None = None, command: bool = False) -> None:
+    """Write text or a table above the live line, by default to standard error; on a terminal to fit and in colour.
 
     command : for the shell; a broken line goes on behind a backslash.
     """
     stream = sys.stderr if stream is None else stream
     if not watched(stream):
-        stream.write(text + "\n")
+        stream.write(f"{piece}\n")
         stream.flush()
         return
     above = next((one for one in _shown if one.stream is stream), None)
     if above is None:
         clear()
     place = console(stream) if above is None or above.console is None else above.console
-    for line in text.split("\n"):
+    if isinstance(piece, Listing):
+        for table in piece.fitted(place.width):
+            place.print(_table(table))
+        return
+    for line in piece.split("\n"):
         place.print(_hung(line, place.width, style, command))
+
+
+def answer(*pieces: Piece) -> None:
+    """Write results to standard output."""
+    for piece in pieces:
+        write(piece, stream=sys.stdout)
+
+
+def next_step(command: str, stream: TextIO | None = None) -> None:
+    """Write the next shell command, by default to standard output."""
+    write(command, "bold", stream=sys.stdout if stream is None else stream, command=True)
 
 
 def clear() -> None:
     """Remove the live line, before a question or the end."""
     for status in list(_shown):
         status.clear()
+
+
+def _table(listing: Listing) -> Padding:
+    """A table for the screen, verdict words in colour."""
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for name, right in zip(listing.head, listing.numbers(), strict=True):
+        table.add_column(Text(name), justify="right" if right else "left", no_wrap=right, overflow="fold")
+    for row in listing.rows:
+        table.add_row(*(Text(cell, style=_VERDICTS.get(cell, "")) for cell in row))
+    return Padding(table, (0, 0, 0, listing.indent), expand=False)
 
 
 def _hung(line: str, width: int, style: str, command: bool) -> Text:
@@ -84,16 +116,13 @@ def _hung(line: str, width: int, style: str, command: bool) -> Text:
         if number:
             rows.append(row + " " * command)
             row = hang
-        *whole, word = _pieces(word, width - len(hang))
+        *whole, word = list(_pieces(word, width - len(hang))) or [""]
         for piece in whole:
             rows.append(row + piece)
             row = ""
         row += word
     text = ("\\\n" if command else "\n").join([*rows, row]).replace("\u00a0", " ")
-    shown = Text(text, style=style, no_wrap=True, overflow="ignore")
-    for words, colour in _WORDS.items() if not style else ():
-        shown.highlight_regex(words, colour)
-    return shown
+    return Text(text, style=style, no_wrap=True, overflow="ignore")
 
 
 def _pieces(word: str, width: int) -> Iterator[str]:

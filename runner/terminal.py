@@ -105,6 +105,14 @@ def forced() -> bool:
     return context is not None and bool(context.meta.get(_FORCE))
 
 
+def tell(result: Any, as_json: bool) -> None:
+    """Write a result to standard output: as JSON, else its tables, lines or text."""
+    if as_json:
+        click.echo(to_json(result.to_dict() if hasattr(result, "to_dict") else result))
+    else:
+        status.answer(*(result.pieces() if hasattr(result, "pieces") else [str(result)]))
+
+
 def hold_json(content: Mapping[str, Any]) -> None:
     """Print this JSON object at the end of the command; an error until then is added to it."""
     click.get_current_context().meta[_HELD] = dict(content)

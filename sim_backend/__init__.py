@@ -10,9 +10,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import fri  # noqa: F401 - finds a place for compiled code
+from fri.on_first_use import on_first_use
 
 if TYPE_CHECKING:
     from sim_backend.process import Emulator
@@ -20,14 +20,4 @@ if TYPE_CHECKING:
 __all__ = ["Emulator"]
 
 
-def __getattr__(name: str) -> Any:
-    # Imported on first use, so that `import sim_backend` stays cheap.
-    if name in __all__:
-        from sim_backend import process
-
-        return getattr(process, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__ = on_first_use(globals(), {".process": ("Emulator",)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -169,14 +170,18 @@ class Emulator:
         if self._hosting:
             self.host = LoopHost()
             command.append(f"--seat={self.host.descriptor}")
-        self._process = subprocess.Popen(
-            command,
-            pass_fds=() if self.host is None else (self.host.descriptor,),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            env=interpreter.environment(),
-        )
+        try:
+            self._process = subprocess.Popen(
+                command,
+                pass_fds=() if self.host is None else (self.host.descriptor,),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                env=interpreter.environment(),
+            )
+        except OSError:
+            self.stop()
+            raise
         if self.host is not None:
             self.host.started(self._process.pid)
         try:
@@ -231,12 +236,18 @@ class Emulator:
         if self._pendant is not None:
             self._pendant.close()
             self._pendant = None
-        if self._process is None:
-            return None
-        process, self._process = self._process, None
         if self.host is not None:
             self.host.close()
             self.host = None
+        errors, self._errors = self._errors, None
+        with contextlib.nullcontext() if errors is None else errors:
+            return self._ended()
+
+    def _ended(self) -> int | None:
+        """Exit status of the process, ended now; None if it never ran."""
+        if self._process is None:
+            return None
+        process, self._process = self._process, None
         # Closing the pipe is the child's sign to end.
         for stream in (process.stdin, process.stdout):
             if stream is not None:
@@ -247,9 +258,6 @@ class Emulator:
             log.warning("emulator %d did not end within %g s and is killed", process.pid, _STOP_S)
             process.kill()
             status = process.wait()
-        if self._errors is not None:
-            self._errors.close()
-            self._errors = None
         return status
 
 

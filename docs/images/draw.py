@@ -5,10 +5,14 @@ The effects are drawn from their own columns, the terminal from real output of t
 
 from __future__ import annotations
 
+import contextlib
+import os
+import pty
 import re
 import subprocess
 import sys
 import tempfile
+import termios
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -139,6 +143,28 @@ def save(name: str, curve: Callable[[Axes], None], size: tuple[float, float] = (
         plt.close(figure)
 
 
+COLUMNS = 100
+
+
+def at_terminal(command: list[str], place: str) -> str:
+    """What a command shows at a terminal, with its colours."""
+    leader, follower = pty.openpty()
+    termios.tcsetwinsize(follower, (60, COLUMNS))
+    kept = {key: value for key, value in os.environ.items() if key not in ("CI", "NO_COLOR", "COLUMNS")}
+    variables = kept | {"TERM": "xterm-256color"}
+    process = subprocess.Popen(
+        command, cwd=place, env=variables, stdin=follower, stdout=follower, stderr=follower
+    )
+    os.close(follower)
+    shown = b""
+    with contextlib.suppress(OSError):  # the process has closed its end
+        while data := os.read(leader, 65536):
+            shown += data
+    os.close(leader)
+    process.wait()
+    return shown.decode().replace("\r", "").rstrip()
+
+
 def draw_terminal() -> None:
     """What some commands print, as text in a frame."""
     from rich.console import Console
@@ -146,12 +172,11 @@ def draw_terminal() -> None:
 
     with tempfile.TemporaryDirectory() as place:
         for name, words in TERMINAL.items():
-            command = [sys.executable, "-m", "runner.cli", *words]
-            shown = subprocess.run(command, cwd=place, capture_output=True, text=True).stdout.rstrip()
+            shown = at_terminal([sys.executable, "-m", "runner.cli", *words], place)
             shown = shown.replace(f"{CONFIGS.parent}/", "")
-            console = Console(record=True, width=130, file=open("/dev/null", "w"))  # noqa: SIM115
+            console = Console(record=True, width=COLUMNS, file=open("/dev/null", "w"))  # noqa: SIM115
             console.print(Text(f"$ lwr-run {' '.join(words)}", style="bold"))
-            console.print(Text(shown))
+            console.print(Text.from_ansi(shown))
             svg = console.export_svg(title="lwr-run", unique_id="lwr")
             # Fonts of the reader's computer, nothing is fetched.
             svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)

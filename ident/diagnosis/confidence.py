@@ -15,9 +15,9 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fri.errors import ConfigurationError
+from lwr_driver.yaml_text import yaml_content
 
 WEIGHTS = "confidence.yaml"
 # Least probability of a finding.
@@ -128,7 +128,7 @@ def probability(grounds: Grounds) -> float:
 @cache
 def _fitted() -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
     text = (resources.files("ident.diagnosis") / WEIGHTS).read_text(encoding="utf-8")
-    content = yaml.safe_load(text)
+    content = yaml_content(text)
     if set(content["weights"]) != set(LIMITS):
         raise ConfigurationError(f"{WEIGHTS} is of other grounds; run `python -m benchmarks.confidence`")
     return float(content["intercept"]), np.array([float(content["weights"][name]) for name in LIMITS])

@@ -26,6 +26,7 @@ from ident.diagnosis.claims_in_words import (
     wrapped,
 )
 from ident.effects.words import spoken
+from lwr_driver.listing import Listing, Piece, text_of
 
 _MOST_ROWS = {"unexplained": 4, "absorbed": 5}
 _REPR_LINES = 10
@@ -76,21 +77,18 @@ class Part:
     head: Sequence[str] = ()
     rows: Sequence[Row] = ()
 
-    def lines(self) -> list[str]:
+    def lines(self) -> list[Piece]:
         """For the terminal."""
         if self.anchor == "limits":
             return [line for note in self.sentences for line in wrapped(note, "note: ", "      ")]
-        found = [self.title]
+        found: list[Piece] = [self.title]
         for sentence in self.sentences:
             found += wrapped(sentence, "  ", "    ")
         if not self.rows:
             return found
         most = _MOST_ROWS.get(self.anchor, len(self.rows))
-        rows = [self.head, *([str(cell) for cell in row] for row in self.rows[:most])]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        for first, *rest in rows:
-            cells = (f"{cell:>{width}}" for cell, width in zip(rest, widths[1:], strict=True))
-            found.append(f"  {first:<{widths[0]}}  {'  '.join(cells)}".rstrip())
+        rows = [[str(cell) for cell in row] for row in self.rows[:most]]
+        found.append(Listing(self.head, rows))
         more = len(self.rows) - most
         return [*found, f"  ... and {more} more"] if more > 0 else found
 
@@ -115,8 +113,12 @@ class Statements:
     parts: tuple[Part, ...]
 
     def text(self) -> str:
+        """The whole as plain text."""
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
         """The whole, for the terminal."""
-        found = [*wrapped(self.about, "", "  "), *wrapped(f"{self.headline}.", "", "")]
+        found: list[Piece] = [*wrapped(self.about, "", "  "), *wrapped(f"{self.headline}.", "", "")]
         found += [f"{answer}." for answer in self.answers]
         found += [line for part in self.parts if part.anchor == "data" for line in part.lines()]
         for finding in (*self.findings, *self.character):
@@ -128,7 +130,7 @@ class Statements:
             if not one.finding:
                 found += [f"Side by side: {one.title}", *beside(one)]
         rest = (part for part in self.parts if part.anchor != "data")
-        return "\n".join([*found, *(line for part in rest for line in part.lines())])
+        return [*found, *(line for part in rest for line in part.lines())]
 
     def brief(self) -> str:
         """Headline and summary, at most ten lines."""

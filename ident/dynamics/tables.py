@@ -25,13 +25,15 @@ class Tabular:
     def _repr_html_(self) -> str:
         """First line of the text form and the rows as HTML."""
         rows = self.records()
+        title = f"<p>{html.escape(repr(self).splitlines()[0])}</p>"
+        if not rows:
+            return title
         names = list(dict.fromkeys(name for row in rows for name in row))
         head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
         body = "".join(
             "<tr>" + "".join(f"<td>{_cell(row.get(name))}</td>" for name in names) + "</tr>" for row in rows
         )
-        title = html.escape(repr(self).splitlines()[0])
-        return f"<p>{title}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        return f"{title}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def rows_of(**columns: Iterable[Any]) -> list[dict[str, Any]]:

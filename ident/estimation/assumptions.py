@@ -28,6 +28,7 @@ from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, normal_tail, student_tail
 from ident.estimators.problem import Problem
+from lwr_driver.listing import Listing, Piece, text_of
 
 _LEVEL = 0.01
 # Share of a joint's torque that matters: the accuracy of joint torque sensors.
@@ -79,12 +80,15 @@ class Assumptions(Tabular):
 
     def summary(self) -> str:
         """Verdict table."""
-        lines = ["assumption            verdict     finding"]
-        for check in self.checks:
-            lines.append(f"{check.name:<21} {check.verdict:<11} {check.finding}")
-            if not check.holds:
-                lines.append(f"{'':<34}{check.consequence}")
-        return "\n".join(lines)
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
+        """The same as a table, and the consequence of what does not hold."""
+        rows = [(check.name, check.verdict, check.finding) for check in self.checks]
+        return [
+            Listing(("assumption", "verdict", "finding"), rows, 0),
+            *(f"  {check.name}: {check.consequence}" for check in self.checks if not check.holds),
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for files: verdict, finding, statistic and p-value by assumption."""

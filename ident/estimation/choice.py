@@ -46,6 +46,7 @@ from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
 from ident.rows.filters import half_width
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
 _SCALES = (1.0, 10.0, 100.0)
@@ -147,18 +148,25 @@ class Choice(Tabular):
         return f"Choice of the estimator: {self.winner.title}"
 
     def __str__(self) -> str:
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
+        """The candidates as a table, and what to know of the choice."""
         instead = f"; this estimate is by {self.used}" if self.used else ""
-        lines = [f"estimator: {self.winner.title}{instead}"]
+        lines: list[Piece] = [f"estimator: {self.winner.title}{instead}"]
         if self.parts:
             lines = [
                 f"estimator by held-back error: {self.winner.title}{instead}",
-                f"  error [% of torque] on {self.parts} parts of the motion held back in turn, in blocks of "
+                f"  error on {self.parts} parts of the motion held back in turn, in blocks of "
                 f"{self.block_s:.1f} s",
+                Listing(
+                    ("candidate", "error %", ""),
+                    [
+                        (c.title, f"{c.held_back_percent:.2f}", "chosen" if number == self.chosen else "")
+                        for number, c in enumerate(self.candidates)
+                    ],
+                ),
             ]
-            width = max(len(c.title) for c in self.candidates)
-            for number, c in enumerate(self.candidates):
-                mark = "  <- chosen" if number == self.chosen else ""
-                lines.append(f"  {c.title:<{width}}{c.held_back_percent:>8.2f}{mark}")
         lines += [f"  not possible: {text}" for text in self.excluded]
         lines += [f"  {text}" for text in self.advice]
         if self.disagreement is not None:
@@ -171,7 +179,7 @@ class Choice(Tabular):
                 f"  joint torque sensors read too much by: {listed}; the model states it as an effect, and "
                 "`lwr-run diagnose` tells a gain from its look-alikes"
             )
-        return "\n".join(lines)
+        return lines
 
 
 def choose(

@@ -15,7 +15,7 @@ The other predictors of the joint torque:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,6 +36,7 @@ from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
 _SAME_ROW = 1e-8
@@ -121,21 +122,30 @@ class Comparison(Tabular):
         ]
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        lines = [
-            f"first   {self.first}",
-            f"second  {self.second}",
-            "",
-            f"{'parameter':<10}{'first':>11} ±{'':<9}{'second':>9} ±{'':<9}{'diff %':>8}{'z':>8}  unit",
-        ]
-        for d in self.differences:
-            mark = " *" if d.name in self.significant else "  "
-            lines.append(
-                f"{d.name:<10}{d.first:>11.5g} {_std(d.first_std):<10}"
-                f"{d.second:>9.5g} {_std(d.second_std):<10}"
-                f"{d.percent:>z8.1f}{d.z:>z8.1f}{mark}{d.unit}" + (f"  ({d.note})" if d.note else "")
+    def listing(self, *, all_rows: bool = True) -> Listing:
+        """The parameters as a table, or the significant differences alone."""
+        rows = [
+            (
+                f"{d.name} *" if d.name in self.significant and all_rows else d.name,
+                f"{d.first:.5g}",
+                f"{d.first_std:.2g}",
+                f"{d.second:.5g}",
+                f"{d.second_std:.2g}",
+                f"{d.percent:z.1f}",
+                f"{d.z:z.1f}",
+                d.unit,
+                d.note,
             )
-        lines.append("")
+            for d in self.differences
+            if all_rows or d.name in self.significant
+        ]
+        head = ("parameter", "first", "±", "second", "±", "diff %", "z", "unit", "as")
+        width = len(head) - (not any(row[-1] for row in rows))
+        return Listing(head[:width], [row[:width] for row in rows], 0)
+
+    def pieces(self) -> list[Piece]:
+        """Names of the models, the table, and what differs beyond chance."""
+        lines: list[Piece] = [f"first   {self.first}", f"second  {self.second}", "", self.listing(), ""]
         if math.isfinite(self.p):
             lines.append(
                 f"{len(self.significant)} of {len(self.differences)} differ by more than chance (*, level "
@@ -148,7 +158,10 @@ class Comparison(Tabular):
         for title, names in (("only first", self.only_first), ("only second", self.only_second)):
             if names:
                 lines.append(f"{title}: {' '.join(names)}")
-        return "\n".join(lines)
+        return lines
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
 
 def compare(
@@ -343,23 +356,23 @@ def _label(model: DynamicModel) -> str:
     return f"{model.robot} (Model {model.structure.model}, {len(model.names)} parameters{count})"
 
 
-def _std(value: float) -> str:
-    return f"± {value:.2g}"
-
-
 def competitor_scores(
     model: DynamicModel,
     sessions: Sessions,
     *,
     settings: SignalSettings | None = None,
-    others: Sequence[DynamicModel] = (),
+    others: Mapping[str, DynamicModel] | Sequence[DynamicModel] = (),
 ) -> tuple[SessionScore, ...]:
     """Scores of every competitor available for each session; joints and URDF are those of the model.
 
     The controller's model and the URDF compete where the session has joint torques, another model on the sides
-    common to both. Raises ConfigurationError for another model without a side in common.
+    common to both. others : models, or models by the name of their scores.
+
+    Raises ConfigurationError for another model without a side in common.
     """
     found = []
+    if not isinstance(others, Mapping):
+        others = {f"model of {other.robot}": other for other in others}
     for session in as_sessions(sessions):
         if session.joint.effort.shape[1] and "joint" in model.structure.sides:
             prepared = prepared_session(model, session, settings, blocks=True)
@@ -368,7 +381,7 @@ def competitor_scores(
                 found.append(controller)
             if model.structure.chain.urdf is not None:
                 found.append(score_cad(model, prepared, session))
-        found += [_score_other(model, other, session, settings) for other in others]
+        found += [_score_other(model, name, other, session, settings) for name, other in others.items()]
     return tuple(found)
 
 
@@ -430,7 +443,7 @@ def _matched(samples: Floats, times: Floats) -> tuple[NDArray[np.int64], NDArray
 
 
 def _score_other(
-    model: DynamicModel, other: DynamicModel, session: Session, settings: SignalSettings | None
+    model: DynamicModel, name: str, other: DynamicModel, session: Session, settings: SignalSettings | None
 ) -> SessionScore:
     common = tuple(side for side in other.structure.sides if side in model.structure.sides)
     if not common:
@@ -441,4 +454,4 @@ def _score_other(
         )
     prepared = prepared_session(other, session, settings, blocks=not other.effects)
     predict = predictor(other, mounted(other, session))
-    return score_session(prepared, predict, common, session, f"model of {other.robot}")
+    return score_session(prepared, predict, common, session, name)

@@ -22,6 +22,7 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate, fisher_limit
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem
+from lwr_driver.listing import Listing, Piece, text_of
 
 
 @dataclass(frozen=True)
@@ -94,18 +95,27 @@ class Essential(Tabular):
 
     def summary(self) -> str:
         """Counts and the reason for each elimination."""
-        lines = [
-            f"{len(self.names)} essential parameters, {len(self.eliminated)} eliminated; the weighted "
-            f"residual grew by {self.loss_percent:.2f} %",
-            f"{'eliminated':<10} {'estimate':>11} {'RSD %':>9} {'F':>7} {'loss %':>7}  reason",
-        ]
-        lines += [
-            f"{e.name:<10} {e.estimate:>11.4g} {min(e.rsd_percent, 99999.0):>9.1f} {e.f_statistic:>7.2f} "
-            f"{e.loss_percent:>7.3f}  {e.reason}"
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
+        """The same with its table."""
+        rows = [
+            (
+                e.name,
+                f"{e.estimate:.4g}",
+                f"{min(e.rsd_percent, 99999.0):.1f}",
+                f"{e.f_statistic:.2f}",
+                f"{e.loss_percent:.3f}",
+                e.reason,
+            )
             for e in self.eliminated
         ]
-        lines += [f"{name}: {reason}" for name, reason in self.kept_because.items()]
-        return "\n".join(lines)
+        return [
+            f"{len(self.names)} essential parameters, {len(self.eliminated)} eliminated; the weighted "
+            f"residual grew by {self.loss_percent:.2f} %",
+            Listing(("eliminated", "estimate", "RSD %", "F", "loss %", "reason"), rows, 0),
+            *(f"{name}: {reason}" for name, reason in self.kept_because.items()),
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for files."""

@@ -28,6 +28,7 @@ from ident.estimation.validate import mounted, prepared_session
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session
 
 _WIDTH_RAD_S = 5e-3
@@ -96,15 +97,22 @@ class ForwardSimulation(Tabular):
             f"simulated torque error {100 * self.relative:.2f} %, {len(self.times)} samples"
         )
 
-    def __str__(self) -> str:
-        lines = [
+    def pieces(self) -> list[Piece]:
+        """Title and table by joint."""
+        rows = [
+            (joint, f"{torque:.3f}", f"{1e3 * position:.3f}")
+            for joint, torque, position in zip(
+                self.joint_names, self.torque_rms, self.position_rms, strict=True
+            )
+        ]
+        return [
             f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
             f"simulated torque error {100 * self.relative:.2f} %",
-            f"  {'joint':<14}{'torque rms Nm':>14}{'position rms mrad':>19}",
+            Listing(("joint", "torque rms Nm", "position rms mrad"), rows),
         ]
-        for joint, torque, position in zip(self.joint_names, self.torque_rms, self.position_rms, strict=True):
-            lines.append(f"  {joint:<14}{torque:>14.3f}{1e3 * position:>19.3f}")
-        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
 
 def simulate_session(

@@ -34,6 +34,7 @@ from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name, require
 from ident.rows.signal_choice import choose_signals
 from ident.screening.screen import require_sound, without_dead
+from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
 if TYPE_CHECKING:
@@ -237,8 +238,12 @@ class Identification(Tabular):
 
     def summary(self) -> str:
         """Counts, sessions, parameters, residuals, assumptions and warnings as text."""
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
+        """The same with its tables."""
         counts = self.counts
-        lines = [
+        lines: list[Piece] = [
             f"Model {self.settings.model}: {counts['standard']} parameters, {counts['not_identifiable']} "
             f"not identifiable, {counts['regrouped']} regrouped, {counts['base']} base"
         ]
@@ -258,13 +263,13 @@ class Identification(Tabular):
             f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
         )
         if self.choice is not None:
-            lines += ["", str(self.choice)]
-        lines += ["", self.estimate.summary(), "", self.assumptions.summary()]
+            lines += ["", *self.choice.pieces()]
+        lines += ["", *self.estimate.pieces(), "", *self.assumptions.pieces()]
         if self.essential is not None:
-            lines += ["", self.essential.summary()]
+            lines += ["", *self.essential.pieces()]
         if self.warnings:
             lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
-        return "\n".join(lines)
+        return lines
 
 
 def identify(

@@ -35,6 +35,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.observation import observe
 from ident.rows.prepare import prepare
 from ident.rows.sessions import payload_name, stated_mass
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
 _BODY = len(INERTIAL)
@@ -165,17 +166,23 @@ class PayloadEstimate(Tabular):
             ]
         )
 
-    def __str__(self) -> str:
+    def listing(self) -> Listing:
+        """The ten parameters as a table."""
         arm = np.sqrt(np.diag(self.arm_covariance))
-        lines = [
-            f"Payload {self.payload!r} of {self.robot}, {self.session}, in the frame of the last link",
-            f"  {'':<6}{'estimate':>11}{'std':>10}{'of it arm':>11}{'consistent':>12}  unit",
-        ]
-        for k, name in enumerate(self.names):
-            lines.append(
-                f"  {name:<6}{self.values[k]:>11.5g}{self.std[k]:>10.2g}{arm[k]:>11.2g}"
-                f"{self.consistent[k]:>12.5g}  {self.units[k]}"
+        rows = [
+            (name, f"{value:.5g}", f"{std:.2g}", f"{of_arm:.2g}", f"{body:.5g}", unit)
+            for name, value, std, of_arm, body, unit in zip(
+                self.names, self.values, self.std, arm, self.consistent, self.units, strict=True
             )
+        ]
+        return Listing(("", "estimate", "std", "of it arm", "consistent", "unit"), rows)
+
+    def pieces(self) -> list[Piece]:
+        """The table, mass and centre of mass, the consistent body, residuals and notes."""
+        lines: list[Piece] = [
+            f"Payload {self.payload!r} of {self.robot}, {self.session}, in the frame of the last link",
+            self.listing(),
+        ]
         mass, _, tensor = to_com(self.consistent)
         moments = ", ".join(f"{value:.4g}" for value in np.linalg.eigvalsh(tensor))
         lines += [
@@ -187,7 +194,10 @@ class PayloadEstimate(Tabular):
         if self.offsets:
             shifts = ", ".join(f"{key} {value:+.3f}" for key, value in self.offsets.items())
             lines.append(f"  offsets moved since the arm model by [Nm]: {shifts}")
-        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+        return [*lines, *(f"  {note}" for note in self.notes)]
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
 
 def identify_payload(

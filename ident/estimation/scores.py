@@ -29,6 +29,7 @@ from ident.dynamics.tables import Tabular
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.notebook import subplots
 from lwr_driver.session import Session
 from lwr_driver.session.spool import Growing, release
@@ -180,29 +181,36 @@ class SessionScore(Tabular):
             f"{worst.joint} {worst.side} {100 * worst.relative:.1f} %"
         )
 
-    def __str__(self) -> str:
+    def pieces(self) -> list[Piece]:
+        """Title, table by joint and side, sentences."""
         label = "  SEEN BY THE ESTIMATE: no validation" if self.seen else ""
-        lines = [f"{self.session}, payload {self.payload or 'none'}: {self.predictor}{label}"]
-        floor = any(math.isfinite(score.floor_rms) for score in self.scores)
-        rows: list[tuple[str, ...]] = [
-            ("", "error", "rms", "bias", "worst", "at", "moving", "standstill", "in band"),
-            ("", "%", "Nm", "Nm", "Nm", "s", "Nm", "% of error", "Nm"),
-        ]
+        rows = []
         for s in self.scores:
             figures = (s.rms, s.bias, s.worst, s.worst_time_s, s.moving_rms)
             shown = (f"{100 * s.relative:.2f}", *(f"{value:.3f}" for value in figures))
-            rows.append(
-                (f"{s.joint} {s.side}", *shown, f"{100 * s.standstill_error:.1f}", f"{s.band_rms:.3f}")
-            )
-        last = ["floor", "Nm", *(f"{score.floor_rms:.3f}" for score in self.scores)]
-        for row, end in zip(rows, last, strict=True):
-            line = f"  {row[0]:<14}" + "".join(
-                f"{cell:>{w}}" for cell, w in zip(row[1:], _WIDTHS, strict=True)
-            )
-            lines.append(line + (f"{end:>8}" if floor else ""))
-        lines += [f"  {sentence}" for sentence in self.sentences]
-        lines += [f"  {note}" for note in self.notes]
-        return "\n".join(lines)
+            more = (f"{100 * s.standstill_error:.1f}", f"{s.band_rms:.3f}", f"{s.floor_rms:.3f}")
+            rows.append((f"{s.joint} {s.side}", *shown, *more))
+        head = [
+            "",
+            "error %",
+            "rms Nm",
+            "bias Nm",
+            "worst Nm",
+            "at s",
+            "moving Nm",
+            "standstill %",
+            "in band Nm",
+        ]
+        if any(math.isfinite(score.floor_rms) for score in self.scores):
+            head.append("floor Nm")
+        return [
+            f"{self.session}, payload {self.payload or 'none'}: {self.predictor}{label}",
+            Listing(head, [row[: len(head)] for row in rows]),
+            *(f"  {line}" for line in (*self.sentences, *self.notes)),
+        ]
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -216,9 +224,6 @@ class SessionScore(Tabular):
             f"standstill: {still}",
             f"moving samples only: {by_side(self.moving_relative)}; in band: below {self.band_hz:g} Hz",
         )
-
-
-_WIDTHS = (8, 8, 9, 9, 9, 9, 12, 9)
 
 
 def by_side(shares: Mapping[str, float]) -> str:

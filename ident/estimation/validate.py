@@ -28,6 +28,7 @@ from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import payload_name
 from ident.screening.doubts import Doubt, settle
 from ident.screening.screen import require_sound, screen
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
 
@@ -105,18 +106,26 @@ class Validation(Tabular):
             ]
         )
 
-    def __str__(self) -> str:
-        parts = [f"Computed torque, {self.robot}", *map(str, self.scores)]
-        if self.competitors:
-            parts.append(self._comparison())
-        parts += [f"not validated: {one}" for one in self.unscored]
-        parts += [f"warning: {warning}" for warning in self.warnings]
-        parts += list(self.notes)
-        return "\n\n".join(parts)
+    def pieces(self) -> list[Piece]:
+        """The scores of each session, the predictors side by side, warnings and notes."""
+        found: list[Piece] = [f"Computed torque, {self.robot}"]
+        for score in self.scores:
+            found += ["", *score.pieces()]
+        found += self.comparison()
+        for text in (
+            *(f"not validated: {one}" for one in self.unscored),
+            *(f"warning: {warning}" for warning in self.warnings),
+            *self.notes,
+        ):
+            found += ["", text]
+        return found
 
-    def _comparison(self) -> str:
-        """RMS per joint of every predictor side by side, all samples."""
-        lines = ["RMS of measured minus computed torque by predictor [Nm]; last: torque error, all joints"]
+    def __str__(self) -> str:
+        return text_of(self.pieces())
+
+    def comparison(self) -> list[Piece]:
+        """RMS per joint of every predictor side by side, all samples; nothing without competitors."""
+        found: list[Piece] = []
         for own in self.scores:
             rivals = [rival for rival in self.competitors if rival.session == own.session]
             for side in own.relative:
@@ -124,13 +133,14 @@ class Validation(Tabular):
                 if len(entries) < 2:
                     continue
                 joints = [score.joint for score in own.scores if score.side == side]
-                head = f"{own.session}, {side} side"
-                lines.append(f"  {head:<40}" + "".join(f"{joint[-8:]:>9}" for joint in joints) + "  error %")
+                rows = []
                 for entry in entries:
                     values = {score.joint: score.rms for score in entry.scores if score.side == side}
-                    row = "".join(f"{values.get(joint, math.nan):>9.3f}" for joint in joints)
-                    lines.append(f"    {entry.predictor:<38}{row}{100 * entry.relative[side]:>9.2f}")
-        return "\n".join(lines)
+                    row = [f"{values.get(joint, math.nan):.3f}" for joint in joints]
+                    rows.append([entry.predictor, f"{100 * entry.relative[side]:.2f}", *row])
+                title = f"{own.session}, {side} side: torque error of all joints, rms by joint [Nm]"
+                found += ["", title, Listing(["predictor", "error %", *joints], rows)]
+        return found
 
 
 def validate(
@@ -184,7 +194,7 @@ def validate(
             unscored.append(Unscored(session.path.name, error))
     notes: tuple[str, ...] = ()
     if model.effects:
-        named = ", ".join(str(effect["cause"]) for effect in model.effects)
+        named = ", ".join(dict.fromkeys(str(effect["cause"]) for effect in model.effects))
         notes = (f"The torque has the effects of the model: {named}.",)
     warnings = settle([doubt for doubt in doubts if not doubt.certain])
     return Validation(
@@ -319,12 +329,17 @@ class CrossValidation(Tabular):
             ]
         )
 
+    def pieces(self) -> list[Piece]:
+        """The scores of each fold, the rms over all."""
+        found: list[Piece] = ["Cross-validation: each session by the model of the others"]
+        for score in self.scores:
+            found += ["", *score.pieces()]
+        rows = [(key, f"{value:.3f}") for key, value in self.rms.items()]
+        found += ["", Listing(("over the folds", "rms Nm"), rows)]
+        return [*found, *self.skipped, *(f"warning: {warning}" for warning in self.warnings)]
+
     def __str__(self) -> str:
-        lines = ["Cross-validation: each session by the model of the others"]
-        lines += ["", *("\n".join([str(score), ""]) for score in self.scores)]
-        lines.append("RMS over the folds [Nm]")
-        lines += [f"  {key:<14}{value:>8.3f}" for key, value in self.rms.items()]
-        return "\n".join([*lines, *self.skipped, *(f"warning: {warning}" for warning in self.warnings)])
+        return text_of(self.pieces())
 
 
 def cross_validate(

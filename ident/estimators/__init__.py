@@ -5,8 +5,9 @@ Each takes its settings in the constructor and has `fit(problem) -> Estimate`. N
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from fri.on_first_use import on_first_use
 
 if TYPE_CHECKING:
     from ident.estimators.covariance import CovarianceSettings, correlation_time
@@ -71,12 +72,12 @@ __all__ = [
 ]
 
 _HOMES = {
-    "covariance": ("CovarianceSettings", "correlation_time"),
-    "errors_in_variables": (
+    ".covariance": ("CovarianceSettings", "correlation_time"),
+    ".errors_in_variables": (
         "InstrumentalVariables",
         "TotalLeastSquares",
     ),
-    "estimate": (
+    ".estimate": (
         "ClassFit",
         "Covariance",
         "Estimate",
@@ -87,47 +88,37 @@ _HOMES = {
         "normal_tail",
         "student_tail",
     ),
-    "least_squares": (
+    ".least_squares": (
         "OrdinaryLeastSquares",
         "RobustLeastSquares",
         "WeightedLeastSquares",
     ),
-    "physical": (
+    ".physical": (
         "BodyPrior",
         "PhysicallyConsistent",
         "cad_prior",
         "nearest_consistent",
     ),
-    "prior": (
+    ".prior": (
         "MaximumAPosteriori",
         "Prior",
     ),
-    "problem": (
+    ".problem": (
         "Nuisance",
         "Problem",
         "RowClass",
         "RowGroup",
         "TriangularFactor",
     ),
-    "recursive": (
+    ".recursive": (
         "RecursiveFilter",
         "RecursiveLeastSquares",
         "RegressorExtensionMixing",
         "Track",
     ),
-    "registry": (
+    ".registry": (
         "ESTIMATORS",
         "EstimatorKind",
     ),
 }
-
-
-def __getattr__(name: str) -> Any:
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{home}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = on_first_use(globals(), _HOMES)

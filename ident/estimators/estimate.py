@@ -15,6 +15,7 @@ from scipy import special
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular, rows_of
 from ident.estimators.problem import Problem
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.notebook import subplots
 
 Value = TypeVar("Value", float, Floats)
@@ -161,33 +162,42 @@ class Estimate(Tabular):
 
     def summary(self) -> str:
         """Table of the parameters and of the residual per joint and side."""
-        units = self._units
-        lines = [
+        return text_of(self.pieces())
+
+    def pieces(self) -> list[Piece]:
+        """The same with its tables."""
+        lines: list[Piece] = [
             f"{self.method}: {len(self.names)} parameters, {sum(c.rows for c in self.classes)} rows, "
             f"{self.iterations} iteration{'s' if self.iterations != 1 else ''}"
             + ("" if self.converged else ", NOT converged"),
             f"standard deviations: {self.covariance.kind}",
             "",
-            f"{'parameter':<10} {'estimate':>12} {'std':>10} {'RSD %':>8}  unit",
         ]
-        rsd = self.rsd_percent
-        for index, name in enumerate(self.names):
-            lines.append(
-                f"{name:<10} {self.values[index]:>12.5g} {self.std[index]:>10.3g} {rsd[index]:>8.2f}  "
-                f"{units[index]}{', from the prior' if name in self.prior_only else ''}"
+        rows = [
+            (
+                name,
+                f"{value:.5g}",
+                f"{std:.3g}",
+                f"{rsd:.2f}",
+                unit + (", from the prior" if name in self.prior_only else ""),
             )
-        lines += ["", f"{'rows':<14} {'count':>7} {'n_eff':>7} {'consumed':>9} {'sigma Nm':>9} {'rms Nm':>9}"]
-        lines += [
-            f"{c.label:<14} {c.rows:>7} {c.n_eff:>7.0f} {c.parameters:>9.1f} {c.sigma:>9.4f} {c.rms:>9.4f}"
+            for name, value, std, rsd, unit in zip(
+                self.names, self.values, self.std, self.rsd_percent, self._units, strict=True
+            )
+        ]
+        lines += [Listing(("parameter", "estimate", "std", "RSD %", "unit"), rows, 0), ""]
+        classes = [
+            (c.label, f"{c.rows}", f"{c.n_eff:.0f}", f"{c.parameters:.1f}", f"{c.sigma:.4f}", f"{c.rms:.4f}")
             for c in self.classes
         ]
+        lines.append(Listing(("rows", "count", "n_eff", "consumed", "sigma Nm", "rms Nm"), classes, 0))
         lines += [f"note: {note}" for note in self.notes]
         if self.prior_only:
             lines.append(
                 f"note: the motion does not show {', '.join(self.prior_only)}: value and standard deviation are "
                 "those of the prior"
             )
-        return "\n".join(lines)
+        return lines
 
 
 class Estimator(Protocol):

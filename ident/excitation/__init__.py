@@ -30,7 +30,7 @@ from ident.excitation.comparison import (
     trade_off,
 )
 from ident.excitation.motions import FourierBasis, FourierSeries, PointToPoint, SplineBasis, SplineMotion
-from ident.excitation.plan import ExcitationPlan, plan_report
+from ident.excitation.plan import ExcitationPlan, plan_pieces
 from ident.excitation.planner import Progress, feasible_fourier, plan
 from ident.excitation.problem import Knowledge, MotionForm, Objective, PlanProblem, Prior, Search
 
@@ -64,7 +64,7 @@ __all__ = [
     "hypervolume",
     "not_dominated",
     "plan",
-    "plan_report",
+    "plan_pieces",
     "random_points",
     "table",
     "table_row",

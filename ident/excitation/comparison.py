@@ -22,6 +22,7 @@ from ident.excitation.motions import Array, ParametricMotion, PointToPoint
 from ident.excitation.program import Bound, Setup
 from ident.excitation.search import Candidate, begin, hop, judge, polish
 from lwr_driver.arm.collision import CollisionChecker
+from lwr_driver.listing import Listing, text_of
 
 _LINE = 60
 _TRIES = 400
@@ -63,7 +64,8 @@ def table_row(
 
 def table(rows: Sequence[TableRow], title: str = "") -> str:
     """Aligned text, one line per motion; torques by joint."""
-    head = ["trajectory", "limits", "T [s]", "cond", "mean RSD %", "worst RSD %", "mean |torque| [Nm]"]
+    joints = max((len(row.torque) for row in rows), default=0)
+    head = ["trajectory", "limits", "T [s]", "cond", "mean RSD %", "worst RSD %"]
     body = [
         [
             row.label,
@@ -72,20 +74,12 @@ def table(rows: Sequence[TableRow], title: str = "") -> str:
             f"{row.condition:.2f}",
             f"{row.rsd_mean:.2f}",
             f"{row.rsd_worst:.2f}",
-            "  ".join(f"{value:5.2f}" for value in row.torque),
+            *(f"{value:.2f}" for value in row.torque),
         ]
         for row in rows
     ]
-    widths = [max(len(line[k]) for line in [head, *body]) for k in range(len(head))]
-    lines = [title] if title else []
-    for index, line in enumerate([head, *body]):
-        cells = [
-            cell.ljust(widths[k]) if k in (0, 6) else cell.rjust(widths[k]) for k, cell in enumerate(line)
-        ]
-        lines.append("  ".join(cells).rstrip())
-        if index == 0:
-            lines.append("-" * len(lines[-1]))
-    return "\n".join(lines)
+    listing = Listing([*head, *(f"|tau{k + 1}| Nm" for k in range(joints))], body, 0)
+    return text_of([title, listing] if title else [listing])
 
 
 def random_points(

@@ -26,7 +26,9 @@ from ident.excitation.motions import (
 from ident.model.model_file import write_checked
 from lwr_driver.configuration import parse, read_mapping
 from lwr_driver.extent import LONGEST_EXCITATION_S, Periods
+from lwr_driver.listing import Listing, Piece
 from lwr_driver.places import Place
+from lwr_driver.yaml_text import yaml_content
 
 _SCHEMA = 1
 _CYCLE_TOLERANCE = 1e-6
@@ -181,7 +183,7 @@ class ExcitationPlan:
         """Write the plan file, read back first."""
 
         def check(text: str) -> None:
-            if ExcitationPlan.from_mapping(yaml.safe_load(text), "plan").to_yaml() != text:
+            if ExcitationPlan.from_mapping(yaml_content(text), "plan").to_yaml() != text:
                 raise DataError("the plan read back differs from the one written")
 
         write_checked(path, self.to_yaml(), check)
@@ -275,15 +277,29 @@ def _margin_from_mapping(entry: Any) -> Margin:
     return Margin(*names, value, limit, slack, str(entry["unit"]), time_s, bool(entry.get("proven", True)))
 
 
-def plan_report(plan: ExcitationPlan) -> str:
-    """Summary of a plan for people: criteria, tightest margins, largest predicted deviations."""
-    lines = [f"period {plan.period_s:g} s, {plan.periods} period(s)", "", "criteria"]
-    width = max((len(name) for name in plan.objectives), default=0)
-    lines += [f"  {name.ljust(width)}  {value:10.4f}" for name, value in plan.objectives.items()]
-    lines += ["", "tightest margins"]
-    lines += [f"  {margin}" for margin in plan.check.tightest()]
+def plan_pieces(plan: ExcitationPlan) -> list[Piece]:
+    """Tables of a plan: criteria, tightest margins, largest predicted deviations."""
+    found: list[Piece] = [
+        Listing(("criterion", "value"), [(name, f"{v:.4f}") for name, v in plan.objectives.items()]),
+        "",
+        Listing(
+            ("tightest margins", "of", "value", "limit", "unit", "at s", ""),
+            [
+                (
+                    margin.constraint,
+                    margin.subject,
+                    f"{margin.value:.4g}",
+                    f"{margin.limit:.4g}",
+                    margin.unit,
+                    f"{margin.time_s:.3f}",
+                    "ok" if margin.ok else "violated" if margin.proven else "not proven",
+                )
+                for margin in plan.check.tightest()
+            ],
+        ),
+    ]
     worst = sorted(plan.rsd_percent.items(), key=lambda item: -item[1])[:8]
     if worst:
-        lines += ["", "largest predicted relative deviations"]
-        lines += [f"  {name:8s} {value:8.2f} %" for name, value in worst]
-    return "\n".join(lines)
+        rows = [(name, f"{value:.2f}") for name, value in worst]
+        found += ["", Listing(("largest predicted deviations", "RSD %"), rows)]
+    return found

@@ -21,6 +21,7 @@ from ident.import_log.mapping import LogMapping, Signal, TimeBase, Transmission,
 from ident.import_log.recording import Recording
 from ident.import_log.tables import Floats
 from lwr_driver.configuration import yaml_text
+from lwr_driver.listing import Listing, Piece, text_of
 
 _RATES = {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "rpm": 30.0 / math.pi}
 _SHORTEST_S, _LONGEST_S = 1e-4, 0.1
@@ -72,21 +73,16 @@ class Guess:
         head = f"{self.HEAD}{self.source.name}; check it. Keys: docs/import_mapping.md\n"
         return head + yaml_text(self.mapping.content())
 
-    def __str__(self) -> str:
-        table = [("quantity", "from", "unit", "why"), *self.rows]
-        widths = [max(len(row[k]) for row in table) for k in range(3)]
-        lines = [
-            "  " + "  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[3]])
-            for row in table
+    def pieces(self) -> list[Piece]:
+        """The signals as a table, and the other fields."""
+        return [
+            f"{self.source.name}: {len(self.mapping.joints)} joint(s) of {self.mapping.robot}",
+            Listing(("quantity", "from", "unit", "why"), self.rows),
+            *([f"  not used: {', '.join(self.unused)}"] if self.unused else []),
         ]
-        left = [f"  not used: {', '.join(self.unused)}"] if self.unused else []
-        return "\n".join(
-            [
-                f"{self.source.name}: {len(self.mapping.joints)} joint(s) of {self.mapping.robot}",
-                *lines,
-                *left,
-            ]
-        )
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
 
 def guess_mapping(source: str | Path, urdf: str | Path, known: Known | None = None) -> Guess:

@@ -53,12 +53,11 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
 
 @dataclass(frozen=True)
 class _Layout:
-    """Names, mark between columns and decimal point of a text, and its numbered rows of numbers, with points."""
+    """Names and mark between columns of a text, and its numbered rows of numbers, with points."""
 
     names: tuple[str, ...]
     named: bool
     mark: str | None
-    point: str
     width: int
     rows: list[tuple[int, str]]
 
@@ -85,7 +84,7 @@ def _layout(path: Path, lines: list[str], delimiter: str | None, header: bool | 
     width = len(names) if named else len(_split(rows[0][1], mark))
     if not named and len(_split(above, mark)) == width and not all(map(_is_number, _split(above, mark))):
         names = tuple(_split(above, mark))
-    return _Layout(names, named, mark, point, width, rows)
+    return _Layout(names, named, mark, width, rows)
 
 
 def _long(path: Path, delimiter: str | None, header: bool | None) -> Table | None:

@@ -36,6 +36,7 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.model.covariance import DIGITS, nearest_covariance, rounded
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.configuration import parse, read_mapping
+from lwr_driver.yaml_text import Dumper, yaml_content
 
 Model: TypeAlias = DynamicModel | str | os.PathLike[str]
 """A model or the path of a model file."""
@@ -148,7 +149,7 @@ def write_checked(path: str | Path, text: str, check: Callable[[str], object]) -
 
 def _check_read(model: DynamicModel, text: str) -> None:
     """Compare the model of a file's text with the written one."""
-    again = read_model(yaml.safe_load(text))
+    again = read_model(yaml_content(text))
     if again.names != model.names or not np.array_equal(again.values, model.values):
         raise DataError("the parameters read back differ from those written")
     if model_text(again) != text:
@@ -331,7 +332,7 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(Dumper):
     """Block style for the file, flow style for its rows, literal blocks for texts of several lines."""
 
 

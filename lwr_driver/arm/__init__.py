@@ -6,9 +6,9 @@ checking loads pinocchio.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from fri.on_first_use import on_first_use
 from lwr_driver.arm.description import JOINTS, Arm, ArmLimits, LinkFrames, LinkInertia, link_inertias
 
 if TYPE_CHECKING:
@@ -29,11 +29,5 @@ __all__ = [
     "link_inertias",
 ]
 
-_HOMES = {"cell": ("Box", "Cell", "PayloadShape"), "collision": ("Clearance", "CollisionChecker")}
-
-
-def __getattr__(name: str) -> Any:
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{home}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+_HOMES = {".cell": ("Box", "Cell", "PayloadShape"), ".collision": ("Clearance", "CollisionChecker")}
+__getattr__, __dir__ = on_first_use(globals(), _HOMES)

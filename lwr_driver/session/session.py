@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
+from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.notebook import optional, subplots
 
 _WIDEST = 120
@@ -401,43 +402,69 @@ class SessionSummary:
         """Plain data, for JSON."""
         return {**asdict(self), "path": str(self.path)}
 
-    def __str__(self) -> str:
+    def pieces(self) -> list[Piece]:
+        """Origin, topics, joints, phases, and what is missing."""
         data = self.metadata
         status = "unknown: the recorder died" if self.end is None else self.end.get("exit_status", "unknown")
         reason = f" ({self.end['reason']})" if self.end and self.end.get("reason") else ""
-        lines = [
+        lines: list[Piece] = [
             f"{self.path}  {self.size_bytes / 1e6:.1f} MB",
             f"  robot        {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
-            f"  payload      {_payload(data)}",
+            f"  payload      {self.payload}",
             f"  experiment   {data.get('experiment', '') or '-'}",
             f"  recorded     {self.utc_first}, {self.duration_s:.3f} s",
             f"  ended        {status}{reason}",
             f"  motor torque {data.get('motor_torque_source', 'unknown')}",
             "",
-            f"  {'topic':<24}{'samples':>9}{'Hz':>9}{'lost':>7}{'longest pause':>16}",
+            self.topics(),
+            "",
+            self.joints(),
         ]
-        lines += [
-            f"  {item.topic:<24}{item.samples:>9}{item.rate_hz:>9.1f}{item.lost:>7}"
-            f"{item.longest_pause_s * 1e3:>13.1f} ms"
-            for item in self.channels
-        ]
-        lines += ["", f"  {'joint':<12}{'from':>9}{'to':>9} rad{'sensor rms':>13}{'motor rms':>12} Nm"]
-        for index, name in enumerate(self.joint_names):
-            low, high = self.position_range[index]
-            efforts = [
-                f"{rms[index]:.3f}" if rms else "-" for rms in (self.effort_rms, self.motor_effort_rms)
-            ]
-            lines.append(f"  {name:<12}{low:>9.4f}{high:>9.4f}    {efforts[0]:>13}{efforts[1]:>12}")
         if self.phases:
-            lines += ["", f"  {'phase':<24}{'begins':>9}{'lasts':>9} s"]
-            lines += [f"  {item.name:<24}{item.begin_s:>9.3f}{item.duration_s:>9.3f}" for item in self.phases]
+            phases = [(item.name, f"{item.begin_s:.3f}", f"{item.duration_s:.3f}") for item in self.phases]
+            lines += ["", Listing(("phase", "begins s", "lasts s"), phases)]
         if self.attachments:
             lines += [
                 "",
                 "  attached     " + ", ".join(f"{k} ({v} bytes)" for k, v in self.attachments.items()),
             ]
-        lines += ["", *(f"  missing      {line}" for line in self.missing or ("nothing",))]
-        return "\n".join(lines)
+        return [*lines, "", *(f"  missing      {line}" for line in self.missing or ("nothing",))]
+
+    @property
+    def payload(self) -> str:
+        """Name and mass of the payload."""
+        return _payload(self.metadata)
+
+    def topics(self) -> Listing:
+        """Samples, rate, lost samples and longest pause of each topic."""
+        rows = [
+            (
+                item.topic,
+                f"{item.samples}",
+                f"{item.rate_hz:.1f}",
+                f"{item.lost}",
+                f"{item.longest_pause_s * 1e3:.1f}",
+            )
+            for item in self.channels
+        ]
+        return Listing(("topic", "samples", "Hz", "lost", "longest pause ms"), rows)
+
+    def joints(self) -> Listing:
+        """Range of the position and rms of both torques of each joint."""
+        nothing = ("-",) * len(self.joint_names)
+        efforts = [
+            [f"{value:.3f}" for value in rms] or nothing for rms in (self.effort_rms, self.motor_effort_rms)
+        ]
+        rows = [
+            (name, f"{low:.4f}", f"{high:.4f}", sensor, motor)
+            for name, (low, high), sensor, motor in zip(
+                self.joint_names, self.position_range, *efforts, strict=True
+            )
+        ]
+        return Listing(("joint", "from rad", "to rad", "sensor rms Nm", "motor rms Nm"), rows)
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
 
 def summarise(session: Session) -> SessionSummary:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from lwr_driver.listing import Listing, Piece
 from runner.output import OUTPUT_FILE
 from runner.terminal import (
     NAMED_FILE,
@@ -22,6 +24,7 @@ from runner.terminal import (
 
 if TYPE_CHECKING:
     from ident.diagnosis import Reference
+    from runner.ending import Ending
     from runner.experiment_file import Experiment
 
 
@@ -85,7 +88,8 @@ def command(
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
     from ident.import_log import read_recording
-    from runner.diagnosis import arm_data, chain_of, known_arm
+    from runner.diagnosis import arm_data, chain_of
+    from runner.estimation import known_arm
     from runner.experiment_file import Experiment
     from runner.files import locked
     from runner.status import StatusLine
@@ -118,8 +122,7 @@ def command(
     if as_json:
         click.echo(to_json(_content(found, paths, out)))
     else:
-        click.echo(_text(found, len(parts), sum(map(len, parts)), chain.joint_names))
-    click.echo(str(out), err=as_json)
+        _ending(found, len(parts), sum(map(len, parts)), chain.joint_names, out).tell()
 
 
 def record_sets(
@@ -202,31 +205,45 @@ def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, 
     return {"file": out, "sets": paths, **{k: v for k, v in stored.items() if k != "sets"}}
 
 
-def _delay(delay_s: float, found: Reference, side: str) -> str:
-    return f"{1e3 * delay_s:.2f} ms (from day to day +-{1e3 * found.delay_std_s[side]:.2f} ms)"
+def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], out: Path) -> Ending:
+    from runner.ending import Ending
+    from runner.report.verdicts import Verdict
 
-
-def _text(found: Reference, sets: int, sessions: int, names: tuple[str, ...]) -> str:
-    lines = [
-        f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}",
-        f"  delays: motor torque {_delay(found.motor_delay_s, found, 'motor')}, joint torque "
-        f"{_delay(found.joint_delay_s, found, 'joint')}; positions are the {found.encoder}s'",
-        f"  {'':<24}" + "".join(f"{name:>9}" for name in names),
-    ]
+    rows: list[tuple[str, ...]] = []
     if len(found.compliance) and (found.compliance > 0.0).all():
-        lines.append(f"  {'stiffness [Nm/rad]':<24}" + "".join(f"{1.0 / c:>9.0f}" for c in found.compliance))
-    for side, values in found.noise.items():
-        lines.append(f"  {f'noise, {side} [Nm]':<24}" + "".join(f"{v:>9.4f}" for v in values))
+        rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" for c in found.compliance)))
+    rows += [(f"noise, {side} [Nm]", *(f"{v:.4f}" for v in values)) for side, values in found.noise.items()]
+    delays = [
+        (f"{side} torque", f"{1e3 * delay:.2f} ± {1e3 * found.delay_std_s[side]:.2f} ms from day to day")
+        for side, delay in (("motor", found.motor_delay_s), ("joint", found.joint_delay_s))
+    ]
     loudest = sorted(found.null.items(), key=lambda item: -item[1])[:_LOUDEST]
     listed = ", ".join(
         f"{cause}{f' {names[joint]}' if joint >= 0 else ''} {gain:.0f}" for (cause, joint), gain in loudest
     )
-    lines.append(f"  largest gains of causes by chance, mean of the sets (fall of chi-square): {listed}")
-    if sets < _RECORDED_SETS:
-        lines.append(
-            f"  {sets} set{'s say' if sets > 1 else ' says'} little about changes from day to day; with "
-            f"{_RECORDED_SETS} or more a diagnosis claims more and errs less"
-        )
-    lines.append("A diagnosis uses it with `lwr-run diagnose ... --reference FILE`, an experiment with")
-    lines.append("`diagnosis: {reference: FILE}` in its file")
-    return "\n".join(lines)
+    tables: list[Piece] = [
+        Listing(("", *names), rows),
+        "",
+        f"largest gains of causes by chance, mean of the sets (fall of chi-square): {listed}",
+    ]
+    few = Verdict(
+        "few sets",
+        f"{sets} set{'s say' if sets > 1 else ' says'} little about changes from day to day; with "
+        f"{_RECORDED_SETS} or more a diagnosis claims more and errs less",
+        "",
+        "look",
+    )
+    look = [few] if sets < _RECORDED_SETS else []
+    return Ending(
+        "look" if look else "good",
+        f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}.",
+        [
+            *((f"delay of the {name}", value) for name, value in delays),
+            ("positions", f"of the {found.encoder}s"),
+        ],
+        look,
+        ["An experiment compares itself with it by `diagnosis: {reference: FILE}` in its file."],
+        f"lwr-run diagnose SESSIONS --reference {quote(str(out))} --out diagnosis",
+        tables,
+        tables[:1],
+    )

@@ -86,11 +86,11 @@ def command(
     from ident.diagnosis.claims_in_words import SURE
     from ident.import_log import read_recording
     from ident.model.model_file import read_model
-    from runner.diagnosis import arm_data, asked, chain_of, known_arm, study
+    from runner.diagnosis import arm_data, asked, chain_of, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
     from runner.ending import of_diagnosis
-    from runner.estimation import recorded_couplings
+    from runner.estimation import known_arm, recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
     from runner.status import StatusLine
@@ -129,4 +129,4 @@ def command(
     if as_json:
         hold_json(content)
     else:
-        of_diagnosis(found.said, page, out, str(found)).tell()
+        of_diagnosis(found.said, page, out).tell()

@@ -8,7 +8,8 @@ import click
 
 from fri.errors import ConfigurationError
 from runner.output import NEW_FOLDER
-from runner.terminal import json_option, to_json, verb
+from runner.status import answer, write
+from runner.terminal import json_option, tell, to_json, verb
 
 
 @verb("example")
@@ -38,12 +39,12 @@ def command(name: str | None, listing: bool, out: Path | None, mirror: str | Non
             for key, e in EXAMPLES.items()
         ]
         lines = (f"{e['name']}\n  {e['meaning']}\n  {e['source']}; {e['licence']}" for e in entries)
-        click.echo(to_json(entries) if as_json else "\n".join(lines))
+        tell(entries if as_json else "\n".join(lines), as_json)
         return
     folder = Path(name) if out is None else out
     found = EXAMPLES.get(name)
     if found is not None and not as_json:
-        click.echo(f"{found.meaning}\nfrom {found.source}\nlicence: {found.licence}", err=True)
+        write(f"{found.meaning}\nfrom {found.source}\nlicence: {found.licence}")
     files = fetch(name, folder, mirror)
     assert found is not None
     if as_json:
@@ -51,5 +52,7 @@ def command(name: str | None, listing: bool, out: Path | None, mirror: str | Non
             to_json({"files": files, "source": found.source, "licence": found.licence, "then": found.then})
         )
         return
-    click.echo("\n".join(map(str, files)))
-    click.echo("\n".join(["then, in that folder:", *(f"  {line}" for line in found.then)]), err=True)
+    answer(*map(str, files))
+    write("then, in that folder:")
+    for line in found.then:
+        write(f"  {line}", command=True)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import click
 
 from fri.errors import ConfigurationError, DataError, LwrError, OperatorError, RobotError
+from lwr_driver.listing import text_of
 from runner.output import NEW_FOLDER, new_folder
-from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, default_file, hold_json, json_option, to_json, verb, verbosity
+from runner.status import StatusLine, next_step
+from runner.terminal import NAMED_FILE, default_file, hold_json, json_option, tell, verb, verbosity
 
 # Everything else is imported on use: the help page needs none of it.
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ def command(
     found = estimate(experiment, arm, records, status.say) if done else None
     summary = summarise(experiment, records, found)
     summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
-    text = write_results(folder, experiment, arm, summary, found)
+    tables = write_results(folder, experiment, arm, summary, found)
     if found is not None:
         status.say(held_out_errors(summary, folder))
     more, advice = [], []
@@ -152,21 +153,21 @@ def command(
             experiment, arm, cell, motions, folder, records, laboratory=laboratory, decide=decide
         )
         summary |= concluded.to_dict()
-        text = f"{text}\n{concluded.text(folder)}"
+        tables += concluded.pieces(folder)
         more = [] if concluded.study is None else [concluded.study.said.headline]
         advice = concluded.advice(folder)
     if experiment.sealed:
         advice.append(
             f"An effect is hidden in the emulated arm; `lwr-run experiment --reveal {folder}` shows it."
         )
-    (folder / "report.txt").write_text(f"{text.rstrip()}\n", encoding="utf-8")
+    (folder / "report.txt").write_text(f"{text_of(tables).rstrip()}\n", encoding="utf-8")
     status.show("writing the report")
     page = _page(folder, status)
     status.clear()
     if as_json:
         hold_json({**summary, "folder": str(folder)})
     else:
-        of_folder(folder, page, text, more, advice).tell()
+        of_folder(folder, page, tables, more, advice).tell()
     if not done:
         raise _failure(records[-1], folder)
     if summary.get("unscored"):
@@ -226,9 +227,9 @@ def _reveal(folder: Path | None, as_json: bool) -> None:
     status.show("writing the report")
     page = _page(folder, status)
     status.clear()
-    click.echo(to_json(shown.to_dict()) if as_json else str(shown))
+    tell(shown, as_json)
     if page is not None and not as_json:
-        click.echo(open_page(page))
+        next_step(open_page(page))
 
 
 def _begin(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
 
 from runner.output import NEW_FOLDER, OUTPUT_FILE
-from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_option, to_json
+from runner.status import answer, next_step, write
+from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_option, tell
 
 _STORE = click.option(
     "--store",
@@ -83,16 +86,17 @@ def batch_command(
     home = FleetStore(store)
     found = find_days([place.resolve() for place in places], home.uids())
     for path, reason in found.unreadable:
-        click.echo(f"{path}: left out: {reason}", err=True)
+        write(f"{path}: left out: {reason}")
     for path in found.repeated:
-        click.echo(f"{path}: left out: a copy of another log", err=True)
+        write(f"{path}: left out: a copy of another log")
     arms = len({day.arm for day in found.days})
-    click.echo(
-        f"{len(found.days)} new days of {arms} arms; {found.known} logs are in {store} already", err=as_json
+    place = sys.stderr if as_json else sys.stdout
+    write(
+        f"{len(found.days)} new days of {arms} arms; {found.known} logs are in {store} already", stream=place
     )
 
     def report(one: Progress) -> None:
-        click.echo(f"{one.arm} {one.day} {one.what}{f': {one.error}' if one.error else ''}", err=as_json)
+        write(f"{one.arm} {one.day} {one.what}{f': {one.error}' if one.error else ''}", stream=place)
 
     with _cluster(dask):
         order = Order(wanted, diagnose, reference_days, jobs)
@@ -110,9 +114,8 @@ def batch_command(
             }
         )
     else:
-        click.echo(
-            f"{len(done) - len(failed)} done, {len(failed)} failed. Next: lwr-run trend --store {store}"
-        )
+        answer(f"{len(done) - len(failed)} done, {len(failed)} failed.")
+        next_step(f"lwr-run trend --store {quote(str(store))}")
     if found.days and len(failed) >= len(done) > 0:
         raise DataError(f"no day could be worked on; the first reason: {failed[0].error}")
 
@@ -150,6 +153,7 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
     lwr-run trend LWR4+_17 --store fleet --out arm17.html
     """
     from fri.errors import DataError
+    from runner.ending import open_page
     from runner.fleet import FleetStore, arm_trend, fleet_trend, usual_scatter
     from runner.fleet.page import arm_html, fleet_html
     from runner.report.page import write_page
@@ -159,11 +163,11 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
         raise DataError(f"{store} holds no results; make them with `lwr-run batch FOLDER... --store {store}`")
     if arm is not None:
         one = arm_trend(home.arm(arm), usual_scatter(home))
-        click.echo(to_json({"schema_version": 1, **one.to_dict()}) if as_json else str(one))
+        tell({"schema_version": 1, **one.to_dict()} if as_json else one, as_json)
         text = arm_html(one) if out is not None else ""
     else:
         fleet = fleet_trend(home)
-        click.echo(to_json({"schema_version": 1, **fleet.to_dict()}) if as_json else str(fleet))
+        tell({"schema_version": 1, **fleet.to_dict()} if as_json else fleet, as_json)
         text = fleet_html(fleet) if out is not None else ""
     if out is not None:
-        click.echo(str(write_page(text, out)), err=as_json)
+        next_step(open_page(write_page(text, out)), sys.stderr if as_json else None)

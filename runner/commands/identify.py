@@ -10,6 +10,7 @@ import click
 
 from fri.errors import ConfigurationError
 from ident.estimators.names import AUTO, SUMMARIES
+from lwr_driver.listing import text_of
 from runner.output import NEW_FOLDER, OUTPUT_FILE, new_folder
 from runner.recordings import GUESSED, guess_options, read_recordings
 from runner.status import StatusLine
@@ -178,9 +179,10 @@ def command(
     result = named_model(
         found.essential_model if essential else found.model, logs[0].metadata.get("robot", "arm")
     )
-    content, text = found.to_dict(), found.summary()
+    content, tables = found.to_dict(), found.pieces()
     if mounting is not None:
-        content["mounting"], text = mounting.to_dict(), f"{text}\n\n{mounting}"
+        content["mounting"] = mounting.to_dict()
+        tables += ["", f"{mounting}"]
     # The model first: nothing in a test session may cost it.
     if out is not None:
         write_model(result, out)
@@ -193,19 +195,19 @@ def command(
     if validation is not None:
         whole = validation.to_dict()
         content |= {"validation": whole["sessions"], "unscored": whole["unscored"]}
-        text = f"{text}\n\n{validation}"
+        tables += ["", *validation.pieces()]
     page = None
     if results is not None:
         from runner.results import write_log_results
 
         status.show("writing the report")
-        page = write_log_results(results, found, logs, tested, result, text=text)
+        page = write_log_results(results, found, logs, tested, result, text=text_of(tables))
     status.clear()
     if as_json:
         hold_json(content)
     elif results is not None:
-        of_folder(results, page, text).tell()
+        of_folder(results, page, tables).tell()
     else:
-        of_estimate(content, out, text).tell()
+        of_estimate(content, out, tables).tell()
     if validation is not None:
         validation.require_all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 
 import click
 
@@ -10,6 +11,7 @@ from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
 from runner.editor import hand_out
 from runner.output import OUTPUT_FOLDER
+from runner.status import answer, next_step
 from runner.terminal import json_option, to_json, verb
 
 FILES = {
@@ -45,6 +47,5 @@ def command(folder: Path, as_json: bool) -> None:
     if as_json:
         click.echo(to_json({"folder": folder, "files": list(FILES)}))
         return
-    for name in FILES:
-        click.echo(str(folder / name))
-    click.echo(f"cd {folder} && lwr-run experiment")
+    answer(*(str(folder / name) for name in FILES))
+    next_step(f"cd {quote(str(folder))} && lwr-run experiment")

@@ -7,8 +7,10 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from lwr_driver.listing import Listing
 from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, check_file, check_folder, default_output, set_aside
-from runner.terminal import NAMED_FILE, PATH, forced, json_option, to_json, verb
+from runner.status import answer
+from runner.terminal import NAMED_FILE, PATH, forced, json_option, tell, to_json, verb
 
 
 @verb("info")
@@ -21,9 +23,13 @@ def info_command(session: Path, as_json: bool) -> None:
     lwr-run info experiments/lwr4plus-20260101-120000/loaded.mcap
     """
     from lwr_driver.session import describe
+    from runner.ending import of_session
 
     summary = describe(session)
-    click.echo(to_json(summary.as_dict()) if as_json else str(summary))
+    if as_json:
+        click.echo(to_json(summary.as_dict()))
+    else:
+        of_session(summary).tell()
 
 
 @verb("recover")
@@ -45,7 +51,7 @@ def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
         raise ConfigurationError(f"--out {target} is the damaged log itself; it is kept, choose another name")
     with set_aside(target):
         done = recover(session, target)
-    click.echo(to_json(done) if as_json else str(done))
+    tell(done, as_json)
 
 
 @verb("attach")
@@ -81,7 +87,7 @@ def attach_command(
             )
     tolerance = None if tolerance_ms is None else tolerance_ms / 1000.0
     done = import_trace(session, trace, out, tolerance_s=tolerance)
-    click.echo(to_json(done) if as_json else str(done))
+    tell(done, as_json)
 
 
 def _rows(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -147,7 +153,7 @@ def import_command(
             tip=tip,
             beside=mapping_path(mapping).parent,
         )
-    click.echo(to_json(done) if as_json else str(done))
+    tell(done, as_json)
 
 
 @verb("report")
@@ -224,7 +230,8 @@ def report_command(
         if as_json:
             click.echo(to_json(content))
         else:
-            of_folder(folder, page, "\n".join(map(str, lines))).tell()
+            rows = [(line.subject, line.level, line.found, line.wanted) for line in lines]
+            of_folder(folder, page, [Listing(("question", "", "found", "wanted"), rows, 0)]).tell()
         return
     from runner.report.paper_folder import save_for_paper
 
@@ -237,4 +244,7 @@ def report_command(
         joints=joints,
         statistics=statistics,
     )
-    click.echo(to_json({"figures": files}) if as_json else "\n".join(map(str, files)))
+    if as_json:
+        click.echo(to_json({"figures": files}))
+    else:
+        answer(*map(str, files))

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from runner.output import OUTPUT_FILE
+from runner.status import answer
 from runner.terminal import NAMED_FILE, PATH, forced, json_option, to_json, verb
 
 
@@ -58,6 +59,7 @@ def validate_command(
     from ident.estimation.validate import cross_validate, signals_for, validate
     from ident.import_log import read_recording
     from ident.model.model_file import read_model
+    from runner.ending import of_validation
     from runner.estimation import IdentifySettings
 
     tested = read_model(model)
@@ -66,14 +68,15 @@ def validate_command(
     if estimate_delay:
         signals = signals_for(tested, signals, estimate_delay=True)
     result = validate(tested, logs, settings=signals, allow_seen=allow_seen)
-    others = [read_model(path) for path in against]
+    others = {str(path): read_model(path) for path in against}
     result = replace(result, competitors=competitor_scores(tested, logs, settings=signals, others=others))
     content: dict[str, Any] = result.to_dict()
-    texts = [str(result)]
+    tables = result.pieces()
     if forward:
         runs = [simulate_session(tested, log, settings=signals) for log in logs]
         content["forward"] = [run.to_dict() for run in runs]
-        texts += [str(run) for run in runs]
+        for run in runs:
+            tables += ["", *run.pieces()]
     if cross:
         structure = tested.structure
         keys = ("model", "without", "couplings", "coulomb")
@@ -82,8 +85,11 @@ def validate_command(
             wanted = replace(wanted, signals=signals)
         folds = cross_validate(logs, structure.chain, wanted)
         content["cross_validation"] = folds.to_dict()
-        texts.append(str(folds))
-    click.echo(to_json(content) if as_json else "\n\n".join(texts))
+        tables += ["", *folds.pieces()]
+    if as_json:
+        click.echo(to_json(content))
+    else:
+        of_validation(result, tables, sessions).tell()
 
 
 @verb("compare")
@@ -110,21 +116,23 @@ def compare_command(first: Path, second: Path, as_json: bool, level: float, repo
     """
     from ident.estimation.compare import compare
     from ident.model.model_file import read_model
+    from runner.ending import of_comparison
 
     labels = (f"{first}", f"{second}")
     paths = [path / "model.yaml" if path.is_dir() else path for path in (first, second)]
     models = [read_model(path) for path in paths]
     result = compare(*models, level=level, labels=labels)
-    click.echo(to_json(result.to_dict()) if as_json else str(result))
+    page = None
     if report is not None:
         from runner.report.comparison import comparison_html
         from runner.report.page import write_page
 
         runs = {str(place): place for place in (first, second) if (place / "summary.json").is_file()}
-        click.echo(
-            str(write_page(comparison_html(result, models[0].structure.chain.joint_names, runs), report)),
-            err=as_json,
-        )
+        page = write_page(comparison_html(result, models[0].structure.chain.joint_names, runs), report)
+    if as_json:
+        click.echo(to_json(result.to_dict()))
+    else:
+        of_comparison(result, (first, second), page).tell()
 
 
 @verb("payload")
@@ -148,13 +156,16 @@ def payload_command(
     from ident.estimation.payload import identify_payload, with_payload
     from ident.import_log import read_recording
     from ident.model.model_file import read_model, write_model
+    from runner.ending import of_payload
 
     arm = read_model(model)
     found = identify_payload(arm, [read_recording(path) for path in sessions], free_offsets=free_offsets)
-    click.echo(to_json(found.to_dict()) if as_json else str(found))
     if out is not None:
         write_model(with_payload(arm, found), out)
-        click.echo(str(out), err=as_json)
+    if as_json:
+        click.echo(to_json(found.to_dict()))
+    else:
+        of_payload(found, model, sessions, out).tell()
 
 
 @verb("export")
@@ -187,7 +198,7 @@ def export_command(
         files = [{"file": output, "format": FORMATS[output.suffix]} for output in outputs]
         click.echo(to_json({"files": files, "title": done.title, "notes": done.notes}))
         return
-    for output in outputs:
-        click.echo(f"{output}: {FORMATS[output.suffix]}, {done.title}")
-    for note in done.notes:
-        click.echo(f"  {note}")
+    answer(
+        *(f"{output}: {FORMATS[output.suffix]}, {done.title}" for output in outputs),
+        *(f"  {note}" for note in done.notes),
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
@@ -29,9 +28,9 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
     lwr-run plan
     lwr-run plan my_arm.yaml --out my_arm.plan.yaml
     """
-    from ident.excitation.plan import plan_report
     from ident.excitation.planner import plan
     from ident.excitation.problem import PlanProblem
+    from runner.ending import of_plan
     from runner.replanning import show_search
 
     problem = PlanProblem.load(file)
@@ -50,8 +49,7 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
         }
         click.echo(to_json(content))
     else:
-        click.echo(plan_report(found))
-    click.echo(str(target), err=as_json)
+        of_plan(found, target).tell()
 
 
 @verb("check")
@@ -69,6 +67,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     """
     from lwr_driver.arm import Arm
     from lwr_driver.arm.cell import Cell
+    from runner.ending import of_check
     from runner.experiment_file import Experiment
     from runner.files import examine, listed
     from runner.planning import Excitations, session_motion
@@ -77,7 +76,7 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
     experiment = Experiment.load(file)
     files = examine(experiment)
     if not as_json:
-        status.write(listed(files), stream=sys.stdout)
+        status.answer(listed(files))
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
     motions = Excitations.of(experiment, arm, cell)
@@ -87,12 +86,14 @@ def check_command(file: str, period_ms: float, as_json: bool) -> None:
         rows = motions.rows(plan, period_ms / 1000)
         motion, found[plan.name] = session_motion(experiment, arm, cell, plan, rows, home)
         if not as_json:
-            text = f"\nsession {plan.name}: {motion.duration_s:.1f} s\n{found[plan.name]}"
-            status.write(text, stream=sys.stdout)
+            status.answer("", f"session {plan.name}: {motion.duration_s:.1f} s", *found[plan.name].pieces())
     if as_json:
         hold_json({name: list_.items for name, list_ in found.items()})
     for preflight in found.values():
         preflight.enforce()
+    if not as_json:
+        status.answer("")
+        of_check(found, file, len(files)).tell()
 
 
 @verb("preview")
@@ -115,6 +116,8 @@ def preview_command(
     lwr-run preview my_lab.yaml --session unloaded --out unloaded.html
     lwr-run preview experiments/lwr4plus-20260101-120000 --serve
     """
+    from runner.ending import open_page
+    from runner.preflight import Preflight
     from runner.preview import planned_motion, preview_html, serve
 
     if not serving:
@@ -125,11 +128,12 @@ def preview_command(
         if as_json:
             click.echo(to_json({**planned.facts(), "place": place}))
             return
-        click.echo(f"{planned.title}: {planned.motion.duration_s:.1f} s, tightest moment {planned.tightest}")
-        for item in planned.preflight.items:
-            if not item.ok:
-                click.echo(str(item))
-        click.echo(place)
+        failed = Preflight(tuple(item for item in planned.preflight.items if not item.ok))
+        status.answer(
+            f"{planned.title}: {planned.motion.duration_s:.1f} s, tightest moment {planned.tightest}",
+            *(failed.pieces() if failed.items else ()),
+        )
+        status.next_step(open_page(Path(place)) if out else place)
 
     if out is None:
         serve(planned, port, tell)

@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 
 from fri.errors import ConfigurationError
+from lwr_driver.listing import Listing
 from runner.output import OUTPUT_FILE
-from runner.terminal import PATH, json_option, to_json, verb
+from runner.terminal import PATH, json_option, tell, verb
 
 
 @verb("schema")
@@ -43,13 +44,12 @@ def command(name: str | None, out: Path | None, files: tuple[Path, ...], as_json
     done = {str(file): refer(file, name) for file in files}
     if done:
         lines = "\n".join(f"{file} refers to {target}" for file, target in done.items())
-        click.echo(to_json({"files": done}) if as_json else lines)
+        tell({"files": done} if as_json else lines, as_json)
     elif name is None:
-        width = max(map(len, FILES))
-        lines = "\n".join(f"{kind:<{width}}  {file.meaning}" for kind, file in FILES.items())
-        click.echo(to_json({kind: file.meaning for kind, file in FILES.items()}) if as_json else lines)
+        known = {kind: file.meaning for kind, file in FILES.items()}
+        tell(known if as_json else Listing(("file", "meaning"), list(known.items()), 0), as_json)
     elif out is not None:
         out.write_text(schema_text(name), encoding="utf-8")
-        click.echo(to_json({"file": str(out)}) if as_json else str(out))
+        tell({"file": str(out)} if as_json else str(out), as_json)
     else:
         click.echo(schema_text(name), nl=False)

@@ -12,7 +12,7 @@ from click.shell_completion import get_completion_class
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
 from runner.status import StatusLine, write
-from runner.terminal import NAMED_FILE, default_file, json_option, to_json, verb
+from runner.terminal import NAMED_FILE, default_file, json_option, tell, verb
 
 
 @verb("doctor")
@@ -97,10 +97,7 @@ def doctor_command(
         stack.callback(status.clear)
         found = examine(patient, link_s=seconds if link else None, wait_s=wait_s, report=status.show)
         status.clear()
-    if as_json:
-        click.echo(to_json(found.to_dict()))
-    else:
-        write(str(found), stream=sys.stdout)
+    tell(found, as_json)
     sys.exit(found.exit_code)
 
 
@@ -174,10 +171,10 @@ def emulator_command(
         ports = {"fri_host": fri_host, "fri_port": fri_port, "pendant_port": emulator.pendant_port}
         text = f"sends to {fri_host}:{fri_port}, pendant on 127.0.0.1:{emulator.pendant_port}; Ctrl-C ends it"
         try:
-            click.echo(to_json(ports) if as_json else text)
+            tell(ports if as_json else text, as_json)
             status = emulator.wait()
         except KeyboardInterrupt:
-            click.echo("ended", err=True)
+            write("ended")
             return
     sys.exit(status)
 

@@ -12,8 +12,8 @@ import click
 
 from fri.errors import ConfigurationError, OperatorError
 from runner.output import NEW_FILE, check_folder
-from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, PATH, ask, default_file, implied, json_option, to_json, verb
+from runner.status import StatusLine, answer
+from runner.terminal import NAMED_FILE, PATH, ask, default_file, implied, json_option, tell, verb
 
 if TYPE_CHECKING:
     from runner.experiment_file import Experiment
@@ -32,6 +32,15 @@ yes_option = click.option("--yes", is_flag=True, help="Confirm every question; f
 rights_option = click.option(
     "--allow-non-realtime", is_flag=True, help="Command a real arm without real-time rights; may stutter."
 )
+
+
+def _step_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of every step that commands the arm."""
+    for option in (json_option, rights_option, yes_option, out_option, payload_option):
+        command = option(command)
+    return command
+
+
 speed_option = click.option(
     "--speed",
     default=_SPEED,
@@ -103,12 +112,9 @@ def _payload(experiment: Experiment, name: str | None) -> Any:
 
 
 def _tell(order: _Order, step: Step, *more: str) -> None:
-    if order.as_json:
-        click.echo(to_json(step))
-        return
-    for line in (*step.notes, *more):
-        click.echo(line)
-    click.echo(str(step))
+    if not order.as_json:
+        answer(*step.notes, *more)
+    tell(step, order.as_json)
 
 
 @verb("record")
@@ -167,11 +173,7 @@ def _write_poses(path: Path, step: Step) -> None:
     type=click.FloatRange(0.5, 3600.0),
     help="Time in command mode.",
 )
-@payload_option
-@out_option
-@yes_option
-@rights_option
-@json_option
+@_step_options
 def hold_command(
     file: str,
     seconds: float,
@@ -199,11 +201,7 @@ def hold_command(
 @click.argument("degrees", type=float)
 @click.argument("file", type=NAMED_FILE, default=default_file, callback=_no_option)
 @speed_option
-@payload_option
-@out_option
-@yes_option
-@rights_option
-@json_option
+@_step_options
 def jog_command(
     joint: str,
     degrees: float,
@@ -242,11 +240,7 @@ def jog_command(
 )
 @click.option("--pose", metavar="NAME", help="One of --poses; default: its `moves.home`.")
 @speed_option
-@payload_option
-@out_option
-@yes_option
-@rights_option
-@json_option
+@_step_options
 def home_command(
     file: str,
     poses: Path | None,

@@ -24,6 +24,7 @@ from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
+from lwr_driver.listing import Piece
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
 from runner.diagnosis.discriminating import Discriminating, offers, open_findings
@@ -102,9 +103,9 @@ class Conclusion:
     answers: tuple[Answer, ...] = ()
     asked: bool = False
 
-    def text(self, folder: Path) -> str:
+    def pieces(self, folder: Path) -> list[Piece]:
         """The diagnosis and `advice`. folder : of the experiment."""
-        return "\n".join([*([] if self.study is None else [str(self.study)]), *self.advice(folder)])
+        return [*([] if self.study is None else self.study.said.pieces()), *self.advice(folder)]
 
     def advice(self, folder: Path) -> list[str]:
         """A failure, answers, and what to do next. folder : of the experiment."""

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from fri.errors import ConfigurationError, DataError
 from ident.effects import described, find_effect, summary_of
 from ident.effects.words import joints_text, quantity_text, spoken
+from lwr_driver.listing import Listing, Piece, text_of
 from runner.hiding.effect import SEALED, HiddenEffect
 from runner.report.diagnosis import DiagnosisFolder
 from runner.report.folder import ResultFolder
@@ -80,20 +81,22 @@ class Revelation:
             "not found": "NOT FOUND: the diagnosis reports nothing",
         }[self.outcome]
 
-    def __str__(self) -> str:
+    def pieces(self) -> list[Piece]:
+        """Truth, findings and verdict, and the parameters as a table."""
         rho = f"error of the base model about {self.effect.rho:.2g} times the healthy one"
-        lines = [
+        lines: list[Piece] = [
             f"Hidden in the emulated arm, seed {self.effect.seed}",
             f"  truth    {self.truth} ({rho})",
         ]
         for number, (title, confidence) in enumerate(self.named, start=1):
             lines.append(f"  finding  {number}. {title}, confidence {confidence:.2f}")
         lines.append(f"  verdict  {self.verdict}")
-        if any(row.found is not None for row in self.parameters):
-            lines.append(f"  {'parameter':<34}{'truth':>12}  {'found':<24}error / std")
-        for name, truth, found, sigmas in self.rows() if self.finding else ():
-            lines.append(f"  {name:<34}{truth:>12}  {found:<24}{sigmas}".rstrip())
-        return "\n".join(lines)
+        if self.finding and self.parameters:
+            lines.append(Listing(("parameter", "truth", "found", "error / std"), self.rows()))
+        return lines
+
+    def __str__(self) -> str:
+        return text_of(self.pieces())
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Parameter, truth, value found, and its error in standard deviations, as text."""

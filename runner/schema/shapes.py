@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Annotated, Any, Union, cast
 
 import msgspec
-import yaml
+
+from lwr_driver.yaml_text import yaml_content
 
 MEANINGS = Path(__file__).with_name("meanings.yaml")
 
@@ -21,7 +22,7 @@ MEANINGS = Path(__file__).with_name("meanings.yaml")
 @functools.cache
 def meanings() -> dict[str, dict[str, str]]:
     """Meaning of each key in a sentence, by the name of its dataclass."""
-    content: dict[str, dict[str, str]] = yaml.safe_load(MEANINGS.read_text(encoding="utf-8"))
+    content: dict[str, dict[str, str]] = yaml_content(MEANINGS.read_text(encoding="utf-8"))
     return content
 
 

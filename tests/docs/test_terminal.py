@@ -91,6 +91,7 @@ REPORTS: dict[str, tuple[str, str]] = {
     "example": ("example --list", "0.name"),
 }
 SLOW_REPORTS = ("commission", "diagnose")
+SLOW_ON_SCREEN = (*SLOW_REPORTS, "experiment", "record", "hold", "jog", "home", "preview")
 MAPPING = {
     "robot": "bench arm",
     "joints": ["a"],
@@ -100,6 +101,16 @@ MAPPING = {
 }
 
 
+def prepare(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files for `REPORTS`, and the stored plan in place of a search."""
+    (place / "other" / "loaded.plain.mcap").rename(place / "bare.mcap")
+    (place / "recording").mkdir()
+    (place / "recording" / "arm.csv").write_text("t,q,tau\n0,0,1\n0.01,0.1,1.1\n0.02,0.2,1\n")
+    (place / "mapping.yaml").write_text(yaml.safe_dump(MAPPING))
+    stored = ExcitationPlan.load(find("plans/default.plan.yaml"))
+    monkeypatch.setattr("ident.excitation.planner.plan", lambda problem, report: stored)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.long) if n in SLOW_REPORTS else n for n in REPORTS]
@@ -107,19 +118,31 @@ MAPPING = {
 def test_commands_that_report_print_one_json_value(
     name: str, workplace: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = workplace()
-    (place / "other" / "loaded.plain.mcap").rename(place / "bare.mcap")
-    (place / "recording").mkdir()
-    (place / "recording" / "arm.csv").write_text("t,q,tau\n0,0,1\n0.01,0.1,1.1\n0.02,0.2,1\n")
-    (place / "mapping.yaml").write_text(yaml.safe_dump(MAPPING))
-    stored = ExcitationPlan.load(find("plans/default.plan.yaml"))
-    monkeypatch.setattr("ident.excitation.planner.plan", lambda problem, report: stored)
+    prepare(workplace(), monkeypatch)
     line, wanted = REPORTS[name]
     code, text = run(*line.split(), "--json")
     assert code == 0, text
     value = json.loads(text, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
     for part in wanted.split("."):
         value = value[int(part)] if isinstance(value, list) else value[part]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.long) if n in SLOW_ON_SCREEN else n for n in REPORTS]
+)
+def test_no_line_of_a_command_is_longer_than_a_narrow_screen(
+    name: str, workplace: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(workplace(), monkeypatch)
+    monkeypatch.setattr("runner.status.watched", lambda stream: True)
+    monkeypatch.setenv("COLUMNS", "40")
+    done = CliRunner().invoke(main, [*REPORTS[name][0].split(), "--verbose"])
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert lines
+    if name != "schema":  # a file for programs
+        assert max(map(len, lines)) <= 40, max(lines, key=len)
 
 
 def test_every_command_reports_here_or_in_tests_of_its_own() -> None:

@@ -45,6 +45,7 @@ def test_loop_process_loads_only_what_it_runs():
         "realtime",
         "references",
         "ring",
+        "yaml_text",
     }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import io
 import json
 import os
 import subprocess
@@ -13,11 +15,15 @@ import pytest
 from click.testing import CliRunner
 
 from lwr_driver.configuration import CONFIGS
+from lwr_driver.listing import Listing
+from runner import status
 from runner.cli import VERBS, main
 from runner.output import OutputFile, set_aside
 from runner.terminal import NAMED_FILE, InputPath
 
 LWR_RUN = str(Path(sys.executable).parent / "lwr-run")
+
+ROOT = Path(__file__).resolve().parents[2]
 
 # One call of each command with a missing input.
 MISSING = (
@@ -273,3 +279,69 @@ def test_a_damaged_log_is_not_replaced_by_its_repair(tmp_path: Path) -> None:
     code, _, said = lwr_run(f"recover {log} --out {log} --force")
     assert (code, log.read_bytes()) == (2, b"damaged")
     assert "the damaged log itself" in said
+
+
+def echoed() -> dict[str, str]:
+    """What the code prints past `runner.status`, by module."""
+    found = {}
+    for path in [*(ROOT / "runner").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "click.echo",
+                "print",
+                "click.secho",
+            ):
+                text = ast.unparse(node.args[0])
+                if not text.startswith("to_json("):
+                    found[f"{path.relative_to(ROOT / 'runner')}: {text}"] = text
+    return found
+
+
+def test_every_command_writes_for_people_in_one_way() -> None:
+    # JSON aside: text of other programs, a word at Ctrl-C, the answers of a process to its parent.
+    assert {place.partition(":")[0] for place in echoed()} == {
+        "cli.py",
+        "commands/schema.py",
+        "commands/setup.py",
+        "live.py",
+    }
+    assert len(echoed()) == 5
+
+
+WIDE = Listing(("predictor", *(f"A{k} error" for k in range(30))), [("model", *["1234.567"] * 30)])
+
+
+def test_a_pipe_gets_whole_lines_without_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("COLUMNS", "CI"):
+        monkeypatch.delenv(name, raising=False)
+    stream = io.StringIO()
+    status.write(WIDE, stream=stream)
+    status.write("ok   " + "word " * 60, "red", stream=stream)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 3
+    assert min(map(len, lines)) > 250
+    assert "\x1b" not in stream.getvalue()
+
+
+@pytest.mark.parametrize("columns", [40, 80, 200])
+def test_a_wide_table_is_broken_into_tables_that_fit(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status, "watched", lambda stream: True)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    stream = io.StringIO()
+    status.write(WIDE, stream=stream)
+    text = stream.getvalue()
+    assert max(map(len, text.splitlines())) <= columns
+    assert text.count("1234.567") == 30
+    assert text.count("predictor") == text.count("model") > 1
+
+
+def test_verdict_words_of_a_table_have_their_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status, "watched", lambda stream: True)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    stream = io.StringIO()
+    rows = [("ok", "position"), ("FAIL", "clearance")]
+    status.write(Listing(("", "condition"), rows), stream=stream)
+    assert "\x1b[32mok" in stream.getvalue()
+    assert "\x1b[1;31mFAIL" in stream.getvalue()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from mcap.reader import make_reader
 
 from fri.errors import ConfigurationError, NetworkError
 from lwr_driver.driver import Driver, LinkSettings
+from lwr_driver.hosted_loop import LoopHost
 from lwr_driver.motion import move_to
 from lwr_driver.session import session_metadata
 from lwr_driver.session.motor_torque import KrlMotorTorque
@@ -89,3 +92,49 @@ def test_one_process_needs_lock_step() -> None:
         driver = Driver(arm(), LinkSettings("127.0.0.1", emulator.fri_port), host=emulator.host)
         with pytest.raises(ConfigurationError, match="needs lock step"):
             driver.connect()
+
+
+def test_a_late_word_of_the_loop_before_is_no_answer_to_the_next() -> None:
+    with EmulatorProcess(hosting=True, period_ms=5) as emulator:
+        assert emulator.host is not None
+        # As of a loop whose driver had stopped waiting for its end.
+        mine, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with mine, theirs:
+            theirs.send(json.dumps({"ended": "late"}).encode())
+            seat, emulator.host.connection = emulator.host.connection, Relay(mine, emulator.host.connection)
+            link = LinkSettings("127.0.0.1", emulator.fri_port, lock_step=True, lock_step_patience_s=5.0)
+            with Driver(arm(), link, host=emulator.host) as driver:
+                driver.connect()
+                assert driver.monitor(10).cycles == 10
+            emulator.host.connection = seat
+
+
+class Relay:
+    """The connection of a host with one message waiting in front of it."""
+
+    def __init__(self, waiting: socket.socket, behind: socket.socket) -> None:
+        self.waiting: socket.socket | None = waiting
+        self.behind = behind
+
+    def fileno(self) -> int:
+        return (self.waiting or self.behind).fileno()
+
+    def recv(self, size: int) -> bytes:
+        now, self.waiting = self.waiting or self.behind, None
+        return now.recv(size)
+
+    def sendmsg(self, *arguments: Any) -> int:
+        return self.behind.sendmsg(*arguments)
+
+
+def test_an_emulator_that_cannot_be_started_leaves_no_socket(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr("sim_backend.process.LoopHost", lambda: made.append(LoopHost()) or made[-1])
+    monkeypatch.setattr("sim_backend.process.subprocess.Popen", refuse)
+    with pytest.raises(OSError, match="no more processes"):
+        EmulatorProcess(hosting=True).start()
+    assert made[0].connection.fileno() == -1
+
+
+def refuse(*arguments: Any, **named: Any) -> None:
+    raise OSError("no more processes")

@@ -27,7 +27,7 @@ from ident.excitation import (
     hypervolume,
     not_dominated,
     plan,
-    plan_report,
+    plan_pieces,
     table,
     table_row,
     trade_off,
@@ -41,6 +41,7 @@ from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Box, Cell
 from lwr_driver.configuration import CONFIGS
+from lwr_driver.listing import text_of
 from lwr_driver.session import SessionWriter, session_metadata
 
 CONDITION = "condition number, essential 49, unscaled"
@@ -342,7 +343,7 @@ def test_table_and_report_name_what_they_show(problem: PlanProblem, solved: Exci
     assert "planned" in text
     assert f"{solved.objectives[CONDITION]:.2f}" in text
     assert rows[1].condition < rows[0].condition
-    report = plan_report(solved)
+    report = text_of(plan_pieces(solved))
     assert CONDITION in report
     assert "tightest margins" in report
 

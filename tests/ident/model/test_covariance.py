@@ -102,3 +102,11 @@ def test_a_model_that_cannot_be_read_back_leaves_the_old_file(tmp_path: Path, mo
 def test_a_place_that_cannot_be_written_is_said_so(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot be written: No such file"):
         write_checked(tmp_path / "none" / "m.yaml", "text", lambda text: None)
+
+
+def test_a_variance_without_a_point_is_read_back(tmp_path: Path) -> None:
+    # `1e-12` is a number of YAML 1.2; in the file it is a row of text.
+    path = tmp_path / "m.yaml"
+    written = model(1e-12 * np.eye(3))
+    write_model(written, path)
+    assert np.allclose(read_model(path).covariance, written.covariance, rtol=1e-9)

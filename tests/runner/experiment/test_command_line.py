@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -78,7 +79,7 @@ def test_check_refuses_a_motion_that_comes_too_near(tmp_path: Path) -> None:
     moves = {"home": [0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0], "max_start_distance_rad": 0.01}
     done = run("check", str(experiment_file(tmp_path, moves=moves)))
     assert done.code == 3
-    assert "FAIL distance to the start" in done.text
+    assert re.search(r"^distance to the start +FAIL ", done.text, re.MULTILINE)
     assert "preflight refuses the motion" in done.text
 
 

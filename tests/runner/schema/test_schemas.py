@@ -242,7 +242,7 @@ def test_a_folder_of_copies_keeps_its_schemas_wherever_it_goes(tmp_path: Path) -
 def test_the_command_prints_lists_and_writes(tmp_path: Path) -> None:
     assert json.loads(CliRunner().invoke(main, ["schema", "cell"]).output) == schema("cell")
     listed = CliRunner().invoke(main, ["schema"]).output
-    assert [line.split()[0] for line in listed.splitlines()] == list(FILES)
+    assert [line.split()[0] for line in listed.splitlines()] == ["file", *FILES]
     out = tmp_path / "cell.json"
     assert CliRunner().invoke(main, ["schema", "cell", "--out", str(out)]).exit_code == 0
     assert out.read_text() == schema_text("cell")
