@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import http.server
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
@@ -123,7 +125,9 @@ def studio(browser: Browser, log: Path, packages: Path, target: Path) -> list[st
             page.goto(f"{address}/index.html?ds=remote-file&ds.url={address}/log.mcap&layoutId=lwr")
             page.wait_for_timeout(20_000)
             page.mouse.click(25, 25)  # closes the list of topics
+            page.mouse.click(838, 58)  # closes a hint
             page.mouse.click(0.4 * SIZE["width"], SIZE["height"] - 56)
+            page.mouse.move(0.5 * SIZE["width"], 5)
             page.wait_for_timeout(20_000)
             page.screenshot(path=target, timeout=120_000)
             page.close()
@@ -136,18 +140,19 @@ def rerun(browser: Browser, log: Path, command: str, target: Path) -> list[str]:
         recording = Path(place) / "log.rrd"
         open_log(log, recording)
         serve = [command, str(recording), "--serve-web", "--web-viewer-port", "19090", "--port", "19876"]
-        with subprocess.Popen(serve, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        with subprocess.Popen(serve, start_new_session=True, **quiet) as process:
             try:
                 time.sleep(8.0)
                 page, errors = browser.new_page(viewport=SIZE), []
                 page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
                 source = "rerun%2Bhttp://127.0.0.1:19876/proxy"
                 page.goto(f"http://127.0.0.1:19090/?url={source}&renderer=webgl")
-                page.wait_for_timeout(60_000)
+                page.wait_for_timeout(90_000)
                 page.screenshot(path=target, timeout=120_000)
                 page.close()
             finally:
-                process.kill()
+                os.killpg(process.pid, signal.SIGKILL)
     return errors
 
 

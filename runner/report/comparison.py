@@ -78,7 +78,17 @@ def _words(one: Difference) -> str:
 
 
 def _table(comparison: Comparison) -> str:
-    head = ("parameter", comparison.first, "±", comparison.second, "±", "unit", "difference [%]", "z", "")
+    head = (
+        "parameter",
+        comparison.first,
+        "±",
+        comparison.second,
+        "±",
+        "unit",
+        "difference [%]",
+        "z",
+        "verdict",
+    )
     rows: list[list[Cell]] = []
     for one in comparison.differences:
         known = math.isfinite(one.percent)

@@ -32,7 +32,7 @@ from runner.report.latex import table_1
 from runner.report.page import write_report
 from runner.report.tables import better_than_published
 from runner.report.verdicts import headline, verdicts
-from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, opened
+from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, flaws, opened
 
 pytestmark = pytest.mark.slow
 
@@ -249,12 +249,28 @@ def test_pictures_have_alternative_texts_with_numbers(report: Seen) -> None:
     assert all(any(sign.isdigit() for sign in text) for text in texts)
 
 
+@pytest.fixture(scope="module")
+def pages(finished: Path, preview: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Every page that is a file: report with a diagnosis, comparison, preview."""
+    place = tmp_path_factory.mktemp("pages")
+    folder = copy(finished, place / "diagnosed")
+    (folder / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
+    comparison = place / "comparison.html"
+    done = CliRunner().invoke(main, ["compare", str(finished), str(folder), "--report", str(comparison)])
+    assert done.exit_code == 0, done.output
+    return {"report": write_report(folder), "comparison": comparison, "preview": preview}
+
+
 @pytest.mark.parametrize("size", [WIDE, NARROW])
-def test_text_is_legible_and_fits_the_window(finished: Path, chrome: Browser, size: tuple[int, int]) -> None:
-    with opened(chrome, finished / "report.html", size) as seen:
+@pytest.mark.parametrize("name", ["report", "comparison", "preview"])
+def test_a_page_is_legible_fits_the_window_and_is_accessible(
+    pages: dict[str, Path], chrome: Browser, name: str, size: tuple[int, int]
+) -> None:
+    with opened(chrome, pages[name], size) as seen:
+        if name != "preview":
+            seen.wait_drawn()
         assert seen.page.evaluate(CONTRAST) >= 4.5
-        assert seen.page.evaluate("document.documentElement.scrollWidth") <= size[0]
-        assert seen.errors == []
+        assert flaws(seen) == []
 
 
 def test_a_diagnosis_is_shown_with_its_evidence(finished: Path, tmp_path: Path, chrome: Browser) -> None:
