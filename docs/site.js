@@ -7,3 +7,4 @@ const reach = () => {
 };
 window.addEventListener("load", () => { reach(); setTimeout(reach, 500); });
 window.addEventListener("resize", reach);
+document.querySelector(".md-search")?.setAttribute("aria-label", "Search");
