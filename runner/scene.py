@@ -29,6 +29,8 @@ JOINT: Colour = (0, 114, 178)
 GHOST: Colour = (0, 158, 115)
 ALARM: Colour = (213, 94, 0)
 CARRIED: Colour = (86, 86, 86)
+# The labels of viser's widgets are pale grey.
+_LEGIBLE = "<style>label, .mantine-Slider-markLabel { color: #343a40 !important; }</style>"
 _DENSITY = 2700.0  # of a payload without shape, drawn as an aluminium ball [kg/m³]
 
 
@@ -51,6 +53,7 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=False)
+    server.gui.add_html(_LEGIBLE)
     server.initial_camera.position = (1.45, -1.35, 1.05)
     server.initial_camera.look_at = (0.0, 0.0, 0.45)
     return server
@@ -85,6 +88,7 @@ class ArmShape:
     """The links of an arm under one node of the scene; `pose` moves them.
 
     scene : viser scene. name : node. colour : of the links; None takes the usual ones. opacity : 0 to 1.
+    base : draw the part that no joint moves.
     """
 
     def __init__(
@@ -96,6 +100,7 @@ class ArmShape:
         payload: Payload | None = None,
         colour: Colour | None = None,
         opacity: float | None = None,
+        base: bool = True,
     ) -> None:
         self._model = pin.buildModelFromXML(arm.urdf)
         self._data = self._model.createData()
@@ -113,6 +118,8 @@ class ArmShape:
         self._links: dict[int, list[Any]] = {}
         for index, shape in enumerate(shapes.geometryObjects):
             joint = int(shape.parentJoint)
+            if joint == 0 and not base:
+                continue
             parent = name if joint == 0 else self._frames[joint - 1][2]
             ball = isinstance(shape.geometry, coal.Sphere)
             shade = colour or (JOINT if ball else BODY)

@@ -71,6 +71,7 @@ def take_replay(browser: Browser, folder: Path, target: Path) -> None:
             assert process.stdout is not None
             page = browser.new_page(viewport=SIZE)
             page.goto(process.stdout.readline().strip())
+            page.wait_for_timeout(5_000)
             page.get_by_label("play").uncheck(timeout=600_000)
             page.add_style_tag(content=CLEAN)
             page.wait_for_timeout(8_000)

@@ -12,7 +12,7 @@ from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 
 
-@pytest.mark.parametrize("size", [0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5])
+@pytest.mark.parametrize("size", [0.07, 0.08, 0.09, 0.1, 0.11, 0.12, 0.13])
 def test_scan(make: Callable[..., Session], chain: Chain, size: float) -> None:
     random = np.random.default_rng(3)
 

@@ -105,6 +105,10 @@ CUT = """() => [...document.querySelectorAll('body *')].filter((node) => {
 """What reaches beyond the window outside of boxes that scroll or clip."""
 
 
+VISER = {"aria-input-field-name", "button-name", "image-alt", "label"}
+"""Violations by the widgets of viser itself: unnamed sliders, the button of its notice on software rendering."""
+
+
 def flaws(seen: Seen) -> list[str]:
     """What is wrong with a page: errors, requests, cut content, and serious violations found by axe-core."""
     page = seen.page
