@@ -10,3 +10,8 @@ _FETCHED = "https://unpkg.com/iframe-worker/shim"
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """The page with its own copy of the shim. Called by mkdocs."""
     return output.replace(_FETCHED, "iframe-worker.js")
+
+
+def on_post_template(output: str, template_name: str, config: Any) -> str:
+    """The same for pages without a document, such as 404.html. Called by mkdocs."""
+    return output.replace(_FETCHED, "iframe-worker.js")
