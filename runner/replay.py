@@ -84,7 +84,9 @@ class Replayed:
     @property
     def time(self) -> Floats:
         """(m,) middle of the means, from the start of the session [s]."""
-        return self.begin_s + (np.arange(len(self.measured)) + 0.5) * _BIN * CYCLE_S
+        return np.asarray(
+            self.begin_s + (np.arange(len(self.measured)) + 0.5) * _BIN * CYCLE_S, dtype=np.float64
+        )
 
 
 class Replay:

@@ -167,10 +167,10 @@ def motion_replay(
 
 
 def _without_end(done: Replayed) -> Replayed:
-    kept = {
-        name: None if (values := getattr(done, name)) is None else values[:-_END]
-        for name in ("position", "motor", "joint", "measured")
-    }
+    kept: dict[str, Any] = {}
+    for name in ("position", "motor", "joint", "measured"):
+        values = getattr(done, name)
+        kept[name] = None if values is None else values[:-_END]
     return replace(done, **kept)
 
 
@@ -249,7 +249,7 @@ class _Page:
         self.shown, gui, names = shown, server.gui, shown.arm.joint_names
         server.scene.add_grid("/ground", width=3.0, height=3.0, cell_size=0.1, section_size=0.5)
         self.measured = ArmShape(server.scene, shown.arm, "/measured", payload=shown.payload)
-        look = {"payload": shown.payload, "colour": GHOST, "opacity": 0.35, "base": False}
+        look: dict[str, Any] = {"payload": shown.payload, "colour": GHOST, "opacity": 0.35, "base": False}
         self.ghost = ArmShape(server.scene, shown.arm, "/simulated", **look)
         gui.configure_theme(control_width="large", show_share_button=False)
         gui.add_markdown(f"## Replay of {shown.session}")

@@ -387,7 +387,8 @@ def _left(axes: Any) -> float:
     texts = axis.get_major_formatter().format_ticks(inside)
     longest = max((4 if "$" in text else len(text) for text in texts), default=1)
     label = axes.get_ylabel()
-    return 1.8 + 1.25 * longest + (_LINE_MM * (1 + label.count("\n")) if label else 0.0)
+    digit = 1.25 if axes.yaxis.label.get_fontfamily()[0] in FONTS else 1.65
+    return 1.8 + digit * longest + (_LINE_MM * (1 + label.count("\n")) if label else 0.0)
 
 
 def _legend(figure: Any, width: float) -> int:

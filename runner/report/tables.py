@@ -78,7 +78,8 @@ def better_than_published(results: ResultFolder) -> str:
     if plan is None:
         return ""
     own, objective = plan
-    better, worse = [], []
+    better: list[str] = []
+    worse: list[str] = []
     for key, name in (
         ("mean_rsd", "mean RSD"),
         ("worst_rsd", "worst RSD"),
