@@ -105,8 +105,15 @@ CUT = """() => [...document.querySelectorAll('body *')].filter((node) => {
 """What reaches beyond the window outside of boxes that scroll or clip."""
 
 
-VISER = {"aria-input-field-name", "button-name", "image-alt", "label"}
-"""Violations by the widgets of viser itself: unnamed sliders, the button of its notice on software rendering."""
+VISER = {
+    "aria-input-field-name",
+    "aria-progressbar-name",
+    "button-name",
+    "image-alt",
+    "label",
+    "scrollable-region-focusable",
+}
+"""Violations by the widgets of viser itself: sliders and bars without a name, its notice on software rendering."""
 
 
 def flaws(seen: Seen) -> list[str]:
