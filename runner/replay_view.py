@@ -264,13 +264,7 @@ class _Page:
             self.enlarged = gui.add_number(
                 "deviation enlarged", shown.enlarged, min=1.0, step=1.0, disabled=not driven
             )
-        gui.add_markdown(
-            "Solid: measured. Green: simulated, its deviation enlarged. A link turns red with the torque error of its "
-            "joint; full red is the largest one by the base model."
-        )
-        self.now = gui.add_markdown("")
         self.joint = gui.add_dropdown("joint of the plot", list(names), initial_value=names[shown.told_joint])
-        plain = [np.nan_to_num(shown.torque_error(name)[:, shown.told_joint]) for name in shown.runs]
         colours = [STYLES["computed"].colour, STYLES["measured"].colour]
         lines = [
             {"label": LABELS[name], "stroke": colour, "width": 1.5}
@@ -278,15 +272,20 @@ class _Page:
         ]
         point = {"label": "now", "stroke": "#000000", "points": {"show": True, "size": 9}}
         self.plot = gui.add_uplot(
-            (shown.time, *plain, np.full(len(shown.time), np.nan)),
+            tuple(np.zeros(1) for _ in range(len(lines) + 2)),
             ({"label": "t"}, *lines, point),
             title=f"{shown.side} torque, measured minus simulated [Nm]",
             axes=({"label": "time [s]"}, {"size": 56}),
             scales={"x": {"time": False}},
-            height=230,
+            height=200,
+        )
+        self.now = gui.add_markdown("")
+        gui.add_markdown(
+            "Solid: measured. Green: simulated, its deviation enlarged. A link turns red with the torque error of its "
+            "joint; full red is the largest one by the base model."
         )
         gui.add_markdown(_summary(shown))
-        self.count = 0
+        self.count, self.plotted = 0, -1
 
     def step(self) -> None:
         """The next moment, or the one of the slider."""
@@ -313,6 +312,11 @@ class _Page:
     def _mark(self, row: int, model: Simulated) -> None:
         shown, joint = self.shown, self.shown.arm.joint_names.index(self.joint.value)
         errors = [np.nan_to_num(shown.torque_error(name)[:, joint]) for name in shown.runs]
+        if joint != self.plotted:
+            # Without a range of its own the plot is blank: the point of the moment is NaN elsewhere.
+            largest = 1.1 * max(float(np.abs(error).max()) for error in errors) or 1.0
+            self.plot.scales = {"x": {"time": False}, "y": {"range": (-largest, largest)}}
+            self.plotted = joint
         here = np.full(len(shown.time), np.nan)
         here[row] = np.nan_to_num(shown.torque_error(model)[row, joint])
         self.plot.data = (shown.time, *(np.ascontiguousarray(error) for error in errors), here)

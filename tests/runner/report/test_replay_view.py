@@ -26,6 +26,13 @@ from tests.runner.report.view_rig import VISER, flaws, opened
 pytestmark = pytest.mark.slow
 
 WRONG_JOINT = 3
+DRAWN = """() => [...document.querySelectorAll('.uplot canvas')].map((canvas) => {
+  const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+  let count = 0;
+  for (let k = 0; k < data.length; k += 4) count += data[k] > 180 && data[k + 2] < 60 && data[k + 3] > 100;
+  return count;
+})[0]"""
+"""Pixels of the line of the base model in the plot of the torque error."""
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +156,7 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
                 page.get_by_text("s, extended model").wait_for(timeout=120_000)
                 page.wait_for_timeout(500)
                 extended = torque_errors(page.inner_text("body"))
+                assert page.evaluate(DRAWN) > 100
                 assert {flaw.split(",")[0] for flaw in flaws(seen)} <= VISER
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
