@@ -1,1 +1,1 @@
-"""The user's programs: command line, experiment, doctor, preflight, preview, report."""
+"""The user's programs: command line, experiment, doctor, preflight, preview, replay, report."""

@@ -34,6 +34,7 @@ VERBS = {
     "plan": "an optimal exciting motion within all limits",
     "check": "every check of an experiment file, without motion",
     "preview": "the planned motion in 3D in the browser",
+    "replay": "a session beside its simulation in 3D, or as a video",
     "report": "report.html of a finished experiment, figures and tables for a paper",
     "emulator": "run the emulated controller and arm until interrupted",
     "identify": "estimate a model from session logs",

@@ -7,9 +7,14 @@ IFAC-PapersOnLine 50-1 (2017): Table 1 (excitation trajectories) and Table 2 (es
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+from fri.errors import LwrError
 from ident.estimation.identify import Identification
+from ident.excitation import Assembled, ExcitationPlan, PlanProblem, assemble, table_row
+from lwr_driver.configuration import find
 
 SOURCE = (
     "Kolyubin, Shiriaev, Jubien: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
@@ -41,6 +46,68 @@ TABLE_1 = (
     PublishedMotion("Optimised, algorithm 1", "yes", 34.01, (3.12, 41.71, 9.30, 13.24, 2.12, 1.56, 0.92)),
     PublishedMotion("Optimised, algorithm 2", "yes", 37.23, (4.63, 42.26, 10.23, 14.05, 1.56, 1.64, 1.64)),
 )
+
+REBUILT = {
+    "Random points": "plans/published/random_points.plan.yaml",
+    "Optimised, algorithm 1": "plans/published/algorithm_1.plan.yaml",
+    "Optimised, algorithm 2": "plans/published/algorithm_2.plan.yaml",
+}
+"""Motions by the rules of Table 1, whose own coefficients were not published; made by `benchmarks.excitation`."""
+
+
+@dataclass(frozen=True)
+class PredictedMotion:
+    """What a motion promises before it is driven, for Model 2 with the 49 parameters of Table 2.
+
+    The noise of the torques is the published one, and each session has equally many independent samples, so motions
+    can be compared. mean_rsd, worst_rsd : of the relative standard deviations, equation (15) [%]. mean_torque : with
+    the payload [Nm].
+    """
+
+    complies: bool
+    condition: float
+    mean_rsd: float
+    worst_rsd: float
+    mean_torque: tuple[float, ...]
+
+
+@cache
+def _assembled() -> Assembled:
+    return assemble(PlanProblem.load("plans/default.yaml"))
+
+
+def predicted(plan: ExcitationPlan) -> PredictedMotion | None:
+    """The prediction for a plan of the arm of Table 1; None for another arm."""
+    if plan.joint_names != _assembled().setup.mechanism.joint_names:
+        return None
+    row = table_row("", _assembled(), plan.motion, plan.check)
+    return PredictedMotion(
+        row.complies, row.condition, row.rsd_mean, row.rsd_worst, tuple(row.torque.tolist())
+    )
+
+
+@cache
+def rebuilt(name: str) -> PredictedMotion:
+    """The prediction for a motion of Table 1 rebuilt by its rule. name : of `REBUILT`."""
+    found = predicted(ExcitationPlan.load(find(REBUILT[name])))
+    assert found is not None
+    return found
+
+
+def planned(folder: Path) -> tuple[PredictedMotion, str] | None:
+    """The prediction for the plan of a run and the objective of its search; None without such a plan."""
+    file = folder / "plan.yaml"
+    try:
+        plan = ExcitationPlan.load(file) if file.is_file() else None
+    except LwrError:
+        return None
+    found = None if plan is None else predicted(plan)
+    if plan is None or found is None:
+        return None
+    problem = plan.provenance.get("problem")
+    objective = problem.get("objective") if isinstance(problem, dict) else None
+    return found, str(objective["criterion"]) if isinstance(objective, dict) else ""
+
 
 _TABLE_2 = """
 Ia1 3.14 1.68    Fvm1 16.68 0.84   Fcm1 15.04 1.02   Ia2 2.58 5.42     Fvm2 19.09 1.29   Fcm2 16.48 1.43

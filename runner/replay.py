@@ -67,7 +67,8 @@ class Replayed:
 
     position, motor : None without motor torques in the log or in the model; motor : NaN near standstill. inertia : (n,)
     of the spring and damper [kg m^2]. exact : whether the model itself was simulated, or the nearest physically
-    possible one. stiff : whether the stiffness of the joints is unknown. duration_s : of the compared part.
+    possible one. stiff : whether the stiffness of the joints is unknown. duration_s : of the compared part. measured :
+    (m, n) positions [rad]. begin_s : of the compared part, from the start of the session.
     """
 
     position: Floats | None
@@ -77,6 +78,15 @@ class Replayed:
     exact: bool
     stiff: bool
     duration_s: float
+    measured: Floats
+    begin_s: float
+
+    @property
+    def time(self) -> Floats:
+        """(m,) middle of the means, from the start of the session [s]."""
+        return np.asarray(
+            self.begin_s + (np.arange(len(self.measured)) + 0.5) * _BIN * CYCLE_S, dtype=np.float64
+        )
 
 
 class Replay:
@@ -206,14 +216,18 @@ def replay(
     used, times = slice(_BEGIN, None), grid[_BEGIN:]
     position_error = motor_error = joint_error = None
     if chosen.motor is not None and chosen.motor.effort.shape[1] and "motor" in model.structure.sides:
-        measured = _resampled(chosen.motor.log_time, chosen.motor.effort, grid)
-        motor_error = _binned(np.where(_sticking(path), np.nan, measured - motor)[used])
-        position, _, _ = bench.run(path, _HELD_HZ, measured)
+        driven = _resampled(chosen.motor.log_time, chosen.motor.effort, grid)
+        motor_error = _binned(np.where(_sticking(path), np.nan, driven - motor)[used])
+        position, _, _ = bench.run(path, _HELD_HZ, driven)
         position_error = _binned((_resampled(joint.log_time, joint.position, grid) - position)[used])
     if joint.effort.shape[1] and "joint" in model.structure.sides:
         joint_error = _binned(_resampled(joint.log_time, joint.effort, times) - link[used])
     errors = position_error, motor_error, joint_error
-    return Replayed(*errors, bench.inertia, bench.exact, stiffness is None, len(times) * CYCLE_S)
+    measured = _binned(_resampled(joint.log_time, joint.position, times))
+    begin_s = (int(times[0]) - chosen.start) * 1e-9
+    return Replayed(
+        *errors, bench.inertia, bench.exact, stiffness is None, len(times) * CYCLE_S, measured, begin_s
+    )
 
 
 class _Bench:

@@ -1,6 +1,6 @@
-"""The arm and its cell as primitive shapes in a viser scene, for preview and live view.
+"""The arm and its cell as primitive shapes in a viser scene, for preview, live view and replay.
 
-viser is part of the extra `view`; only preview and live view import this module.
+viser is part of the extra `view`; only these three import this module.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ JOINT: Colour = (0, 114, 178)
 GHOST: Colour = (0, 158, 115)
 ALARM: Colour = (213, 94, 0)
 CARRIED: Colour = (86, 86, 86)
+# The labels of viser's widgets are pale grey.
+_LEGIBLE = "<style>label, .mantine-Slider-markLabel { color: #343a40 !important; }</style>"
 _DENSITY = 2700.0  # of a payload without shape, drawn as an aluminium ball [kg/m³]
 
 
@@ -51,6 +53,7 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=False)
+    server.gui.add_html(_LEGIBLE)
     server.initial_camera.position = (1.45, -1.35, 1.05)
     server.initial_camera.look_at = (0.0, 0.0, 0.45)
     return server
@@ -85,6 +88,7 @@ class ArmShape:
     """The links of an arm under one node of the scene; `pose` moves them.
 
     scene : viser scene. name : node. colour : of the links; None takes the usual ones. opacity : 0 to 1.
+    base : draw the part that no joint moves.
     """
 
     def __init__(
@@ -96,6 +100,7 @@ class ArmShape:
         payload: Payload | None = None,
         colour: Colour | None = None,
         opacity: float | None = None,
+        base: bool = True,
     ) -> None:
         self._model = pin.buildModelFromXML(arm.urdf)
         self._data = self._model.createData()
@@ -110,12 +115,18 @@ class ArmShape:
                 node, show_axes=False, position=tuple(placement.translation), wxyz=_wxyz(placement.rotation)
             )
             self._frames.append((frame, placement.rotation.copy(), node))
+        self._links: dict[int, list[Any]] = {}
         for index, shape in enumerate(shapes.geometryObjects):
             joint = int(shape.parentJoint)
+            if joint == 0 and not base:
+                continue
             parent = name if joint == 0 else self._frames[joint - 1][2]
             ball = isinstance(shape.geometry, coal.Sphere)
             shade = colour or (JOINT if ball else BODY)
-            _add_shape(scene, f"{parent}/shape_{index}", shape.geometry, shape.placement, shade, opacity)
+            drawn = _add_shape(
+                scene, f"{parent}/shape_{index}", shape.geometry, shape.placement, shade, opacity
+            )
+            self._links.setdefault(joint, []).append(drawn)
         if payload is not None:
             tip = self._frames[-1][2]
             geometry, placement = _payload_shape(payload)
@@ -125,6 +136,12 @@ class ArmShape:
         """Put the arm into the posture q, (7,) [rad]."""
         for (frame, rotation, _), angle in zip(self._frames, q, strict=True):
             frame.wxyz = _wxyz(rotation @ _about_z(float(angle)))
+
+    def paint(self, joint: int, colour: Colour) -> None:
+        """Colour the link moved by a joint, counted from 1."""
+        for drawn in self._links.get(joint, ()):
+            if tuple(drawn.color) != colour:
+                drawn.color = colour
 
     def tip(self, q: Floats) -> Floats:
         """Position (3,) of the last frame of the URDF, the flange, in the posture q, (7,) [rad]."""
@@ -162,21 +179,19 @@ def _payload_shape(payload: Payload) -> tuple[Any, pin.SE3]:
 
 def _add_shape(
     scene: Any, name: str, geometry: Any, placement: pin.SE3, colour: Colour, opacity: float | None
-) -> None:
+) -> Any:
     where = {"position": tuple(placement.translation), "wxyz": _wxyz(placement.rotation)}
     look = {"color": colour, "opacity": opacity}
     if isinstance(geometry, coal.Sphere):
-        scene.add_icosphere(name, radius=float(geometry.radius), **look, **where)
-    elif isinstance(geometry, coal.Cylinder):
+        return scene.add_icosphere(name, radius=float(geometry.radius), **look, **where)
+    if isinstance(geometry, coal.Cylinder):
         height = 2.0 * float(geometry.halfLength)
-        scene.add_cylinder(name, radius=float(geometry.radius), height=height, **look, **where)
-    elif isinstance(geometry, coal.Box):
-        scene.add_box(name, dimensions=tuple(2.0 * np.asarray(geometry.halfSide)), **look, **where)
-    else:
-        raise ConfigurationError(
-            f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the "
-            "URDF"
-        )
+        return scene.add_cylinder(name, radius=float(geometry.radius), height=height, **look, **where)
+    if isinstance(geometry, coal.Box):
+        return scene.add_box(name, dimensions=tuple(2.0 * np.asarray(geometry.halfSide)), **look, **where)
+    raise ConfigurationError(
+        f"shape {type(geometry).__name__} of {name} cannot be drawn; use sphere, cylinder or box in the URDF"
+    )
 
 
 def _about_z(angle: float) -> Floats:

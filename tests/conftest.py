@@ -4,8 +4,9 @@ import fcntl
 import os
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -55,3 +56,14 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
         return folder
 
     return once
+
+
+@pytest.fixture(scope="session")
+def chrome() -> Iterator[Any]:
+    """The one browser of a process."""
+    from tests.runner.report.view_rig import browser, chromium
+
+    if chromium() is None:
+        pytest.skip("no chromium on this computer; install the system's package `chromium`")
+    with browser() as opened_browser:
+        yield opened_browser

@@ -43,6 +43,7 @@ def main(arguments: list[str]) -> None:
         with sync_playwright() as playwright:
             opened = playwright.chromium.launch(executable_path=browser, args=FLAGS)
             take(opened, report, preview, HERE)
+            take_replay(opened, folder, HERE)
             opened.close()
 
 
@@ -60,6 +61,24 @@ def take(browser: Browser, report: Path, preview: Path, target: Path) -> None:
     page.wait_for_timeout(8_000)
     page.screenshot(path=target / "preview.png", timeout=600_000)
     page.close()
+
+
+def take_replay(browser: Browser, folder: Path, target: Path) -> None:
+    """Open the replay of a run and write its picture into the folder `target`."""
+    command = [sys.executable, "-m", "runner.cli", "replay", str(folder), "--port", "18232"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            page = browser.new_page(viewport=SIZE)
+            page.goto(process.stdout.readline().strip())
+            page.wait_for_timeout(5_000)
+            page.get_by_label("play").uncheck(timeout=600_000)
+            page.add_style_tag(content=CLEAN)
+            page.wait_for_timeout(8_000)
+            page.screenshot(path=target / "replay.png", timeout=600_000)
+            page.close()
+        finally:
+            process.terminate()
 
 
 if __name__ == "__main__":

@@ -237,9 +237,11 @@ def again_with(
     # Rows without a claim keep their noise: the null was counted in it.
     for side, joint in {key for c in selection.claims for key in c.trial.rows}:
         new = new_sigma[side][joint]
-        # Of a model with more in it no more noise is left; a longer correlation of less residual is chance.
-        most = inflation[side][joint] * (sigma[side][joint] / new) ** 2
-        sigma[side][joint], inflation[side][joint] = new, min(new_inflation[side][joint], most)
+        before = inflation[side][joint] * (sigma[side][joint] / new) ** 2
+        after = new_inflation[side][joint]
+        # A model with more in it leaves no more noise. Where it seems to, both are estimates of the same noise, and
+        # their geometric mean is better than either.
+        sigma[side][joint], inflation[side][joint] = new, min(after, float(np.sqrt(before * after)))
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(
         nominal, settings, sigma, inflation, evidence.prior, compared=evidence.compared, floor=floor

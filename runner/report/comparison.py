@@ -66,7 +66,7 @@ def _verdict(comparison: Comparison, changed: Sequence[Difference]) -> tuple[Lev
     if not math.isfinite(comparison.p):
         return "look", f"{count} parameters, no significance: a model has no covariance"
     if not changed:
-        return "good", f"no difference beyond chance in {count} parameters"
+        return "good", f"No difference beyond chance in {count} parameters"
     names = [one.name for one in sorted(changed, key=lambda one: one.p)]
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return "look", f"{len(names)} of {count} parameters differ: {', '.join(names[:_NAMED])}{more}"
@@ -78,7 +78,17 @@ def _words(one: Difference) -> str:
 
 
 def _table(comparison: Comparison) -> str:
-    head = ("parameter", comparison.first, "±", comparison.second, "±", "unit", "difference [%]", "z", "")
+    head = (
+        "parameter",
+        comparison.first,
+        "±",
+        comparison.second,
+        "±",
+        "unit",
+        "difference [%]",
+        "z",
+        "verdict",
+    )
     rows: list[list[Cell]] = []
     for one in comparison.differences:
         known = math.isfinite(one.percent)

@@ -192,6 +192,10 @@ def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
     if said.anchor == "replay" and diagnosis.replayed is not None:
         figures = replay_figures(diagnosis.replayed, diagnosis.joint_names)
         html += "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
+        if diagnosis.experiment is not None:
+            html += paragraph(
+                f"In 3D with a time slider, or as a video: `lwr-run replay {diagnosis.experiment.name}`."
+            )
     return html
 
 

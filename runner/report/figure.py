@@ -16,6 +16,7 @@ from runner.report.paper import checked_target, draw_matrix, draw_panels, paper_
 from runner.report.plot import Panel, Role
 
 Floats = NDArray[np.float64]
+_SCREEN_FONT = "DejaVu Sans"  # comes with matplotlib
 
 
 @dataclass(frozen=True)
@@ -126,11 +127,11 @@ class MatrixFigure:
         return _png(draw_matrix(self.names, self.values, DIVERGING).figure)
 
 
-def inline_svg(panel: Panel, width: float = 110.0) -> str:
+def inline_svg(panel: Panel, width: float = 105.0) -> str:
     """One panel as an SVG element for a page, as wide as its place; width [mm] is that of its texts."""
-    axes = draw_panels([panel], width)
+    axes = draw_panels([panel], width, font=_SCREEN_FONT)
     stream = io.StringIO()
-    with paper_style():
+    with paper_style(_SCREEN_FONT):
         axes.flat[0].figure.savefig(stream, format="svg", metadata={"Date": None})
     text = stream.getvalue()
     head = f"<svg role='img' style='width:100%;height:auto' aria-label='{escape(panel.alt, quote=True)}' "

@@ -110,6 +110,7 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
     if panel.x_names:
         places = list(range(1, len(panel.x_names) + 1))
         layout["xaxis"] |= {"tickvals": places, "ticktext": list(panel.x_names)}
+        layout["xaxis"] |= {"automargin": True, "autotickangles": [0, -90]}
         layout["yaxis"]["automargin"] = True
     if panel.split:
         # The x axis belongs to the lower part, so the frame of the upper one is drawn.

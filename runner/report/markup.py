@@ -55,7 +55,9 @@ def table(
     rows = list(rows)
     right = [any(isinstance(row[place], Number) for row in rows) for place in range(len(head))]
     titles = zip(head, right, strict=True)
-    lines = [f"<tr>{''.join(f'<th scope=col{_NUMBER * n}>{escape(name)}</th>' for name, n in titles)}</tr>"]
+    # A heading without text is none to a screen reader.
+    heads = [f"<th scope=col{_NUMBER * n}>{escape(name)}</th>" if name else "<td></td>" for name, n in titles]
+    lines = [f"<tr>{''.join(heads)}</tr>"]
     for index, row in enumerate(rows):
         cells = []
         for place, cell in enumerate(row):
@@ -78,7 +80,7 @@ def table(
 def conditions_table(items: Iterable[Mapping[str, Any]], label: str) -> str:
     """The conditions of a preflight, each with `subject`, `value`, `limit` and `ok`."""
     rows = [[i["subject"], i["value"], i["limit"], "held" if i["ok"] else "NOT HELD"] for i in items]
-    return table(("condition", "found", "limit", ""), rows, label)
+    return table(("condition", "found", "limit", "verdict"), rows, label)
 
 
 def figure_html(figure: Figure, *, tall: bool = False) -> str:
@@ -96,7 +98,7 @@ def chart_html(chart: dict[str, Any], alt: str, classes: str = "") -> str:
     """A chart to be drawn by the page's script; `take_charts` moves its data to one place of the page."""
     data = chart_json(chart).replace("</", "<\\/")
     return (
-        f"<div class='chart {classes}' role=img aria-label='{escape(alt, quote=True)}'></div>"
+        f"<div class='chart {classes}' role=figure aria-label='{escape(alt, quote=True)}'></div>"
         f"{_DATA[0]}{data}{_DATA[1]}"
     )
 

@@ -112,8 +112,8 @@ def joint_labels(names: Sequence[str], joints: str) -> tuple[str, ...]:
 
 
 @contextmanager
-def paper_style() -> Iterator[Any]:
-    """The module matplotlib, with the style of the figures while the context is open."""
+def paper_style(font: str = "") -> Iterator[Any]:
+    """The module matplotlib, with the style of the figures while the context is open. font : instead of Times."""
     try:
         import matplotlib
         from matplotlib import font_manager
@@ -122,7 +122,7 @@ def paper_style() -> Iterator[Any]:
             "figure: matplotlib is not installed; run `pip install 'matplotlib>=3.8,<4'`"
         ) from error
     here = set(font_manager.get_font_names())
-    font = next((name for name in FONTS if name in here), "serif")
+    font = font or next((name for name in FONTS if name in here), "serif")
     style: Any = {**_STYLE, "font.family": font}
     with matplotlib.rc_context(style):
         yield matplotlib
@@ -167,18 +167,19 @@ def draw_panels(
     panels: Sequence[Panel],
     width: str | float = "ieee-wide",
     *,
+    font: str = "",
     columns: int | None = None,
     statistics: bool = False,
     shown: bool = False,
 ) -> NDArray[Any]:
     """The matplotlib axes of panels in one figure, (n,), or (n, 2) with lower parts (None where there is none).
 
-    width : see `width_mm`. columns : panels side by side; by default as many as stay legible.
-    statistics : the note of each panel in its title. shown : as in `new_figure`.
+    width : see `width_mm`. columns : panels side by side; by default as many as stay legible. font : instead of
+    Times. statistics : the note of each panel in its title. shown : as in `new_figure`.
     """
     wide = width_mm(width)
     columns = max(1, min(columns or int(wide // _PANEL_MM), len(panels)))
-    with paper_style():
+    with paper_style(font):
         figure = new_figure(wide, 10.0, shown=shown)
         found = np.full((len(panels), 2), None, dtype=object)
         for index, panel in enumerate(panels):
@@ -386,7 +387,8 @@ def _left(axes: Any) -> float:
     texts = axis.get_major_formatter().format_ticks(inside)
     longest = max((4 if "$" in text else len(text) for text in texts), default=1)
     label = axes.get_ylabel()
-    return 1.8 + 1.25 * longest + (_LINE_MM * (1 + label.count("\n")) if label else 0.0)
+    digit = 1.25 if axes.yaxis.label.get_fontfamily()[0] in FONTS else 1.65
+    return 1.8 + digit * longest + (_LINE_MM * (1 + label.count("\n")) if label else 0.0)
 
 
 def _legend(figure: Any, width: float) -> int:

@@ -8,12 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from runner.published import TABLE_1, TABLE_2
+from runner.published import REBUILT, TABLE_1, TABLE_2, PredictedMotion, planned, rebuilt
 from runner.report.figures import interval_95, pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, Number
 
 _WORDS: dict[bool | None, str] = {True: "yes", False: "no", None: "–"}
+_OBJECTIVES = {
+    "condition_number": "the condition number",
+    "d_optimality": "the volume of the confidence region",
+    "mean_rsd": "the mean RSD",
+    "worst_rsd": "the worst RSD",
+    "goal_attainment": "equation (10)",
+}
 TRUTH = "true (emulator)"
 """Head of the column of true values: the parameters set in the emulated arm."""
 
@@ -28,9 +35,10 @@ class Table:
 
 
 def table_1(results: ResultFolder) -> Table:
-    """Table 1 of the paper with this run: condition number, precision of the estimate, mean torques.
+    """Table 1 of the paper with this run: condition number, predicted relative standard deviations, mean torques.
 
-    Mean and worst RSD belong to the parameters of Table 2: a plan may be made for them instead of the condition number.
+    A plan may be made for the deviations instead of the condition number. They are predicted alike for all motions
+    (`runner.published.PredictedMotion`); of the published motions, whose coefficients are unknown, for rebuilt ones.
     """
     excitation = results.summary.get("excitation", {})
     condition, torque = excitation.get("condition", {}), excitation.get("mean_torque_nm", {})
@@ -38,29 +46,63 @@ def table_1(results: ResultFolder) -> Table:
     names = {session.path.name: name for name, session in results.sessions.items()}
     kept = {name: all(item["ok"] for item in items) for name, items in results.preflights.items()}
     blank: list[Cell] = [Number(None), Number(None)]
-    rows: list[list[Cell]] = [
-        [one.name, one.constraints, Number(one.condition, ".2f"), *blank]
-        + [Number(value, ".2f") for value in one.mean_torque]
-        for one in TABLE_1
-    ]
-    published = [one.rsd_percent for one in TABLE_2]
-    nothing: list[Cell] = [Number(None) for _ in TABLE_1[0].mean_torque]
-    rows.append(["Published estimate, Table 2", "–", Number(None), *_mean_and_worst(published), *nothing])
+    rows: list[list[Cell]] = []
+    for one in TABLE_1:
+        figures = [Number(value, ".2f") for value in one.mean_torque]
+        rows.append([one.name, one.constraints, Number(one.condition, ".2f"), *blank, *figures])
+        rows.append(_predicted(f"{one.name}, rebuilt", rebuilt(one.name)))
+    plan, published = planned(results.path), len(rows)
+    if plan is not None:
+        rows.append(_predicted("Plan of this run", plan[0]))
     payloads = {s.path.name: s.metadata.get("payload", "none") for s in results.sessions.values()}
-    of_run = _mean_and_worst([row[0]["rsd_percent"] for row in _entries(results).values()])
     for file, means in sorted(torque.items(), key=lambda item: payloads.get(item[0], "none") == "none"):
         rows.append(
             [
                 f"This run, {file.removesuffix('.mcap')}",
                 _WORDS[kept.get(names.get(file, ""))],
                 Number(condition.get("paper"), ".2f", "excitation.condition.paper"),
-                *of_run,
+                *blank,
                 *(Number(means.get(j), ".2f", f"excitation.mean_torque_nm.{file}.{j}") for j in joints),
             ]
         )
     torques = (f"|τ{k + 1}| [Nm]" for k in range(len(joints) or 7))
-    head = ("motion", "constraints kept", "condition number", "mean RSD %", "worst RSD %", *torques)
-    return Table(head, tuple(rows), tuple(range(len(TABLE_1) + 1, len(rows))))
+    head = ("motion", "limits kept", "condition number", "mean RSD %", "worst RSD %", *torques)
+    width = len(head)
+    rows = [(row + [Number(None)] * width)[:width] for row in rows]
+    return Table(head, tuple(rows), tuple(range(published, len(rows))))
+
+
+def better_than_published(results: ResultFolder) -> str:
+    """A sentence on the plan of this run beside the rebuilt motions; empty without a plan."""
+    plan = planned(results.path)
+    if plan is None:
+        return ""
+    own, objective = plan
+    better: list[str] = []
+    worse: list[str] = []
+    for key, name in (
+        ("mean_rsd", "mean RSD"),
+        ("worst_rsd", "worst RSD"),
+        ("condition", "condition number"),
+    ):
+        value = getattr(own, key)
+        others = ", ".join(f"{getattr(rebuilt(one), key):.2f}" for one in REBUILT)
+        text = f"{name} ({value:.2f}; {others})"
+        (better if all(value < getattr(rebuilt(one), key) for one in REBUILT) else worse).append(text)
+    made = f", made for {_OBJECTIVES[objective]}," if objective in _OBJECTIVES else ""
+    parts = [f"Beside the three rebuilt motions the plan of this run{made} is"]
+    parts.append(f"better in {' and '.join(better)}" if better else "better in nothing")
+    return " ".join(parts) + (f", and not the best in {' and '.join(worse)}." if worse else ".")
+
+
+def estimate_rsd(results: ResultFolder) -> str:
+    """A sentence on the relative standard deviations of the estimates, by parameters common to run and Table 2."""
+    found = [row[0]["rsd_percent"] for row in _entries(results).values()]
+    published = [one.rsd_percent for one in TABLE_2]
+    text = f"RSD of the published estimate (Table 2): mean {np.mean(published):.2f} %, worst {np.max(published):.2f} %"
+    if found:
+        text += f"; of the estimate of this run: mean {np.mean(found):.2f} %, worst {np.max(found):.2f} %"
+    return f"{text}, each with its own noise and length of recording."
 
 
 def table_2(results: ResultFolder) -> Table:
@@ -119,7 +161,6 @@ def _entries(results: ResultFolder) -> dict[str, tuple[Mapping[str, Any], str]]:
     return {printed.name: found[printed.name] for printed in TABLE_2 if printed.name in found}
 
 
-def _mean_and_worst(rsd: Sequence[float]) -> list[Cell]:
-    if not rsd:
-        return [Number(None), Number(None)]
-    return [Number(float(np.mean(rsd)), ".2f"), Number(float(np.max(rsd)), ".2f")]
+def _predicted(name: str, motion: PredictedMotion) -> list[Cell]:
+    values = (motion.condition, motion.mean_rsd, motion.worst_rsd, *motion.mean_torque)
+    return [name, _WORDS[motion.complies], *(Number(value, ".2f") for value in values)]

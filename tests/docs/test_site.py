@@ -12,30 +12,33 @@ from typing import Any
 
 import pytest
 import yaml
+from playwright.sync_api import Browser
 
 from runner.cli import VERBS
 from tests.docs.markdown import DOCUMENTS, ROOT
+from tests.runner.report.view_rig import NARROW, WIDE, flaws, opened
 
 PAGES: dict[str, Any] = runpy.run_path(str(ROOT / "docs/site_pages.py"))
 WIDEST = 120
 PROSE = (*DOCUMENTS, Path("CHANGELOG.md"))
 
 
-@pytest.mark.slow
-def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "mkdocs",
-        "build",
-        "--strict",
-        "--quiet",
-        "--site-dir",
-        str(tmp_path / "site"),
-    ]
+SHOWN = ("index.html", "identification.html")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the built site."""
+    target = tmp_path_factory.mktemp("built") / "site"
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(target)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    pages = list((tmp_path / "site").glob("*.html"))
+    return target
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_fetches_nothing(site: Path) -> None:
+    pages = list(site.glob("*.html"))
     assert len(pages) >= 30
     for page in pages:
         text = page.read_text(encoding="utf-8")
@@ -46,6 +49,15 @@ def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path)
         assert fetched == [], page.name
         for target in re.findall(r"<img\b[^>]*\bsrc=\"([^\":]+)\"", text):
             assert (page.parent / target).is_file(), f"{page.name}: {target}"
+
+
+@pytest.mark.slow
+def test_the_site_is_accessible_and_fits_the_window(site: Path, chrome: Browser) -> None:
+    for name in SHOWN:
+        for size in (WIDE, NARROW):
+            with opened(chrome, site / name, size) as seen:
+                seen.page.wait_for_timeout(700)
+                assert flaws(seen) == [], f"{name} at {size[0]} px"
 
 
 def test_every_command_and_option_is_on_the_page_of_commands() -> None:

@@ -75,6 +75,10 @@ REPORTS: dict[str, tuple[str, str]] = {
     "plan": ("plan --out my.plan.yaml", "margins.0.limit"),
     "check": ("check my_lab.yaml", "loaded.0.limit"),
     "preview": ("preview my_lab.yaml --out preview.html", "tightest.distance_m"),
+    "replay": (
+        "replay loaded.mcap --model model.yaml --longest-s 3 --length-s 1 --out loaded.gif",
+        "rms.base.torque_nm.0",
+    ),
     "report": ("report results", "verdicts.0.level"),
     "identify": ("identify unloaded.mcap --model 1", "parameters.0.estimate"),
     "validate": ("validate model.yaml another.mcap", "sessions.0.scores.0.rms"),

@@ -35,6 +35,7 @@ WITH_OUTPUT = (
     "report {}",
     "plan --out {}/m.yaml",
     "preview --out {}/m.html",
+    "replay no --out {}/m.gif",
     "experiment --out {}/m",
 )
 

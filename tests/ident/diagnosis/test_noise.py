@@ -27,7 +27,7 @@ def sticky(s: dict[str, np.ndarray]) -> None:
     s["motor"][:, 1] += 0.5 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
 
-def test_a_model_with_more_in_it_leaves_no_more_noise(
+def test_a_longer_correlation_of_less_residual_counts_half(
     make: Make, chain: Chain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = signature_bench([make("a.mcap", 1, sticky), make("b.mcap", 2, sticky, 1)], chain)
@@ -47,7 +47,9 @@ def test_a_model_with_more_in_it_leaves_no_more_noise(
     assert again is not None
     after = again.evidence
     assert after.sigma[side][joint] == pytest.approx(0.9 * evidence.sigma[side][joint])
-    assert after.sigma[side][joint] ** 2 * after.variance_inflation[side][joint] == pytest.approx(before)
+    assert after.sigma[side][joint] ** 2 * after.variance_inflation[side][joint] == pytest.approx(
+        before * np.sqrt(5.0 * 0.9**2)
+    )
 
 
 def test_noise_of_a_residual_follows_its_autocorrelation(make: Make, chain: Chain) -> None:

@@ -391,3 +391,15 @@ def test_the_stored_default_plan_solves_the_default_problem() -> None:
     assert values[CONDITION] <= 35.0
     assert values == pytest.approx(dict(stored.objectives), rel=1e-6)
     assert deviations == pytest.approx(dict(stored.rsd_percent), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["algorithm_1", "algorithm_2", "random_points"])
+def test_the_rebuilt_published_motions_keep_every_limit_and_their_figures(name: str) -> None:
+    folder = CONFIGS / "plans/published"
+    problem = folder / f"{'algorithm_1' if name == 'random_points' else name}.yaml"
+    assembled = assemble(PlanProblem.load(problem))
+    stored = ExcitationPlan.load(folder / f"{name}.plan.yaml")
+    assert assembled.check(stored.motion).ok
+    values, deviations = assembled.describe(stored.motion)
+    assert values == pytest.approx(dict(stored.objectives), rel=1e-6)
+    assert deviations == pytest.approx(dict(stored.rsd_percent), rel=1e-6)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from playwright.sync_api import Browser
 
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
@@ -15,6 +16,7 @@ from runner.cli import main
 from runner.fleet import FleetStore, fleet_trend
 from tests.fleet import Event, Fleet
 from tests.ident.known_arm import truth_model  # noqa: F401  fixture
+from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, flaws, opened
 
 ARMS, DAYS = 5, 9
 EVENTS = (
@@ -110,3 +112,17 @@ def test_trend_prints_and_writes_a_page(store: FleetStore, tmp_path: Path) -> No
     unknown = CliRunner().invoke(main, ["trend", "nobody", "--store", str(store.folder)])
     assert unknown.exit_code == 2
     assert "LWR4+_arm_02" in unknown.output
+
+
+@pytest.mark.slow
+def test_the_pages_of_a_trend_are_accessible_and_fit(
+    store: FleetStore, tmp_path: Path, chrome: Browser
+) -> None:
+    for name, arm in (("fleet", []), ("arm", ["LWR4+_arm_02"])):
+        page = tmp_path / f"{name}.html"
+        done = CliRunner().invoke(main, ["trend", *arm, "--store", str(store.folder), "--out", str(page)])
+        assert done.exit_code == 0, done.output
+        for size in (WIDE, NARROW):
+            with opened(chrome, page, size) as seen:
+                assert seen.page.evaluate(CONTRAST) >= 4.5
+                assert flaws(seen) == []

@@ -1,16 +1,14 @@
-"""One short experiment and one browser for all tests of what people look at."""
+"""One short experiment for all tests of what people look at."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from playwright.sync_api import Browser
 
 from runner.cli import main
-from tests.runner.report.view_rig import browser, chromium
 
 EXPERIMENT = """
 name: short
@@ -40,11 +38,3 @@ def finished(made_once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
         assert done.exit_code == 0, done.output
 
     return made_once("finished", experiment) / "run"
-
-
-@pytest.fixture(scope="session")
-def chrome() -> Iterator[Browser]:
-    if chromium() is None:
-        pytest.skip("no chromium on this computer; install the system's package `chromium`")
-    with browser() as opened_browser:
-        yield opened_browser

@@ -22,7 +22,7 @@ from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
 from runner.experiment_file import Experiment, Payload
 from runner.live import LiveView, Sample, phase_at
-from tests.runner.report.view_rig import opened
+from tests.runner.report.view_rig import VISER, flaws, opened
 
 ROOT = Path(__file__).parents[3]
 
@@ -110,12 +110,12 @@ def test_the_page_shows_arm_progress_and_link(ring: Ring, chrome: Browser) -> No
                 sequence += 1
                 seen.page.wait_for_timeout(20)
             text = seen.page.inner_text("body")
+            found = {flaw.split(",")[0] for flaw in flaws(seen)}
         assert "0.2 of 0.5 s, 0.3 s left" in text
         assert "CMD, quality PERFECT" in text
         assert "2 missed, 0 lost" in text
         assert "+2.0" in text
-        assert seen.errors == []
-        assert seen.external == []
+        assert found <= VISER
     assert view._process.returncode is not None
 
 

@@ -41,11 +41,13 @@ def test_without_a_folder_the_default_experiment_is_run(
     monkeypatch.setattr(take.shutil, "which", lambda name: name)
     monkeypatch.setattr(take, "preview_html", lambda planned: planned.title)
     monkeypatch.setattr(take, "take", lambda *arguments: taken.append(arguments))
+    monkeypatch.setattr(take, "take_replay", lambda *arguments: taken.append(arguments))
     monkeypatch.setattr(take, "sync_playwright", lambda: MagicMock())
     take.main([])
     assert commands == [[sys.executable, "-m", "runner.cli", "experiment", "--yes", "--out", commands[0][-1]]]
     _, report, _, target = taken[0]
     assert (report.name, target) == ("report.html", ROOT / "docs/images")
+    assert taken[1][2] == target
 
 
 @pytest.mark.long

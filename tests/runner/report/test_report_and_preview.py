@@ -21,14 +21,18 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from ident.diagnosis.statements import error_change
+from ident.excitation import ExcitationPlan, PlanProblem, assemble, table_row
+from lwr_driver.configuration import find
 from lwr_driver.session import Session
 from runner.cli import main
-from runner.published import TABLE_1, TABLE_2
+from runner.published import TABLE_1, TABLE_2, rebuilt
 from runner.report.figures import torque_figure
 from runner.report.folder import ResultFolder
+from runner.report.latex import table_1
 from runner.report.page import write_report
+from runner.report.tables import better_than_published
 from runner.report.verdicts import headline, verdicts
-from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, opened
+from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, flaws, opened
 
 pytestmark = pytest.mark.slow
 
@@ -173,6 +177,34 @@ def test_the_published_tables_stand_beside_the_run(report: Seen) -> None:
     assert all(entry.name in second for entry in TABLE_2)
 
 
+def test_table_1_says_what_the_plan_was_made_for(finished: Path, report: Seen) -> None:
+    rows = report.page.locator("#table-1 tbody tr")
+    cells = {row.locator("th").inner_text(): row.locator("td").all_inner_texts() for row in rows.all()}
+    plan = ExcitationPlan.load(finished / "plan.yaml")
+    assembled = assemble(PlanProblem.load("plans/default.yaml"))
+    values = table_row("", assembled, plan.motion, plan.check)
+    expected = [values.condition, values.rsd_mean, values.rsd_worst, *values.torque]
+    assert cells["Plan of this run"][1:] == [f"{value:.2f}" for value in expected]
+    for one in TABLE_1:
+        assert cells[one.name][2:4] == ["–", "–"]
+        motion = rebuilt(one.name)
+        wanted = [motion.condition, motion.mean_rsd, motion.worst_rsd]
+        assert cells[f"{one.name}, rebuilt"][1:4] == [f"{value:.2f}" for value in wanted]
+    text = report.page.inner_text("#table-1")
+    assert "Beside the three rebuilt motions the plan of this run" in text
+    assert "RSD of the published estimate (Table 2): mean 3.00 %, worst 12.70 %" in text
+    latex = table_1(finished)
+    assert f"Plan of this run & yes & {expected[0]:.2f} & {expected[1]:.2f} & {expected[2]:.2f} &" in latex
+
+
+def test_the_default_plan_is_better_where_it_was_meant_to_be(tmp_path: Path) -> None:
+    shutil.copy(find("plans/default.plan.yaml"), tmp_path / "plan.yaml")
+    text = better_than_published(ResultFolder(tmp_path, {}))
+    assert "made for the mean RSD, is better in mean RSD (2.76;" in text
+    assert "and worst RSD (8.84;" in text
+    assert "not the best in condition number (34.30;" in text
+
+
 def test_a_motion_that_the_estimate_has_not_seen_stands_first_in_figure_3(
     finished: Path, report: Seen
 ) -> None:
@@ -217,12 +249,28 @@ def test_pictures_have_alternative_texts_with_numbers(report: Seen) -> None:
     assert all(any(sign.isdigit() for sign in text) for text in texts)
 
 
+@pytest.fixture(scope="module")
+def pages(finished: Path, preview: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Every page that is a file: report with a diagnosis, comparison, preview."""
+    place = tmp_path_factory.mktemp("pages")
+    folder = copy(finished, place / "diagnosed")
+    (folder / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
+    comparison = place / "comparison.html"
+    done = CliRunner().invoke(main, ["compare", str(finished), str(folder), "--report", str(comparison)])
+    assert done.exit_code == 0, done.output
+    return {"report": write_report(folder), "comparison": comparison, "preview": preview}
+
+
 @pytest.mark.parametrize("size", [WIDE, NARROW])
-def test_text_is_legible_and_fits_the_window(finished: Path, chrome: Browser, size: tuple[int, int]) -> None:
-    with opened(chrome, finished / "report.html", size) as seen:
+@pytest.mark.parametrize("name", ["report", "comparison", "preview"])
+def test_a_page_is_legible_fits_the_window_and_is_accessible(
+    pages: dict[str, Path], chrome: Browser, name: str, size: tuple[int, int]
+) -> None:
+    with opened(chrome, pages[name], size) as seen:
+        if name != "preview":
+            seen.wait_drawn()
         assert seen.page.evaluate(CONTRAST) >= 4.5
-        assert seen.page.evaluate("document.documentElement.scrollWidth") <= size[0]
-        assert seen.errors == []
+        assert flaws(seen) == []
 
 
 def test_a_diagnosis_is_shown_with_its_evidence(finished: Path, tmp_path: Path, chrome: Browser) -> None:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -91,3 +92,43 @@ CONTRAST = """() => {
   return Math.min(...worst);
 }"""
 """Lowest contrast of any text to what is behind it, as WCAG 2 counts."""
+
+
+CUT = """() => [...document.querySelectorAll('body *')].filter((node) => {
+  const box = node.getBoundingClientRect();
+  if (!box.width || !box.height || box.right <= innerWidth + 1) return false;
+  for (let outer = node.parentElement; outer; outer = outer.parentElement) {
+    if (['auto', 'scroll', 'hidden'].includes(getComputedStyle(outer).overflowX)) return false;
+  }
+  return true;
+}).map((node) => node.outerHTML.slice(0, 80))"""
+"""What reaches beyond the window outside of boxes that scroll or clip."""
+
+
+VISER = {
+    "aria-input-field-name",
+    "aria-progressbar-name",
+    "button-name",
+    "image-alt",
+    "label",
+    "scrollable-region-focusable",
+}
+"""Violations by the widgets of viser itself: sliders and bars without a name, its notice on software rendering."""
+
+
+def flaws(seen: Seen) -> list[str]:
+    """What is wrong with a page: errors, requests, cut content, and serious violations found by axe-core."""
+    page = seen.page
+    found = [f"console: {error}" for error in seen.errors] + [f"request: {one}" for one in seen.external]
+    width = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
+    if width[0] > width[1]:
+        found.append(f"{width[0]} px wide in a window of {width[1]} px")
+    found += [f"cut off: {html}" for html in page.evaluate(CUT)]
+    axe = resources.files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+    page.evaluate(axe)
+    result = page.evaluate("axe.run(document, {resultTypes: ['violations'], preload: false})")
+    for violation in result["violations"]:
+        if violation["impact"] in ("serious", "critical"):
+            first = violation["nodes"][0]
+            found.append(f"{violation['id']}, {len(violation['nodes'])} times: {first['html'][:120]}")
+    return found
