@@ -50,7 +50,7 @@ def command(
     """
     from runner.replay_video import check_format, write_video
     from runner.replay_view import motion_replay, serve
-    from runner.status import StatusLine
+    from runner.status import StatusLine, next_step
 
     if out is not None:
         check_format(out)
@@ -67,7 +67,7 @@ def command(
             return
         for note in shown.notes:
             status.say(note)
-        click.echo(place)
+        next_step(place)
 
     if out is None:
         serve(shown, port, tell)
