@@ -236,12 +236,7 @@ def again_with(
     inflation = {side: value.copy() for side, value in evidence.variance_inflation.items()}
     # Rows without a claim keep their noise: the null was counted in it.
     for side, joint in {key for c in selection.claims for key in c.trial.rows}:
-        new = new_sigma[side][joint]
-        before = inflation[side][joint] * (sigma[side][joint] / new) ** 2
-        after = new_inflation[side][joint]
-        # A model with more in it leaves no more noise. Where it seems to, both are estimates of the same noise, and
-        # their geometric mean is better than either.
-        sigma[side][joint], inflation[side][joint] = new, min(after, float(np.sqrt(before * after)))
+        sigma[side][joint], inflation[side][joint] = new_sigma[side][joint], new_inflation[side][joint]
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(
         nominal, settings, sigma, inflation, evidence.prior, compared=evidence.compared, floor=floor
