@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from runner.computer import git_commit
 
 ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("survivors.yaml")
+_CAUGHT = ("caught", "time")
 # The first tests of a mutant take so long at most; most mutants need no more of them.
 _FIRST_S = 4.0
 # Tests from other folders than the one that mirrors the module's are left out beyond so long, the longest first.
@@ -40,6 +42,35 @@ def known_lines(trials: Trials, folder: Path) -> dict[str, exercise.FileOfTests]
         known = exercise.load(path)
     present = {str(p.relative_to(trials.tree)) for p in (trials.tree / "tests").rglob("*.py")}
     return {file: entry for file, entry in known.items() if file in present}
+
+
+class Tried:
+    """Results of mutants by the content of their file: caught once is caught; survived holds for the same tests."""
+
+    def __init__(self, path: Path, known: dict[str, exercise.FileOfTests]) -> None:
+        self._path = path
+        self._tests = hashlib.sha256(
+            json.dumps(sorted((file, entry.digest) for file, entry in known.items())).encode()
+        ).hexdigest()[:16]
+        self._results: dict[str, dict[str, Any]] = (
+            json.loads(path.read_text("utf-8")) if path.exists() else {}
+        )
+
+    def get(self, mutant: Mutant) -> dict[str, Any] | None:
+        """The result of an earlier trial, None if there is none that still holds."""
+        found = self._results.get(self._key(mutant))
+        holds = found and (found["outcome"] in _CAUGHT or found["tests"] == self._tests)
+        return found if holds else None
+
+    def put(self, mutant: Mutant, result: dict[str, Any]) -> dict[str, Any]:
+        """Keep a result; returns it."""
+        self._results[self._key(mutant)] = result = {**result, "tests": self._tests}
+        self._path.write_text(json.dumps(self._results), encoding="utf-8")
+        return result
+
+    @staticmethod
+    def _key(mutant: Mutant) -> str:
+        return f"{mutant.file} {exercise.digest(ROOT / mutant.file)} {mutant.operator} {mutant.occurrence}"
 
 
 def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTests]) -> dict[str, Any]:
@@ -98,7 +129,7 @@ def table(results: list[dict[str, Any]], reasons: list[dict[str, str]]) -> str:
     lines = [f"{'module':<40} {'mutants':>8} {'caught':>8} {'survived':>8} {'caught':>8}"]
 
     def row(name: str, some: list[dict[str, Any]]) -> str:
-        caught = sum(r["outcome"] in ("caught", "time") for r in some)
+        caught = sum(r["outcome"] in _CAUGHT for r in some)
         share = 100.0 * caught / max(len(some), 1)
         return f"{name:<40} {len(some):>8} {caught:>8} {len(some) - caught:>8} {share:>6.1f} %"
 
@@ -111,7 +142,7 @@ def table(results: list[dict[str, Any]], reasons: list[dict[str, str]]) -> str:
             by_file[r["file"]].append(r)
         lines += [row(stratum, mine), *(row(f"  {file}", some) for file, some in sorted(by_file.items()))]
     lines.append(row("all", results))
-    alive = [r for r in results if r["outcome"] in ("survived", "not run")]
+    alive = [r for r in results if r["outcome"] not in _CAUGHT]
     kinds = Counter(reason_of(r, reasons).get("kind", "no reason yet") for r in alive)
     if alive:
         lines.append("survivors: " + ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())))
@@ -168,9 +199,8 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=400, help="number of mutants of all modules")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=[], help="draw from files that begin so")
-    parser.add_argument(
-        "--again", action="store_true", help="try the survivors of the last run again, keep the others"
-    )
+    parser.add_argument("--package", nargs="+", choices=STRATA, help="of the sample, these packages alone")
+    parser.add_argument("--anew", action="store_true", help="forget the results of earlier runs")
     parser.add_argument("--bugs", action="store_true", help="replay the bugs written by hand instead")
     parser.add_argument(
         "--control", action="store_true", help="run the tests as for a mutant, without a change"
@@ -199,26 +229,29 @@ def main() -> int:
             answer = trials.run(sorted(known), names, 3600.0)
             print(f"without a change: {answer['test'] or 'no test'} fails, {answer['seconds']:.0f} s")
             return min(answer["outcome"] != "survived", 1)
-        drawn = sample(ROOT, arguments.sample, arguments.seed, arguments.only)
-        done = {(r["file"], r["old"], r["new"]): r for r in before if arguments.again}
-        results, open_ = [], []
-        for mutant in drawn:
-            source = (ROOT / mutant.file).read_text("utf-8")
-            earlier = done.get((mutant.file, *change(source, mutant.code(source))))
-            if earlier and earlier["outcome"] in ("caught", "time"):
-                results.append({**earlier, "line": mutant.line})
-            else:
-                open_.append((earlier is not None, mutant))
-        # What was never tried comes first.
-        for number, (_, mutant) in enumerate(sorted(open_, key=lambda item: item[0]), start=1):
-            results.append(attempt(trials, mutant, known))
-            last = results[-1]
-            print(
-                f"{number}/{len(open_)} {last['outcome']:<8} {last['seconds']:5.1f} s {last['file']}:{last['line']}  "
-                f"{last['old'][:90]} -> {last['new'][:90]}",
-                flush=True,
-            )
-            store(folder, results, arguments)
+        tried_path = folder / "tried.json"
+        if arguments.anew:
+            tried_path.unlink(missing_ok=True)
+        tried = Tried(tried_path, known)
+        places = tuple(place for name in arguments.package or STRATA for place in STRATA[name])
+        drawn = [
+            mutant
+            for mutant in sample(ROOT, arguments.sample, arguments.seed, arguments.only)
+            if mutant.file.startswith(places)
+        ]
+        results = []
+        for number, mutant in enumerate(drawn, start=1):
+            result = tried.get(mutant)
+            if result is None:
+                result = tried.put(mutant, attempt(trials, mutant, known))
+                print(
+                    f"{number}/{len(drawn)} {result['outcome']:<8} {result['seconds']:5.1f} s "
+                    f"{mutant.file}:{mutant.line}  {result['old'][:90]} -> {result['new'][:90]}",
+                    flush=True,
+                )
+            results.append({**result, "line": mutant.line})
+            if number % 10 == 0:
+                store(folder, results, arguments)
         print(store(folder, results, arguments))
     return 0
 
