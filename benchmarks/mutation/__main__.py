@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
 import json
 import subprocess
 import sys
 from collections import Counter, defaultdict
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +75,41 @@ class Tried:
         return f"{mutant.file} {exercise.digest(ROOT / mutant.file)} {mutant.operator} {mutant.occurrence}"
 
 
+def _compiled(source: str) -> list[ast.FunctionDef]:
+    """The functions compiled by numba: coverage does not see their lines, and a binary of them may be stored."""
+    return [
+        node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.FunctionDef)
+        and any("njit" in ast.unparse(decorator) for decorator in node.decorator_list)
+    ]
+
+
+@cache
+def _held_names(tree: Path) -> frozenset[str]:
+    """All names in compiled functions: a binary holds the values of constants."""
+    sources = [path.read_text("utf-8") for path in tree.rglob("*.py")]
+    return frozenset(
+        node.id
+        for source in sources
+        if "njit" in source
+        for function in _compiled(source)
+        for node in ast.walk(function)
+        if isinstance(node, ast.Name)
+    )
+
+
+def _held_constant(source: str, line: int, tree: Path) -> bool:
+    """Whether a line of a module sets a constant of compiled functions."""
+    return any(
+        isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in _held_names(tree)
+        for statement in ast.parse(source).body
+        if isinstance(statement, ast.Assign | ast.AnnAssign)
+        and statement.lineno <= line <= (statement.end_lineno or 0)
+        for node in ast.walk(statement)
+    )
+
+
 def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTests]) -> dict[str, Any]:
     """The fate of a mutant: its change, whether it was caught, by which test and in what time."""
     source = (trials.tree / mutant.file).read_text("utf-8")
@@ -83,7 +120,7 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
         compile(code, mutant.file, "exec")
     except SyntaxError:
         return {**result, "outcome": "caught", "test": "the compiler", "seconds": 0.0}
-    jitted = "njit" in source
+    jitted = any(node.lineno <= mutant.line <= (node.end_lineno or 0) for node in _compiled(source))
     lines = range(mutant.line, mutant.last + 1)
     tests = exercise.tests_of(known, mutant.file, lines, anywhere=False)
     if jitted or not tests:
@@ -103,7 +140,7 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
     seconds = 0.0
     with trials.replace(mutant.file, code):
         # Functions compiled before may hold a changed constant: such a survivor is tried without them too.
-        constant = not source.splitlines()[mutant.line - 1].startswith((" ", ")", "]", "}"))
+        constant = _held_constant(source, mutant.line, trials.tree)
         for fresh in (True,) if jitted else (False, True) if constant else (False,):
             for stage in stages if tests else ():
                 files = [file for file, _, _ in stage]

@@ -204,3 +204,18 @@ def test_short_or_constant_channels_show_nothing():
     smooth = np.sin(0.05 * np.arange(200))[:, None]
     assert passed_band(np.ones((200, 2)), 0.004) is None
     assert passed_band(smooth[:63], 0.004) is None
+
+
+def test_samples_of_an_older_moment_are_counted_once_each():
+    effort, position = noisy(), columns(noisy()).position.copy()
+    time = np.arange(COUNT) / RATE
+    for row in (400, 900, 1300, 1700):
+        position[row] = [np.sin(time[row] - 0.5 / RATE), np.cos(1.3 * (time[row] - 0.5 / RATE))]
+    (found,) = sample_loss([session(columns(effort, position))])
+    assert (found.lost, found.repeated, found.stale) == (0, 0, 4)
+
+
+def test_the_limit_of_a_single_joint_is_found():
+    whole = columns(np.clip(noisy(), -np.inf, 8.0))
+    one = replace(whole, names=("a",), position=whole.position[:, :1], effort=whole.effort[:, :1])
+    assert clipped_at(one).tolist() == [8.0]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import butter
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.structure import ModelStructure
@@ -22,6 +23,7 @@ from ident.rows.filters import (
     low_pass,
     median_step,
     moving,
+    settling,
     thinning,
 )
 from ident.rows.observation import observe, stack
@@ -78,6 +80,14 @@ def test_a_low_pass_of_a_short_series_is_padded_by_what_there_is():
     with pytest.raises(ConfigurationError):
         low_pass(np.ones((50, 1)), 0.01, 50.0)
     low_pass(np.ones((500, 1)), 0.01, 49.9)
+
+
+@pytest.mark.parametrize("order", [1, 2, 4, 7])
+def test_a_low_pass_has_settled_when_its_slowest_pole_has_decayed(order: int):
+    _, poles, _ = butter(order, 2 * np.pi * 5.0, analog=True, output="zpk")
+    slowest = -poles.real.max()
+    assert np.exp(-slowest * settling(5.0, order)) == pytest.approx(np.exp(-40.0), rel=1e-6)
+    assert settling(5.0) == settling(5.0, 4)
 
 
 def test_thinning_leaves_forty_samples_a_period():
@@ -253,6 +263,16 @@ def test_a_few_steps_of_the_encoder_are_no_outlier():
     spike = np.cumsum(np.full(400, 0.01))[:, None]
     spike[200] += 0.2
     assert np.flatnonzero(flag_outliers(spike, 8.0)[0]).tolist() == [200]
+
+
+@pytest.mark.parametrize("noisy", [slice(0, 30), slice(210, 240), slice(-28, None)])
+def test_a_noisy_part_has_no_outliers_wherever_it_lies(noisy: slice):
+    random = np.random.default_rng(3)
+    values = 0.001 * random.normal(size=(4030, 1))
+    values[noisy] *= 30.0
+    assert not flag_outliers(values, 8.0)[0].any()
+    values[100] += 0.5
+    assert np.flatnonzero(flag_outliers(values, 8.0)[0]).tolist() == [100]
 
 
 @pytest.mark.parametrize(("count", "crowded"), [(20, []), (21, [0])])
