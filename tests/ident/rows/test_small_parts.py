@@ -13,6 +13,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.structure import ModelStructure
 from ident.rows.binned import bins
 from ident.rows.filters import (
+    Excitation,
     ParallelFilter,
     SignalSettings,
     advice,
@@ -158,6 +159,19 @@ def test_the_share_of_flagged_samples_is_that_of_their_weight():
     assert not parallel.share(np.zeros(len(times), dtype=bool)).any()
     nowhere = ParallelFilter(times, np.array([90.0]), 2.0)
     assert (nowhere.share(flagged).tolist(), nowhere.coverage().tolist()) == ([[0.0, 0.0, 0.0]], [0.0])
+
+
+def test_the_excitation_is_that_of_the_joint_that_moves_also_block_by_block():
+    time = np.arange(12_000) / 200.0
+    # The weak joint creeps, so that the means of its blocks differ.
+    fast, weak = np.sin(2 * np.pi * time), 1e-3 * np.sin(14 * np.pi * time) + 1e-3 * np.floor(time / 10.0)
+    velocity = np.column_stack([fast, weak])
+    whole = excitation_frequency(velocity, 1 / 200.0)
+    parts = Excitation(len(velocity), 1 / 200.0)
+    for first in range(0, len(velocity), 2000):
+        parts.add(velocity[first : first + 2000])
+    assert parts.frequency() == pytest.approx(whole)
+    assert whole == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_joint_that_hardly_moves_has_no_part_in_the_excitation():
