@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import hashlib
 import json
 import subprocess
 import sys
@@ -47,28 +46,31 @@ def known_lines(trials: Trials, folder: Path) -> dict[str, exercise.FileOfTests]
 
 
 class Tried:
-    """Results of mutants by the content of their file: caught once is caught; survived holds for the same tests."""
+    """Results of mutants by the content of their file: caught once is caught, a survivor meets new tests alone."""
 
     def __init__(self, path: Path, known: dict[str, exercise.FileOfTests]) -> None:
-        self._path = path
-        self._tests = hashlib.sha256(
-            json.dumps(sorted((file, entry.digest) for file, entry in known.items())).encode()
-        ).hexdigest()[:16]
+        self._path, self._known = path, known
         self._results: dict[str, dict[str, Any]] = (
             json.loads(path.read_text("utf-8")) if path.exists() else {}
         )
 
-    def get(self, mutant: Mutant) -> dict[str, Any] | None:
-        """The result of an earlier trial, None if there is none that still holds."""
-        found = self._results.get(self._key(mutant))
-        holds = found and (found["outcome"] in _CAUGHT or found["tests"] == self._tests)
-        return found if holds else None
+    def open(self, mutant: Mutant) -> dict[str, exercise.FileOfTests]:
+        """The files of tests that a mutant has not met, none if it is caught."""
+        found = self._results.get(self._key(mutant), {})
+        if found.get("outcome") in _CAUGHT:
+            return {}
+        met = found.get("met", {})
+        return {file: entry for file, entry in self._known.items() if met.get(file) != entry.digest}
 
-    def put(self, mutant: Mutant, result: dict[str, Any]) -> dict[str, Any]:
-        """Keep a result; returns it."""
-        self._results[self._key(mutant)] = result = {**result, "tests": self._tests}
+    def get(self, mutant: Mutant) -> dict[str, Any] | None:
+        """The result of an earlier trial, None without one."""
+        return self._results.get(self._key(mutant))
+
+    def put(self, mutant: Mutant, result: dict[str, Any]) -> None:
+        """Keep a result."""
+        met = {} if result["outcome"] in _CAUGHT else {file: e.digest for file, e in self._known.items()}
+        self._results[self._key(mutant)] = {**result, "met": met}
         self._path.write_text(json.dumps(self._results), encoding="utf-8")
-        return result
 
     @staticmethod
     def _key(mutant: Mutant) -> str:
@@ -278,15 +280,18 @@ def main() -> int:
         ]
         results = []
         for number, mutant in enumerate(drawn, start=1):
-            result = tried.get(mutant)
-            if result is None:
-                result = tried.put(mutant, attempt(trials, mutant, known))
+            result, open_ = tried.get(mutant), tried.open(mutant)
+            if result is None or open_:
+                earlier, result = result, attempt(trials, mutant, open_)
+                if earlier is not None and result["outcome"] == "not run":
+                    result["outcome"] = earlier["outcome"]
+                tried.put(mutant, result)
                 print(
                     f"{number}/{len(drawn)} {result['outcome']:<8} {result['seconds']:5.1f} s "
                     f"{mutant.file}:{mutant.line}  {result['old'][:90]} -> {result['new'][:90]}",
                     flush=True,
                 )
-            results.append({**result, "line": mutant.line})
+            results.append({key: value for key, value in result.items() if key != "met"})
             if number % 10 == 0:
                 store(folder, results, arguments)
         print(store(folder, results, arguments))
