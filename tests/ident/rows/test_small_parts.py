@@ -270,6 +270,18 @@ def test_irregular_times_are_bridged_where_no_sample_is_near():
     assert part.bridged.any()
 
 
+@pytest.mark.parametrize(("steps", "found"), [(1, []), (5, []), (6, [1000, 1100, 1200])])
+def test_an_encoder_at_rest_jumps_by_five_steps_at_most(steps: int, found: list[int]):
+    resolution = 2.0**-10
+    position = np.zeros(4000)
+    # A motion of fifty steps, later.
+    position[2000:2500] = np.arange(500) // 10
+    position[2500:] = 50
+    position[[1000, 1100, 1200]] += steps
+    flags, crowded = flag_outliers(resolution * position[:, None], 8.0)
+    assert (np.flatnonzero(flags).tolist(), crowded) == (found, [])
+
+
 def test_a_few_steps_of_the_encoder_are_no_outlier():
     steps = np.zeros((400, 1))
     steps[::40] = 1.0
