@@ -259,6 +259,18 @@ def test_flagged_samples_are_bridged_like_lost_ones():
     np.testing.assert_allclose(part.values[:, 0], np.sin(3.0 * time), atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_irregular_times_are_sampled_from_the_first_to_the_last(seed: int):
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.uniform(0.006, 0.014, 300))
+    ((part,), lost) = stretches(times, np.sin(times)[:, None], np.zeros(300, dtype=bool), 0.01, 0.1)
+    assert part.resampled
+    assert lost == 0
+    assert part.times[0] == times[0]
+    assert times[-1] - 0.01 < part.end <= times[-1]
+    np.testing.assert_allclose(part.values[:, 0], np.sin(part.times), atol=1e-7)
+
+
 def test_irregular_times_are_bridged_where_no_sample_is_near():
     random = np.random.default_rng(0)
     time = np.arange(300) * 0.01 + random.uniform(-0.002, 0.002, 300)
@@ -289,6 +301,13 @@ def test_a_few_steps_of_the_encoder_are_no_outlier():
     spike = np.cumsum(np.full(400, 0.01))[:, None]
     spike[200] += 0.2
     assert np.flatnonzero(flag_outliers(spike, 8.0)[0]).tolist() == [200]
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0])
+def test_a_lone_spike_of_a_still_channel_is_an_outlier(size: float):
+    values = np.zeros((400, 1))
+    values[200] = size
+    assert np.flatnonzero(flag_outliers(values, 8.0)[0]).tolist() == [200]
 
 
 @pytest.mark.parametrize("noisy", [slice(0, 45), slice(205, 250), slice(-45, None)])
