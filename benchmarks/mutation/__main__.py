@@ -26,8 +26,6 @@ REASONS = Path(__file__).with_name("survivors.yaml")
 _CAUGHT = ("caught", "time")
 # The first tests of a mutant take so long at most; most mutants need no more of them.
 _FIRST_S = 4.0
-# Tests from other folders than the one that mirrors the module's are left out beyond so long, the longest first.
-_MOST_S = 25.0
 # A mutant may be slower than the code so many times, and longer by so much.
 _SLOWER, _LONGER_S = 3.0, 10.0
 
@@ -66,10 +64,11 @@ class Tried:
         """The result of an earlier trial, None without one."""
         return self._results.get(self._key(mutant))
 
-    def put(self, mutant: Mutant, result: dict[str, Any]) -> None:
-        """Keep a result."""
-        met = {} if result["outcome"] in _CAUGHT else {file: e.digest for file, e in self._known.items()}
-        self._results[self._key(mutant)] = {**result, "met": met}
+    def put(self, mutant: Mutant, result: dict[str, Any], met: set[str]) -> None:
+        """Keep a result after the tests of the files `met`."""
+        before = self._results.get(self._key(mutant), {}).get("met", {})
+        now = {file: self._known[file].digest for file in met}
+        self._results[self._key(mutant)] = {**result, "met": {**before, **now}}
         self._path.write_text(json.dumps(self._results), encoding="utf-8")
 
     @staticmethod
@@ -112,8 +111,13 @@ def _held_constant(source: str, line: int, tree: Path) -> bool:
     )
 
 
-def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTests]) -> dict[str, Any]:
-    """The fate of a mutant: its change, whether it was caught, by which test and in what time."""
+def attempt(
+    trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTests], most_s: float
+) -> tuple[dict[str, Any], set[str]]:
+    """The fate of a mutant: its change, whether it was caught, by which test and in what time; the tests' files.
+
+    known : files of tests it has not met. most_s : the longest tests are left out beyond so many seconds.
+    """
     source = (trials.tree / mutant.file).read_text("utf-8")
     code = mutant.code(source)
     old, new = change(source, code)
@@ -121,7 +125,7 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
     try:
         compile(code, mutant.file, "exec")
     except SyntaxError:
-        return {**result, "outcome": "caught", "test": "the compiler", "seconds": 0.0}
+        return {**result, "outcome": "caught", "test": "the compiler", "seconds": 0.0}, set()
     jitted = any(node.lineno <= mutant.line <= (node.end_lineno or 0) for node in _compiled(source))
     lines = range(mutant.line, mutant.last + 1)
     tests = exercise.tests_of(known, mutant.file, lines, anywhere=False)
@@ -130,8 +134,10 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
     tests = tests or exercise.tests_naming(known, mutant.file, trials.tree)
     near = f"tests/{Path(mutant.file).parent}/"
     tests.sort(key=lambda item: (not item[0].startswith(near), item[2]))
-    while sum(item[2] for item in tests) > _MOST_S and len(tests) > 1 and not tests[-1][0].startswith(near):
+    useless = set(known) - {file for file, _, _ in tests}
+    while sum(item[2] for item in tests) > most_s and len(tests) > 1:
         tests.pop()
+    met = useless | {file for file, _, _ in tests}
     stages: list[list[tuple[str, list[str], float]]] = [[]]
     for entry in tests:
         if stages[-1] and sum(item[2] for item in stages[-1]) + entry[2] > _FIRST_S * 4.0 ** (
@@ -151,8 +157,8 @@ def attempt(trials: Trials, mutant: Mutant, known: dict[str, exercise.FileOfTest
                 answer = trials.run(files, functions, limit, fresh=fresh)
                 seconds += answer["seconds"]
                 if answer["outcome"] != "survived":
-                    return {**result, **answer, "seconds": seconds}
-    return {**result, "outcome": "survived" if tests else "not run", "test": "", "seconds": seconds}
+                    return {**result, **answer, "seconds": seconds}, set()
+    return {**result, "outcome": "survived" if tests else "not run", "test": "", "seconds": seconds}, met
 
 
 def reason_of(result: dict[str, Any], reasons: list[dict[str, str]]) -> dict[str, str]:
@@ -239,6 +245,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=[], help="draw from files that begin so")
     parser.add_argument("--package", nargs="+", choices=STRATA, help="of the sample, these packages alone")
+    parser.add_argument(
+        "--most", type=float, default=60.0, metavar="S", help="seconds of tests a mutant, the quickest first"
+    )
     parser.add_argument("--anew", action="store_true", help="forget the results of earlier runs")
     parser.add_argument("--bugs", action="store_true", help="replay the bugs written by hand instead")
     parser.add_argument(
@@ -282,10 +291,11 @@ def main() -> int:
         for number, mutant in enumerate(drawn, start=1):
             result, open_ = tried.get(mutant), tried.open(mutant)
             if result is None or open_:
-                earlier, result = result, attempt(trials, mutant, open_)
+                earlier = result
+                result, met = attempt(trials, mutant, open_, arguments.most)
                 if earlier is not None and result["outcome"] == "not run":
                     result["outcome"] = earlier["outcome"]
-                tried.put(mutant, result)
+                tried.put(mutant, result, met)
                 print(
                     f"{number}/{len(drawn)} {result['outcome']:<8} {result['seconds']:5.1f} s "
                     f"{mutant.file}:{mutant.line}  {result['old'][:90]} -> {result['new'][:90]}",
