@@ -80,6 +80,7 @@ def test_factors_are_combined_with_their_weights_and_empty_ones_left_out() -> No
     parts = [random.normal(size=(m, 4)) for m in (7, 0, 9)]
     factors = [TriangularFactor.of(part[:, :3], part[:, 3]) for part in parts]
     assert factors[1].rows == 0
+    assert TriangularFactor.of(np.ones((1, 2)), np.array([3.0])).mean_square == pytest.approx(9.0)
     assert factors[1].mean_square == 0.0
     found = TriangularFactor.combine(factors, [2.0, 5.0, 0.5])
     expected = 2.0 * parts[0].T @ parts[0] + 0.5 * parts[2].T @ parts[2]
@@ -690,6 +691,17 @@ def test_the_deviations_of_total_least_squares_are_those_of_repeated_data() -> N
     scatter = np.std([estimate.values for estimate in found], axis=0)
     stated = np.mean([estimate.std for estimate in found], axis=0)
     np.testing.assert_allclose(stated / scatter, 1.0, atol=0.25)
+
+
+def test_without_errors_of_the_columns_total_least_squares_has_the_covariances_of_least_squares() -> None:
+    case, *_ = one_class(3, 400, 0.0)
+    total, plain = TotalLeastSquares(1e-7).fit(case), WeightedLeastSquares().fit(case)
+    for kind in ("textbook", "hac"):
+        np.testing.assert_allclose(
+            total.covariances[kind].matrix, plain.covariances[kind].matrix, rtol=1e-4, atol=1e-9
+        )
+    for one, other in zip(total.classes, plain.classes, strict=True):
+        assert one.sigma == pytest.approx(other.sigma, rel=1e-4)
 
 
 def test_column_noise_is_given_by_name_too() -> None:
