@@ -97,3 +97,44 @@ def test_functions_take_and_give_degrees(call: str, value: float) -> None:
 def test_a_function_has_its_number_of_arguments(name: str, arguments: str) -> None:
     with pytest.raises((ConfigurationError, RobotError), match=name):
         reals(f"$FRI_TO_REA[1]={name}({arguments})")
+
+
+def test_an_unknown_variable_is_made_as_it_is_used_and_a_known_one_must_be_set() -> None:
+    body = "$NOVELTY.A=2.0\n$FRI_TO_REA[1]=$NOVELTY.A\n$FRI_TO_REA[2]=$NOVELTY.B\n"
+    body += "$OTHER[3]=5.0\n$FRI_TO_REA[3]=$OTHER[3]\n$FRI_TO_REA[4]=$OTHER[2]\n$FRI_TO_REA[5]=$THIRD"
+    assert reals(body)[:5] == [2.0, 0.0, 5.0, 0.0, 0.0]
+    with pytest.raises(RobotError, match="CDIS"):
+        reals("$FRI_TO_REA[1]=$APO.CDIS")
+
+
+@pytest.mark.parametrize(
+    ("header", "passes", "after"),
+    [
+        ("FOR K=1 TO 3", [1, 2, 3], 4),
+        ("FOR K=3 TO 1 STEP -1", [3, 2, 1], 0),
+        ("FOR K=1 TO 6 STEP 2", [1, 3, 5], 7),
+        ("FOR K=1 TO 0", [], 1),
+        ("FOR K=0 TO 1 STEP -1", [], 0),
+        ("FOR K=2 TO 2 STEP -1", [2], 1),
+        ("FOR K=2 TO 1 STEP 0", [], 2),
+    ],
+)
+def test_a_count_goes_from_the_first_to_the_last(header: str, passes: list[int], after: int) -> None:
+    body = f"DECL INT K,N\nN=0\n{header}\nN=N+1\n$FRI_TO_REA[N]=K\nENDFOR\n$FRI_TO_REA[8]=K"
+    found = reals(body)
+    assert found[: len(passes) + 1] == [*map(float, passes), 0.0]
+    assert found[7] == after
+
+
+def test_a_function_gives_its_value_and_a_plain_return_none() -> None:
+    rig = Rig()
+    program = KrlProgram(
+        "DEF p( )\n$FRI_TO_REA[1]=HALF(7.0)\n$FRI_TO_REA[2]=HALF(HALF(8.0))\nEARLY()\n"
+        "$FRI_TO_REA[4]=1.0\nEND\n"
+        "DEFFCT REAL HALF(X:IN)\nREAL X\nRETURN X/2.0\nENDFCT\n"
+        "DEF EARLY( )\nRETURN\n$FRI_TO_REA[3]=1.0\nEND\n"
+    )
+    for _ in range(5):
+        if not program.finished:
+            program.step(rig.session)
+    assert [float(value) for value in rig.session.to_real[:4]] == [3.5, 2.0, 0.0, 1.0]
