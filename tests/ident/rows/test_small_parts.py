@@ -27,7 +27,7 @@ from ident.rows.filters import (
     settling,
     thinning,
 )
-from ident.rows.observation import observe, stack
+from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
 from ident.rows.reversals import away_from_reversals
 from ident.rows.sessions import payload_name, require, stated_mass
@@ -480,6 +480,37 @@ def test_the_torque_of_an_outlier_is_bridged_in_the_motor_channel():
     torque = [np.concatenate([p.motor.torque for p in one.passages]) for one in (clean, mended)]
     np.testing.assert_allclose(torque[0], torque[1], atol=0.5)
     assert np.concatenate([p.motor.flagged for p in mended.passages])[:, 1].sum() == 1
+
+
+def test_between_irregular_times_both_neighbours_of_an_outlier_are_unknown():
+    session = arm.session(motor=False)
+    kept = np.cumsum(np.random.default_rng(0).integers(2, 5, 2000))
+    kept = kept[kept < len(session.joint)]
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    part = {name: getattr(session.joint, name)[kept] for name in fields}
+    part["sequence"] = np.arange(len(kept))
+    hit = np.arange(400, len(kept) - 200, 150)
+    part["effort"][hit, 3] += 400.0
+    uneven = replace(session, joint=replace(session.joint, **part))
+    stamps = part["publish_time"]
+    prepared = prepare(uneven, advise=False)
+    assert prepared.counts["resampled"]
+    (passage,) = prepared.passages
+    times, flagged = passage.joint.times, passage.joint.flagged[:, 3]
+    for time in (stamps[hit] - stamps[0]) * 1e-9:
+        # The samples of the grid on either side are interpolated through the outlier.
+        beside = np.flatnonzero(np.abs(times - time) < passage.joint.period_s)
+        assert flagged[beside].all()
+    assert np.abs(passage.joint.torque[:, 3]).max() < 200.0
+
+
+@pytest.mark.parametrize(("first", "last", "whole"), [(0, None, True), (0, -900, False), (900, None, False)])
+def test_a_commanded_motion_must_cover_the_measured_one(first: int, last: int | None, whole: bool):
+    session = arm.session(motor=False, command=True)
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    part = {name: getattr(session.command, name)[first:last] for name in fields}
+    cut = replace(session, command=replace(session.command, **part))
+    assert (commanded(cut, prepare(cut, advise=False)) is not None) == whole
 
 
 def test_the_mean_torque_is_that_of_the_rows_span():
