@@ -524,6 +524,12 @@ def test_the_form_of_a_metric_is_its_definition(metric: str) -> None:
     np.testing.assert_allclose(found[20:], 0.0)
 
 
+@pytest.mark.parametrize("relative_std", [0.0, -0.8, np.array([0.2, np.nan])])
+def test_a_prior_of_bodies_has_positive_deviations(relative_std: float) -> None:
+    with pytest.raises(ConfigurationError, match="is not positive"):
+        body_prior(relative_std)
+
+
 def bodies_seen(prior: BodyPrior, truth: np.ndarray, noise: float, rows: int = 400) -> Problem:
     random = np.random.default_rng(3)
     scale = 1.0 / np.append(np.tile(np.abs(BODY) + 0.01, 2), [1.0, 1.0])
