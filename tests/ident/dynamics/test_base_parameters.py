@@ -309,3 +309,14 @@ def test_both_routes_agree_on_gantries(seed):
     joints[0]["alpha"] = 0.0
     chain = Chain.from_table(joints)
     assert_same(ModelStructure(chain, int(rng.integers(1, 3)), without=() if seed % 2 else ("offl", "offm")))
+
+
+@pytest.mark.parametrize("kinds", ["PR", "RPR", "PRR", "PPRR", "RPPR"])
+@pytest.mark.parametrize("tilt", [0.0, RIGHT])
+def test_both_routes_agree_on_lifts(kinds: str, tilt: float):
+    """Slides along the first turning axis, all along gravity or all across."""
+    joints = [{"kind": "prismatic" if kind == "P" else "revolute", "alpha": 0.0} for kind in kinds]
+    joints[0]["alpha"] = tilt
+    joints.append({"kind": "revolute", "alpha": RIGHT, "d": 0.2})
+    chain = Chain.from_table(joints)
+    assert_same(ModelStructure(chain, 2, without=("offl", "offm")))
