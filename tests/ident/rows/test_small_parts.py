@@ -366,6 +366,15 @@ def test_a_problem_knows_the_period_of_each_record():
     assert found.sample_time_s == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize("period_s", [9.9, 10.0])
+def test_rows_divide_a_period_evenly(period_s: float):
+    prepared = prepare(arm.session(motor=False, period_s=period_s, periods=2))
+    assert prepared.period_rows == 50
+    assert prepared.row_time_s == pytest.approx(period_s / 50)
+    (passage,) = prepared.passages
+    np.testing.assert_allclose(np.diff(passage.rows), period_s / 50, atol=1e-9)
+
+
 def test_one_period_is_not_averaged():
     settings = SignalSettings(average_periods=True)
     session = arm.session(periods=1, period_s=12.0, motor=False)
