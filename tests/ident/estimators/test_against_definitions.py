@@ -27,7 +27,14 @@ from ident.estimators import (
     WeightedLeastSquares,
     nearest_consistent,
 )
-from ident.estimators.covariance import Scores, _stationary, correlation_time, effective_rows, jackknife
+from ident.estimators.covariance import (
+    Scores,
+    _Blocks,
+    _stationary,
+    correlation_time,
+    effective_rows,
+    jackknife,
+)
 from ident.estimators.least_squares import class_variances
 from tests.ident.regression_problems import ar1, design, problem
 
@@ -835,6 +842,20 @@ def test_the_variance_of_stationary_residuals_is_that_of_their_toeplitz_matrix()
     )
     found = _stationary(case, spread, np.array([4.0]), None)
     np.testing.assert_allclose(found, np.asarray(expected) * 400 / 396, rtol=1e-9)
+
+
+def test_blocks_of_a_period_are_those_of_its_phase() -> None:
+    groups = tuple(
+        RowGroup("A1", "joint", record, np.ones((n, 1)), np.ones(n), np.arange(n))
+        for record, n in enumerate((120, 40))
+    )
+    cut = _Blocks.of(Problem(("a",), groups, 0.1, periods=(40, None)), 1.0)
+    assert cut.periodic
+    assert cut.length == 10
+    # Three periods of four blocks, and a record of its own four.
+    found = [(block, rows.start, rows.stop) for block, rows in cut.runs(groups[0])]
+    assert found == [(k % 4, 10 * k, 10 * k + 10) for k in range(12)]
+    assert [block for block, _ in cut.runs(groups[1])] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("block_s", [2.0, 5.0])

@@ -149,6 +149,16 @@ def test_a_limit_has_over_ten_times_the_samples_of_the_values_beside(count: int,
     assert np.isfinite(clipped_at(columns(effort))[0]) == seen
 
 
+def test_the_two_next_values_alone_tell_whether_a_limit_is_chance():
+    effort = noisy()
+    effort[:, 0] += np.linspace(0.0, 1e-3, COUNT)
+    order = np.argsort(effort[:, 0])
+    effort[order[:12], 0] = -20.0
+    # The third next value is frequent, too.
+    effort[order[14:18], 0] = effort[order[14], 0]
+    assert clipped_at(columns(effort))[0] == 20.0
+
+
 def test_a_dead_zone_is_counted_in_the_motion_alone():
     effort = noisy()
     effort[np.abs(effort[:, 0]) < 1.0, 0] = 0.0
