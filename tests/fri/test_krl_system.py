@@ -126,15 +126,17 @@ def test_a_count_goes_from_the_first_to_the_last(header: str, passes: list[int],
     assert found[7] == after
 
 
-def test_a_function_gives_its_value_and_a_plain_return_none() -> None:
+@pytest.mark.parametrize("statement_ms", [0.0, 0.5])
+def test_a_function_gives_its_value_and_a_plain_return_none(statement_ms: float) -> None:
     rig = Rig()
     program = KrlProgram(
         "DEF p( )\n$FRI_TO_REA[1]=HALF(7.0)\n$FRI_TO_REA[2]=HALF(HALF(8.0))\nEARLY()\n"
         "$FRI_TO_REA[4]=1.0\nEND\n"
         "DEFFCT REAL HALF(X:IN)\nREAL X\nRETURN X/2.0\nENDFCT\n"
-        "DEF EARLY( )\nRETURN\n$FRI_TO_REA[3]=1.0\nEND\n"
+        "DEF EARLY( )\nRETURN\n$FRI_TO_REA[3]=1.0\nEND\n",
+        statement_ms=statement_ms,
     )
-    for _ in range(5):
+    for _ in range(50):
         if not program.finished:
             program.step(rig.session)
     assert [float(value) for value in rig.session.to_real[:4]] == [3.5, 2.0, 0.0, 1.0]
