@@ -26,6 +26,8 @@ REASONS = Path(__file__).with_name("survivors.yaml")
 _CAUGHT = ("caught", "time")
 # The first tests of a mutant take so long at most; most mutants need no more of them.
 _FIRST_S = 4.0
+# Sources that also run in processes unseen by coverage, and the tests that start these; their quick functions.
+_APART, _QUICK_S = {"lwr_driver/loop.py": ("tests/lwr_driver/test_process.py",)}, 3.0
 # A mutant may be slower than the code so many times, and longer by so much.
 _SLOWER, _LONGER_S = 3.0, 10.0
 
@@ -132,6 +134,9 @@ def attempt(
     if jitted or not tests:
         tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
     tests = tests or exercise.tests_naming(known, mutant.file, trials.tree)
+    for file in set(_APART.get(mutant.file, ())) & set(known) - {file for file, _, _ in tests}:
+        quick = {name: took for name, took in known[file].seconds.items() if took < _QUICK_S}
+        tests.append((file, list(quick), sum(quick.values())))
     near = f"tests/{Path(mutant.file).parent}/"
     tests.sort(key=lambda item: (not item[0].startswith(near), item[2]))
     useless = set(known) - {file for file, _, _ in tests}

@@ -81,6 +81,16 @@ def test_motion_arrives_row_by_row(rig, period_ms):
     check_sent(r)
 
 
+def test_an_arm_in_command_mode_holds_until_a_motion_is_asked_for(rig):
+    r = rig()
+    r.enter()
+    target = r.target.copy()
+    for _ in range(30):
+        r.cycles(1)
+        assert r.mode is Mode.HOLD
+        np.testing.assert_array_equal(r.target, target)
+
+
 def test_stop_request_stops_within_limits_and_the_session_goes_on(rig):
     r = rig()
     in_motion(r, 400)
@@ -532,6 +542,7 @@ def test_a_reason_counts_the_irregular_packets_of_command_mode(rig):
     for _ in range(3):
         r.cycle(lose_packet=True)
         r.cycles(5)
+    assert r.loop._meanwhile() == " (packets in command mode: 3 lost)"
     for _ in range(2):
         r.end.send(b"nonsense")
         r.cycle()
