@@ -292,10 +292,12 @@ def main() -> int:
             for mutant in sample(ROOT, arguments.sample, arguments.seed, arguments.only)
             if mutant.file.startswith(places)
         ]
+        reasons: list[dict[str, str]] = yaml.safe_load(REASONS.read_text("utf-8")) or []
         results = []
         for number, mutant in enumerate(drawn, start=1):
             result, open_ = tried.get(mutant), tried.open(mutant)
-            if result is None or open_:
+            # A survivor with a reason is not tried again.
+            if result is None or (open_ and not reason_of(result, reasons)):
                 earlier = result
                 result, met = attempt(trials, mutant, open_, arguments.most)
                 if earlier is not None and result["outcome"] == "not run":
