@@ -731,3 +731,21 @@ def test_in_lock_step_a_full_ring_is_waited_for(rig, monkeypatch):
             r.session.close_cycle()
         assert sum(rows) + len(ring.take()) == 20
         ring.release(len(ring.take()))
+
+
+def test_packets_that_stay_ahead_of_their_time_end_the_motion(rig):
+    r = rig()
+    in_motion(r, 100)
+    r.loop.pace = pace = SimpleNamespace(
+        feed=lambda *_, **__: 0, too_fast=False, hasty=False, reset=lambda *_: None
+    )
+    row = r.target.copy()
+    r.cycles(1)
+    assert r.mode is Mode.MOTION
+    np.testing.assert_array_equal(r.target, row)
+    pace.too_fast = True
+    r.cycles(1)
+    assert r.mode is Mode.STOP
+    pace.feed = lambda counted, *_, **__: counted
+    assert r.until_done() is Result.NETWORK
+    assert "run ahead of time" in r.reason

@@ -234,6 +234,14 @@ def test_a_urdf_without_an_axis_turns_about_x():
     assert other.to_dict() == one.to_dict()
 
 
+def test_an_origin_without_place_or_angles_has_zeros():
+    text = urdf([{}, {"xyz": "0 0.1 0.2", "axis": "1 0 0"}, {"rpy": "0.2 0 0", "axis": "0 1 0"}])
+    bare = text.replace(' xyz="0 0 0"', "").replace(' rpy="0 0 0"', "").replace("xyz='0 0 0'", "")
+    assert bare.count("xyz") < text.count("xyz")
+    one, other = Chain.from_urdf(text), Chain.from_urdf(bare)
+    assert other.to_dict() == one.to_dict()
+
+
 def test_frames_have_no_rounding_about_zero():
     for joints in (UPRIGHT, PARALLEL):
         chain = Chain.from_urdf(urdf(joints))
