@@ -88,6 +88,14 @@ def _compiled(source: str) -> list[ast.FunctionDef]:
     ]
 
 
+def _lines(source: str, mutant: Mutant) -> range:
+    """Lines whose tests may notice: those of the change, or of the function whose head it is in."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef) and node.lineno <= mutant.line < node.body[0].lineno:
+            return range(node.body[0].lineno, (node.end_lineno or node.lineno) + 1)
+    return range(mutant.line, mutant.last + 1)
+
+
 @cache
 def _held_names(tree: Path) -> frozenset[str]:
     """All names in compiled functions: a binary holds the values of constants."""
@@ -129,7 +137,7 @@ def attempt(
     except SyntaxError:
         return {**result, "outcome": "caught", "test": "the compiler", "seconds": 0.0}, set()
     jitted = any(node.lineno <= mutant.line <= (node.end_lineno or 0) for node in _compiled(source))
-    lines = range(mutant.line, mutant.last + 1)
+    lines = _lines(source, mutant)
     tests = exercise.tests_of(known, mutant.file, lines, anywhere=False)
     if jitted or not tests:
         tests = exercise.tests_of(known, mutant.file, lines, anywhere=True)
