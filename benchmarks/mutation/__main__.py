@@ -145,11 +145,12 @@ def attempt(
     for file in set(_APART.get(mutant.file, ())) & set(known) - {file for file, _, _ in tests}:
         quick = {name: took for name, took in known[file].seconds.items() if took < _QUICK_S}
         tests.append((file, list(quick), sum(quick.values())))
-    near = f"tests/{Path(mutant.file).parent}/"
-    tests.sort(key=lambda item: (not item[0].startswith(near), item[2]))
+    near, mirror = f"tests/{Path(mutant.file).parent}/", f"test_{Path(mutant.file).stem}.py"
     useless = set(known) - {file for file, _, _ in tests}
+    tests.sort(key=lambda item: (not item[0].endswith(mirror), not item[0].startswith(near), item[2]))
     while sum(item[2] for item in tests) > most_s and len(tests) > 1:
         tests.pop()
+    tests.sort(key=lambda item: (not item[0].startswith(near), item[2]))
     met = useless | {file for file, _, _ in tests}
     stages: list[list[tuple[str, list[str], float]]] = [[]]
     for entry in tests:
