@@ -88,12 +88,24 @@ def _compiled(source: str) -> list[ast.FunctionDef]:
     ]
 
 
-def _lines(source: str, mutant: Mutant) -> range:
-    """Lines whose tests may notice: those of the change, or of the function whose head it is in."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.FunctionDef) and node.lineno <= mutant.line < node.body[0].lineno:
-            return range(node.body[0].lineno, (node.end_lineno or node.lineno) + 1)
-    return range(mutant.line, mutant.last + 1)
+def _lines(source: str, mutant: Mutant) -> set[int]:
+    """Lines whose tests may notice: those of the change, of the function with it in its head, or with the constant."""
+    tree = ast.parse(source)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    set_here = {
+        node.id
+        for statement in tree.body
+        if isinstance(statement, ast.Assign | ast.AnnAssign)
+        and statement.lineno <= mutant.line <= (statement.end_lineno or 0)
+        for node in ast.walk(statement)
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+    }
+    found = set(range(mutant.line, mutant.last + 1))
+    for function in functions:
+        used = {node.id for node in ast.walk(function) if isinstance(node, ast.Name)}
+        if function.lineno <= mutant.line < function.body[0].lineno or used & set_here:
+            found.update(range(function.body[0].lineno, (function.end_lineno or 0) + 1))
+    return found
 
 
 @cache
