@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
-import random
+import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -236,26 +237,36 @@ def files(root: Path, places: Sequence[str]) -> list[str]:
 def sample(root: Path, number: int, seed: int, only: Sequence[str] = ()) -> list[Mutant]:
     """`number` mutants of all strata, each with its share of all mutants.
 
+    A mutant's place in the draw depends on the seed and on its own line alone: a change elsewhere draws the same ones.
     only : beginnings of paths; the sample is drawn from these files
     """
     by_stratum = {
         stratum: [
-            mutant
+            drawn
             for file in files(root, places)
             if not only or file.startswith(tuple(only))
-            for mutant in mutants_of(file, (root / file).read_text("utf-8"))
+            for drawn in _drawn(file, (root / file).read_text("utf-8"), seed)
         ]
         for stratum, places in STRATA.items()
     }
     total = sum(map(len, by_stratum.values()))
-    if total <= number:
-        return [mutant for all_ in by_stratum.values() for mutant in all_]
-    exact = {stratum: number * len(all_) / total for stratum, all_ in by_stratum.items()}
+    number = min(number, total)
+    exact = {stratum: number * len(all_) / max(total, 1) for stratum, all_ in by_stratum.items()}
     counts = {stratum: int(share) for stratum, share in exact.items()}
     for stratum in sorted(exact, key=lambda s: counts[s] - exact[s])[: number - sum(counts.values())]:
         counts[stratum] += 1
     return [
         mutant
         for stratum, all_ in by_stratum.items()
-        for mutant in random.Random(f"{seed} {stratum}").sample(all_, counts[stratum])
+        for _, mutant in sorted(all_, key=lambda item: item[0])[: counts[stratum]]
     ]
+
+
+def _drawn(file: str, source: str, seed: int) -> Iterator[tuple[bytes, Mutant]]:
+    """All mutants of a file, each with a number to draw by."""
+    lines, seen = source.splitlines(), Counter[str]()
+    for mutant in mutants_of(file, source):
+        text = "\n".join(line.strip() for line in lines[mutant.line - 1 : mutant.last])
+        name = f"{file} {mutant.operator} {text}"
+        yield hashlib.sha256(f"{seed} {seen[name]} {name}".encode()).digest(), mutant
+        seen[name] += 1

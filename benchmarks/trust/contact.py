@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.trust.stand import Clock, TimedTurnaround, shared_ring
 from benchmarks.trust.table import Ledger, Line
 from fri.controller_end import ControllerEnd
+from fri.in_process import Network
 from fri.states import State
 from lwr_driver.arm import Arm
 from lwr_driver.contact import ContactSettings, ContactWatch, ExpectedArm
@@ -127,9 +128,11 @@ class Bench:
             mass, com, inertia = load_data(arm, payload)
             watch.carry(mass, np.array(com), np.array(inertia))
         order = LoopSettings("127.0.0.1", 0, None, not ahead, "stanford", 0.1, 0.2, arm.joint_names)
-        self.loop = Loop(order, arm.limits, self.control, ring, watch)
+        # Compiled answers need a socket.
+        network = None if ahead else Network()
+        self.loop = Loop(order, arm.limits, self.control, ring, watch, network)
         self.loop.turnaround = TimedTurnaround(self.loop, self.control, self.clock) if ahead else None
-        self.end = ControllerEnd(self.loop.remote.address)
+        self.end = ControllerEnd(self.loop.remote.address, network=network)
         self.cabinet.start_program()
         self._millisecond = self.cabinet._millisecond
         self.cabinet._millisecond = self._one_millisecond  # type: ignore[method-assign]
@@ -346,19 +349,22 @@ def campaign(ledger: Ledger, options: Any) -> None:
             ledger.finish("contact", what)
             options.say(str(line))
         runs = options.runs or _HEALTHY
-        for period_ms in (1, 5):
+        slow = 3 * runs // 4
+        for period_ms, count in ((1, runs - slow), (5, slow)):
             what = f"healthy, loaded, {period_ms} ms"
             if ledger.has("contact", what):
                 continue
-            line, quiet = ledger.line("contact", what), []
-            for number in range(runs - 3 * runs // 4 if period_ms == 1 else 3 * runs // 4):
+            for number in range(count):
+                piece = f"{what}, {number}"
+                if ledger.has("contact", piece):
+                    continue
                 seed = options.seed * 10_000 + 2000 + number
-                quiet.append(healthy(period_ms, seed, ring))
-                line.count(quiet[-1].bad, f"seed {seed}")
-            line.figures = {
-                "external torque over its limit, at most": round(_most(quiet, "peak"), 2),
-                "joint torque over its limit, at most": round(_most(quiet, "share"), 2),
-                **_stamp(),
-            }
+                run, line = healthy(period_ms, seed, ring), ledger.line("contact", what)
+                line.count(run.bad, f"seed {seed}")
+                for name, value in (("external", run.peak), ("joint", run.share)):
+                    figure = f"{name} torque over its limit, at most"
+                    line.figures[figure] = max(round(value, 2), line.figures.get(figure, 0.0))
+                line.figures |= _stamp()
+                ledger.finish("contact", piece)
             ledger.finish("contact", what)
-            options.say(str(line))
+            options.say(str(ledger.line("contact", what)))

@@ -133,7 +133,7 @@ class _Rigid:
         own, moved = effective[j], np.zeros((10, effective.shape[2]))
         stays = list(range(10))
         if chain.prismatic[j]:
-            moved[:6], own[:6] = own[:6], 0.0
+            moved[:6] = own[:6]
             stays = [_MX, _MY, _MZ, _M]
             if j < axes.r1:
                 stays = [_M]
@@ -144,7 +144,6 @@ class _Rigid:
             moved[0] = moved[_YY] = symmetric
             moved[_MZ], moved[_M] = own[_MZ], own[_M]
             own[0] -= symmetric
-            own[[_YY, _MZ, _M]] = 0.0
             stays = [k for k in stays if k not in (_YY, _MZ, _M)]
             if j < axes.r2:
                 stays = [_ZZ] if self._stands_still(j) else [_ZZ, _MX, _MY]
@@ -156,8 +155,7 @@ class _Rigid:
         """Prismatic link between r1 and r2: the remaining first moments after regrouping (and the mass)."""
         a = np.where(np.abs(self.axes.axis[j]) < _SAME, 0.0, self.axes.axis[j])
         if abs(self.axes.along[j]) > 1 - _SAME:
-            moved[_MX], moved[_MY] = own[_MX].copy(), own[_MY].copy()
-            own[_MX:_M] = 0.0
+            moved[_MX], moved[_MY] = own[_MX], own[_MY]
             return [_M]
         pivot = next(k for k in (2, 1, 0) if a[k] != 0.0)
         eliminated = own[_MX + pivot].copy()

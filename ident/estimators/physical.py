@@ -66,6 +66,10 @@ class BodyPrior:
             raise ConfigurationError(
                 f"bodies {self.bodies.shape} and their prior {self.inertial.shape} must both be (k, 10)"
             )
+        if not np.all(np.asarray(self.relative_std) > 0.0):
+            raise ConfigurationError(
+                f"relative standard deviation {np.min(self.relative_std):g} of a prior is not positive; 0.2 is typical"
+            )
         for number, body in enumerate(self.inertial):
             if np.linalg.eigvalsh(pseudo_inertia(body))[0] <= 0:
                 raise ConfigurationError(

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -60,3 +62,14 @@ def test_a_named_place_that_cannot_be_written_is_replaced(sealed, tmp_path, monk
     )
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/nowhere")
     assert sealed(place) == str(place)
+
+
+def test_the_place_is_there_once_the_package_is_imported(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": "/proc/nowhere", "HOME": str(tmp_path)}
+    environment.pop("XDG_CACHE_HOME", None)
+    command = [sys.executable, "-c", "import fri, os; print(os.environ['NUMBA_CACHE_DIR'])"]
+    found = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True
+    ).stdout.strip()
+    assert Path(found) == tmp_path / ".cache/lwr-identification/numba"
+    assert Path(found).is_dir()

@@ -9,7 +9,7 @@ from fri.controller_end import ControllerEnd
 from fri.errors import NetworkError
 from fri.in_process import Network
 from fri.krc import KrcPolicy, KrcSession, Sample
-from fri.remote import RemoteEnd
+from fri.remote import LinkEventKind, RemoteEnd
 from tests.fri.fri_rig import LIMITS, Q_START, QUICK
 
 HERE, THERE = ("127.0.0.1", 5000), ("127.0.0.2", 6000)
@@ -66,3 +66,24 @@ def test_both_ends_exchange_packets_and_notice_the_end_of_the_other() -> None:
     remote.close()
     controller.send(session.packet(Sample()))
     assert controller.refused > 0
+
+
+def test_cycles_ahead_of_time_are_counted_and_told_once_until_they_pause() -> None:
+    network = Network()
+    session = KrcSession(LIMITS, Q_START, KrcPolicy(**QUICK))
+    session.fri_open(2)
+    with (
+        RemoteEnd("127.0.0.1", 0, network=network) as remote,
+        ControllerEnd(remote.address, network=network) as end,
+    ):
+        told = []
+        for cycle in range(2000):
+            end.send(session.packet(Sample()))
+            assert remote.receive(0.0) is not None
+            session.close_cycle()
+            if cycle in (1, 2, 900, 1950):
+                remote.tell_ahead(2, "early")
+                told.append(sum(event.kind is LinkEventKind.AHEAD for event in remote.events))
+    # A thousand packets without one make the next one news.
+    assert told == [1, 1, 1, 2]
+    assert remote.ahead == 8

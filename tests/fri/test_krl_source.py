@@ -109,6 +109,9 @@ def test_a_wait_lasts_whole_ticks() -> None:
     assert not program.finished
     program, _ = run("WAIT SEC 0.036", ticks=4)
     assert program.finished
+    # 2000 ticks of 12 ms.
+    assert not run("WAIT SEC 24.0", ticks=2000)[0].finished
+    assert run("WAIT SEC 24.0", ticks=2001)[0].finished
 
 
 def test_settings_take_the_place_of_the_data_list() -> None:
@@ -134,6 +137,8 @@ def test_settings_take_the_place_of_the_data_list() -> None:
         ("$FRI_TO_INT[1]=1 2", "line 2: '2' is too much"),
         ("$FRI_TO_INT[1]=?", "line 2: .* is not understood"),
         ("$LOAD.CM.Q=1", "line 2: there is no variable"),
+        ("E6AXIS L\nL={A1 1 A2 2}", "line 3: .*A2"),
+        ("E6AXIS L\nL={1, 2}", "line 3: '1' is no field"),
     ],
 )
 def test_what_is_not_krl_is_refused_with_its_line(body: str, message: str) -> None:
@@ -319,6 +324,9 @@ def only_statement(line: str) -> object:
         ("WAIT FOR B", WaitFor(Name("B"), 2)),
         ("PTP XHOME", Move(Name("XHOME"), 2)),
         ("PTP_REL {A1 0.5}", Move(Aggregate((("A1", Constant(0.5)),)), 2, relative=True)),
+        ("L={LOAD: M 3.5}", Assign(Name("L"), Aggregate((("M", Constant(3.5)),)), 2)),
+        ("L={A1 1, A2 2}", Assign(Name("L"), Aggregate((("A1", Constant(1)), ("A2", Constant(2)))), 2)),
+        ("L={}", Assign(Name("L"), Aggregate(()), 2)),
         ("HALT", Halt(2)),
         ("INTERRUPT ON 3", Ignored("INTERRUPT ON 3", 2)),
         ("EXIT", Leave("EXIT", 2)),

@@ -233,6 +233,7 @@ def test_faulty_command_leaves_the_buffer_as_it_was():
     good["send_seq"], good["refl_seq"], good["krl_bool"], good["cmd_flags"] = 3, 4, 0x8001, 0x35
     good["krl_int"] = np.arange(16)
     buffer = CmdBuffer()
+    assert (buffer.send_seq, buffer.refl_seq, buffer.krl_bool, buffer.cmd_flags) == (0, 0, 0, 0)
     assert buffer.load(good.tobytes()) is None
     assert (buffer.send_seq, buffer.refl_seq, buffer.krl_bool, buffer.cmd_flags) == (3, 4, 0x8001, 0x35)
     bad = good.copy()

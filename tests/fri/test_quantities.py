@@ -8,7 +8,18 @@ from typing import Annotated
 import pytest
 
 from fri.errors import ConfigurationError
-from fri.quantities import check, described, entries, within
+from fri.quantities import (
+    FileName,
+    Name,
+    Share,
+    Version,
+    check,
+    check_value,
+    described,
+    entries,
+    metas,
+    within,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,3 +66,21 @@ def test_a_range_in_words() -> None:
     assert described(within(0.5, 60.0, "s")) == "0.5 to 60 s"
     assert described(within(0.0, 1.0, "share", above=True, below=True)) == "above 0 to below 1"
     assert described(within(1, 1)) == "1"
+
+
+@pytest.mark.parametrize(
+    ("hint", "inside", "outside"),
+    [
+        (Version, [1], [0, 2, -1]),
+        (Share, [1e-9, 0.5, 1.0], [0.0, -0.1, 1.001, 2.0]),
+        (Name, ["a", "a" * 64], ["", "a" * 65]),
+        (FileName, ["a", "a" * 1000], ["", "a" * 1001]),
+    ],
+)
+def test_common_kinds_have_their_ranges(hint: object, inside: list[object], outside: list[object]) -> None:
+    _, ranges = metas(hint)
+    for value in inside:
+        check_value(value, ranges, "`key`")
+    for value in outside:
+        with pytest.raises(ConfigurationError, match="`key`"):
+            check_value(value, ranges, "`key`")

@@ -4,8 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fri.track import StopRamp
-from tests.fri.fri_rig import A_MAX, Q_MAX, V_MAX
+from fri.krc import KrcPolicy
+from fri.track import SetpointTrack, StopRamp
+from tests.fri.fri_rig import A_MAX, LIMITS, Q_MAX, Q_START, V_MAX
 
 JERK = A_MAX / 0.02
 DT = 1e-4
@@ -49,3 +50,21 @@ def test_ramp_does_not_leave_the_ends_of_travel():
 def test_ramp_that_begins_outside_goes_no_further():
     _, positions = sampled(Q_MAX + 0.01, V_MAX)
     assert np.allclose(positions, Q_MAX + 0.01)
+
+
+def test_missing_commands_are_bridged_at_the_pace_of_the_last_ones():
+    track = SetpointTrack(LIMITS, KrcPolicy(), Q_START)
+    step = np.linspace(-1e-3, 1e-3, 7)
+    for begin in (Q_START, Q_START + 0.1):
+        track.place(begin)
+        track.command(begin + step)
+        # From rest the first command is a step of one cycle.
+        np.testing.assert_allclose(track.extrapolated(), begin + 2 * step, atol=1e-12)
+        np.testing.assert_allclose(track.bridge()[-1], begin + 2 * step, atol=1e-12)
+        # After two cycles without a command the next one is a step of three.
+        track.bridge()
+        change, span = track.change_of_step(begin + 4 * step)
+        np.testing.assert_allclose(change, 0.0, atol=1e-12)
+        assert span == 2.0
+        track.command(begin + 4 * step)
+        np.testing.assert_allclose(track.extrapolated(), begin + 5 * step, atol=1e-12)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -79,6 +82,16 @@ def test_motion_arrives_row_by_row(rig, period_ms):
     assert r.session.state is State.CMD
     assert np.array_equal(r.arrived.rows[-1], rows[-1])
     check_sent(r)
+
+
+def test_an_arm_in_command_mode_holds_until_a_motion_is_asked_for(rig):
+    r = rig()
+    r.enter()
+    target = r.target.copy()
+    for _ in range(30):
+        r.cycles(1)
+        assert r.mode is Mode.HOLD
+        np.testing.assert_array_equal(r.target, target)
 
 
 def test_stop_request_stops_within_limits_and_the_session_goes_on(rig):
@@ -532,6 +545,7 @@ def test_a_reason_counts_the_irregular_packets_of_command_mode(rig):
     for _ in range(3):
         r.cycle(lose_packet=True)
         r.cycles(5)
+    assert r.loop._meanwhile() == " (packets in command mode: 3 lost)"
     for _ in range(2):
         r.end.send(b"nonsense")
         r.cycle()
@@ -651,3 +665,87 @@ def test_a_start_is_asked_for_only_after_the_program_has_taken_the_stop(rig, mon
     assert int(r.loop.remote.command["krl_int"][15]) == 10
     taken = False
     assert r.until_done(200) is Result.DONE
+
+
+@pytest.mark.parametrize("step", ["turn", "_serve"])
+def test_in_lock_step_the_last_answer_is_repeated_after_a_second_of_silence(rig, monkeypatch, step):
+    r, late = rig(), [0.0]
+    clock = SimpleNamespace(
+        monotonic=lambda: time.monotonic() + late[0], monotonic_ns=time.monotonic_ns, sleep=lambda _: None
+    )
+    monkeypatch.setattr("lwr_driver.loop.time", clock)
+
+    def heard() -> bool:
+        getattr(r.loop, step)()
+        return r.end.receive(0.0) is not None
+
+    r.enter()
+    # At rest in command mode, without a request.
+    assert not heard()
+    late[0] += 1.1
+    assert [heard(), heard()] == [True, False]
+    # During a measurement; a packet that comes is answered, and nothing is repeated beside.
+    r.post(Job.CYCLES, 5)
+    late[0] = 0.0
+    r.end.send(r.session.packet(r.sample))
+    assert [heard(), heard()] == [True, False]
+    r.session.close_cycle()
+    late[0] = 3.0
+    assert [heard(), heard()] == [True, False]
+
+
+def test_in_lock_step_a_turn_tells_whether_a_packet_was_handled(rig):
+    r = rig()
+    r.cycles(50)
+    assert not r.loop.turn()
+    r.post(Job.CYCLES, 3)
+    assert not r.loop.turn()
+    for _ in range(3):
+        r.end.send(r.session.packet(r.sample))
+        assert r.loop.turn()
+        r.session.receive(r.end.receive(0.0))
+        r.session.close_cycle()
+        assert not r.loop.turn()
+    assert r.result is Result.DONE
+
+
+def test_in_lock_step_a_full_ring_is_waited_for(rig, monkeypatch):
+    with Ring.create(8) as ring:
+        r, rows = rig(ring=ring), []
+        r.loop.begin()
+        for _ in range(50):
+            r.cycles(1)
+            ring.release(len(ring.take()))
+
+        def sleep(_: float) -> None:
+            rows.append(len(ring.take()))
+            ring.release(rows[-1])
+
+        clock = SimpleNamespace(monotonic=time.monotonic, monotonic_ns=time.monotonic_ns, sleep=sleep)
+        monkeypatch.setattr("lwr_driver.loop.time", clock)
+        r.post(Job.CYCLES, 20)
+        for _ in range(20):
+            r.end.send(r.session.packet(r.sample))
+            assert r.loop.turn()
+            r.session.receive(r.end.receive(0.0))
+            r.session.close_cycle()
+        assert sum(rows) + len(ring.take()) == 20
+        ring.release(len(ring.take()))
+
+
+def test_packets_that_stay_ahead_of_their_time_end_the_motion(rig):
+    r = rig()
+    in_motion(r, 100)
+    r.loop.pace = pace = SimpleNamespace(
+        feed=lambda *_, **__: 0, too_fast=False, hasty=False, reset=lambda *_: None
+    )
+    row = r.target.copy()
+    r.cycles(1)
+    assert r.mode is Mode.MOTION
+    np.testing.assert_array_equal(r.target, row)
+    pace.too_fast = True
+    r.cycles(1)
+    assert r.mode is Mode.STOP
+    pace.feed = lambda counted, *_, **__: counted
+    assert r.until_done() is Result.NETWORK
+    assert "run ahead of time" in r.reason

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from lwr_driver.guard import Stop, stop_extent
+from lwr_driver.guard import Retreat, Stop, stop_extent
 from lwr_driver.motion import move_to
 from tests.lwr_driver.driver_rig import START, arm
 
@@ -180,3 +180,24 @@ def test_the_jerk_of_a_stop_begins_with_its_first_row(v, a, jerk):
     first = stop.advance(1)
     second = (first - 2.0 * history_of[0] + history_of[1])[0] / period**2
     assert second == pytest.approx(a + jerk * limits.j_max[0] * period, abs=1e-6)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(way=unit, period=periods)
+def test_a_retreat_is_a_straight_way_within_its_limits(way, period):
+    retreat, goal = Retreat(arm().limits, period), START + 0.2 * way
+    retreat.begin(START, goal)
+    rows = [START]
+    while not retreat.arrived:
+        rows.append(retreat.advance(1))
+    np.testing.assert_allclose(rows[-1], goal, atol=1e-9)
+    size = np.linalg.norm(goal - START)
+    if size < 1e-6:
+        return
+    moved = np.array(rows) - START
+    along = moved @ (goal - START) / size
+    assert np.all(np.diff(along) >= -1e-9)
+    np.testing.assert_allclose(moved, np.outer(along, (goal - START) / size), atol=1e-7)
+    padded = np.vstack([rows[:1] * 3, rows, rows[-1:] * 3])
+    for order, limit in enumerate((arm().limits.v_max, arm().limits.a_max, arm().limits.j_max), start=1):
+        assert np.all(np.abs(np.diff(padded, order, axis=0)) <= limit * period**order + 1e-9)

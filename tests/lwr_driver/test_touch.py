@@ -9,6 +9,7 @@ from fri.states import EventKind, Quality, State
 from lwr_driver.commander import CONTACT, RETREAT
 from lwr_driver.contact import Contact
 from lwr_driver.control import Mode, Result, Text, Word
+from lwr_driver.loop import _UNACCEPTABLE_PACKETS
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import Ring
 from tests.lwr_driver.driver_rig import Rig, arm
@@ -284,8 +285,11 @@ def test_unacceptable_quality_in_command_mode_stops_the_motion(rig):
     r = rig(policy=LENIENT)
     in_motion(r)
     r.session.quality_ceiling = Quality.UNACCEPTABLE
-    r.cycles(2)
-    assert r.mode is Mode.MOTION
+    rated = 0
+    while r.mode is Mode.MOTION:
+        r.cycles(1)
+        rated += r.loop.remote.quality == Quality.UNACCEPTABLE
+    assert rated == _UNACCEPTABLE_PACKETS
     assert r.until_done() is Result.NETWORK
     assert r.session.state is State.CMD
     assert "the controller rates the link UNACCEPTABLE in command mode" in r.reason

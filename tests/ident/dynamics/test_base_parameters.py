@@ -204,6 +204,16 @@ def test_expand_gives_the_nearest_to_the_prior():
     assert null[102:] @ (near - prior) == pytest.approx(np.zeros(34), abs=1e-12)
 
 
+def test_parameters_left_out_of_a_model_stay_zero():
+    base = numeric_base(ModelStructure(lwr(), 2, without=("offl", "Ia3")))
+    assert len(base.excluded)
+    rng = np.random.default_rng(2)
+    values, prior = rng.normal(size=len(base.columns)), rng.normal(size=base.structure.n_columns)
+    for found in (base.expand(values), base.expand(values, prior)):
+        assert not found[base.excluded].any()
+        assert base.reduce(found) == pytest.approx(values, abs=1e-12)
+
+
 def test_published_values_of_table_2_come_out_of_the_emulated_arm():
     """The emulator's standard parameters were made from Table 2 of Kolyubin et al. (two decimals)."""
     content = yaml.safe_load(find("emulator/table2.yaml").read_text(encoding="utf-8"))
@@ -309,3 +319,14 @@ def test_both_routes_agree_on_gantries(seed):
     joints[0]["alpha"] = 0.0
     chain = Chain.from_table(joints)
     assert_same(ModelStructure(chain, int(rng.integers(1, 3)), without=() if seed % 2 else ("offl", "offm")))
+
+
+@pytest.mark.parametrize("kinds", ["PR", "RPR", "PRR", "PPRR", "RPPR"])
+@pytest.mark.parametrize("tilt", [0.0, RIGHT])
+def test_both_routes_agree_on_lifts(kinds: str, tilt: float):
+    """Slides along the first turning axis, all along gravity or all across."""
+    joints = [{"kind": "prismatic" if kind == "P" else "revolute", "alpha": 0.0} for kind in kinds]
+    joints[0]["alpha"] = tilt
+    joints.append({"kind": "revolute", "alpha": RIGHT, "d": 0.2})
+    chain = Chain.from_table(joints)
+    assert_same(ModelStructure(chain, 2, without=("offl", "offm")))

@@ -54,6 +54,8 @@ PARALLEL = [
     {"xyz": "0.1 0 0", "axis": "0 0 1"},
     {"xyz": "0 0 0.2", "axis": "0 0 1", "type": "continuous"},
 ]
+# Intersecting axes with common normals along each axis of the link frames.
+CARDAN = [{"axis": axis} for axis in ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 1", "0 -1 0", "1 0 0")]
 
 
 def test_the_lwr_urdf_has_the_published_table():
@@ -73,7 +75,9 @@ def test_a_urdf_without_mdh_frames_gets_the_same_table():
     assert chain.d == pytest.approx(np.zeros(7), abs=1e-12)
 
 
-@pytest.mark.parametrize("joints", [UPRIGHT, SKEW, PARALLEL], ids=["upright", "skew", "parallel"])
+@pytest.mark.parametrize(
+    "joints", [UPRIGHT, SKEW, PARALLEL, CARDAN], ids=["upright", "skew", "parallel", "cardan"]
+)
 def test_dynamics_of_any_urdf_equal_pinocchios(joints):
     text = urdf(joints)
     chain = Chain.from_urdf(text, snap_rad=0.0)
@@ -92,7 +96,9 @@ def test_dynamics_of_any_urdf_equal_pinocchios(joints):
     assert found == pytest.approx(np.array(expected), abs=1e-11)
 
 
-@pytest.mark.parametrize("joints", [UPRIGHT, SKEW, PARALLEL[:5]], ids=["upright", "skew", "parallel"])
+@pytest.mark.parametrize(
+    "joints", [UPRIGHT, SKEW, PARALLEL[:5], CARDAN], ids=["upright", "skew", "parallel", "cardan"]
+)
 def test_link_frames_are_where_the_urdf_has_them(joints):
     text = urdf(joints)
     chain = Chain.from_urdf(text, snap_rad=0.0)
@@ -224,6 +230,14 @@ def test_a_urdf_without_an_axis_turns_about_x():
     text = urdf([{"axis": "1 0 0"}, {"xyz": "0 0.1 0.2", "axis": "1 0 0"}])
     bare = text.replace('<axis xyz="1 0 0"/>', "")
     assert "axis" not in bare
+    one, other = Chain.from_urdf(text), Chain.from_urdf(bare)
+    assert other.to_dict() == one.to_dict()
+
+
+def test_an_origin_without_place_or_angles_has_zeros():
+    text = urdf([{}, {"xyz": "0 0.1 0.2", "axis": "1 0 0"}, {"rpy": "0.2 0 0", "axis": "0 1 0"}])
+    bare = text.replace(' xyz="0 0 0"', "").replace(' rpy="0 0 0"', "").replace("xyz='0 0 0'", "")
+    assert bare.count("xyz") < text.count("xyz")
     one, other = Chain.from_urdf(text), Chain.from_urdf(bare)
     assert other.to_dict() == one.to_dict()
 

@@ -105,6 +105,25 @@ def test_energy_balance():
     assert power == pytest.approx((energy(step) - energy(-step)) / (2 * step), rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_any_choice_of_columns_has_the_values_of_all_columns(seed: int):
+    random = np.random.default_rng(seed)
+    chain = random_chain(random, longest=5)
+    q, qd, qdd = states(chain, 4, seed)
+    whole = regressor.rigid_regressor(chain, q, qd, qdd)
+    for share in (0.2, 0.5, 0.8):
+        chosen = np.flatnonzero(random.random(10 * chain.n) < share)
+        places = np.full(10 * chain.n, -1)
+        places[chosen] = random.permutation(len(chosen))
+        # It may leave a column without a parameter.
+        places[random.integers(10 * chain.n)] = len(chosen)
+        part = regressor.rigid_regressor(chain, q, qd, qdd, columns=places.reshape(-1, 10))
+        for column in np.flatnonzero(places >= 0):
+            np.testing.assert_allclose(part[..., places[column]], whole[..., column], atol=1e-12)
+        empty = np.setdiff1d(np.arange(part.shape[-1]), places)
+        assert not part[..., empty].any()
+
+
 def test_wanted_columns_go_where_the_map_says():
     chain = lwr()
     q, qd, qdd = states(chain, 10)

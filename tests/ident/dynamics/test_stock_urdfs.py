@@ -42,6 +42,9 @@ def test_seven_columns_are_the_arm_before_the_fingers(name: str) -> None:
     read = read_urdf(VARIANTS[name])
     assert read.arm(count=7) == JOINTS
     assert read.arm(names=[entry.name for entry in read.joints]) == JOINTS
+    assert read.arm(names=JOINTS) == JOINTS
+    with pytest.raises(ConfigurationError, match="no serial arms"):
+        read.arm(names=JOINTS[1:])
 
 
 def test_a_finger_in_the_log_belongs_to_the_chain() -> None:

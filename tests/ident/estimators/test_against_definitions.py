@@ -27,7 +27,14 @@ from ident.estimators import (
     WeightedLeastSquares,
     nearest_consistent,
 )
-from ident.estimators.covariance import Scores, correlation_time, effective_rows
+from ident.estimators.covariance import (
+    Scores,
+    _Blocks,
+    _stationary,
+    correlation_time,
+    effective_rows,
+    jackknife,
+)
 from ident.estimators.least_squares import class_variances
 from tests.ident.regression_problems import ar1, design, problem
 
@@ -80,11 +87,20 @@ def test_factors_are_combined_with_their_weights_and_empty_ones_left_out() -> No
     parts = [random.normal(size=(m, 4)) for m in (7, 0, 9)]
     factors = [TriangularFactor.of(part[:, :3], part[:, 3]) for part in parts]
     assert factors[1].rows == 0
+    assert TriangularFactor.of(np.ones((1, 2)), np.array([3.0])).mean_square == pytest.approx(9.0)
     assert factors[1].mean_square == 0.0
     found = TriangularFactor.combine(factors, [2.0, 5.0, 0.5])
     expected = 2.0 * parts[0].T @ parts[0] + 0.5 * parts[2].T @ parts[2]
     np.testing.assert_allclose(found.r.T @ found.r, expected, atol=1e-12)
     assert found.rows == 16
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_rows_of_a_joint_that_nothing_moves_have_a_factor(order: str) -> None:
+    target = np.arange(5.0)
+    factor = TriangularFactor.of(np.zeros((5, 3), order=order), target)  # type: ignore[call-overload]
+    np.testing.assert_allclose(factor.normal, np.zeros((3, 3)))
+    assert factor.sum_of_squares(np.ones(3)) == pytest.approx(float(target @ target))
 
 
 def test_a_constant_torque_of_zero_has_a_factor() -> None:
@@ -321,6 +337,19 @@ def test_a_prior_serves_where_the_motion_excites_nothing() -> None:
     assert 0.2 < estimate.std[9] < 0.5
 
 
+def test_a_free_parameter_without_a_column_is_zero_beside_a_prior() -> None:
+    matrices = [m.copy() for m in design()]
+    for matrix in matrices:
+        matrix[:, 5] = 0.0
+    case = problem(matrices, CHI, [0.1 * np.random.default_rng(2).normal(size=len(m)) for m in matrices])
+    known = np.arange(12) == 2
+    found = MaximumAPosteriori(Prior(known * CHI, np.diag(100.0 * known)), 1.0).fit(case)
+    others = np.arange(12) != 5
+    assert found.values[5] == pytest.approx(0.0, abs=1e-9)
+    assert np.abs((found.values - CHI) / found.std)[others].max() < 4.0
+    assert found.std[5] > 10.0 * found.std[others].max()
+
+
 def test_an_independent_prior_has_infinite_deviations_for_free_parameters() -> None:
     prior = Prior.independent(np.array([1.0, 2.0, 3.0]), np.array([0.5, np.inf, 2.0]))
     assert prior.mean.tolist() == [1.0, 0.0, 3.0]
@@ -502,6 +531,12 @@ def test_the_form_of_a_metric_is_its_definition(metric: str) -> None:
     np.testing.assert_allclose(found[20:], 0.0)
 
 
+@pytest.mark.parametrize("relative_std", [0.0, -0.8, np.array([0.2, np.nan])])
+def test_a_prior_of_bodies_has_positive_deviations(relative_std: float) -> None:
+    with pytest.raises(ConfigurationError, match="is not positive"):
+        body_prior(relative_std)
+
+
 def bodies_seen(prior: BodyPrior, truth: np.ndarray, noise: float, rows: int = 400) -> Problem:
     random = np.random.default_rng(3)
     scale = 1.0 / np.append(np.tile(np.abs(BODY) + 0.01, 2), [1.0, 1.0])
@@ -581,6 +616,9 @@ def test_the_entropic_distance_is_the_divergence_of_its_definition() -> None:
     )
     for _ in range(40):
         assert cost(found.standard + 0.1 * deviation * random.normal(size=22)) > best - 1e-3
+    for step in np.diag(0.01 * deviation):
+        # The slope by a standard deviation; the curvature is 2.
+        assert abs(cost(found.standard + step) - cost(found.standard - step)) / 0.02 < 0.02
 
 
 @pytest.mark.parametrize("margin", [1e-2, 0.2])
@@ -692,6 +730,42 @@ def test_the_deviations_of_total_least_squares_are_those_of_repeated_data() -> N
     np.testing.assert_allclose(stated / scatter, 1.0, atol=0.25)
 
 
+@pytest.mark.parametrize("share", [0.03, 0.1])
+def test_the_textbook_covariance_of_total_least_squares_is_the_curvature_of_its_criterion(
+    share: float,
+) -> None:
+    case, _, rms = one_class(5, 400, share)
+    estimate = TotalLeastSquares(share).fit(case)
+    group = case.groups[0]
+    column = share * rms * np.array([0.0, 0.0, 1.0, 1.0, 1.0])
+    square = float(np.sum((group.target - group.matrix @ estimate.values) ** 2))
+    torque = square / (400 - 5) - float(np.sum((column * estimate.values) ** 2))
+
+    def cost(x: np.ndarray) -> float:
+        residual = group.target - group.matrix @ (estimate.values + x)
+        return 0.5 * float(residual @ residual / (torque + np.sum((column * (estimate.values + x)) ** 2)))
+
+    steps = np.diag(1e-2 * estimate.std)
+    curvature = np.array(
+        [[cost(a + b) - cost(a - b) - cost(b - a) + cost(-a - b) for b in steps] for a in steps]
+    ) / (4.0 * np.outer(np.diag(steps), np.diag(steps)))
+    expected = np.linalg.inv(curvature)
+    size = np.sqrt(np.diag(expected))
+    found = estimate.covariances["textbook"].matrix
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=5e-3)
+
+
+def test_without_errors_of_the_columns_total_least_squares_has_the_covariances_of_least_squares() -> None:
+    case, *_ = one_class(3, 400, 0.0)
+    total, plain = TotalLeastSquares(1e-7).fit(case), WeightedLeastSquares().fit(case)
+    for kind in ("textbook", "hac"):
+        np.testing.assert_allclose(
+            total.covariances[kind].matrix, plain.covariances[kind].matrix, rtol=1e-4, atol=1e-9
+        )
+    for one, other in zip(total.classes, plain.classes, strict=True):
+        assert one.sigma == pytest.approx(other.sigma, rel=1e-4)
+
+
 def test_column_noise_is_given_by_name_too() -> None:
     case, *_ = one_class(2, 400, 0.1)
     same = TotalLeastSquares({"XX1": 0.1, "YY1": 0.1, "ZZ1": 0.1}).fit(case)
@@ -738,6 +812,67 @@ def test_bartletts_weights_fall_linearly_with_the_lag_within_a_record(length: in
             for j in range(len(record)):
                 expected += max(0.0, 1.0 - abs(i - j) / length) * np.outer(record[i], record[j])
     np.testing.assert_allclose(Scores(records).bartlett(length), expected, atol=1e-12)
+
+
+def test_the_variance_of_stationary_residuals_is_that_of_their_toeplitz_matrix() -> None:
+    random = np.random.default_rng(6)
+    groups, spread = [], []
+    for record, gap in enumerate((0, 7)):
+        times = np.arange(200) + np.where(np.arange(200) < 120, 0, gap)
+        groups.append(RowGroup("A1", "joint", record, random.normal(size=(200, 2)), np.zeros(200), times))
+        spread.append(ar1(random, times[-1] + 1, 0.4)[times])
+    groups.append(RowGroup("A1", "joint", 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=int)))
+    spread.append(np.zeros(0))
+    case = Problem(("a", "b"), tuple(groups), 0.1)
+    lagged = []
+    for lag in range(60):
+        pairs = [
+            residual[i] * residual[j]
+            for group, residual in zip(groups, spread, strict=True)
+            for i, j in zip(
+                *np.nonzero(np.subtract.outer(group.time_index, group.time_index) == lag), strict=True
+            )
+        ]
+        lagged.append(float(np.mean(pairs)))
+    until = next(lag for lag, value in enumerate(lagged) if abs(value) < 2.0 / np.sqrt(400) * lagged[0])
+    weight = np.array(lagged[:until] + [0.0] * 300)
+    expected = sum(
+        group.matrix.T @ weight[np.abs(np.subtract.outer(group.time_index, group.time_index))] @ group.matrix
+        for group in groups
+    )
+    found = _stationary(case, spread, np.array([4.0]), None)
+    np.testing.assert_allclose(found, np.asarray(expected) * 400 / 396, rtol=1e-9)
+
+
+def test_blocks_of_a_period_are_those_of_its_phase() -> None:
+    groups = tuple(
+        RowGroup("A1", "joint", record, np.ones((n, 1)), np.ones(n), np.arange(n))
+        for record, n in enumerate((120, 40))
+    )
+    cut = _Blocks.of(Problem(("a",), groups, 0.1, periods=(40, None)), 1.0)
+    assert cut.periodic
+    assert cut.length == 10
+    # Three periods of four blocks, and a record of its own four.
+    found = [(block, rows.start, rows.stop) for block, rows in cut.runs(groups[0])]
+    assert found == [(k % 4, 10 * k, 10 * k + 10) for k in range(12)]
+    assert [block for block, _ in cut.runs(groups[1])] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("block_s", [2.0, 5.0])
+def test_a_jackknife_has_one_degree_of_freedom_less_than_blocks(block_s: float) -> None:
+    case = noisy()
+    plain = WeightedLeastSquares().fit(case)
+    weights = plain.weights[list(case.class_of_group)]
+    residuals = case.residuals(plain.values)
+    found = jackknife(
+        case,
+        plain.covariances["textbook"].matrix,
+        [weight * e for weight, e in zip(weights, residuals, strict=True)],
+        [np.full(len(e), weight) for weight, e in zip(weights, residuals, strict=True)],
+        block_s,
+    )
+    # Two records of 40 s.
+    assert found.degrees_of_freedom == 2 * 40 / block_s - 1
 
 
 def test_thinned_scores_are_sums_of_neighbours() -> None:

@@ -495,6 +495,56 @@ def test_missing_columns_and_confused_parameters_are_named():
         WeightedLeastSquares().fit(problem(matrices, CHI, white(0, matrices)))
 
 
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        OrdinaryLeastSquares(),
+        WeightedLeastSquares(),
+        RobustLeastSquares("huber"),
+        TotalLeastSquares(1e-3, exact=r"p[012]$"),
+    ],
+    ids=lambda e: type(e).__name__,
+)
+def test_every_estimator_refuses_columns_that_are_sums_of_others(estimator):
+    matrices = [m.copy() for m in design()]
+    for matrix in matrices:
+        matrix[:, 5] = 3.0 * matrix[:, 6] - matrix[:, 7]
+    with pytest.raises(DataError, match="cannot tell p5, p6, p7 apart"):
+        estimator.fit(problem(matrices, CHI, white(0, matrices)))
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        WeightedLeastSquares(),
+        RobustLeastSquares("huber"),
+        TotalLeastSquares(exact=r"p[012]$"),
+        RecursiveLeastSquares(memory_s=40.0),
+        RegressorExtensionMixing(),
+    ],
+    ids=lambda e: type(e).__name__,
+)
+def test_a_record_may_begin_at_any_time(estimator):
+    case = sample()
+    later = tuple(
+        RowGroup(g.joint, g.side, g.record, g.matrix, g.target, g.time_index + 37) for g in case.groups
+    )
+    plain, moved = estimator.fit(case), estimator.fit(Problem(case.names, later, case.sample_time_s))
+    np.testing.assert_allclose(moved.values, plain.values, rtol=1e-9)
+    for kind in ("textbook", "hac"):
+        if kind in plain.covariances:
+            np.testing.assert_allclose(moved.covariances[kind].std, plain.covariances[kind].std, rtol=1e-9)
+
+
+def test_a_plot_has_each_value_in_the_middle_of_its_interval():
+    pytest.importorskip("matplotlib")
+    estimate = WeightedLeastSquares().fit(sample())
+    (axis,) = estimate.plot()
+    np.testing.assert_allclose(axis.lines[0].get_xdata(), estimate.values)
+    ends = np.array([segment[:, 0] for segment in axis.collections[0].get_segments()])
+    np.testing.assert_allclose(ends, estimate.interval())
+
+
 def test_too_few_rows_and_non_finite_rows_are_refused():
     matrices = design(samples=3, records=1)
     with pytest.raises(DataError, match=r"record a longer motion|cannot tell"):

@@ -53,6 +53,23 @@ def test_blocks_give_the_rows_of_the_whole_session(long, stiffness):
         np.testing.assert_allclose(other.target, mine.target, atol=1e-9 * np.abs(mine.target).max())
 
 
+def test_a_block_has_the_samples_in_reach_of_its_filters_and_no_more(monkeypatch):
+    monkeypatch.setattr(prepare_module, "_BLOCK_S", 10.0)
+    count = {}
+    for periods in (8, 12):
+        session = arm.session(seed=4, periods=periods, period_s=10.0, motor=False)
+        whole, blocks = (
+            prepare(session, SignalSettings(decimate_hz=8.0), log=False, blocks=cut) for cut in (False, True)
+        )
+        sizes = [len(passage.joint.times) for passage in blocks.passages]
+        assert len(sizes) > 3
+        assert max(sizes[1:-1]) < 0.5 * len(whole.passages[0].joint.times)
+        assert sum(sizes) >= len(whole.passages[0].joint.times)
+        count[periods] = max(sizes[1:-1])
+    # The memory of a block does not grow with the session.
+    assert count[8] == count[12]
+
+
 def test_commanded_motion_in_blocks_is_that_of_the_whole_session(long):
     structure = ModelStructure(arm.chain(), 1)
     rows = []

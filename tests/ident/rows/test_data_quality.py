@@ -149,6 +149,16 @@ def test_a_limit_has_over_ten_times_the_samples_of_the_values_beside(count: int,
     assert np.isfinite(clipped_at(columns(effort))[0]) == seen
 
 
+def test_the_two_next_values_alone_tell_whether_a_limit_is_chance():
+    effort = noisy()
+    effort[:, 0] += np.linspace(0.0, 1e-3, COUNT)
+    order = np.argsort(effort[:, 0])
+    effort[order[:12], 0] = -20.0
+    # The third next value is frequent, too.
+    effort[order[14:18], 0] = effort[order[14], 0]
+    assert clipped_at(columns(effort))[0] == 20.0
+
+
 def test_a_dead_zone_is_counted_in_the_motion_alone():
     effort = noisy()
     effort[np.abs(effort[:, 0]) < 1.0, 0] = 0.0
@@ -204,3 +214,18 @@ def test_short_or_constant_channels_show_nothing():
     smooth = np.sin(0.05 * np.arange(200))[:, None]
     assert passed_band(np.ones((200, 2)), 0.004) is None
     assert passed_band(smooth[:63], 0.004) is None
+
+
+def test_samples_of_an_older_moment_are_counted_once_each():
+    effort, position = noisy(), columns(noisy()).position.copy()
+    time = np.arange(COUNT) / RATE
+    for row in (400, 900, 1300, 1700):
+        position[row] = [np.sin(time[row] - 0.5 / RATE), np.cos(1.3 * (time[row] - 0.5 / RATE))]
+    (found,) = sample_loss([session(columns(effort, position))])
+    assert (found.lost, found.repeated, found.stale) == (0, 0, 4)
+
+
+def test_the_limit_of_a_single_joint_is_found():
+    whole = columns(np.clip(noisy(), -np.inf, 8.0))
+    one = replace(whole, names=("a",), position=whole.position[:, :1], effort=whole.effort[:, :1])
+    assert clipped_at(one).tolist() == [8.0]

@@ -66,3 +66,26 @@ def test_another_channel_follows_the_same_clock() -> None:
     clock = sample_clock(stamps, _motion(true + 1.0))
     assert clock is not None
     assert clock.at(stamps[::3], stamps) == pytest.approx(clock.times[::3])
+
+
+def _wandering(late: Floats) -> Floats:
+    """Stamps [periods of 1 ms] that are late by `late` and jitter by a fifth of a period."""
+    jitter = 0.2 * np.random.default_rng(5).random(len(late))
+    return 1e-3 * (np.arange(len(late)) + late + jitter)
+
+
+@pytest.mark.parametrize(("most", "followed"), [(33.0, True), (42.0, False)])
+def test_stamps_wander_by_five_times_their_usual_distance_at_most(most: float, followed: bool) -> None:
+    samples = np.arange(6000)
+    # Usually 5 periods early or late, in robust terms a standard deviation of 7.4.
+    late = 5.0 * np.tanh(20.0 * np.sin(2 * np.pi * samples / 2000.0))
+    late = late + (most - 5.0) * np.exp(-(((samples - 2500) / 100.0) ** 2))
+    clock = sample_clock(_wandering(late), _motion(1e-3 * samples + 11.0))
+    assert (clock is not None) == followed
+
+
+@pytest.mark.parametrize(("count", "followed"), [(60, False), (61, True)])
+def test_a_short_recording_keeps_its_stamps(count: int, followed: bool) -> None:
+    true = np.arange(count) / 1000.0
+    clock = sample_clock(_wandering(np.zeros(count)), _motion(true + 11.5))
+    assert (clock is not None) == followed

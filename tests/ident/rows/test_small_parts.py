@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import butter
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.structure import ModelStructure
 from ident.rows.binned import bins
 from ident.rows.filters import (
+    Excitation,
     ParallelFilter,
     SignalSettings,
     advice,
@@ -22,9 +24,10 @@ from ident.rows.filters import (
     low_pass,
     median_step,
     moving,
+    settling,
     thinning,
 )
-from ident.rows.observation import observe, stack
+from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
 from ident.rows.reversals import away_from_reversals
 from ident.rows.sessions import payload_name, require, stated_mass
@@ -78,6 +81,14 @@ def test_a_low_pass_of_a_short_series_is_padded_by_what_there_is():
     with pytest.raises(ConfigurationError):
         low_pass(np.ones((50, 1)), 0.01, 50.0)
     low_pass(np.ones((500, 1)), 0.01, 49.9)
+
+
+@pytest.mark.parametrize("order", [1, 2, 4, 7])
+def test_a_low_pass_has_settled_when_its_slowest_pole_has_decayed(order: int):
+    _, poles, _ = butter(order, 2 * np.pi * 5.0, analog=True, output="zpk")
+    slowest = -poles.real.max()
+    assert np.exp(-slowest * settling(5.0, order)) == pytest.approx(np.exp(-40.0), rel=1e-6)
+    assert settling(5.0) == settling(5.0, 4)
 
 
 def test_thinning_leaves_forty_samples_a_period():
@@ -148,6 +159,19 @@ def test_the_share_of_flagged_samples_is_that_of_their_weight():
     assert not parallel.share(np.zeros(len(times), dtype=bool)).any()
     nowhere = ParallelFilter(times, np.array([90.0]), 2.0)
     assert (nowhere.share(flagged).tolist(), nowhere.coverage().tolist()) == ([[0.0, 0.0, 0.0]], [0.0])
+
+
+def test_the_excitation_is_that_of_the_joint_that_moves_also_block_by_block():
+    time = np.arange(12_000) / 200.0
+    # The weak joint creeps, so that the means of its blocks differ.
+    fast, weak = np.sin(2 * np.pi * time), 1e-3 * np.sin(14 * np.pi * time) + 1e-3 * np.floor(time / 10.0)
+    velocity = np.column_stack([fast, weak])
+    whole = excitation_frequency(velocity, 1 / 200.0)
+    parts = Excitation(len(velocity), 1 / 200.0)
+    for first in range(0, len(velocity), 2000):
+        parts.add(velocity[first : first + 2000])
+    assert parts.frequency() == pytest.approx(whole)
+    assert whole == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_joint_that_hardly_moves_has_no_part_in_the_excitation():
@@ -235,6 +259,18 @@ def test_flagged_samples_are_bridged_like_lost_ones():
     np.testing.assert_allclose(part.values[:, 0], np.sin(3.0 * time), atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_irregular_times_are_sampled_from_the_first_to_the_last(seed: int):
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.uniform(0.006, 0.014, 300))
+    ((part,), lost) = stretches(times, np.sin(times)[:, None], np.zeros(300, dtype=bool), 0.01, 0.1)
+    assert part.resampled
+    assert lost == 0
+    assert part.times[0] == times[0]
+    assert times[-1] - 0.01 < part.end <= times[-1]
+    np.testing.assert_allclose(part.values[:, 0], np.sin(part.times), atol=1e-7)
+
+
 def test_irregular_times_are_bridged_where_no_sample_is_near():
     random = np.random.default_rng(0)
     time = np.arange(300) * 0.01 + random.uniform(-0.002, 0.002, 300)
@@ -246,6 +282,18 @@ def test_irregular_times_are_bridged_where_no_sample_is_near():
     assert part.bridged.any()
 
 
+@pytest.mark.parametrize(("steps", "found"), [(1, []), (5, []), (6, [1000, 1100, 1200])])
+def test_an_encoder_at_rest_jumps_by_five_steps_at_most(steps: int, found: list[int]):
+    resolution = 2.0**-10
+    position = np.zeros(4000)
+    # A motion of fifty steps, later.
+    position[2000:2500] = np.arange(500) // 10
+    position[2500:] = 50
+    position[[1000, 1100, 1200]] += steps
+    flags, crowded = flag_outliers(resolution * position[:, None], 8.0)
+    assert (np.flatnonzero(flags).tolist(), crowded) == (found, [])
+
+
 def test_a_few_steps_of_the_encoder_are_no_outlier():
     steps = np.zeros((400, 1))
     steps[::40] = 1.0
@@ -253,6 +301,23 @@ def test_a_few_steps_of_the_encoder_are_no_outlier():
     spike = np.cumsum(np.full(400, 0.01))[:, None]
     spike[200] += 0.2
     assert np.flatnonzero(flag_outliers(spike, 8.0)[0]).tolist() == [200]
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0])
+def test_a_lone_spike_of_a_still_channel_is_an_outlier(size: float):
+    values = np.zeros((400, 1))
+    values[200] = size
+    assert np.flatnonzero(flag_outliers(values, 8.0)[0]).tolist() == [200]
+
+
+@pytest.mark.parametrize("noisy", [slice(0, 45), slice(205, 250), slice(-45, None)])
+def test_a_noisy_part_has_no_outliers_wherever_it_lies(noisy: slice):
+    random = np.random.default_rng(3)
+    values = 0.001 * random.normal(size=(6030, 1))
+    values[noisy] *= 30.0
+    assert not flag_outliers(values, 8.0)[0].any()
+    values[1000] += 0.5
+    assert np.flatnonzero(flag_outliers(values, 8.0)[0]).tolist() == [1000]
 
 
 @pytest.mark.parametrize(("count", "crowded"), [(20, []), (21, [0])])
@@ -299,6 +364,15 @@ def test_a_problem_knows_the_period_of_each_record():
     assert found.periods == (None, 30, None)
     assert found.record_names == ("unloaded.mcap",) * 3
     assert found.sample_time_s == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("period_s", [9.9, 10.0])
+def test_rows_divide_a_period_evenly(period_s: float):
+    prepared = prepare(arm.session(motor=False, period_s=period_s, periods=2))
+    assert prepared.period_rows == 50
+    assert prepared.row_time_s == pytest.approx(period_s / 50)
+    (passage,) = prepared.passages
+    np.testing.assert_allclose(np.diff(passage.rows), period_s / 50, atol=1e-9)
 
 
 def test_one_period_is_not_averaged():
@@ -415,6 +489,37 @@ def test_the_torque_of_an_outlier_is_bridged_in_the_motor_channel():
     torque = [np.concatenate([p.motor.torque for p in one.passages]) for one in (clean, mended)]
     np.testing.assert_allclose(torque[0], torque[1], atol=0.5)
     assert np.concatenate([p.motor.flagged for p in mended.passages])[:, 1].sum() == 1
+
+
+def test_between_irregular_times_both_neighbours_of_an_outlier_are_unknown():
+    session = arm.session(motor=False)
+    kept = np.cumsum(np.random.default_rng(0).integers(2, 5, 2000))
+    kept = kept[kept < len(session.joint)]
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    part = {name: getattr(session.joint, name)[kept] for name in fields}
+    part["sequence"] = np.arange(len(kept))
+    hit = np.arange(400, len(kept) - 200, 150)
+    part["effort"][hit, 3] += 400.0
+    uneven = replace(session, joint=replace(session.joint, **part))
+    stamps = part["publish_time"]
+    prepared = prepare(uneven, advise=False)
+    assert prepared.counts["resampled"]
+    (passage,) = prepared.passages
+    times, flagged = passage.joint.times, passage.joint.flagged[:, 3]
+    for time in (stamps[hit] - stamps[0]) * 1e-9:
+        # The samples of the grid on either side are interpolated through the outlier.
+        beside = np.flatnonzero(np.abs(times - time) < passage.joint.period_s)
+        assert flagged[beside].all()
+    assert np.abs(passage.joint.torque[:, 3]).max() < 200.0
+
+
+@pytest.mark.parametrize(("first", "last", "whole"), [(0, None, True), (0, -900, False), (900, None, False)])
+def test_a_commanded_motion_must_cover_the_measured_one(first: int, last: int | None, whole: bool):
+    session = arm.session(motor=False, command=True)
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    part = {name: getattr(session.command, name)[first:last] for name in fields}
+    cut = replace(session, command=replace(session.command, **part))
+    assert (commanded(cut, prepare(cut, advise=False)) is not None) == whole
 
 
 def test_the_mean_torque_is_that_of_the_rows_span():
