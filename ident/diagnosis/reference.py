@@ -21,7 +21,7 @@ from ident.diagnosis.evidence import Floats
 from ident.diagnosis.nominal import GAIN_STD
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import PER_LINK
-from ident.effects import NAMELESS
+from ident.effects import EFFECTS, NAMELESS
 from ident.effects.nameless import KNOTS
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
@@ -189,6 +189,12 @@ class Reference:
         for key, gain in self.null.items():
             mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
             found[key] = noise + (function if key[0] in terms else single) * max(mean - noise, 0.0)
+        # On a healthy arm a cause reaches at least the gain of its special cases, and is not counted beside them.
+        for effect in EFFECTS.values():
+            for case in effect.contains:
+                for (cause, joint), limit in list(found.items()):
+                    if cause == case:
+                        found[effect.cause, joint] = max(limit, found.get((effect.cause, joint), 0.0))
         return found
 
     def loosened(self, symbol: str, share: float) -> Reference:

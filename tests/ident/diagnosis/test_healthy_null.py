@@ -155,3 +155,15 @@ def test_another_payload_shares_no_parameter_and_has_its_announced_mass(chain: C
         assert values[mass] == 4.0
         assert 1.0 / np.sqrt(precision[mass, mass]) == pytest.approx(0.08)
     assert np.all(np.diag(unknown[0])[mine] == 0.0)
+
+
+def test_a_cause_is_held_against_what_its_special_case_reaches_on_the_healthy_arm(
+    model: DynamicModel,
+) -> None:
+    null = {("joint_zero_offset", joint): gain for joint, gain in enumerate((30.0, 5.0, 10.0))}
+    null |= {("encoder_eccentricity", 0): 0.0, ("stribeck", 0): 1.0, ("stribeck", 1): 0.5}
+    limits = reference(model, null, 2).limits()
+    for joint in range(3):
+        assert limits["encoder_eccentricity", joint] == limits["joint_zero_offset", joint]
+    more = reference(model, null | {("encoder_eccentricity", 1): 500.0}, 2).limits()
+    assert more["encoder_eccentricity", 1] > more["joint_zero_offset", 1]
