@@ -138,7 +138,7 @@ def of_validation(found: Validation, tables: Sequence[Piece], sessions: Sequence
     look += [Verdict("warning", text, "", "look") for text in found.warnings]
     return Ending(
         _level(look),
-        sentence,
+        " ".join([sentence, *found.notes]),
         numbers,
         look,
         _VERBOSE,

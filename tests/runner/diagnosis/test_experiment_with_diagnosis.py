@@ -234,9 +234,8 @@ def test_a_failure_of_the_diagnosis_leaves_the_experiment_alone(
     motions: Any = None
     ended = conclude_run(experiment, arm, cell, motions, tmp_path, [], laboratory=fail)
     assert ended.study is None
-    assert ended.text(tmp_path) == (
-        "No diagnosis: LinAlgError: singular matrix. The results of the experiment stand."
-    )
+    said = ["No diagnosis: LinAlgError: singular matrix. The results of the experiment stand."]
+    assert ended.pieces(tmp_path) == ended.advice(tmp_path) == said
     assert ended.to_dict()["diagnosis"] is None
 
 
