@@ -34,6 +34,8 @@ Floats = NDArray[np.float64]
 
 _RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)
 _PARTS = 10
+# Findings of a generator for its full weight.
+_ENOUGH = 50
 _INTERCEPT = -1.5
 _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 1.0001)
 
@@ -181,7 +183,9 @@ def _fit(said: Sequence[Said], write: bool) -> None:
     points = np.array([stored.scaled(one.grounds) for one in said])
     right = np.array([one.right for one in said], float)
     count = {source: sum(one.source == source for one in said) for source in {one.source for one in said}}
-    weight = np.array([len(said) / len(count) / count[one.source] for one in said])
+    # A handful of findings says little about its generator.
+    weight = np.array([1.0 / max(count[one.source], _ENOUGH) for one in said])
+    weight *= len(said) / weight.sum()
     losses = {
         ridge: log_loss(held_back(said, points, right, weight, ridge), right, weight) for ridge in _RIDGES
     }
