@@ -182,22 +182,18 @@ def _session(source: Path, name: str | None) -> tuple[Session, list[Session]]:
         raise ConfigurationError(
             f"{source}: no such folder or log; name an experiment's folder or a .mcap file"
         )
+    if source.is_file() and name is not None:
+        raise ConfigurationError(f"--session {name}: {source} is a log; name the folder of its experiment")
     folder = source if source.is_dir() else source.parent
-    if source.is_file() and (name is not None or not (folder / "summary.json").is_file()):
-        if name is not None:
-            raise ConfigurationError(
-                f"--session {name}: {source} is a log; name the folder of its experiment"
-            )
-        log = read_recording(source, status=False)
-        return log, [log]
+    if source.is_file():
+        of_run = ResultFolder.load(folder).sessions if (folder / "summary.json").is_file() else {}
+        log = next((one for one in of_run.values() if one.path.name == source.name), None)
+        if log is None:
+            log, of_run = read_recording(source, status=False), {}
+        return log, list(of_run.values()) or [log]
     results = ResultFolder.load(folder)
     known = results.sessions
-    if source.is_file():
-        name = next((key for key, one in known.items() if one.path.name == source.name), None)
-        if name is None:
-            log = read_recording(source, status=False)
-            return log, [log]
-    elif name is None:
+    if name is None:
         held_out = [
             e["name"] for e in results.summary["sessions"] if e.get("validation") and e["name"] in known
         ]
