@@ -27,6 +27,8 @@ _NEAR = 4
 _FLAT, _OVER_NEXT = 10, 10
 # Least speed of a working motor.
 _MOVING_RAD_S = 0.01
+# Least duration of held torques over the usual time between two values.
+_HELD = 5.0
 # Share of the power above a quarter of the sampling rate without any sensor's noise: a 17-bit converter makes more.
 _SILENT = 1e-10
 # Halvings of an interval of shares, for a millionth.
@@ -106,6 +108,31 @@ def stale(columns: JointColumns) -> Flags:
     if _repeated(columns.effort):
         old |= _same(columns.effort) & _same(columns.position)
     return old
+
+
+def held(effort: Floats, times: Floats, path_times: Floats, path: Floats) -> Flags:
+    """Torques (N, J) kept in all joints for long while the arm moves: True (N,) for the repeated ones.
+
+    times : (N,) [s]. path : (P, J) positions [rad] at path_times (P,). A channel slower than its stamps repeats each
+    value equally long; an arm at rest may show equal torques.
+    """
+    same = _same(effort)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    first, after = edges[::2], edges[1::2]
+    fresh = np.flatnonzero(~same)
+    usual = float(np.median(np.diff(fresh))) if len(fresh) > 1 else np.inf
+    long = after - first >= _HELD * usual
+    first, after = first[long], after[long]
+    begin, end = times[first - 1], times[after - 1]
+    speed = np.zeros(len(first))
+    for joint in range(path.shape[1] if len(first) else 0):
+        q = column(path, joint)
+        way = np.interp(end, path_times, q) - np.interp(begin, path_times, q)
+        speed = np.maximum(speed, np.abs(way) / np.maximum(end - begin, 1e-6))
+    found = np.zeros(len(same), dtype=bool)
+    for a, b in zip(first[speed > _MOVING_RAD_S], after[speed > _MOVING_RAD_S], strict=True):
+        found[a:b] = True
+    return found
 
 
 def clipped_at(columns: JointColumns) -> Floats:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import DriveMotion
-from ident.rows.data_quality import stale
+from ident.rows.data_quality import held, stale
 from ident.rows.delay import DELAY_DB, DELAY_HZ, Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     Excitation,
@@ -213,6 +213,8 @@ def prepare(
     warnings: list[str] = []
     position_flags, crowded = flag_outliers(position, settings.outlier_scale)
     effort_flags, also = flag_outliers(effort, settings.outlier_scale)
+    kept = held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool)
+    effort_flags |= kept[:, None]
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
     names = moving(position, session.joint_names)
@@ -238,10 +240,11 @@ def prepare(
     flagged = {
         "stale": int(old.sum()),
         "position_outliers": int(position_flags.sum()),
-        "joint_torque_outliers": int(effort_flags.sum()),
+        "joint_torque_outliers": int(effort_flags[~kept].sum()),
+        "joint_torque_held": int(kept.sum()),
     }
     # A tenth of a gigabyte for an hour.
-    del parts, longest, position_flags, effort_flags, old, bad, times
+    del parts, longest, position_flags, effort_flags, old, kept, bad, times
     motor_data = (
         _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
     )
@@ -616,6 +619,8 @@ def _motor(
     effort = session.motor.effort
     flags, crowded = flag_outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
+    path_times = np.asarray((reference - origin) * 1e-9, dtype=np.float64)
+    flags |= held(effort, times, path_times, session.joint.position)[:, None]
     effort = effort.copy() if flags.any() else effort
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]

@@ -11,6 +11,7 @@ import pytest
 from ident.rows.data_quality import (
     SampleLoss,
     clipped_at,
+    held,
     passed_band,
     sample_loss,
     stale,
@@ -106,6 +107,21 @@ def test_stale_samples_are_the_repeated_ones_and_those_of_jolting_positions():
     assert 1200 in found
     assert found.min() >= 798
     assert set(found) <= {*range(798, 804), *range(1198, 1204)}
+
+
+def test_held_torques_of_a_moving_arm_are_found_and_a_slower_channel_or_a_resting_arm_is_none():
+    effort, whole = noisy(), columns(noisy())
+    times, path = np.arange(COUNT) * 1e-3, np.outer(np.arange(COUNT) * 1e-3, [0.2, 0.0])
+    stopped = effort.copy()
+    stopped[900:930] = stopped[899]
+    # One repeated sample is no matter, and torques of one joint alone may stay.
+    stopped[400] = stopped[399]
+    stopped[500:530, 0] = stopped[499, 0]
+    assert np.flatnonzero(held(stopped, times, times, path)).tolist() == list(range(900, 930))
+    assert not held(stopped, times, times, np.zeros_like(path)).any()
+    slower = np.repeat(effort[: COUNT // 8], 8, axis=0)
+    assert not held(slower, times[: len(slower)], times, path).any()
+    assert not held(whole.effort[:, :1] * 0.0, times, times, path).any()
 
 
 def test_a_jolt_of_one_joint_of_two_or_beside_a_gap_is_not_stale():

@@ -215,6 +215,24 @@ def test_lost_samples_and_outliers_are_counted_and_do_not_bend_the_rows():
         assert np.abs(group.target - group.matrix @ chi).max() < 5e-3
 
 
+def test_held_torques_of_either_channel_make_no_row():
+    whole = arm.session()
+    effort, motor = whole.joint.effort.copy(), whole.motor.effort.copy()
+    late = (whole.motor.log_time - whole.joint.log_time[0]) * 1e-9
+    hold, hold_motor = slice(3001, 3081), slice(*np.searchsorted(late, [4.0, 4.1]).tolist())
+    effort[hold], motor[hold_motor] = effort[3000], motor[hold_motor.start - 1]
+    session = dataclasses.replace(
+        whole,
+        joint=dataclasses.replace(whole.joint, effort=effort),
+        motor=dataclasses.replace(whole.motor, effort=motor),
+    )
+    prepared = prepare(session)
+    assert prepared.counts["joint_torque_held"] == 80
+    assert prepared.counts["motor_torque_outliers"] >= 7 * (hold_motor.stop - hold_motor.start)
+    assert len(prepared.passages) == len(prepare(whole).passages)
+    assert sum(passage.joint.flagged.any(axis=1).sum() for passage in prepared.passages) == 80
+
+
 def test_a_long_gap_costs_its_rows_and_nothing_else():
     whole = prepare(arm.session(motor=False))
     holed = prepare(arm.session(motor=False, sensors=arm.Sensors(lost=tuple(range(3000, 3050)))))
